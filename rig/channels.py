@@ -1,0 +1,154 @@
+"""The channel table: what the rig measures, and how counts become volts and engineering values.
+
+Everything outside the physics (wire, drivers, recorder, viewer, exports) knows the rig through this table alone.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, model_validator
+
+TABLE = Path(__file__).with_name("channels.toml")
+
+
+class Channel(BaseModel):
+    """One measured channel with its complete calibration; half a scale is refused on load."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    label: str
+    group: str
+    signal: str
+    """Ideal signal of the model that the sensor feels (see `rig.kernels.signals`)."""
+    unit: str
+    si: PositiveFloat
+    """One engineering unit in SI."""
+    sensitivity_v: float
+    """[V per engineering unit]"""
+    bias_v: float
+    """Output at value zero [V]."""
+    range_v: tuple[float, float]
+    """Output limits of the conditioner [V]."""
+    bandwidth_hz: PositiveFloat
+    """-3 dB corner of the anti-alias low-pass [Hz]."""
+    highpass_hz: Annotated[float, Field(ge=0)]
+    """AC coupling [Hz]; 0 is DC-coupled."""
+    noise_v: Annotated[float, Field(ge=0)]
+    """White noise [V rms] at the converter."""
+    adc_v: PositiveFloat
+    """Converter range is +-adc_v [V]."""
+    adc_bits: Annotated[int, Field(ge=8, le=32)]
+    rate_hz: PositiveInt
+    """Sample rate [Hz]."""
+    kind: str
+    """Provenance of the values, as for parameters."""
+
+    @model_validator(mode="after")
+    def _whole_scale(self) -> Channel:
+        if self.sensitivity_v == 0.0:
+            raise ValueError(f"channel {self.name}: sensitivity_v must be non-zero")
+        low, high = self.range_v
+        if not -self.adc_v <= low < high <= self.adc_v:
+            raise ValueError(f"channel {self.name}: range_v must lie inside +-adc_v and be ascending")
+        return self
+
+    @property
+    def lsb_v(self) -> float:
+        """Converter step [V]."""
+        return 2.0 * self.adc_v / 2**self.adc_bits
+
+    @property
+    def scale(self) -> float:
+        """Engineering units per count."""
+        return self.lsb_v / self.sensitivity_v
+
+    @property
+    def offset(self) -> float:
+        """Engineering value at count zero."""
+        return -self.bias_v / self.sensitivity_v
+
+
+class Group(BaseModel):
+    """Channels that share a connector: one key, one block, one rate."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    title: str
+    rate_hz: PositiveInt
+    channels: tuple[Channel, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channel names in column order."""
+        return tuple(channel.name for channel in self.channels)
+
+    def engineering(self, counts: np.ndarray) -> np.ndarray:
+        """Convert ADC counts to engineering values.
+
+        Args:
+            counts: Integer counts, shape (n, channels).
+
+        Returns:
+            Values in each channel's unit, float64, shape (n, channels).
+        """
+        scale = np.array([channel.scale for channel in self.channels])
+        offset = np.array([channel.offset for channel in self.channels])
+        return counts * scale + offset
+
+
+class ChannelTable(BaseModel):
+    """All groups, by name."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    groups: dict[str, Group]
+
+    @property
+    def channels(self) -> dict[str, Channel]:
+        """All channels by name, in table order."""
+        return {channel.name: channel for group in self.groups.values() for channel in group.channels}
+
+    def only(self, names: tuple[str, ...], rate_hz: int | None = None) -> ChannelTable:
+        """The table with only the named groups, and another sample rate where one is given."""
+        kept = {}
+        for name in names:
+            group = self.groups[name]
+            if rate_hz is not None:
+                # A slower channel needs its anti-alias filter at a quarter of its own rate.
+                rows = tuple(
+                    channel.model_copy(
+                        update={"rate_hz": rate_hz, "bandwidth_hz": min(channel.bandwidth_hz, rate_hz / 4.0)}
+                    )
+                    for channel in group.channels
+                )
+                group = group.model_copy(update={"rate_hz": rate_hz, "channels": rows})
+            kept[name] = group
+        return ChannelTable(groups=kept)
+
+
+def parse_table(text: str) -> ChannelTable:
+    """Parse a channel table from TOML text (group defaults merged into each row)."""
+    groups = {}
+    names: set[str] = set()
+    for group_name, body in tomllib.loads(text)["groups"].items():
+        shared = {**body.get("defaults", {}), "group": group_name, "rate_hz": body["rate_hz"], "kind": body["kind"]}
+        rows = tuple(Channel(**{**shared, **row}) for row in body["channels"])
+        for row in rows:
+            if row.name in names:
+                raise ValueError(f"channel {row.name} stands twice in the channel table")
+            names.add(row.name)
+        groups[group_name] = Group(name=group_name, title=body["title"], rate_hz=body["rate_hz"], channels=rows)
+    return ChannelTable(groups=groups)
+
+
+@cache
+def default_table() -> ChannelTable:
+    """The rig's own channel table."""
+    return parse_table(TABLE.read_text())

@@ -1,0 +1,184 @@
+"""`rig run`: simulate a scene and serve it."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.errors import InputError
+from rig.transport import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from rig.pacing import Clock
+    from rig.service import Service
+
+
+class Pace(StrEnum):
+    """What decides when the next block runs."""
+
+    REAL_TIME = "real-time"
+    LOCKSTEP = "lockstep"
+    FREE = "free"
+
+
+def run(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")],
+    *,
+    pace: Annotated[
+        Pace, typer.Option(help="By the wall clock, by `rig step`, or as fast as everything attached keeps up.")
+    ] = Pace.REAL_TIME,
+    block_ms: Annotated[float, typer.Option(help="Length of a published block, in ms.")] = 10.0,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = DEFAULT_ENDPOINT,
+    expose: Annotated[bool, typer.Option("--expose", help="Allow --listen on a host other than 127.0.0.1.")] = False,
+    parameters: Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
+    ] = None,
+    engine: Annotated[str | None, typer.Option(help="Integration method.")] = None,
+    duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")] = None,
+) -> None:
+    """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
+    overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
+
+    from rig.scenes import load_scene
+    from rig.service import Service
+    from rig.simulation import Simulation
+    from rig.transport.zenoh import ZenohServer
+
+    loaded = load_scene(scene, overrides)
+    with ZenohServer(listen, expose=expose, wait=pace is not Pace.REAL_TIME) as server:
+        simulation = Simulation(loaded)
+        block_ticks = _block_ticks(block_ms, simulation)
+        service = Service(simulation, server, _clock(pace), block_ticks=block_ticks)
+        typer.echo(f"rig: scene {scene}, {pace}, preparing (the first run on a machine compiles for a while)", err=True)
+        service.prepare()
+        typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
+        with _stopping_on_signals(service.stop), _showing(service):
+            summary = service.run()
+    _print_summary(summary)
+
+
+def scene_overrides(
+    changes: list[str],
+    *,
+    parameters: str | None = None,
+    engine: str | None = None,
+    duration_s: float | None = None,
+    seed: int | None = None,
+) -> dict[str, str]:
+    """Changes to a scene from the command line, by dotted key.
+
+    Raises:
+        InputError: A change is not of the form KEY=VALUE.
+    """
+    overrides = {}
+    for text in changes:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip() or not value.strip():
+            raise InputError("--set", "KEY=VALUE, such as drive.speed_hz=5.2", text)
+        overrides[key.strip()] = value.strip()
+    named = {"parameters": parameters, "engine.name": engine, "duration_s": duration_s, "seed": seed}
+    return overrides | {key: str(value) for key, value in named.items() if value is not None}
+
+
+def _block_ticks(block_ms: float, simulation: Any) -> int:
+    ticks = block_ms * simulation.tick_rate_hz / 1000
+    unit_ms = simulation.block_ticks * 1000 / simulation.tick_rate_hz
+    # Blocks of more than a second would make commands wait that long.
+    if not 0 < block_ms <= 1000 or ticks % simulation.block_ticks:
+        raise InputError("--block-ms", f"a positive whole multiple of {unit_ms:g} ms, at most 1000 ms", block_ms)
+    return round(ticks)
+
+
+def _clock(pace: Pace) -> Clock:
+    from rig.pacing import FreeRun, Lockstep, RealTime
+
+    if pace is Pace.REAL_TIME:
+        return RealTime()
+    return Lockstep() if pace is Pace.LOCKSTEP else FreeRun()
+
+
+@contextmanager
+def _stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM end the run in good order; a second SIGINT interrupts at once."""
+
+    def handle(number: int, _: object) -> None:
+        if number == signal.SIGINT:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        stop()
+
+    former = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _showing(service: Service) -> Iterator[None]:
+    """Show the status while the run lasts: one live line on a terminal, else a line every 5 s."""
+    done = threading.Event()
+    # A thread of its own, so that a terminal that is held up (Ctrl-S) holds up nothing else.
+    show = _show_live if sys.stderr.isatty() else _show_lines
+    thread = threading.Thread(target=show, args=(service, done), name="display", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join(timeout=1.0)
+
+
+def _show_live(service: Service, done: threading.Event) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
+        while not done.wait(0.5):
+            live.update(_line(service.status()), refresh=True)
+
+
+def _show_lines(service: Service, done: threading.Event) -> None:
+    while not done.wait(5.0):
+        typer.echo(_line(service.status()), err=True)
+
+
+def _line(status: dict[str, Any]) -> str:
+    late, queue = status["lateness_ms"], status["queue"]
+    parts = [
+        f"{status['time_s']:9.2f} s",
+        f"x{status['real_time_factor']:.4f}",
+        f"late p99 {late['p99']:.2f} max {late['max']:.2f} ms",
+        f"overruns {status['overruns']}",
+        f"dropped {queue['dropped']}",
+        f"clients {len(status['clients'])}",
+    ]
+    if status["spin_hz"] is not None:
+        parts.insert(1, f"spin {status['spin_hz']:.2f} Hz")
+    if status["congestion"].get("stalled_links"):
+        parts.append(f"stalled links {status['congestion']['stalled_links']:.0f}")
+    return "  ".join(parts)
+
+
+def _print_summary(summary: dict[str, Any]) -> None:
+    late, queue = summary["lateness_ms"], summary["queue"]
+    typer.echo(
+        f"scene {summary['scene']}: {summary['reason']} at {summary['time_s']:.3f} s after {summary['wall_s']:.2f} s"
+    )
+    typer.echo(
+        f"real-time factor {summary['real_time_factor']:.6f}, lateness p50 {late['p50']:.3f} p99 {late['p99']:.3f}"
+        f" max {late['max']:.3f} last {late['last']:.3f} ms, overruns {summary['overruns']}"
+    )
+    typer.echo(
+        f"{summary['samples_published']} samples a channel published, blocks dropped {queue['dropped']},"
+        f" commands taken {summary['commands']}"
+    )

@@ -1,0 +1,94 @@
+"""`rig status`: how a running rig is doing."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.cli.connection import Connect, console
+from rig.transport import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def status(
+    *,
+    as_json: Annotated[bool, typer.Option("--json", help="The whole status document, as JSON.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Again twice a second, until Ctrl-C or the end.")] = False,
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Show time, pace, lateness, losses, clients and doubts of a running rig."""
+    with console(connect, "status") as rig:
+        if not watch:
+            document = rig.status()
+            if as_json:
+                typer.echo(json.dumps(document, indent=2))
+            else:
+                _print(document)
+            return
+        try:
+            _watch(rig, as_json)
+        except KeyboardInterrupt:
+            return
+
+
+def _watch(rig: Any, as_json: bool) -> None:
+    import time
+
+    from rich.console import Console as Screen
+    from rich.live import Live
+
+    if as_json:
+        while (document := rig.status())["state"] == "running":
+            typer.echo(json.dumps(document))
+            time.sleep(0.5)
+        return
+    with Live(status_table(rig.status()), console=Screen(), auto_refresh=False) as live:
+        while (document := rig.status())["state"] == "running":
+            live.update(status_table(document), refresh=True)
+            time.sleep(0.5)
+        live.update(status_table(document), refresh=True)
+
+
+def _print(document: dict[str, Any]) -> None:
+    from rich.console import Console as Screen
+
+    Screen().print(status_table(document))
+
+
+def status_table(document: dict[str, Any]) -> Table:
+    """A status document as a table of two columns."""
+    from rich.table import Table
+
+    late, queue, energy = document["lateness_ms"], document["queue"], document["energy"]
+    table = Table(title=f"rig: {document['scene']}, {document['state']}", show_header=False, title_justify="left")
+    end = "" if document["end_s"] is None else f" of {document['end_s']:g} s"
+    table.add_row("simulated time", f"{document['time_s']:.3f} s{end} (tick {document['tick']})")
+    table.add_row("pace", f"{document['pace']}, blocks of {document['block_ms']:g} ms")
+    table.add_row("real-time factor", f"{document['real_time_factor']:.6f}")
+    table.add_row(
+        "lateness", f"p50 {late['p50']:.3f}, p99 {late['p99']:.3f}, max {late['max']:.3f}, last {late['last']:.3f} ms"
+    )
+    table.add_row("overruns", str(document["overruns"]))
+    table.add_row(
+        "queue", f"{queue['depth']} of {queue['capacity']}, at most {queue['high_water']}, dropped {queue['dropped']}"
+    )
+    table.add_row("spin", _figure(document["spin_hz"], "Hz"))
+    residual, dissipated = _figure(energy.get("residual_j"), "J"), _figure(energy.get("dissipated_j"), "J")
+    table.add_row("energy", f"residual {residual}, dissipated {dissipated}")
+    table.add_row("samples published", str(document["samples_published"]))
+    table.add_row("commands taken", str(document["commands"]))
+    table.add_row("links", ", ".join(f"{name} {value:g}" for name, value in document["congestion"].items()) or "-")
+    for name, client in document["clients"].items():
+        text = f"lag {client['lag_s']:.3f} s, heard {client['last_heard_s']:.1f} s ago, lost {client['lost']}"
+        table.add_row(f"client {name}", text)
+    for text in document["warnings"]:
+        table.add_row("warning", f"[yellow]{text}[/yellow]")
+    return table
+
+
+def _figure(value: float | None, unit: str) -> str:
+    return "not finite" if value is None else f"{value:.4g} {unit}"

@@ -1,0 +1,186 @@
+"""`rig view`: a recording or the running rig in rerun."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.connection import Connect
+from rig.errors import InputError, RefusedError
+from rig.transport import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+    from recorder.viewer.window import Kind, Window
+
+
+def view(
+    file: Annotated[Path | None, typer.Argument(help="Recording to view (.mcap, or what is left of one).")] = None,
+    *,
+    live: Annotated[bool, typer.Option("--live", help="View the running rig.")] = False,
+    connect: Connect = DEFAULT_ENDPOINT,
+    wait_s: Annotated[float, typer.Option(help="Wait that long for the rig to be there, in s (with --live).")] = 5.0,
+    web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
+    save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening a viewer.")] = None,
+    screenshot: Annotated[Path | None, typer.Option(help="Write a .png picture instead of opening a viewer.")] = None,
+    at_s: Annotated[
+        float | None, typer.Option(help="Simulated time of the picture, in s; default: the last contact, else the end.")
+    ] = None,
+) -> None:
+    """View a recording, or the running rig, in rerun.
+
+    Opens a window where there is a screen; otherwise serves the viewer on 127.0.0.1 and prints the address.
+    """
+    _check(file, live=live, web=web, save=save, screenshot=screenshot, at_s=at_s)
+    with _interruptible():
+        if live:
+            _view_live(connect, wait_s=wait_s, web=web, save=save)
+        elif file is not None:
+            _view_file(file, web=web, save=save, screenshot=screenshot, at_s=at_s)
+
+
+def _check(
+    file: Path | None, *, live: bool, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None
+) -> None:
+    """Refuse what does not go together before anything starts."""
+    if (file is None) != live:
+        raise InputError("view", "given either a FILE or --live", "both" if live else "neither")
+    if sum((web, save is not None, screenshot is not None)) > 1:
+        raise InputError("view", "given at most one of --web, --save and --screenshot", "several")
+    if live and screenshot is not None:
+        raise InputError("--screenshot", "used with a FILE", "--live")
+    if at_s is not None and screenshot is None:
+        raise InputError("--at-s", "used with --screenshot", at_s)
+    for option, path, suffix in (("--save", save, ".rrd"), ("--screenshot", screenshot, ".png")):
+        if path is not None:
+            if path.suffix != suffix:
+                raise InputError(option, f"a file name that ends in {suffix}", str(path))
+            if not path.absolute().parent.is_dir():
+                raise InputError(option, "in a folder that exists", str(path))
+            if path.is_dir():
+                raise InputError(option, "a file", str(path))
+
+
+def _view_file(file: Path, *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None) -> None:
+    _hush()
+    from recorder.reader import Recording
+    from recorder.viewer import blueprint, window
+    from recorder.viewer.canvas import Canvas, new_stream
+    from recorder.viewer.file import paint
+    from recorder.viewer.geometry import Geometry
+
+    recording = Recording.open(file)
+    stream = new_stream(file.name)
+    plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
+    if save is not None:
+        stream.save(save, default_blueprint=plan)
+        painted = paint(recording, Canvas(stream))
+        _close(stream)
+        size = save.stat().st_size / 1e6
+        typer.echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
+        return
+    with window.picture_of(screenshot) if screenshot is not None else window.Window(_kind(web=web)) as shown:
+        stream.connect_grpc(shown.url, default_blueprint=plan)
+        try:
+            painted = paint(recording, Canvas(stream))
+        finally:
+            _close(stream)
+        if screenshot is not None:
+            latest = painted.end_s if painted.last_contact_s is None else painted.last_contact_s
+            shown.picture(screenshot, at_s=latest if at_s is None else at_s, end_s=painted.end_s)
+            typer.echo(f"{screenshot}: at {latest if at_s is None else at_s:.3f} s")
+        else:
+            _tell(shown, file.name)
+            while not shown.wait(0.5):
+                pass
+
+
+def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> None:
+    _hush()
+    from recorder.viewer import blueprint, live, window
+    from recorder.viewer.canvas import Canvas, new_stream
+    from rig.transport import NoReplyError
+    from rig.transport.zenoh import ZenohClient
+
+    try:
+        client = ZenohClient(connect, wait_s=wait_s)
+    except NoReplyError as error:
+        raise RefusedError(str(error)) from None
+    with client:
+        try:
+            described = live.ask(client)
+        except NoReplyError as error:
+            raise RefusedError(str(error)) from None
+        stream = new_stream(f"rig at {connect}")
+        plan = blueprint.layout(described.table, described.geometry, live=True)
+        if save is not None:
+            stream.save(save, default_blueprint=plan)
+            view = live.LiveView(client, Canvas(stream), described)
+            try:
+                typer.echo(view.run())
+            finally:
+                _close(stream)
+            return
+        with window.Window(_kind(web=web), memory="512MiB") as shown:
+            stream.connect_grpc(shown.url, default_blueprint=plan)
+            _tell(shown, f"the rig at {connect}")
+            try:
+                view = live.LiveView(client, Canvas(stream), described)
+                typer.echo(view.run(stop=lambda: not shown.open))
+            finally:
+                _close(stream)
+            if shown.open:
+                typer.echo("the viewer stays open; end it with Ctrl-C")
+            sys.stdout.flush()
+            while not shown.wait(0.5):
+                pass
+
+
+def _kind(*, web: bool) -> Kind:
+    from recorder.viewer.window import screen_is_there
+
+    return "web" if web or not screen_is_there() else "native"
+
+
+def _tell(shown: Window, what: str) -> None:
+    typer.echo(f"viewing {what} at {shown.address}" if shown.address else f"viewing {what}")
+    typer.echo("Ctrl-C ends the viewer")
+    sys.stdout.flush()
+
+
+def _hush() -> None:
+    """Keep rerun's own log off the terminal: a window that the user closes is no error here."""
+    import os
+
+    os.environ.setdefault("RUST_LOG", "off")
+
+
+def _close(stream: rr.RecordingStream) -> None:
+    """Send what is buffered, as long as there is somebody to take it."""
+    with suppress(RuntimeError, ValueError):  # the viewer is gone: nobody misses the rest
+        stream.flush(timeout_sec=5.0)
+    stream.disconnect()
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Ctrl-C and a request to terminate are both how a viewer ends: child processes go, the exit status is 0."""
+    import signal
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

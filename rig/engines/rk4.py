@@ -1,0 +1,26 @@
+"""Classical Runge-Kutta of order 4, four stages; no error estimate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rig.engines import fixed_step
+from rig.engines.fixed_step import CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, Tableau, start
+
+__all__ = ["CLAMPS", "CONTACTS", "FLOORED", "MEMORY", "PEAK_FORCE", "advance", "start"]
+
+ORDER = 4
+TABLEAU = Tableau(
+    a=np.array([[0, 0, 0, 0], [1 / 2, 0, 0, 0], [0, 1 / 2, 0, 0], [0, 0, 1, 0]]),
+    b=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
+    c=np.array([0, 1 / 2, 1 / 2, 1]),
+    coarse=np.zeros(5),
+    fine=np.zeros(5),
+    order=float(ORDER),
+    tolerance=np.inf,
+)
+
+
+def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
+    """See `rig.engines` and `rig.engines.fixed_step.advance`."""
+    fixed_step.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

@@ -1,0 +1,41 @@
+"""Dormand and Prince's Runge-Kutta of order 8, twelve stages, with its estimates of order 5 and 3 (DOP853; coefficients as scipy has them).
+
+The houses ring at 1.6 kHz with little damping, and each impact makes small errors larger: through the first impacts order 4 needs 2 us for
+what this does at 25 us, at a third of the work.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rig.engines import fixed_step
+from rig.engines.fixed_step import CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, Tableau, start
+
+__all__ = ["CLAMPS", "CONTACTS", "FLOORED", "MEMORY", "PEAK_FORCE", "advance", "start"]
+
+ORDER = 8
+TOLERANCE = 1e-8
+"""Scaled error estimate above which a step is divided."""
+
+
+def _tableau() -> Tableau:
+    from scipy.integrate import DOP853
+
+    s = DOP853.n_stages
+    return Tableau(
+        a=np.ascontiguousarray(DOP853.A[:s, :s]),
+        b=np.ascontiguousarray(DOP853.B),
+        c=np.ascontiguousarray(DOP853.C[:s]),
+        coarse=np.ascontiguousarray(DOP853.E3),  # pyright: ignore[reportAttributeAccessIssue]
+        fine=np.ascontiguousarray(DOP853.E5),  # pyright: ignore[reportAttributeAccessIssue]
+        order=float(ORDER),
+        tolerance=TOLERANCE,
+    )
+
+
+TABLEAU = _tableau()
+
+
+def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
+    """See `rig.engines` and `rig.engines.fixed_step.advance`."""
+    fixed_step.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

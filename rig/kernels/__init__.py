@@ -1,0 +1,43 @@
+"""Numba kernels: functions of floats, arrays and NamedTuples, nothing else.
+
+numba's own cache looks only at the file of the function it loads: it returns stale machine code when a kernel or a constant in
+*another* file has changed. So the cache folder is named by a digest of every kernel and engine file (unless the user set
+NUMBA_CACHE_DIR), before the first kernel is defined.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from pathlib import Path
+
+import numba
+
+_SOURCES = (Path(__file__).parent, Path(__file__).parent.parent / "engines", Path(__file__).parent.parent / "sensors")
+
+
+def source_digest() -> str:
+    """Digest of all files that hold compiled code."""
+    digest = hashlib.sha256()
+    for path in sorted(path for folder in _SOURCES for path in folder.glob("*.py")):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    if sys.platform == "win32":
+        root = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return root / "rotor-stator-rig" / "kernels" / source_digest()
+
+
+if "NUMBA_CACHE_DIR" not in os.environ:
+    numba.config.CACHE_DIR = str(_cache_folder())  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def compiled_before() -> bool:
+    """True where the cache already holds kernels of exactly these sources: the start will be quick."""
+    folder = Path(str(numba.config.CACHE_DIR))  # pyright: ignore[reportAttributeAccessIssue]
+    return folder.is_dir() and any(folder.rglob("*.nbc"))

@@ -1,0 +1,114 @@
+"""Run a scene as fast as it goes and keep everything as named arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rig.channels import ChannelTable
+from rig.kernels.signals import COLUMN, ROW
+from rig.scenes import Scene
+from rig.simulation import Frame, Simulation, energy_balance
+
+UNITS = {signal.name: signal.unit for signal in ROW}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        simulation: The simulation at its end (model, scene, engine memory).
+        times_s: Instants of the signals [s], shape (n,).
+        signals: Every state, force and energy of the model, SI, shape (n, N_ROW); `run["normal_force"]` is one column.
+        sample_times_s: Instants of the samples [s], shape (m,).
+        samples: What each sensor showed, in its own unit, by channel name, each shape (m,).
+        counts: The same as the converter gave it, int32, by channel name.
+        edges_s: Keyphasor edges [s], shape (turns,).
+        events: What took effect, each with event, tick and time_s.
+    """
+
+    simulation: Simulation
+    times_s: np.ndarray
+    signals: np.ndarray
+    sample_times_s: np.ndarray
+    samples: dict[str, np.ndarray]
+    counts: dict[str, np.ndarray]
+    edges_s: np.ndarray
+    events: list[dict[str, Any]]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """One signal of the model [SI], shape (n,)."""
+        return self.signals[:, COLUMN[name]]
+
+    def unit(self, name: str) -> str:
+        """Unit of a signal or of a channel."""
+        return UNITS[name] if name in UNITS and name not in self.table.channels else self.table.channels[name].unit
+
+    @property
+    def table(self) -> ChannelTable:
+        """Channel table of the sensors that were on."""
+        return self.simulation.table
+
+    def energy(self) -> dict[str, np.ndarray]:
+        """Energy ledger: stored, supplied, dissipated, residual [J], each shape (n,)."""
+        return energy_balance(self.signals, self.signals[0])
+
+
+def frames(simulation: Simulation, *, chunk_s: float = 0.1) -> Iterator[Frame]:
+    """Advance a simulation to the end of its scene, chunk by chunk."""
+    chunk = max(1, round(chunk_s * simulation.tick_rate_hz) // simulation.block_ticks) * simulation.block_ticks
+    while simulation.tick < simulation.end_tick:
+        yield simulation.advance(min(chunk, simulation.end_tick - simulation.tick))
+
+
+def simulate(
+    scene: Scene,
+    *,
+    duration_s: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Run:
+    """Run a scene as fast as it goes.
+
+    Args:
+        scene: What to run.
+        duration_s: Another duration than the scene's [s].
+        progress: Called with the part done, 0 to 1.
+
+    Returns:
+        The run; signals are kept at the sensors' rate.
+    """
+    if duration_s is not None:
+        scene = Scene(**{**scene.model_dump(), "duration_s": duration_s})
+    simulation = Simulation(scene)
+    every = simulation.tick_rate_hz // scene.sensors.rate_hz // simulation.row_ticks
+    signals, edges, events = [], [], []
+    counts: dict[str, list[np.ndarray]] = {group: [] for group in simulation.table.groups}
+    for frame in frames(simulation):
+        signals.append(frame.rows[::every].copy())
+        for group, block in frame.samples.items():
+            counts[group].append(block.values)
+        if frame.edges is not None:
+            edges.append((frame.edges.tick + frame.edges.values[:, 0]) / simulation.tick_rate_hz)
+        events += frame.events
+        if progress is not None:
+            progress(simulation.tick / simulation.end_tick)
+    table = simulation.table
+    whole = {group: np.concatenate(blocks) for group, blocks in counts.items()}
+    values = {group: table.groups[group].engineering(block) for group, block in whole.items()}
+    columns = {name: (group, c) for group in whole for c, name in enumerate(table.groups[group].names)}
+    rows = np.concatenate(signals)
+    times_s = np.arange(len(rows)) / scene.sensors.rate_hz
+    return Run(
+        simulation=simulation,
+        times_s=times_s,
+        signals=rows,
+        sample_times_s=times_s,
+        samples={name: values[group][:, c] for name, (group, c) in columns.items()},
+        counts={name: whole[group][:, c] for name, (group, c) in columns.items()},
+        edges_s=np.concatenate(edges) if edges else np.empty(0),
+        events=events,
+    )

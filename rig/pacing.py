@@ -1,0 +1,244 @@
+"""When the next block of simulated time may run, and when its result is due: three clocks over the same loop.
+
+The loop is `grant` (may I run?), run, `release` (wait until the result is due). No clock changes the step of the
+simulation; the time source and the sleep are arguments.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+_NS = 1_000_000_000
+
+
+class StepTimeoutError(TimeoutError):
+    """Nobody granted a step in time."""
+
+
+class Histogram:
+    """Quantiles of any number of non-negative values in bounded memory.
+
+    Logarithmic bins from `low` to `high`; a quantile is the upper edge of its bin, hence up to 1/`bins_a_decade` of a
+    decade too large (4.7 % at 50), never too small, and never above the largest value. Counts are integers: hours do
+    not wear them out.
+
+    Args:
+        low: Everything below counts as `low`.
+        high: Everything above falls into the last bin.
+        bins_a_decade: Resolution.
+    """
+
+    def __init__(self, *, low: float = 1e-6, high: float = 1e3, bins_a_decade: int = 50) -> None:
+        self._low = low
+        self._a_decade = bins_a_decade
+        self._counts = [0] * (math.ceil(math.log10(high / low) * bins_a_decade) + 1)
+        self.count = 0
+        self.largest = 0.0
+
+    def add(self, value: float) -> None:
+        """Count one value."""
+        at = 0 if value <= self._low else math.ceil(math.log10(value / self._low) * self._a_decade)
+        self._counts[min(at, len(self._counts) - 1)] += 1
+        self.count += 1
+        self.largest = max(self.largest, value)
+
+    def quantile(self, fraction: float) -> float:
+        """The value that `fraction` of all values do not exceed; 0 where there are none."""
+        rank = math.ceil(fraction * self.count)
+        seen = 0
+        for at, count in enumerate(self._counts):
+            seen += count
+            if count and seen >= rank:
+                return min(self._low * 10 ** (at / self._a_decade), self.largest)
+        return self.largest
+
+
+class Clock(Protocol):
+    """Paces a simulation; `grant` and `release` are called by the simulation thread alone."""
+
+    pace: str
+    """Name of the pace: real-time, lockstep or free."""
+
+    def start(self, tick: int, tick_rate_hz: int) -> None:
+        """Take this tick as the origin; wall time runs from now on."""
+        ...
+
+    def grant(self, ticks: int) -> int:
+        """How many ticks may run now, at most `ticks`; 0 after a `wake`, so that the caller can look around."""
+        ...
+
+    def release(self, tick: int) -> None:
+        """Return when what was simulated up to `tick` is due."""
+        ...
+
+    def wake(self) -> None:
+        """Make a waiting `grant` return; from any thread."""
+        ...
+
+    def statistics(self) -> dict[str, object]:
+        """`real_time_factor`, `lateness_ms` (p50, p99, max, last) and `overruns`; from any thread."""
+        ...
+
+
+class FreeRun:
+    """As fast as it goes; only measures the real-time factor."""
+
+    pace = "free"
+
+    def __init__(self, *, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._now_ns = now_ns
+        self._lateness_s = Histogram()
+        self._last_s = 0.0
+        self._overruns = 0
+        self._origin_ns = now_ns()
+        self._origin_tick = 0
+        self._tick_rate_hz = 1
+        self._factor = 0.0
+
+    def start(self, tick: int, tick_rate_hz: int) -> None:
+        """Take this tick as the origin; wall time runs from now on."""
+        self._origin_tick = tick
+        self._tick_rate_hz = tick_rate_hz
+        self._origin_ns = self._now_ns()
+
+    def grant(self, ticks: int) -> int:
+        """All of them."""
+        return ticks
+
+    def release(self, tick: int) -> None:
+        """Results are due at once."""
+        self._measure(tick, self._now_ns())
+
+    def wake(self) -> None:
+        """Nothing waits here."""
+
+    def statistics(self) -> dict[str, object]:
+        """Real-time factor since the start, lateness of results [ms], and how many were not ready in time."""
+        # Read without a lock: a value that is one block old does no harm, and the simulation thread never waits.
+        late = self._lateness_s
+        return {
+            "real_time_factor": round(self._factor, 6),
+            "lateness_ms": {
+                "p50": round(1e3 * late.quantile(0.5), 4),
+                "p99": round(1e3 * late.quantile(0.99), 4),
+                "max": round(1e3 * late.largest, 4),
+                "last": round(1e3 * self._last_s, 4),
+            },
+            "overruns": self._overruns,
+        }
+
+    def _measure(self, tick: int, now_ns: int) -> None:
+        elapsed_ns = now_ns - self._origin_ns
+        if elapsed_ns > 0:
+            self._factor = (tick - self._origin_tick) * _NS / (self._tick_rate_hz * elapsed_ns)
+
+
+class RealTime(FreeRun):
+    """Results are due when the wall clock reaches their tick: absolute deadlines from one origin, so nothing adds up.
+
+    Where the simulation is behind, it runs on without waiting until it has caught up; each result that was not ready at
+    its deadline is an overrun. Lateness is the time from the deadline to the return of `release`.
+
+    Args:
+        spin_s: Wake this much earlier and poll the clock [s]. Costs that much CPU a block; sleeping alone is
+            about 0.1 ms late.
+        now_ns: Time source [ns], monotonic.
+        sleep: Sleeps for a number of seconds.
+    """
+
+    pace = "real-time"
+
+    def __init__(
+        self,
+        *,
+        spin_s: float = 0.0,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        super().__init__(now_ns=now_ns)
+        self._spin_ns = round(spin_s * _NS)
+        self._sleep = sleep
+
+    def deadline_ns(self, tick: int) -> int:
+        """When a tick is due, in the time of the time source [ns]."""
+        return self._origin_ns + (tick - self._origin_tick) * _NS // self._tick_rate_hz
+
+    def release(self, tick: int) -> None:
+        """Return when the wall clock has reached the tick."""
+        deadline = self.deadline_ns(tick)
+        now = self._now_ns()
+        if now > deadline:
+            self._overruns += 1
+        while now < deadline:
+            rest = deadline - now - self._spin_ns
+            if rest > 0:
+                self._sleep(rest / _NS)
+            now = self._now_ns()
+        self._last_s = (now - deadline) / _NS
+        self._lateness_s.add(self._last_s)
+        self._measure(tick, now)
+
+
+class Lockstep(FreeRun):
+    """Runs only what was granted by `allow`.
+
+    Args:
+        timeout_s: A run that is granted nothing for this long ends with `StepTimeoutError` [s]: a partner that died
+            must not leave it hanging.
+        now_ns: Time source [ns], monotonic.
+        wait: Waits on a held condition for a number of seconds; tests put a clock of their own here.
+    """
+
+    pace = "lockstep"
+
+    def __init__(
+        self,
+        *,
+        timeout_s: float = 300.0,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        wait: Callable[[threading.Condition, float], object] = threading.Condition.wait,
+    ) -> None:
+        super().__init__(now_ns=now_ns)
+        self._timeout_s = timeout_s
+        self._wait = wait
+        self._changed = threading.Condition()
+        self._allowed = 0
+        self._woken = False
+        self._idle_since_ns: int | None = None
+
+    def allow(self, ticks: int) -> None:
+        """Grant this many further ticks; from any thread."""
+        with self._changed:
+            self._allowed += ticks
+            self._changed.notify()
+
+    def wake(self) -> None:
+        """Make a waiting `grant` return 0; from any thread."""
+        with self._changed:
+            self._woken = True
+            self._changed.notify()
+
+    def grant(self, ticks: int) -> int:
+        """Wait for an allowance and take at most `ticks` of it; 0 after a `wake`.
+
+        Raises:
+            StepTimeoutError: Nothing was allowed in time.
+        """
+        with self._changed:
+            if self._idle_since_ns is None:
+                self._idle_since_ns = self._now_ns()
+            while self._allowed == 0 and not self._woken:
+                left_s = self._timeout_s - (self._now_ns() - self._idle_since_ns) / _NS
+                if left_s <= 0:
+                    raise StepTimeoutError(f"no step was granted within {self._timeout_s:g} s")
+                self._wait(self._changed, left_s)
+            self._woken = False
+            granted = min(self._allowed, ticks)
+            self._allowed -= granted
+            if granted:
+                self._idle_since_ns = None
+            return granted

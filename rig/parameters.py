@@ -1,0 +1,209 @@
+"""Parameter sets: data files in, checked and frozen SI values out. The only module that knows units.
+
+A set is a TOML file of values with unit, symbol, source and kind. `corrected` lists every parameter; any other set names a
+`base` and the values in which it differs. A user's own file works the same way.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+
+from rig.errors import InputError
+
+SETS = Path(__file__).with_name("sets")
+DEFAULT_SET = "corrected"
+
+SI = {
+    "1": 1.0, "kg": 1.0, "kg m^2": 1.0, "m": 1.0, "mm": 1e-3, "rad": 1.0, "Pa": 1.0, "N": 1.0,
+    "N/m": 1.0, "kN/m": 1e3, "N/m^1.5": 1.0, "N s/m": 1.0, "m/s": 1.0, "mm/s": 1e-3, "m/s^2": 1.0,
+    "A/m": 1.0, "kA/m": 1e3, "N m s": 1.0, "Hz": 2.0 * math.pi, "Hz/s": 2.0 * math.pi,
+}  # fmt: skip
+"""Every unit that a set may use, in SI (a frequency becomes rad/s)."""
+
+Kind = Literal["paper", "corrected", "literature", "datasheet", "fitted", "assumed"]
+
+
+class Parameter(BaseModel):
+    """One value with its unit, its place in the paper, its provenance and what the model accepts."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    value: float | str
+    unit: str
+    symbol: str
+    source: str
+    kind: Kind
+    range: tuple[float, float]
+    rules: tuple[str, ...] = ()
+
+    @field_validator("unit")
+    @classmethod
+    def _known_unit(cls, unit: str) -> str:
+        if unit not in SI:
+            raise ValueError(f"one of {', '.join(SI)}")
+        return unit
+
+
+class ParameterSet:
+    """All parameters of a rig, checked and frozen.
+
+    Attributes:
+        name: Name of the set, or the path of a user's file.
+        title: One line on what it is.
+        entries: Every parameter by its dotted key, in file order.
+    """
+
+    def __init__(self, name: str, title: str, entries: dict[str, Parameter]) -> None:
+        self.name = name
+        self.title = title
+        self.entries = entries
+        for key, entry in entries.items():
+            _check(key, entry)
+
+    def __getitem__(self, key: str) -> float:
+        """The value of a numeric parameter in SI.
+
+        Raises:
+            KeyError: No such parameter.
+            TypeError: The value is a rule; the model works it out.
+        """
+        entry = self.entries[key]
+        if isinstance(entry.value, str):
+            raise TypeError(f"{key} is the rule {entry.value!r}; its number comes from the model")
+        return entry.value * SI[entry.unit]
+
+    def rule(self, key: str) -> str | None:
+        """The name of the rule that gives the value, or None where it is a number."""
+        value = self.entries[key].value
+        return value if isinstance(value, str) else None
+
+    def override(self, changes: dict[str, Any], *, kind: Kind = "assumed", source: str = "override") -> ParameterSet:
+        """The set with some values replaced, given in each parameter's own unit.
+
+        Args:
+            changes: New values (numbers or names of rules) by dotted key.
+            kind: Provenance recorded for the changed values.
+            source: Source recorded for the changed values.
+
+        Raises:
+            InputError: Unknown key, or a value outside what the parameter accepts.
+        """
+        entries = dict(self.entries)
+        for key, value in changes.items():
+            if key not in entries:
+                raise InputError(key, f"a parameter of the set ({_nearest(key, entries)})", value)
+            if isinstance(value, bool) or not isinstance(value, int | float | str):
+                raise InputError(key, _accepts(entries[key]), value)
+            value = value if isinstance(value, str) else float(value)
+            entries[key] = entries[key].model_copy(update={"value": value, "kind": kind, "source": source})
+        return ParameterSet(self.name, self.title, entries)
+
+    def document(self) -> dict[str, Any]:
+        """The set as a JSON document: what is recorded beside every stream."""
+        return {
+            "set": self.name,
+            "title": self.title,
+            "values": {key: entry.model_dump(mode="json", exclude={"range", "rules"}) for key, entry in self.entries.items()},
+        }
+
+
+def set_names() -> list[str]:
+    """Names of the sets that come with the rig, the default first."""
+    return sorted((path.stem for path in SETS.glob("*.toml")), key=lambda name: (name != DEFAULT_SET, name))
+
+
+@cache
+def load_parameters(name_or_path: str = DEFAULT_SET) -> ParameterSet:
+    """Load a set by name, or a user's file by path.
+
+    Raises:
+        InputError: No such set, not a set file, an unknown key, or a value outside what the model accepts.
+    """
+    path = SETS / f"{name_or_path}.toml"
+    if not path.is_file():
+        path = Path(name_or_path)
+        if path.suffix != ".toml" or not path.is_file():
+            raise InputError("parameters", f"one of {', '.join(set_names())}, or the path of a .toml file", name_or_path)
+    return _parse(name_or_path, read_toml(path), path)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file, a syntax error told in one line.
+
+    Raises:
+        InputError: The file cannot be read, or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(str(path), "a TOML file", str(error)) from None
+    except OSError as error:
+        raise InputError(str(path), "a readable file", error.strerror) from None
+
+
+def _parse(name: str, data: dict[str, Any], path: Path) -> ParameterSet:
+    data = dict(data)
+    title = data.pop("title", name)
+    base = data.pop("base", None)
+    if base == name:
+        raise InputError(f"{path.name}: base", "another set", base)
+    if base is None and path.parent != SETS:
+        raise InputError(f"{path.name}: base", f"the set that the file changes, one of {', '.join(set_names())}", base)
+    entries = dict(load_parameters(base).entries) if base is not None else {}
+    for section, members in data.items():
+        if not isinstance(members, dict):
+            raise InputError(f"{path.name}: {section}", "a table of parameters", members)
+        for member, fields in members.items():
+            key = f"{section}.{member}"
+            # A bare number is a user's short form of a table with only a value.
+            given = fields if isinstance(fields, dict) else {"value": fields, "kind": "assumed", "source": path.name}
+            if base is not None and key not in entries:
+                raise InputError(f"{path.name}: {key}", f"a parameter of the set {base} ({_nearest(key, entries)})", given.get("value"))
+            known = entries[key].model_dump() if key in entries else {}
+            if "unit" in given and known and given["unit"] != known["unit"]:
+                raise InputError(f"{path.name}: {key}.unit", known["unit"], given["unit"])
+            try:
+                entries[key] = Parameter(**{**known, **given})
+            except ValidationError as error:
+                raise input_error(error, f"{path.name}: {key}") from None
+    return ParameterSet(name, title, entries)
+
+
+def input_error(error: ValidationError, where: str) -> InputError:
+    """The first complaint of a validation as the one line that users see."""
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"] if not str(part).startswith(("function-", "constrained-")))
+    field = ".".join(part for part in (where, place) if part)
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    if first["type"] == "extra_forbidden":
+        message = "left out (there is no such field)"
+    elif first["type"] == "missing":
+        message = "given"
+    return InputError(field, message, None if first["type"] == "missing" else first["input"])
+
+
+def _accepts(entry: Parameter) -> str:
+    low, high = entry.range
+    text = f"a number from {low:g} to {high:g} {entry.unit}"
+    return text + (f" or one of {', '.join(entry.rules)}" if entry.rules else "")
+
+
+def _check(key: str, entry: Parameter) -> None:
+    value = entry.value
+    low, high = entry.range
+    good = value in entry.rules if isinstance(value, str) else math.isfinite(value) and low <= value <= high
+    if not good:
+        raise InputError(key, _accepts(entry), value)
+
+
+def _nearest(key: str, entries: dict[str, Parameter]) -> str:
+    import difflib
+
+    close = difflib.get_close_matches(key, entries, n=3, cutoff=0.3)
+    return f"such as {', '.join(close)}" if close else "see `rig params`"

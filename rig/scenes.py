@@ -1,0 +1,290 @@
+"""Scenes: what happens in a run. TOML in, checked and frozen out; single values may be overridden by dotted key."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator, model_validator
+
+from rig.channels import default_table
+from rig.errors import InputError
+from rig.parameters import DEFAULT_SET, ParameterSet, input_error, load_parameters, read_toml
+
+SCENES = Path(__file__).with_name("scenes")
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class HammerCommand(_Part):
+    """A blow of the pendulum hammer at the disk: a half-sine pulse."""
+
+    command: Literal["hammer"] = "hammer"
+    force_n: Annotated[FiniteFloat, Field(ge=1.0, le=1000.0)] = 100.0
+    """Peak force [N]."""
+    duration_ms: Annotated[FiniteFloat, Field(ge=0.5, le=50.0)] = 5.0
+    """Length of the pulse [ms]; the paper gives none."""
+    direction: Literal["x", "y", "-x", "-y"] | Annotated[FiniteFloat, Field(ge=-360.0, le=360.0)] = "x"
+    """Along x (EAST), y (up), or at an angle from x toward y [degrees]."""
+
+    @property
+    def cosines(self) -> tuple[float, float]:
+        """Direction as a unit vector (x, y)."""
+        named = {"x": (1.0, 0.0), "y": (0.0, 1.0), "-x": (-1.0, 0.0), "-y": (0.0, -1.0)}
+        if isinstance(self.direction, str):
+            return named[self.direction]
+        angle = math.radians(self.direction)
+        return math.cos(angle), math.sin(angle)
+
+
+class SpeedCommand(_Part):
+    """A new speed, approached at the drive's ramp rate."""
+
+    command: Literal["speed"] = "speed"
+    speed_hz: Annotated[FiniteFloat, Field(ge=0.0)]
+    """Target [Hz]; the parameter drive.top_speed limits it further."""
+
+
+class ReleaseCommand(_Part):
+    """The drop device: the magnets let go of the shaft."""
+
+    command: Literal["release"] = "release"
+
+
+Command = HammerCommand | SpeedCommand | ReleaseCommand
+COMMANDS: dict[str, type[Command]] = {"hammer": HammerCommand, "speed": SpeedCommand, "release": ReleaseCommand}
+
+
+def parse_command(name: str, request: dict[str, Any]) -> Command:
+    """Check a command that came from outside.
+
+    Raises:
+        InputError: No such command, an unknown field, or a value out of its range; the message names the range.
+    """
+    if name not in COMMANDS:
+        raise InputError("command", f"one of {', '.join(COMMANDS)}", name)
+    try:
+        return COMMANDS[name](**{**request, "command": name})
+    except (ValidationError, TypeError) as error:
+        if isinstance(error, ValidationError):
+            raise input_error(error, name) from None
+        raise InputError(name, "a set of named fields", request) from None
+
+
+class TimedCommand(_Part):
+    """A command at a fixed time of the scene."""
+
+    at_s: Annotated[FiniteFloat, Field(ge=0.0)]
+    request: Annotated[Command, Field(discriminator="command")]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flat(cls, data: Any) -> Any:
+        # In the file the command's own fields stand beside at_s.
+        if isinstance(data, dict) and "request" not in data:
+            return {"at_s": data.get("at_s"), "request": {key: value for key, value in data.items() if key != "at_s"}}
+        return data
+
+
+class Initial(_Part):
+    """Where the shaft is at time zero, at rest but for its spin."""
+
+    position: Literal["equilibrium", "top", "bottom", "given"] = "equilibrium"
+    x_mm: FiniteFloat = 0.0
+    """Shaft in the ring, for position "given" [mm]."""
+    y_mm: FiniteFloat = 0.0
+    """Shaft in the ring, for position "given" [mm]."""
+    magnets: bool = True
+    """False: the magnets have let go already."""
+
+
+class Drive(_Part):
+    """What the motor aims at."""
+
+    mode: Literal["torque", "ideal"] = "torque"
+    """A torque law (the spin can dip) or a prescribed spin."""
+    speed_hz: Annotated[FiniteFloat, Field(ge=0.0)] = 0.0
+    """Constant speed [Hz], unless a profile is given."""
+    profile: tuple[tuple[FiniteFloat, FiniteFloat], ...] = ()
+    """Points (time [s], speed [Hz]), joined by straight lines; the last is held."""
+
+    @field_validator("profile")
+    @classmethod
+    def _ascending(cls, profile: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        times = [time for time, _ in profile]
+        if profile and (times[0] != 0.0 or any(b <= a for a, b in zip(times, times[1:], strict=False))):
+            raise ValueError("points of ascending time, the first at 0")
+        if any(speed < 0.0 for _, speed in profile):
+            raise ValueError("points of speed >= 0")
+        return profile
+
+
+class EngineChoice(_Part):
+    """How the equations are integrated."""
+
+    name: str = "rk8"
+    step_us: Annotated[int, Field(ge=1, le=1000)] = 25
+    """Step [us], a whole number of ticks."""
+
+
+class SensorChoice(_Part):
+    """What is measured, and how often."""
+
+    groups: tuple[str, ...] = tuple(default_table().groups)
+    rate_hz: Annotated[int, Field(ge=100, le=1_000_000)] = 20_000
+    """Sample rate of every channel [Hz]."""
+    truth_rate_hz: Annotated[int, Field(ge=10, le=1_000_000)] = 2_000
+    """Rate of the truth that is published beside the sensors [Hz]."""
+    noise: bool = True
+    """False leaves the sensors' noise out."""
+
+    @field_validator("groups")
+    @classmethod
+    def _known(cls, groups: tuple[str, ...]) -> tuple[str, ...]:
+        known = default_table().groups
+        if not groups or any(group not in known for group in groups) or len(set(groups)) < len(groups):
+            raise ValueError(f"a list of different names out of {', '.join(known)}")
+        return groups
+
+
+class Scene(_Part):
+    """One run: initial state, drive, timed commands, engine, sensors, seed, and the parameters it runs on."""
+
+    name: str = "scene"
+    title: str = ""
+    parameters: str = DEFAULT_SET
+    """Name of a parameter set, or the path of a file."""
+    set: dict[str, FiniteFloat | str] = {}
+    """Parameters changed for this scene, each in its own unit."""
+    duration_s: Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)] = 2.0
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    initial: Initial = Initial()
+    drive: Drive = Drive()
+    commands: tuple[TimedCommand, ...] = ()
+    engine: EngineChoice = EngineChoice()
+    sensors: SensorChoice = SensorChoice()
+
+    @model_validator(mode="after")
+    def _whole_rates(self) -> Scene:
+        for field in ("rate_hz", "truth_rate_hz"):
+            rate = getattr(self.sensors, field)
+            # A sample is taken at the end of a step, never between two.
+            if 1_000_000 % rate or (1_000_000 // rate) % self.engine.step_us:
+                rates = [r for r in (100_000, 50_000, 25_000, 20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
+                         if (1_000_000 // r) % self.engine.step_us == 0]  # fmt: skip
+                raise ValueError(
+                    f"sensors.{field}: a rate whose period is a whole number of steps of {self.engine.step_us} us"
+                    f" (such as {', '.join(map(str, rates[:6]))} Hz), not {rate} Hz"
+                )
+        return self
+
+    def load_parameters(self) -> ParameterSet:
+        """The scene's parameters with its own changes applied."""
+        parameters = load_parameters(self.parameters)
+        return parameters.override(dict(self.set), source=f"scene {self.name}") if self.set else parameters
+
+
+def scene_names() -> list[str]:
+    """Names of the scenes that come with the rig."""
+    return sorted(path.stem for path in SCENES.glob("*.toml"))
+
+
+def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None) -> Scene:
+    """Load a scene by name, or a user's file by path.
+
+    Args:
+        name_or_path: One of `scene_names()`, or a .toml file.
+        overrides: Changes by dotted key, of the scene (`drive.speed_hz`) or of its parameters (`contact.friction`, in the
+            parameter's own unit). Strings are read as TOML values where they are such.
+
+    Raises:
+        InputError: The one thing that is wrong, with its field.
+    """
+    path = SCENES / f"{name_or_path}.toml"
+    if not path.is_file():
+        path = Path(name_or_path)
+        if path.suffix != ".toml" or not path.is_file():
+            raise InputError("scene", f"one of {', '.join(scene_names())}, or the path of a .toml file", str(name_or_path))
+    data = {"name": path.stem, **read_toml(path)}
+    for key, value in (overrides or {}).items():
+        _override(data, key, _read_value(value) if isinstance(value, str) else value)
+    scene = parse_scene(data)
+    # Parameters are checked here, so that a scene that loads can run.
+    top = scene.load_parameters().entries["drive.top_speed"].value
+    speeds = [scene.drive.speed_hz, *(speed for _, speed in scene.drive.profile)]
+    speeds += [timed.request.speed_hz for timed in scene.commands if isinstance(timed.request, SpeedCommand)]
+    if not isinstance(top, str) and max(speeds) > top:
+        raise InputError("drive.speed_hz", f"at most drive.top_speed = {top:g} Hz", max(speeds))
+    return scene
+
+
+def parse_scene(data: dict[str, Any]) -> Scene:
+    """Check the fields of a scene.
+
+    Raises:
+        InputError: The first wrong field.
+    """
+    try:
+        return Scene(**data)
+    except ValidationError as error:
+        raise _scene_error(error) from None
+    except TypeError:
+        raise InputError("scene", "a table of named fields", list(data)) from None
+
+
+def _scene_error(error: ValidationError) -> InputError:
+    first = error.errors()[0]
+    text = first["msg"].removeprefix("Value error, ")
+    if not first["loc"] and ": " in text:  # a rule over several fields names its own
+        field, _, rest = text.partition(": ")
+        must, _, received = rest.rpartition(", not ")
+        return InputError(field, must, received)
+    return input_error(error, "")
+
+
+def _override(data: dict[str, Any], key: str, value: Any) -> None:
+    if key in load_parameters().entries:
+        data["set"] = {**data.get("set", {}), key: value}
+        return
+    *path, last = key.split(".")
+    fields: Any = Scene
+    for part in [*path, last]:
+        known = getattr(fields, "model_fields", {})
+        if part not in known:
+            keys = [*_scene_keys(), *load_parameters().entries]
+            close = difflib.get_close_matches(key, keys, n=3, cutoff=0.4)
+            raise InputError(key, "a field of a scene or a parameter" + (f", such as {', '.join(close)}" if close else ""), value)
+        fields = known[part].annotation
+    place = data
+    for part in path:
+        place[part] = dict(place.get(part, {}))
+        place = place[part]
+    place[last] = value
+    if key == "drive.speed_hz":
+        place.pop("profile", None)
+
+
+def _scene_keys() -> list[str]:
+    keys = []
+    for name, field in Scene.model_fields.items():
+        inner = getattr(field.annotation, "model_fields", None)
+        keys += [f"{name}.{part}" for part in inner] if inner else [name]
+    return keys
+
+
+def _read_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def scene_document(scene: Scene) -> dict[str, Any]:
+    """The scene as a JSON document, complete enough to run it again."""
+    return json.loads(scene.model_dump_json())

@@ -1,0 +1,703 @@
+"""The only place where a simulation, a clock and a transport meet.
+
+The simulation thread (the caller of `Service.run`) takes commands at a block boundary, advances, waits until the block
+is due and puts it into a bounded queue; it never waits for another process. A publisher thread encodes and
+publishes. What does not fit into the queue of a paced run is dropped oldest first, whole blocks at a time, and counted;
+the gap also shows in the row numbers. An unpaced run waits for the publisher instead.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from rig import wire
+from rig.errors import InputError
+from rig.pacing import Clock, Lockstep, RealTime, StepTimeoutError
+from rig.transport import Server
+
+SIMULATION_COMMANDS = ("hammer", "speed", "release")
+"""Commands that the simulation itself checks and carries out."""
+COMMANDS = (*SIMULATION_COMMANDS, "stop", "step")
+
+_PENDING_COMMANDS = 256
+_REQUEST_BYTES = 10_000
+_STEP_S = 3600
+"""Longest single step [s of simulated time]."""
+_CLIENTS = 64
+_CLIENT_FORGOTTEN_S = 600.0
+_CLIENT_GONE_S = 3.0
+"""A client that did not report for this long is not waited for at the end of a run; others report twice a second."""
+_FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
+_QUIET_S = 0.6
+"""At the end of a run: for how long nobody must be behind before the cache may go; two heartbeats of the transport."""
+
+
+class Frame(Protocol):
+    """Everything that one `advance` produced; its arrays are not written to again."""
+
+    @property
+    def tick(self) -> int:
+        """Start [ticks]."""
+        ...
+
+    @property
+    def ticks(self) -> int:
+        """Length [ticks]."""
+        ...
+
+    @property
+    def samples(self) -> Mapping[str, wire.Block]:
+        """ADC counts by sensor group."""
+        ...
+
+    @property
+    def edges(self) -> wire.Block | None:
+        """Keyphasor edges, where there were any."""
+        ...
+
+    @property
+    def truth(self) -> Mapping[str, wire.Block]:
+        """Model values by truth table."""
+        ...
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """What took effect: event, tick, time_s and further fields."""
+        ...
+
+
+class Simulation(Protocol):
+    """What the service needs of `rig.simulation.Simulation`."""
+
+    @property
+    def tick(self) -> int:
+        """Where it stands [ticks]."""
+        ...
+
+    @property
+    def tick_rate_hz(self) -> int:
+        """Ticks per simulated second."""
+        ...
+
+    @property
+    def block_ticks(self) -> int:
+        """Every advance is a whole multiple of this [ticks]."""
+        ...
+
+    @property
+    def end_tick(self) -> int | None:
+        """Where it ends, or None."""
+        ...
+
+    def advance(self, ticks: int, /) -> Frame:
+        """Simulate on."""
+        ...
+
+    def submit(self, command: str, request: dict[str, Any], /) -> int:
+        """Check a command and take it; returns the tick at which it takes effect. Raises InputError."""
+        ...
+
+    def catalogue(self) -> dict[str, Any]:
+        """Channels and truth tables."""
+        ...
+
+    def parameters_document(self) -> dict[str, Any]:
+        """All parameters with unit, source and kind."""
+        ...
+
+    def scene_document(self) -> dict[str, Any]:
+        """Name, scene and seed."""
+        ...
+
+    def health(self) -> dict[str, Any]:
+        """`spin_hz`, `energy` and `warnings`."""
+        ...
+
+    def warm_up(self) -> None:
+        """Compile and run all kernels once."""
+        ...
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A command on its way from a transport thread to the simulation thread."""
+
+    command: str
+    request: dict[str, Any]
+    sender: str
+    reply: Future[dict[str, Any]] = field(default_factory=Future)
+
+
+@dataclass(slots=True)
+class _Entry:
+    """What the publisher sends in one go: events, a block of everything, events; then replies that waited for it."""
+
+    before: list[dict[str, Any]]
+    frame: Frame | None = None
+    after: list[dict[str, Any]] = field(default_factory=list)
+    replies: list[tuple[Future[dict[str, Any]], dict[str, Any]]] = field(default_factory=list)
+
+
+class _Queue:
+    """Queue of entries between two threads, bounded in its blocks; events and replies are few and never dropped."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.high_water = 0
+        self.dropped = 0
+        self._entries: deque[_Entry] = deque()
+        self._blocks = 0
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def __len__(self) -> int:
+        return self._blocks
+
+    def put(self, entry: _Entry) -> int:
+        """Append without waiting; returns how many blocks had to be dropped for it."""
+        dropped = 0
+        with self._changed:
+            while entry.frame is not None and self._blocks >= self.capacity:
+                oldest = self._entries.popleft()
+                heir = self._entries[0] if self._entries else entry
+                heir.before = [*oldest.before, *oldest.after, *heir.before]
+                heir.replies = [*oldest.replies, *heir.replies]
+                if oldest.frame is not None:
+                    self._blocks -= 1
+                    dropped += 1
+            self._entries.append(entry)
+            self._blocks += entry.frame is not None
+            self.dropped += dropped
+            self.high_water = max(self.high_water, self._blocks)
+            self._changed.notify_all()
+        return dropped
+
+    def take(self, timeout_s: float) -> _Entry | None:
+        """The oldest entry, or None after the time or at the end."""
+        with self._changed:
+            if not self._entries and not self._closed:
+                self._changed.wait(timeout_s)
+            if not self._entries:
+                return None
+            entry = self._entries.popleft()
+            self._blocks -= entry.frame is not None
+            self._changed.notify_all()
+            return entry
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        """Whether another block fits, at the latest after the time."""
+        with self._changed:
+            if self._blocks >= self.capacity:
+                self._changed.wait(timeout_s)
+            return self._blocks < self.capacity
+
+    def close(self) -> None:
+        """Nothing will be put any more."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    @property
+    def finished(self) -> bool:
+        """Closed and empty."""
+        return self._closed and not self._entries
+
+
+@dataclass(slots=True)
+class _ClientReport:
+    received_index: int
+    lost: int
+    heard_s: float
+
+
+class Service:
+    """Runs one simulation to its end and serves it.
+
+    Args:
+        simulation: Advances, checks commands, describes itself.
+        server: Transport; stays open when the run ends.
+        clock: Pace.
+        block_ticks: Length of a published block [ticks], a whole multiple of the simulation's own.
+        queue_seconds: Blocks that may wait for the publisher [s of simulated time]; more than the transport's patience
+            with one client that stalls in the middle of its recovery.
+        status_period_s: Wall time between status messages [s].
+        linger_s: At the end of a run, wait at most this long [s] until clients have recovered what they missed.
+
+    Raises:
+        InputError: `block_ticks` does not fit the simulation.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        server: Server,
+        clock: Clock,
+        *,
+        block_ticks: int,
+        queue_seconds: float = 30.0,
+        status_period_s: float = 0.5,
+        linger_s: float = 10.0,
+    ) -> None:
+        if block_ticks <= 0 or block_ticks % simulation.block_ticks:
+            raise InputError("block_ticks", f"a whole multiple of {simulation.block_ticks} ticks", block_ticks)
+        self._simulation = simulation
+        self._server = server
+        self._clock = clock
+        self._block_ticks = block_ticks
+        self._status_period_s = status_period_s
+        self._linger_s = linger_s
+        self._rate = simulation.tick_rate_hz
+        self._queue = _Queue(max(2, math.ceil(queue_seconds * self._rate / block_ticks)))
+        self._may_drop = isinstance(clock, RealTime)
+
+        self._scene = simulation.scene_document()
+        self._tick = simulation.tick
+        self._state = "running"
+        self._prepared = False
+        self._stop_requested = False
+        self._health: dict[str, Any] = {}
+        self._next_health_s = 0.0
+        self._known_warnings: set[str] = set()
+        self._overflowing = False
+
+        self._pending: deque[_Pending] = deque()
+        self._pending_lock = threading.Lock()
+        self._accepting = True
+        self._accepted = 0
+        self._steps: list[tuple[int, Future[dict[str, Any]], dict[str, Any]]] = []
+        self._step_target: int | None = None
+
+        self._rows: dict[str, int] = {}
+        self._samples_rate_hz = 0.0
+        self._samples_published = 0
+        self._congestion: dict[str, float] = {}
+        self._publisher_error: BaseException | None = None
+        self._clients: dict[str, _ClientReport] = {}
+        self._clients_lock = threading.Lock()
+        self._bad_reports = 0
+
+    # ---- from any thread ----
+
+    def stop(self) -> None:
+        """End the run at the next block boundary; from any thread or signal handler."""
+        self._stop_requested = True
+        self._clock.wake()
+
+    def status(self) -> dict[str, Any]:
+        """The status document (see COMMANDS and keys in the README)."""
+        health = self._health
+        warnings = list(health.get("warnings", []))
+        if self._queue.dropped:
+            warnings.append(f"{self._queue.dropped} blocks dropped: the publisher did not keep up")
+        if self._bad_reports:
+            warnings.append(f"{self._bad_reports} client reports could not be read")
+        return _finite(
+            {
+                "scene": self._scene.get("name"),
+                "tick": self._tick,
+                "time_s": self._tick / self._rate,
+                "end_s": None if self._simulation.end_tick is None else self._simulation.end_tick / self._rate,
+                "wall_s": time.time(),
+                "state": self._state,
+                "pace": self._clock.pace,
+                "block_ms": 1e3 * self._block_ticks / self._rate,
+                **self._clock.statistics(),
+                "queue": {
+                    "depth": len(self._queue),
+                    "capacity": self._queue.capacity,
+                    "high_water": self._queue.high_water,
+                    "dropped": self._queue.dropped,
+                },
+                "congestion": self._congestion,
+                "clients": self._client_rows(),
+                "spin_hz": health.get("spin_hz"),
+                "energy": health.get("energy", {}),
+                "warnings": warnings,
+                "samples_published": self._samples_published,
+                "commands": self._accepted,
+            }
+        )
+
+    def _client_rows(self) -> dict[str, dict[str, Any]]:
+        now = time.monotonic()
+        with self._clients_lock:
+            rows = dict(self._clients)
+        return {
+            name: {
+                "received_index": row.received_index,
+                "lag_s": round(self._behind(row) / self._samples_rate_hz, 4) if self._samples_rate_hz else 0.0,
+                "last_heard_s": round(now - row.heard_s, 3),
+                "lost": row.lost,
+            }
+            for name, row in rows.items()
+        }
+
+    def _behind(self, row: _ClientReport) -> int:
+        return max(0, self._samples_published - row.received_index)
+
+    # ---- on transport threads ----
+
+    def _serve(self) -> None:
+        for key, document in (
+            (wire.CATALOGUE, self._simulation.catalogue()),
+            (wire.PARAMETERS, self._simulation.parameters_document()),
+            (wire.SCENE, self._scene),
+        ):
+            payload = wire.encode_document(document)
+            self._server.answer(key, lambda _, payload=payload: payload)
+        self._server.answer(wire.STATUS, lambda _: wire.encode_document(self.status()))
+        for name in COMMANDS:
+            self._server.answer(wire.command_key(name), lambda payload, name=name: self._on_command(name, payload))
+        self._server.hear(f"{wire.CLIENTS}/*", self._on_report)
+
+    def _on_command(self, name: str, payload: bytes) -> bytes:
+        """Hand a command to the simulation thread and wait for its answer."""
+        try:
+            pending = _parse_command(name, payload)
+            with self._pending_lock:
+                if not self._accepting:
+                    raise InputError(name, "sent while the rig runs", "a run that has ended")
+                if len(self._pending) >= _PENDING_COMMANDS:
+                    raise InputError("commands", f"at most {_PENDING_COMMANDS} at a time", len(self._pending) + 1)
+                self._pending.append(pending)
+        except InputError as error:
+            return wire.encode_document(_refusal(error))
+        self._clock.wake()
+        # Answered at the next block boundary, or when the run ends; a step, when it is done.
+        return wire.encode_document(pending.reply.result())
+
+    def _on_report(self, key: str, payload: bytes) -> None:
+        name = key.rpartition("/")[2]
+        try:
+            document = wire.decode_document(payload)
+            row = _ClientReport(int(document["received_index"]), int(document.get("lost", 0)), time.monotonic())
+        except (ValueError, KeyError, TypeError):
+            self._bad_reports += 1
+            return
+        with self._clients_lock:
+            for old in [key for key, old in self._clients.items() if row.heard_s - old.heard_s > _CLIENT_FORGOTTEN_S]:
+                del self._clients[old]
+            if name in self._clients or len(self._clients) < _CLIENTS:
+                self._clients[name] = row
+
+    # ---- on the simulation thread ----
+
+    def prepare(self) -> None:
+        """Compile everything, answer requests and show the rig's token; `run` does it where it was not done before."""
+        if self._prepared:
+            return
+        self._simulation.warm_up()
+        self._health = self._simulation.health()
+        self._serve()
+        self._server.announce()
+        self._prepared = True
+
+    def run(self) -> dict[str, Any]:
+        """Run to the end, to a stop, or to a failure, which is raised after the stream has been ended.
+
+        Returns:
+            Summary: reason, tick, time_s, wall_s, rows by key, and the last status's figures.
+        """
+        simulation = self._simulation
+        self.prepare()
+        start = {"scene": self._scene.get("name"), "seed": self._scene.get("seed"), "pace": self._clock.pace}
+        self._queue.put(_Entry([self._event("start", **start)]))
+        publisher = threading.Thread(target=self._publish_all, name="publisher", daemon=True)
+        publisher.start()
+        # What the start left behind is never garbage, and walking it took 5 to 8 ms of a full collection.
+        gc.collect()
+        gc.freeze()
+        started = time.monotonic()
+        reason = "failed: the service itself failed"
+        try:
+            self._clock.start(simulation.tick, self._rate)
+            reason = self._advance_all()
+        except KeyboardInterrupt:
+            reason = "stopped"
+            raise
+        except StepTimeoutError as error:
+            reason = f"failed: {error}"
+            raise
+        except BaseException as error:
+            reason = f"failed: {type(error).__name__}: {_one_line(error)}"
+            raise
+        finally:
+            wall_s = time.monotonic() - started
+            gc.unfreeze()
+            self._finish(reason)
+            publisher.join(timeout=60.0)
+            # Where the publisher failed, nobody else answers the steps that it left.
+            while (entry := self._queue.take(0.0)) is not None:
+                self._answer(entry)
+            self._linger()
+        if self._publisher_error is not None:
+            raise self._publisher_error
+        status = self.status()
+        kept = ("scene", "pace", "tick", "time_s", "real_time_factor", "lateness_ms", "overruns", "queue", "congestion")
+        return {
+            "reason": reason,
+            "wall_s": wall_s,
+            **{name: status[name] for name in kept},
+            "samples_published": self._samples_published,
+            "commands": self._accepted,
+            "rows": dict(self._rows),
+        }
+
+    def _advance_all(self) -> str:
+        """The loop; returns why it ended."""
+        simulation, clock, queue = self._simulation, self._clock, self._queue
+        end = simulation.end_tick
+        while True:
+            events = self._take_commands()
+            if self._stop_requested or (end is not None and simulation.tick >= end):
+                queue.put(_Entry(events))
+                return "stopped" if self._stop_requested else "completed"
+            if self._publisher_error is not None:
+                raise RuntimeError("the publisher failed") from self._publisher_error
+            want = self._block_ticks
+            if end is not None:
+                rest = end - simulation.tick
+                want = min(want, math.ceil(rest / simulation.block_ticks) * simulation.block_ticks)
+            if not self._may_drop and not queue.wait_for_room(0.1):
+                self._defer(events)
+                continue
+            ticks = clock.grant(want)
+            if ticks == 0:
+                self._defer(events)
+                continue
+            frame = simulation.advance(ticks)
+            clock.release(simulation.tick)
+            self._tick = simulation.tick
+            after = [{**event, "wall_s": time.time()} for event in frame.events]
+            after += self._refresh_health()
+            self._overflow(queue.put(_Entry(events, frame, after, self._finished_steps())))
+
+    def _defer(self, events: list[dict[str, Any]]) -> None:
+        """Publish events without a block, where the next block is not yet to be run."""
+        if events:
+            self._queue.put(_Entry(events))
+
+    def _overflow(self, dropped: int) -> None:
+        """Say once for each time that the queue overflows; the count is in the status."""
+        if dropped and not self._overflowing:
+            text = "the publisher does not keep up: the oldest blocks in the queue are dropped"
+            self._queue.put(_Entry([self._event("warning", text=text)]))
+        self._overflowing = bool(dropped)
+
+    def _take_commands(self) -> list[dict[str, Any]]:
+        """Carry out all commands that have arrived; returns their events."""
+        events = []
+        while self._pending:
+            with self._pending_lock:
+                pending = self._pending.popleft()
+            try:
+                event = self._carry_out(pending)
+            except InputError as error:
+                pending.reply.set_result(_refusal(error))
+            except (ValueError, TypeError, KeyError) as error:
+                # A request that the simulation's own checks let through must not end the run.
+                pending.reply.set_result(_refusal(InputError(pending.command, "readable", _one_line(error))))
+            else:
+                events.append(event)
+        return events
+
+    def _carry_out(self, pending: _Pending) -> dict[str, Any]:
+        simulation = self._simulation
+        tick, done_tick = simulation.tick, None
+        if pending.command == "stop":
+            _only_fields(pending.request, ())
+            self._stop_requested = True
+        elif pending.command == "step":
+            done_tick = self._check_step(pending.request)
+        else:
+            tick = simulation.submit(pending.command, dict(pending.request))
+        self._accepted += 1
+        reply = {"accepted": True, "id": self._accepted, "command": pending.command}
+        if done_tick is None:
+            pending.reply.set_result({**reply, "tick": tick, "time_s": tick / self._rate})
+        else:
+            reply |= {"tick": done_tick, "time_s": done_tick / self._rate}
+            self._steps.append((done_tick, pending.reply, reply))
+        detail = {"id": self._accepted, "command": pending.command, "request": pending.request, "from": pending.sender}
+        return self._event("command", tick=tick, **detail)
+
+    def _check_step(self, request: dict[str, Any]) -> int:
+        """Grant a step; returns the tick at which it is done."""
+        if not isinstance(self._clock, Lockstep):
+            raise InputError("step", "sent to a rig that runs with --pace lockstep", f"--pace {self._clock.pace}")
+        _only_fields(request, ("ticks",))
+        ticks, unit = request.get("ticks"), self._simulation.block_ticks
+        most = _STEP_S * self._rate
+        if not isinstance(ticks, int) or isinstance(ticks, bool) or not 0 < ticks <= most or ticks % unit:
+            raise InputError("ticks", f"a positive whole multiple of {unit}, at most {most}", ticks)
+        start = self._step_target if self._step_target is not None else self._simulation.tick
+        end = self._simulation.end_tick
+        if end is not None and start + ticks > end:
+            raise InputError("ticks", f"at most {end - start}, the rest of the scene", ticks)
+        self._step_target = start + ticks
+        self._clock.allow(ticks)
+        return self._step_target
+
+    def _finished_steps(self) -> list[tuple[Future[dict[str, Any]], dict[str, Any]]]:
+        """Steps that the last block completed; they are answered once that block is published."""
+        if not self._steps:
+            return []
+        done = [(reply, document) for tick, reply, document in self._steps if tick <= self._tick]
+        self._steps = [row for row in self._steps if row[0] > self._tick]
+        if not self._steps:
+            self._step_target = None
+        return done
+
+    def _refresh_health(self) -> list[dict[str, Any]]:
+        """Ask the simulation how it is, a few times a second; returns an event for each new kind of warning."""
+        now = time.monotonic()
+        if now < self._next_health_s:
+            return []
+        self._next_health_s = now + self._status_period_s
+        self._health = self._simulation.health()
+        events = []
+        for text in self._health.get("warnings", []):
+            # A warning whose figures have moved on is not a new one; the status always shows the latest.
+            kind = _FIGURES.sub("#", text)
+            if kind not in self._known_warnings:
+                self._known_warnings.add(kind)
+                events.append(self._event("warning", text=text))
+        return events
+
+    def _event(self, name: str, *, tick: int | None = None, **fields: Any) -> dict[str, Any]:
+        tick = self._simulation.tick if tick is None else tick
+        return {"event": name, "tick": tick, "time_s": tick / self._rate, "wall_s": time.time(), **fields}
+
+    def _finish(self, reason: str) -> None:
+        """Refuse what is still waiting, and put the end of the stream into the queue."""
+        self._state = "ended"
+        with self._pending_lock:
+            self._accepting = False
+            waiting = [pending.reply for pending in self._pending]
+            self._pending.clear()
+        waiting += [reply for _, reply, _ in self._steps]
+        for reply in waiting:
+            reply.set_result(_refusal(InputError("command", "sent while the rig runs", f"a run that ended: {reason}")))
+        self._queue.put(_Entry([self._event("end", reason=reason)]))
+        self._queue.close()
+
+    def _linger(self) -> None:
+        """Keep the cache until everybody who is connected has everything."""
+        deadline = time.monotonic() + self._linger_s
+        quiet_since = time.monotonic()
+        while (now := time.monotonic()) < deadline:
+            self._congestion = self._server.congestion()
+            if not self._congestion.get("links", 0) or now - quiet_since >= _QUIET_S:
+                return
+            with self._clients_lock:
+                rows = list(self._clients.values())
+            behind = any(now - row.heard_s < _CLIENT_GONE_S and self._behind(row) for row in rows)
+            if behind or self._congestion.get("stalled_links", 0):
+                quiet_since = now
+            time.sleep(0.1)
+
+    # ---- on the publisher thread ----
+
+    def _publish_all(self) -> None:
+        next_status_s = time.monotonic()
+        try:
+            while not self._queue.finished:
+                entry = self._queue.take(max(0.0, next_status_s - time.monotonic()))
+                if entry is not None:
+                    self._publish_entry(entry)
+                now = time.monotonic()
+                if now >= next_status_s:
+                    self._publish_status()
+                    # Not one period after the last: a status that was held up is not followed by a burst.
+                    next_status_s = now + self._status_period_s
+            self._publish_status()
+        except BaseException as error:
+            self._publisher_error = error
+
+    def _publish_entry(self, entry: _Entry) -> None:
+        for event in entry.before:
+            self._publish_event(event)
+        if entry.frame is not None:
+            for group, block in entry.frame.samples.items():
+                self._publish_block(wire.sensor_key(group), block)
+            if entry.frame.edges is not None:
+                self._publish_block(wire.EDGES, entry.frame.edges)
+            for table, block in entry.frame.truth.items():
+                self._publish_block(wire.truth_key(table), block)
+            self._count_samples(entry.frame)
+        for event in entry.after:
+            self._publish_event(event)
+        self._answer(entry)
+
+    def _publish_block(self, key: str, block: wire.Block) -> None:
+        self._server.publish(key, wire.encode_block(block))
+        self._rows[key] = block.index + len(block.values)
+
+    def _publish_event(self, event: dict[str, Any]) -> None:
+        if event["event"] == "end":
+            # Blocks and events travel apart: whoever has the end can tell from this what it still lacks.
+            event = {**event, "rows": dict(self._rows)}
+        self._server.publish(wire.EVENTS, wire.encode_document(_finite(event)))
+
+    def _publish_status(self) -> None:
+        self._congestion = self._server.congestion()
+        self._server.publish(wire.STATUS, wire.encode_document(self.status()))
+
+    def _count_samples(self, frame: Frame) -> None:
+        """What clients are measured against: the probes, or the first group of a scene without them."""
+        group = "probes" if "probes" in frame.samples else next(iter(frame.samples), None)
+        if group is not None:
+            self._samples_rate_hz = frame.samples[group].rate_hz
+            self._samples_published = self._rows[wire.sensor_key(group)]
+
+    @staticmethod
+    def _answer(entry: _Entry) -> None:
+        for reply, document in entry.replies:
+            reply.set_result(document)
+
+
+def _parse_command(name: str, payload: bytes) -> _Pending:
+    if len(payload) > _REQUEST_BYTES:
+        raise InputError(name, f"a request of at most {_REQUEST_BYTES} bytes", len(payload))
+    try:
+        request = wire.decode_document(payload)
+    except (ValueError, RecursionError) as error:
+        raise InputError(name, "a JSON object", _one_line(error)) from None
+    sender = request.pop("from", "unknown")
+    if not isinstance(sender, str) or not sender.isprintable() or not 1 <= len(sender) <= 100:
+        raise InputError("from", "a name of 1 to 100 printable characters", sender)
+    return _Pending(name, request, sender)
+
+
+def _only_fields(request: dict[str, Any], allowed: tuple[str, ...]) -> None:
+    for name in request:
+        if name not in allowed:
+            raise InputError("request", f"without fields other than {', '.join(allowed) or 'from'}", name)
+
+
+def _refusal(error: Exception) -> dict[str, Any]:
+    return {"accepted": False, "error": _one_line(error)}
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _finite(value: Any) -> Any:
+    """The same document with None for numbers that JSON cannot carry: a diverged run must still be able to say so."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return value

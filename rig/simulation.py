@@ -1,0 +1,357 @@
+"""A running simulation: scene in, frames of samples and truth out, commands on the way. No clock, no threads, no I/O.
+
+`Simulation.advance` is the one stepper behind every way to run the rig: free, in lockstep, or in real time. Time is an integer tick of 1 us.
+How a run is cut into calls changes no bit of the result.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rig.channels import ChannelTable, default_table
+from rig.engines import load_engine
+from rig.errors import InputError
+from rig.kernels import signals as S
+from rig.kernels.constants import Inputs
+from rig.kernels.magnet import magnet_force
+from rig.kernels.signals import COLUMN
+from rig.model import build_model, describe
+from rig.scenes import HammerCommand, ReleaseCommand, Scene, SpeedCommand, parse_command, scene_document
+from rig.sensors.conditioning import Conditioner
+from rig.sensors.keyphasor import Keyphasor
+from rig.wire import ROOT, Block
+
+TICK_RATE_HZ = 1_000_000
+ROW_TICKS = 25
+"""Rows are observed every 25 us, more often where rates ask for it, or every step where that is longer: the sensors' filters run at this rate."""
+ENERGY_ALARM = 1e-3
+"""Energy residual over dissipated energy above which a run is in doubt."""
+
+STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy")
+SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
+DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
+
+
+class SimulationError(RuntimeError):
+    """The numbers have gone wrong: the state is no longer finite."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What one `advance` made.
+
+    Attributes:
+        tick: Start.
+        ticks: Length.
+        samples: ADC counts by sensor group.
+        edges: Keyphasor edges, ticks from the block's tick, or None where there was none.
+        truth: Truth tables by name.
+        events: What took effect, each with event, tick and time_s.
+        rows: Observed rows, shape (n, N_ROW); a view that the next `advance` overwrites.
+    """
+
+    tick: int
+    ticks: int
+    samples: dict[str, Block]
+    edges: Block | None
+    truth: dict[str, Block]
+    events: list[dict[str, Any]]
+    rows: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class _Segment:
+    """The speed target from a tick on: `speed + slope (t - tick)` [rad/s]."""
+
+    tick: int
+    speed: float
+    slope: float
+
+
+class Simulation:
+    """One run of one scene.
+
+    Attributes:
+        scene: The scene.
+        model: The model it runs on.
+        table: Channel table of the sensors that are on.
+        tick: Present time.
+        tick_rate_hz: Ticks a second.
+        block_ticks: An advance must be a whole multiple of this.
+        end_tick: Where the scene ends.
+        row_ticks: Ticks between observed rows.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.tick_rate_hz = TICK_RATE_HZ
+        self.model = build_model(scene.load_parameters())
+        self._engine = load_engine(scene.engine.name)
+        self._step_ticks = scene.engine.step_us
+        sensors = scene.sensors
+        periods = [TICK_RATE_HZ // rate for rate in (sensors.rate_hz, sensors.truth_rate_hz)]
+        # The coarsest grid up to ROW_TICKS that steps, samples and truth all fall on.
+        grid = math.gcd(*periods)
+        self._stride = max(n for n in range(1, max(1, ROW_TICKS // self._step_ticks) + 1) if grid % (n * self._step_ticks) == 0)
+        self.row_ticks = self._stride * self._step_ticks
+        self.block_ticks = math.lcm(*periods)
+        self.end_tick = math.ceil(round(scene.duration_s * TICK_RATE_HZ) / self.block_ticks) * self.block_ticks
+        self.table: ChannelTable = default_table().only(sensors.groups, sensors.rate_hz)
+        row_rate = TICK_RATE_HZ // self.row_ticks
+        self._conditioners = {
+            name: Conditioner(group, row_rate_hz=row_rate, seed=scene.seed, noise=sensors.noise)
+            for name, group in self.table.groups.items()
+        }
+        self._keyphasor = Keyphasor() if "drive" in sensors.groups else None
+        self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
+        self._truth_columns = {name: [COLUMN[column] for column in columns] for name, columns in S.TRUTH.items()}
+
+        self.tick = 0
+        self._segments = self._profile()
+        self._engaged = scene.initial.magnets
+        self._blow: tuple[HammerCommand, int, int] | None = None
+        self._pending = sorted(
+            ((self._on_grid(timed.at_s), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
+        )
+        speed = self._segments[0].speed
+        self._y = self._initial_state(speed)
+        self._memory = np.zeros(self._engine.MEMORY)
+        self._engine.start(self.model.constants, self._inputs(), self._y, self._memory)
+        self._rows = np.empty((0, S.N_ROW))
+        self._first = self._look()
+        self._last = self._first
+
+    def advance(self, ticks: int) -> Frame:
+        """Move on by `ticks`.
+
+        Raises:
+            InputError: `ticks` is not a positive whole multiple of `block_ticks`.
+            SimulationError: The state has become non-finite.
+        """
+        if ticks <= 0 or ticks % self.block_ticks:
+            raise InputError("ticks", f"a positive multiple of {self.block_ticks}", ticks)
+        start, end = self.tick, self.tick + ticks
+        n = ticks // self.row_ticks
+        if len(self._rows) < n:
+            self._rows = np.empty((n, S.N_ROW))
+        rows = self._rows[:n]
+        events: list[dict[str, Any]] = []
+        while self.tick < end:
+            self._take_effect(events)
+            stop = min(end, self._next_change())
+            self._run(rows[(self.tick - start) // self.row_ticks : (stop - start) // self.row_ticks], stop - self.tick)
+        self._last = rows[-1].copy()
+        if not np.isfinite(self._y).all():
+            raise SimulationError(f"the state is no longer finite at {self.tick / TICK_RATE_HZ:.6f} s; try a shorter engine.step_us")
+        return Frame(
+            tick=start, ticks=ticks, samples=self._sample(rows, start), edges=self._edges(rows, start),
+            truth=self._truth(rows, start), events=events, rows=rows,
+        )  # fmt: skip
+
+    def submit(self, name: str, request: dict[str, Any]) -> int:
+        """Check a command and schedule it for the present tick.
+
+        Returns:
+            The tick at which it takes effect.
+
+        Raises:
+            InputError: Unknown, malformed, out of range, or not possible now.
+        """
+        command = parse_command(name, request)
+        if isinstance(command, HammerCommand) and self._blow is not None and self.tick < self._blow[2]:
+            raise InputError("hammer", f"idle (it is in a blow until {self._blow[2] / TICK_RATE_HZ:.6f} s)", "another blow")
+        if isinstance(command, SpeedCommand):
+            top = self.model.parameters.entries["drive.top_speed"].value
+            if not isinstance(top, str) and command.speed_hz > top:
+                raise InputError("speed.speed_hz", f"at most drive.top_speed = {top:g} Hz", command.speed_hz)
+        if isinstance(command, ReleaseCommand) and not self._engaged:
+            raise InputError("release", "given once (the magnets have let go already)", "another release")
+        self._pending.insert(0, (self.tick, command))
+        return self.tick
+
+    def warm_up(self) -> None:
+        """Compile (or load) every kernel that `advance` will call, without moving on."""
+        twin = Simulation(self.scene)
+        twin.advance(twin.block_ticks)
+
+    def health(self) -> dict[str, Any]:
+        """Spin, energy ledger and doubts at the present tick, for the status."""
+        balance = energy_balance(self._last[None, :], self._first)
+        residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
+        engine, warnings = self._engine, []
+        if abs(residual) > ENERGY_ALARM * max(dissipated, 1e-6):
+            warnings.append(f"energy residual {residual:.2e} J is above {ENERGY_ALARM:g} of what was dissipated")
+        if self._memory[engine.CLAMPS]:
+            warnings.append(f"the contact law would have pulled at {self._memory[engine.CLAMPS]:.0f} steps and was held at 0")
+        if self._memory[engine.FLOORED]:
+            warnings.append(f"{self._memory[engine.FLOORED]:.0f} contacts began slower than contact.speed_floor")
+        return {
+            "spin_hz": float(self._last[COLUMN["theta_rate"]]) / (2.0 * math.pi),
+            "energy": {"residual_j": residual, "dissipated_j": dissipated},
+            "contacts": int(self._memory[engine.CONTACTS]),
+            "peak_normal_force_n": float(self._memory[engine.PEAK_FORCE]),
+            "warnings": warnings,
+        }
+
+    def catalogue(self) -> dict[str, Any]:
+        """Channel table with calibrations, and the columns of the truth tables, as a JSON document."""
+        signals = {signal.name: signal for signal in S.ROW}
+        return {
+            "root": ROOT,
+            "tick_rate_hz": TICK_RATE_HZ,
+            "table": self.table.model_dump(mode="json"),
+            "truth": {
+                name: {"rate_hz": self.scene.sensors.truth_rate_hz, "columns": [signals[column]._asdict() for column in columns]}
+                for name, columns in S.TRUTH.items()
+            },
+        }
+
+    def parameters_document(self) -> dict[str, Any]:
+        """The parameters as a JSON document."""
+        return describe(self.model)
+
+    def scene_document(self) -> dict[str, Any]:
+        """The scene as a JSON document."""
+        return {"name": self.scene.name, "seed": self.scene.seed, "scene": scene_document(self.scene)}
+
+    def _initial_state(self, spin: float) -> np.ndarray:
+        initial, clearance = self.scene.initial, self.model.constants.contact.clearance
+        if initial.position == "equilibrium":
+            return self.model.state(spin=spin)
+        # A hair inside the clearance, so that rounding does not make it a contact.
+        inside = clearance * (1.0 - 1e-12)
+        x, y = {"top": (0.0, inside), "bottom": (0.0, -inside), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}[
+            initial.position
+        ]
+        if math.hypot(x, y) > clearance:
+            raise InputError("initial.position", f"inside the ring (r0 = {clearance * 1e3:g} mm)", [initial.x_mm, initial.y_mm])
+        return self.model.state(ring_x=x, ring_y=y, spin=spin)
+
+    def _on_grid(self, time_s: float) -> int:
+        # The first row at or after the time asked for.
+        return math.ceil(round(time_s * TICK_RATE_HZ) / self.row_ticks) * self.row_ticks
+
+    def _profile(self) -> list[_Segment]:
+        drive = self.scene.drive
+        points = [(self._on_grid(time), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))]
+        segments = [
+            _Segment(tick=t0, speed=w0, slope=(w1 - w0) / (t1 - t0) * TICK_RATE_HZ)
+            for (t0, w0), (t1, w1) in zip(points, points[1:], strict=False)
+        ]
+        return [*segments, _Segment(tick=points[-1][0], speed=points[-1][1], slope=0.0)]
+
+    def _segment(self) -> _Segment:
+        return max((segment for segment in self._segments if segment.tick <= self.tick), key=lambda segment: segment.tick)
+
+    def _take_effect(self, events: list[dict[str, Any]]) -> None:
+        while self._pending and self._pending[0][0] <= self.tick:
+            command = self._pending.pop(0)[1]
+            event: dict[str, Any] = {"event": command.command, "tick": self.tick, "time_s": self.tick / TICK_RATE_HZ}
+            event |= command.model_dump(exclude={"command"})
+            if isinstance(command, HammerCommand):
+                length = max(1, round(command.duration_ms * 1e-3 * TICK_RATE_HZ / self.row_ticks)) * self.row_ticks
+                self._blow = (command, self.tick, self.tick + length)
+            elif isinstance(command, SpeedCommand):
+                self._ramp_to(2.0 * math.pi * command.speed_hz)
+            else:
+                self._release()
+            events.append(event)
+
+    def _ramp_to(self, target: float) -> None:
+        segment = self._segment()
+        now = segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
+        length = self._on_grid(abs(target - now) / self.model.parameters["drive.ramp_rate"])
+        hold = _Segment(tick=self.tick + length, speed=target, slope=0.0)
+        slope = (target - now) / length * TICK_RATE_HZ if length else 0.0
+        self._segments = [_Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
+
+    def _release(self) -> None:
+        # What the magnets hold is gone with them: booked, so that the ledger closes.
+        shaft, magnet = self.model.constants.shaft, self.model.constants.magnet
+        gamma, beta = self._y[0], self._y[1]
+        x, y = math.sin(beta), -math.sin(gamma) * math.cos(beta)
+        _, _, stored = magnet_force(
+            shaft.arm_magnet * x, shaft.arm_magnet * y, magnet.stiffness, magnet.a3, magnet.a5, magnet.a7
+        )
+        self._y[S.RELEASE_WORK] -= stored
+        self._engaged = False
+
+    def _next_change(self) -> int:
+        ticks = [segment.tick for segment in self._segments if segment.tick > self.tick]
+        ticks += [tick for tick, _ in self._pending]
+        return min(ticks, default=2**62)
+
+    def _inputs(self) -> Inputs:
+        segment = self._segment()
+        force, (dx, dy), begin, end = 0.0, (1.0, 0.0), 0, 0
+        if self._blow is not None:
+            command, begin, end = self._blow
+            force, (dx, dy) = float(command.force_n), command.cosines
+        return Inputs(
+            tick_s=1.0 / TICK_RATE_HZ, hammer_force=force, hammer_x=dx, hammer_y=dy, hammer_start=begin, hammer_end=end,
+            speed=segment.speed, speed_slope=segment.slope, speed_tick=segment.tick,
+            ideal_drive=self.scene.drive.mode == "ideal", magnet_engaged=self._engaged,
+        )  # fmt: skip
+
+    def _run(self, rows: np.ndarray, ticks: int) -> None:
+        self._engine.advance(
+            self.model.constants, self._inputs(), self._y, self._memory, self.tick, self._step_ticks,
+            ticks // self._step_ticks, self._stride, rows,
+        )  # fmt: skip
+        self.tick += ticks
+
+    def _look(self) -> np.ndarray:
+        """The row of the present instant."""
+        row = np.empty((1, S.N_ROW))
+        self._engine.advance(
+            self.model.constants, self._inputs(), self._y.copy(), self._memory.copy(), self.tick, self._step_ticks, 1, 1, row
+        )
+        return row[0]
+
+    def _sample(self, rows: np.ndarray, start: int) -> dict[str, Block]:
+        blocks = {}
+        for name, conditioner in self._conditioners.items():
+            rate = conditioner.group.rate_hz
+            blocks[name] = self._block(start, start * rate // TICK_RATE_HZ, rate, conditioner.counts(rows))
+        return blocks
+
+    def _edges(self, rows: np.ndarray, start: int) -> Block | None:
+        if self._keyphasor is None:
+            return None
+        index = self._keyphasor.edges_seen
+        edges = self._keyphasor.edges(rows, self.row_ticks)
+        return self._block(start, index, 0, edges[:, None]) if len(edges) else None
+
+    def _truth(self, rows: np.ndarray, start: int) -> dict[str, Block]:
+        rate = self.scene.sensors.truth_rate_hz
+        kept = rows[:: self._truth_every]
+        index = start * rate // TICK_RATE_HZ
+        return {name: self._block(start, index, rate, kept[:, columns]) for name, columns in self._truth_columns.items()}
+
+    def _block(self, tick: int, index: int, rate_hz: int, values: np.ndarray) -> Block:
+        return Block(tick=tick, index=index, rate_hz=float(rate_hz), tick_rate_hz=float(TICK_RATE_HZ), values=values)
+
+
+def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]:
+    """The energy ledger of a run.
+
+    Args:
+        rows: Observed rows, shape (n, N_ROW).
+        first: Row at the start of the run, shape (N_ROW,).
+
+    Returns:
+        stored (change since the start), supplied, dissipated, and residual = stored - supplied + dissipated [J], each shape (n,).
+    """
+
+    def total(names: tuple[str, ...], table: np.ndarray) -> np.ndarray:
+        return np.sum([table[..., COLUMN[name]] for name in names], axis=0)
+
+    stored = total(STORED, rows) - total(STORED, first)
+    supplied, dissipated = total(SUPPLIED, rows), total(DISSIPATED, rows)
+    return {"stored": stored, "supplied": supplied, "dissipated": dissipated, "residual": stored - supplied + dissipated}
+
+

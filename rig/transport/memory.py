@@ -1,0 +1,166 @@
+"""Both ends of a transport in one process, for tests: every call is done when it returns, on the caller's thread."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rig.transport import NoReplyError
+
+
+def key_matches(expression: str, key: str) -> bool:
+    """Whether a key lies in an expression, where `*` is one chunk and `**` any number of chunks."""
+
+    def match(pattern: list[str], chunks: list[str]) -> bool:
+        if not pattern:
+            return not chunks
+        if pattern[0] == "**":
+            return any(match(pattern[1:], chunks[n:]) for n in range(len(chunks) + 1))
+        return bool(chunks) and pattern[0] in ("*", chunks[0]) and match(pattern[1:], chunks[1:])
+
+    return match(expression.split("/"), key.split("/"))
+
+
+@dataclass(frozen=True, slots=True)
+class _Subscription:
+    expression: str
+    on_message: Callable[[str, bytes], None]
+    owner: MemoryClient
+
+
+class MemoryServer:
+    """The rig's side; clients are made from it: `MemoryClient(server)`.
+
+    Args:
+        cache: Number of messages kept for subscribers that ask for history.
+    """
+
+    def __init__(self, *, cache: int = 100_000) -> None:
+        self._lock = threading.RLock()
+        self._cache: deque[tuple[str, bytes]] = deque(maxlen=cache)
+        self._subscriptions: list[_Subscription] = []
+        self._watchers: list[tuple[MemoryClient, Callable[[bool], None]]] = []
+        self._handlers: dict[str, Callable[[bytes], bytes]] = {}
+        self._listeners: list[tuple[str, Callable[[str, bytes], None]]] = []
+        self._announced = False
+        self._closed = False
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Hand one payload to all subscribers, in the order in which they subscribed."""
+        with self._lock:
+            self._cache.append((key, payload))
+            matching = [row for row in self._subscriptions if key_matches(row.expression, key)]
+            # Delivery under the lock keeps each subscriber's messages in order; the lock is re-entrant for callbacks
+            # that ask the rig something.
+            for row in matching:
+                row.on_message(key, payload)
+
+    def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
+        """Answer requests on a key; the handler is called on the asking thread."""
+        with self._lock:
+            self._handlers[key] = handler
+
+    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+        """Receive what clients report on matching keys."""
+        with self._lock:
+            self._listeners.append((key, callback))
+
+    def announce(self) -> None:
+        """Show the rig's token to those who watch."""
+        with self._lock:
+            self._announced = True
+            watchers = list(self._watchers)
+        for _, callback in watchers:
+            callback(True)
+
+    def congestion(self) -> dict[str, float]:
+        """Nothing: a message has arrived when `publish` returns."""
+        return {}
+
+    def close(self) -> None:
+        """Forget all subscribers and tell the watchers."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            watchers = list(self._watchers) if self._announced else []
+            self._handlers.clear()
+            self._subscriptions.clear()
+            self._listeners.clear()
+            self._watchers.clear()
+        for _, callback in watchers:
+            callback(False)
+
+    def __enter__(self) -> MemoryServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class MemoryClient:
+    """A client's side of a `MemoryServer` in the same process."""
+
+    def __init__(self, server: MemoryServer) -> None:
+        self._server = server
+
+    def subscribe(
+        self,
+        key: str,
+        on_message: Callable[[str, bytes], None],
+        *,
+        on_miss: Callable[[str, int], None] | None = None,
+        history: bool = False,
+        lossless: bool = True,
+    ) -> None:
+        """Receive payloads in order; nothing is ever missed here, so `on_miss` and `lossless` change nothing."""
+        server = self._server
+        with server._lock:
+            if history:
+                for past_key, payload in list(server._cache):
+                    if key_matches(key, past_key):
+                        on_message(past_key, payload)
+            server._subscriptions.append(_Subscription(key, on_message, self))
+
+    def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
+        """Ask the rig and return its reply.
+
+        Raises:
+            NoReplyError: Nobody answers on that key.
+        """
+        with self._server._lock:
+            handler = self._server._handlers.get(key)
+        if handler is None:
+            raise NoReplyError(f"no rig answers {key} in this process")
+        return handler(payload)
+
+    def watch(self, key: str, callback: Callable[[bool], None]) -> None:
+        """Call back with True / False when the rig's token appears / vanishes."""
+        with self._server._lock:
+            self._server._watchers.append((self, callback))
+            announced = self._server._announced and not self._server._closed
+        if announced:
+            callback(True)
+
+    def report(self, key: str, payload: bytes) -> None:
+        """Send one payload to the rig."""
+        with self._server._lock:
+            listeners = list(self._server._listeners)
+        for expression, callback in listeners:
+            if key_matches(expression, key):
+                callback(key, payload)
+
+    def close(self) -> None:
+        """Forget this client's subscriptions and watches."""
+        server = self._server
+        with server._lock:
+            server._subscriptions = [row for row in server._subscriptions if row.owner is not self]
+            server._watchers = [row for row in server._watchers if row[0] is not self]
+
+    def __enter__(self) -> MemoryClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,426 @@
+"""Server and client over zenoh: loopback TCP between two peers, no router, no multicast, no gossip.
+
+The server publishes without waiting (a stalled subscriber must not delay it) and keeps the last messages of each key;
+a lossless client notices from the sequence numbers what it did not get and fetches it from there. Measured with a
+subscriber that was stopped for 8 s, and with one whose callback slept for 8 s: all messages arrived, in order.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from rig import wire
+from rig.errors import InputError
+from rig.transport import DEFAULT_ENDPOINT, NoReplyError
+
+LOOPBACK_HOSTS = ("127.0.0.1", "localhost")
+
+_BLOCKS_A_SECOND = 100
+_CACHE_S = 30.0
+_SLOW_PUT_S = 0.5e-3
+_STALLED_BYTES = 256 * 1024
+"""Unread bytes that make a link stalled: about 0.1 s of all streams; one that keeps up leaves none."""
+_LEASE_S = 60.0
+"""A stopped subscriber sends no keep-alives, and must keep its link for well over 10 s. A killed process is noticed
+by its closed socket, not by the lease."""
+_PATIENCE_S = 20.0
+_HEARTBEAT_S = 0.25
+"""How soon a subscriber learns that the last message of a key is missing."""
+_RING = 2000
+"""Messages that a subscriber which may lose some holds: about 2 s of all streams."""
+
+
+def parse_endpoint(text: str, *, field: str = "endpoint") -> tuple[str, int]:
+    """Split HOST:PORT.
+
+    Raises:
+        InputError: It is not of that form.
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon or not host or "/" in host or not port.isdecimal() or not 1 <= int(port) <= 65535:
+        raise InputError(field, f"HOST:PORT with a port of 1 to 65535, such as {DEFAULT_ENDPOINT}", text)
+    return host, int(port)
+
+
+def _locator(host: str, port: int) -> str:
+    # "localhost" may resolve to ::1 first, where nobody listens.
+    return f"tcp/{'127.0.0.1' if host == 'localhost' else host}:{port}"
+
+
+def _config(**settings: Any) -> Any:
+    """The settings that both sides share, and those given (`__` stands for `/`)."""
+    import zenoh
+
+    config = zenoh.Config()
+    shared = {
+        "mode": "peer",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # Blocks are of a few kB: shared memory saves nothing and would leave segments behind when a process is killed.
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": round(_LEASE_S * 1000),
+        "transport/link/tx/keep_alive": 30,
+        # Recovered messages wait for room in their link, and while they do, the publisher of that key waits for its
+        # cache. After this time the link is closed instead, which can cost that client messages. It must be below the
+        # time that the service can queue [us].
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(_PATIENCE_S * 1e6),
+        # A client that is stopped while its recovery is under way must not give it up when it goes on [ms].
+        "queries_default_timeout": round(_LEASE_S * 1e3),
+    }
+    for key, value in {**shared, **{name.replace("__", "/"): value for name, value in settings.items()}}.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class _Session:
+    """A zenoh session with its receiving threads, closed for certain.
+
+    zenoh's own callback threads are not daemons: a script that forgets to close would hang on exit. So all receiving
+    is by channels, drained by daemon threads, and an exit handler closes what was left open.
+    """
+
+    def __init__(self, config: Any) -> None:
+        import zenoh
+
+        self.session = zenoh.open(config)
+        self._threads: list[threading.Thread] = []
+        self._closing = threading.Lock()
+        self._closed = False
+        atexit.register(self.close)
+
+    def drain(self, channel: Any, take: Callable[[Any], None], name: str) -> None:
+        """Give all that arrives in a channel to `take`, on a thread of its own."""
+
+        def loop() -> None:
+            for item in channel:
+                take(item)
+
+        thread = threading.Thread(target=loop, name=f"zenoh {name}", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    def close(self) -> None:
+        with self._closing:
+            if self._closed:
+                return
+            self._closed = True
+        atexit.unregister(self.close)
+        self.session.close()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(timeout=1.0)
+
+
+def _fifo() -> Any:
+    import zenoh
+
+    return zenoh.handlers.FifoChannel(256)
+
+
+class ZenohServer:
+    """The rig's side: listens on one address.
+
+    Args:
+        endpoint: HOST:PORT to listen on.
+        expose: Allow a host other than loopback.
+        wait: Make `publish` wait for slow subscribers (at most 5 s, then their link is closed and they recover from
+            the cache) instead of letting them recover later. For runs that are not paced by the wall clock: there the
+            cache would hold a much shorter wall time.
+
+    Raises:
+        InputError: The endpoint is malformed, in use, or not on loopback without `expose`.
+    """
+
+    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, expose: bool = False, wait: bool = False) -> None:
+        import zenoh
+
+        host, port = parse_endpoint(endpoint, field="listen")
+        if host not in LOOPBACK_HOSTS and not expose:
+            raise InputError("listen", "on 127.0.0.1 unless --expose is given as well", endpoint)
+        try:
+            self._session = _Session(_config(listen__endpoints=[_locator(host, port)], connect__endpoints=[]))
+        except zenoh.ZError as error:
+            must = "an address of this machine that can be listened on"
+            if "in use" in str(error):
+                must = "a free address (another rig runs there, or another program)"
+            raise InputError("listen", must, endpoint) from None
+        self.endpoint = endpoint
+        self._port = port
+        self._congestion_control = zenoh.CongestionControl.BLOCK if wait else zenoh.CongestionControl.DROP
+        self._publishers: dict[str, Any] = {}
+        self._declared: list[Any] = []
+        self._token: Any = None
+        self._slow_puts = 0
+        self._longest_put_s = 0.0
+        self._stalls = 0
+        self._stalled: set[int] = set()
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send one payload to all subscribers, and keep it for those who miss it. One thread only."""
+        publisher = self._publishers.get(key) or self._declare(key)
+        start = time.perf_counter()
+        publisher.put(payload)
+        taken = time.perf_counter() - start
+        if taken > _SLOW_PUT_S:
+            self._slow_puts += 1
+            self._longest_put_s = max(self._longest_put_s, taken)
+
+    def _declare(self, key: str) -> Any:
+        from zenoh import ext
+
+        schema = wire.schema_of(key)
+        publisher = ext.declare_advanced_publisher(
+            self._session.session,
+            key,
+            encoding="application/json" if schema is None else f"application/cdr;{schema}",
+            congestion_control=self._congestion_control,
+            cache=ext.CacheConfig(round(_CACHE_S * _BLOCKS_A_SECOND)),
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
+            # Lets a subscriber that was there before the rig (or outlived one) fetch what was sent before they met.
+            publisher_detection=True,
+        )
+        self._publishers[key] = publisher
+        return publisher
+
+    def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
+        """Answer requests on a key, one after another, on a thread of that key."""
+        queryable = self._session.session.declare_queryable(key, _fifo())
+        self._declared.append(queryable)
+
+        def take(query: Any) -> None:
+            # An error here would end the thread, and with it this key, for good.
+            with query:
+                try:
+                    payload = handler(query.payload.to_bytes() if query.payload is not None else b"")
+                except Exception as error:
+                    query.reply_err(f"{type(error).__name__}: {error}".encode())
+                else:
+                    query.reply(query.key_expr, payload, encoding="application/json")
+
+        self._session.drain(queryable, take, f"answers {key}")
+
+    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+        """Receive what clients report on matching keys."""
+        subscriber = self._session.session.declare_subscriber(key, _fifo())
+        self._declared.append(subscriber)
+        self._session.drain(subscriber, lambda x: callback(str(x.key_expr), x.payload.to_bytes()), f"hears {key}")
+
+    def announce(self) -> None:
+        """Show the rig's token: it vanishes when this process ends, however it ends."""
+        self._token = self._session.session.liveliness().declare_token(wire.ALIVE)
+
+    def congestion(self) -> dict[str, float]:
+        """What a stalled subscriber looks like from here.
+
+        A put waits once, for 1 ms, when a link's queue fills, and drops at once from then on: `slow_puts` counts
+        the beginnings of long stalls, not their length. What shows a stall at once and as long as it lasts is the
+        number of bytes that its link holds unread (`backlog_bytes`: the largest of all links, 0 where the operating
+        system does not tell). `stalls` counts how often a link was found stalled that was not in the call before.
+        """
+        links = list(self._session.session.info.links())
+        backlog = _backlog(self._port)
+        stalled = {port for port, size in backlog.items() if size > _STALLED_BYTES}
+        self._stalls += len(stalled - self._stalled)
+        self._stalled = stalled
+        return {
+            "links": len(links),
+            "stalled_links": len(stalled),
+            "stalls": self._stalls,
+            "backlog_bytes": max(backlog.values(), default=0),
+            "slow_puts": self._slow_puts,
+            "longest_put_ms": round(self._longest_put_s * 1e3, 3),
+        }
+
+    def close(self) -> None:
+        """Close the session and with it all that was declared."""
+        self._session.close()
+
+    def __enter__(self) -> ZenohServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _backlog(port: int) -> dict[int, int]:
+    """Bytes on their way in each established link of a listening port, by the other side's port (Linux).
+
+    Those that our socket has not sent, and, where the other side is a process of this machine, those it has not read.
+    """
+    found: dict[int, int] = {}
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        with contextlib.suppress(OSError):
+            for row in Path(table).read_text().splitlines()[1:]:
+                fields = row.split()
+                if fields[3] != "01":  # established
+                    continue
+                local, remote = (int(fields[n].rpartition(":")[2], 16) for n in (1, 2))
+                unsent, unread = (int(part, 16) for part in fields[4].split(":"))
+                if local == port:
+                    found[remote] = found.get(remote, 0) + unsent
+                elif remote == port:
+                    found[local] = found.get(local, 0) + unread
+    return found
+
+
+class ZenohClient:
+    """A client's side: connects to one rig and listens on nothing. Reconnects by itself when that rig is started again.
+
+    Args:
+        endpoint: HOST:PORT of the rig.
+        wait_s: How long to wait for a rig to be there [s]; may be infinite.
+
+    Raises:
+        InputError: The endpoint is malformed.
+        NoReplyError: No rig was there in time.
+    """
+
+    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0) -> None:
+        import zenoh
+
+        host, port = parse_endpoint(endpoint, field="connect")
+        self.endpoint = endpoint
+        deadline = time.monotonic() + wait_s
+        while True:
+            left = deadline - time.monotonic()
+            config = _config(
+                listen__endpoints=[],
+                connect__endpoints=[_locator(host, port)],
+                # Opening waits for the link, so that the first request cannot come too early; in slices, so that
+                # Ctrl-C works meanwhile.
+                connect__timeout_ms=round(1000 * min(0.5, max(left, 0.05))),
+                connect__exit_on_failure=True,
+                connect__retry={"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
+            )
+            try:
+                self._session = _Session(config)
+                break
+            except zenoh.ZError:
+                if time.monotonic() >= deadline:
+                    raise self._no_reply() from None
+        self._declared: list[Any] = []
+
+    def _no_reply(self) -> NoReplyError:
+        return NoReplyError(f"no rig answers at {self.endpoint}; start one with: rig run hammer (see rig run --help)")
+
+    def subscribe(
+        self,
+        key: str,
+        on_message: Callable[[str, bytes], None],
+        *,
+        on_miss: Callable[[str, int], None] | None = None,
+        history: bool = False,
+        lossless: bool = True,
+    ) -> None:
+        """Receive payloads on a thread of this subscription.
+
+        The messages of each key arrive in order; messages of different keys may arrive in another order than they
+        were sent in (after a stall each key is recovered for itself), so an `end` event can overtake blocks.
+        A callback that blocks stops only this subscription; the rig goes on, and what was missed is recovered.
+        `on_miss` and `on_message` are never called at the same time.
+        """
+        import zenoh
+        from zenoh import ext
+
+        session = self._session.session
+        lock = threading.Lock()
+        if not lossless:
+            subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_RING))
+            self._declared.append(subscriber)
+            self._session.drain(subscriber, lambda x: on_message(str(x.key_expr), x.payload.to_bytes()), f"takes {key}")
+            return
+
+        sources: dict[str, str] = {}
+
+        def take(sample: Any) -> None:
+            name = str(sample.key_expr)
+            if on_miss is not None and name not in sources.values() and sample.source_info is not None:
+                sources[repr(sample.source_info.source_id)] = name
+            with lock:
+                on_message(name, sample.payload.to_bytes())
+
+        def missed(miss: Any) -> None:
+            # A miss names the publisher; which key that is, the messages told. A restarted rig has new publishers.
+            name = sources.get(repr(miss.source))
+            if name is None:
+                sources.clear()
+            with lock:
+                assert on_miss is not None
+                on_miss(name or key, miss.nb)
+
+        subscriber = ext.declare_advanced_subscriber(
+            session,
+            key,
+            _fifo(),
+            history=ext.HistoryConfig(detect_late_publishers=True) if history else None,
+            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+        self._declared.append(subscriber)
+        if on_miss is not None:
+            listener = subscriber.sample_miss_listener(_fifo())
+            self._declared.append(listener)
+            self._session.drain(listener, missed, f"misses {key}")
+        self._session.drain(subscriber, take, f"takes {key}")
+
+    def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
+        """Ask the rig and return its reply.
+
+        Raises:
+            NoReplyError: Nobody answered in time, or the answer is that the rig failed to make one.
+        """
+        import zenoh
+
+        deadline = time.monotonic() + timeout_s
+        while True:
+            replies: Iterator[Any] = self._session.session.get(
+                key,
+                payload=payload,
+                timeout=max(deadline - time.monotonic(), 0.01),
+                # Replies inherit both. One that waits for room in the queue of a stalled client would hold up all
+                # others and close the link after 5 s; and replies need not queue behind recovered blocks.
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.INTERACTIVE_HIGH,
+            )
+            for reply in replies:
+                payload_back = reply.result.payload.to_bytes()
+                if reply.ok is not None:
+                    return payload_back
+                if (text := payload_back.decode(errors="replace")) != "Timeout":
+                    raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
+            # Without a rig the reply is empty at once: it may be about to start.
+            if time.monotonic() + 0.05 >= deadline:
+                raise self._no_reply()
+            time.sleep(0.05)
+
+    def watch(self, key: str, callback: Callable[[bool], None]) -> None:
+        """Call back with True / False when the rig's token appears / vanishes; True at once if it is there."""
+        import zenoh
+
+        subscriber = self._session.session.liveliness().declare_subscriber(key, _fifo(), history=True)
+        self._declared.append(subscriber)
+        self._session.drain(subscriber, lambda x: callback(x.kind == zenoh.SampleKind.PUT), f"watches {key}")
+
+    def report(self, key: str, payload: bytes) -> None:
+        """Send one payload to the rig; it is dropped where the link is congested."""
+        import zenoh
+
+        self._session.session.put(
+            key, payload, encoding="application/json", congestion_control=zenoh.CongestionControl.DROP
+        )
+
+    def close(self) -> None:
+        """Close the session and with it all that was declared."""
+        self._session.close()
+
+    def __enter__(self) -> ZenohClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

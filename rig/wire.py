@@ -1,0 +1,169 @@
+"""Sans-IO codec: blocks of samples and documents to bytes and back, and the keys they travel under.
+
+A block is one CDR message (little-endian, ROS 2 message definitions below), so that any reader of ROS 2 messages decodes
+it without this project. A document is JSON. A stream is an event `start`, blocks, and an event `end` with a reason;
+any step of a block's index other than its length is a gap, counted by `Continuity` and never hidden.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+ROOT = "rig"
+STATUS = f"{ROOT}/status"
+EVENTS = f"{ROOT}/events"
+CATALOGUE = f"{ROOT}/catalogue"
+PARAMETERS = f"{ROOT}/parameters"
+SCENE = f"{ROOT}/scene"
+ALIVE = f"{ROOT}/alive"
+SENSORS = f"{ROOT}/sensors"
+EDGES = f"{SENSORS}/keyphasor_edges"
+TRUTH = f"{ROOT}/truth"
+COMMAND = f"{ROOT}/command"
+CLIENTS = f"{ROOT}/clients"
+
+
+def sensor_key(group: str) -> str:
+    """Key of one sensor group's blocks."""
+    return f"{SENSORS}/{group}"
+
+
+def truth_key(table: str) -> str:
+    """Key of one truth table's blocks."""
+    return f"{TRUTH}/{table}"
+
+
+def command_key(name: str) -> str:
+    """Key on which a command is answered."""
+    return f"{COMMAND}/{name}"
+
+
+_HEADER_FIELDS = """\
+int64 tick             # time of the first row, in ticks of the simulated clock
+int64 index            # number of the first row since the start of the stream
+float64 rate_hz        # rows per simulated second
+float64 tick_rate_hz   # ticks per simulated second
+uint32 columns         # values per row
+"""
+SAMPLE_SCHEMA = "rig_msgs/msg/SampleBlock"
+TRUTH_SCHEMA = "rig_msgs/msg/TruthBlock"
+SCHEMAS = {
+    SAMPLE_SCHEMA: _HEADER_FIELDS + "int32[] values         # ADC counts, row after row\n",
+    TRUTH_SCHEMA: _HEADER_FIELDS + "float64[] values       # row after row\n",
+}
+"""ROS 2 message definitions of the two blocks. Keyphasor edges travel as TruthBlock rows of one column: ticks from `tick`."""
+
+_DTYPES = {SAMPLE_SCHEMA: np.dtype("<i4"), TRUTH_SCHEMA: np.dtype("<f8")}
+_ENCAPSULATION = b"\x00\x01\x00\x00"
+_HEAD = struct.Struct("<qqddII")
+
+
+def schema_of(key: str) -> str | None:
+    """Block schema of a key's payloads, or None where they are JSON documents."""
+    if key == EDGES or key.startswith(TRUTH + "/"):
+        return TRUTH_SCHEMA
+    return SAMPLE_SCHEMA if key.startswith(SENSORS + "/") else None
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Consecutive rows of one stream.
+
+    Attributes:
+        tick: Time of the first row [ticks].
+        index: Number of the first row since the start of the stream.
+        rate_hz: Rows per simulated second [Hz].
+        tick_rate_hz: Ticks per simulated second [Hz].
+        values: int32 counts or float64 values, shape (rows, columns).
+    """
+
+    tick: int
+    index: int
+    rate_hz: float
+    tick_rate_hz: float
+    values: np.ndarray
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """Simulated time of each row [s], shape (rows,)."""
+        ticks_a_row = self.tick_rate_hz / self.rate_hz
+        return (self.tick + ticks_a_row * np.arange(len(self.values))) / self.tick_rate_hz
+
+
+def encode_block(block: Block) -> bytes:
+    """One block as a CDR message; the schema follows from the dtype of its values."""
+    values = np.ascontiguousarray(block.values)
+    if values.dtype not in (_DTYPES[SAMPLE_SCHEMA], _DTYPES[TRUTH_SCHEMA]) or values.ndim != 2:
+        raise TypeError(f"values must be int32 or float64 of two dimensions; instead received {values.dtype}, {values.ndim}")
+    head = _HEAD.pack(block.tick, block.index, block.rate_hz, block.tick_rate_hz, values.shape[1], values.size)
+    return b"".join((_ENCAPSULATION, head, values.tobytes()))
+
+
+def decode_block(payload: bytes, schema: str) -> Block:
+    """The block in a CDR message.
+
+    Raises:
+        ValueError: The payload is not a whole message of that schema.
+    """
+    dtype = _DTYPES[schema]
+    start = len(_ENCAPSULATION) + _HEAD.size
+    if len(payload) < start or payload[:4] != _ENCAPSULATION:
+        raise ValueError(f"payload must be a {schema} message; instead received {len(payload)} bytes that are none")
+    tick, index, rate_hz, tick_rate_hz, columns, size = _HEAD.unpack_from(payload, len(_ENCAPSULATION))
+    if columns == 0 or size % columns or len(payload) != start + size * dtype.itemsize:
+        raise ValueError(
+            f"payload must hold whole rows of {columns} values, {size} in all; instead received {len(payload)} bytes"
+        )
+    values = np.frombuffer(payload, dtype, offset=start).reshape(-1, columns)
+    return Block(tick=tick, index=index, rate_hz=rate_hz, tick_rate_hz=tick_rate_hz, values=values)
+
+
+def encode_document(document: dict[str, Any]) -> bytes:
+    """A JSON document as bytes."""
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def decode_document(payload: bytes) -> dict[str, Any]:
+    """The JSON document in a payload.
+
+    Raises:
+        ValueError: The payload is not a JSON object.
+    """
+    document = json.loads(payload)
+    if not isinstance(document, dict):
+        raise ValueError(f"payload must be a JSON object; instead received {type(document).__name__}")
+    return document
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Rows that never arrived: `size` of them, from number `index` on."""
+
+    key: str
+    index: int
+    size: int
+
+
+class Continuity:
+    """Follows the row numbers of any number of streams and reports each gap with its size."""
+
+    def __init__(self) -> None:
+        self._next: dict[str, int] = {}
+        self.lost: dict[str, int] = {}
+        self.received: dict[str, int] = {}
+
+    def follow(self, key: str, index: int, rows: int) -> Gap | None:
+        """Take the next block of a stream; return the gap before it, if there is one."""
+        expected = self._next.get(key, index)
+        self._next[key] = index + rows
+        self.received[key] = self.received.get(key, 0) + rows
+        self.lost.setdefault(key, 0)
+        if index == expected:
+            return None
+        self.lost[key] += max(0, index - expected)
+        return Gap(key=key, index=expected, size=index - expected)

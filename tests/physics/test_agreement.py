@@ -1,0 +1,330 @@
+"""What must agree with what, and why: the physics of the rig against things that are not its own code.
+
+| the rig's                        | must agree with                                    | because                                                |
+|----------------------------------|----------------------------------------------------|--------------------------------------------------------|
+| contact force, turned            | itself, turned by the same angle                   | the law knows no direction (frame invariance)          |
+| first impacts, 0.1 s of hammer   | DOP853 at 1e-11 on equations derived by Lagrange   | two derivations, two solvers; not chaotic              |
+| first impacts, 0.06 s of drop    | the same                                           | the same                                               |
+| drop: time and speed of impact   | rigid pendulum, closed form                        | free fall before contact                               |
+| free flight                      | matrix exponential of the linearised equations     | small motion is linear                                 |
+| energy ledger                    | zero residual                                      | first law                                              |
+| momentum ledger                  | zero residual                                      | Newton and Euler                                       |
+| pivot reaction                   | static lever rule                                  | statics                                                |
+| order of each engine             | 4 and 8                                            | Runge-Kutta on the smooth problem                      |
+| restitution of the exact factor  | what was asked for                                 | definition of e                                        |
+| contact stiffness                | Hertz, 2.86e10 / 5.40e9 N/m^1.5                    | elastostatics                                          |
+| whirl                            | backward, rolling, -spin R_S/(r0+delta)            | kinematics of rolling; the paper's eq. 41              |
+| mean whirl force                 | grows as spin squared                              | centrifugal force                                      |
+| 2 ms hammer                      | dies out                                           | too little energy to keep rolling                      |
+| magnet map                       | field sum of eqs. 35, 38                           | it is fitted to it                                     |
+| field sum, far apart             | exact cylinders (magpylib)                         | dipoles are the far field of cylinders                 |
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from rig import InputError, Run, load_parameters, load_scene, simulate
+from rig.engines import load_engine
+from rig.engines.fixed_step import DIVIDED, SCALES
+from rig.kernels import signals as S
+from rig.kernels.contact import ring_force
+from rig.magnets import REACH, MagnetGeometry, field_sum_force, fit_map
+from rig.model import build_model, restitution_factor
+from rig.offline import frames
+from rig.simulation import DISSIPATED, Simulation
+
+from . import reference
+
+
+def reference_rig(run: Run) -> reference.Rig:
+    """The reference's plain numbers for the model of a run (magnet damping belongs to the magnets)."""
+    c = run.simulation.model.constants
+    shaft, magnet, contact, house = c.shaft, c.magnet, c.contact, c.house
+    engaged = run.simulation.scene.initial.magnets
+    return reference.Rig(
+        M=shaft.mass, Ixx=shaft.transverse_inertia, Izz=shaft.polar_inertia, l0A=shaft.arm_ring, l0B=shaft.arm_magnet,
+        l0C=shaft.arm_centre, l0I=shaft.arm_disk, eps=shaft.unbalance / shaft.mass, phi=shaft.unbalance_phase, g=shaft.gravity,
+        K_mag=magnet.stiffness, a3=magnet.a3, a5=magnet.a5, a7=magnet.a7, D_x=magnet.damping_x if engaged else 0.0,
+        D_y=magnet.damping_y if engaged else 0.0, c_d=c.torque_gain, R_S=shaft.radius, r0=contact.clearance, x0=contact.offset_x,
+        y0=contact.offset_y, K=contact.stiffness, c=contact.damping_factor, mu=contact.friction, v_s=contact.smoothing_speed,
+        v_floor=contact.speed_floor, M_ih=house.inner_mass, M_oh=house.outer_mass, K_bv=house.inner_beam_stiffness,
+        K_bh=house.outer_beam_stiffness, D_bv=house.inner_beam_damping, D_bh=house.outer_beam_damping,
+        k_ns=house.pair_stiffness_vertical, k_ew=house.pair_stiffness_horizontal, P0=house.preload,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def whirl() -> Run:
+    """The hammer scene in full, without noise."""
+    return simulate(load_scene("hammer", {"sensors.noise": False}))
+
+
+@pytest.mark.parametrize(("scene", "duration_s"), [("hammer", 0.1), ("drop", 0.06)])
+def test_first_impacts_against_independent_solver(scene: str, duration_s: float) -> None:
+    run = simulate(load_scene(scene, {"sensors.noise": False, "sensors.rate_hz": 10_000}), duration_s=duration_s)
+    blow = next((event for event in run.events if event["event"] == "hammer"), None)
+    solution = reference.solve(
+        reference_rig(run), run.signals[0, : S.N_STATE], run.times_s,
+        omega0=2 * math.pi * run.simulation.scene.drive.speed_hz,
+        hammer=None if blow is None else (blow["time_s"], blow["duration_ms"] * 1e-3, blow["force_n"], 0.0),
+        magnet=run.simulation.scene.initial.magnets,
+    )  # fmt: skip
+    assert len(solution.onsets) >= 2, "the comparison must reach through impacts"
+    error = np.abs(run.signals[:, : S.N_STATE] - solution.states) / SCALES
+    assert np.sqrt(np.mean(error**2, axis=1)).max() < 1e-4
+    assert run.simulation.health()["contacts"] == len(solution.onsets)
+
+
+def test_contact_force_is_frame_invariant() -> None:
+    rng = np.random.default_rng(3)
+    law = dict(clearance=0.926e-3, onset_speed=0.1, stiffness=2.86e10, damping_factor=0.17, friction=0.25, smoothing_speed=5e-3)
+    for _ in range(200):
+        angle = rng.uniform(-math.pi, math.pi)
+        e = rng.normal(size=2)
+        e *= (0.926e-3 + rng.uniform(0, 3e-5)) / np.hypot(*e)
+        v = rng.normal(size=2) * 0.1
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        surface = rng.normal() * 0.3
+        plain = np.array(ring_force(*e, *v, surface, *law.values()))
+        turned = np.array(ring_force(*(turn @ e), *(turn @ v), surface, *law.values()))
+        assert plain[2] > 0.0
+        np.testing.assert_allclose(turned[:2], turn @ plain[:2], rtol=1e-9)
+        # A turn by rounding moves the penetration by 1e-19 m, one part in 1e11 of the smallest here.
+        np.testing.assert_allclose(turned[2:], plain[2:], rtol=1e-8)
+
+
+def test_drop_hits_when_and_as_fast_as_a_falling_pendulum() -> None:
+    run = simulate(load_scene("drop", {"engine.step_us": 10, "sensors.rate_hz": 100_000, "sensors.truth_rate_hz": 100_000}), duration_s=0.03)
+    shaft, contact = run.simulation.model.constants.shaft, run.simulation.model.constants.contact
+    fall = shaft.mass * shaft.gravity * shaft.arm_centre * shaft.arm_ring / shaft.transverse_inertia
+    first = int(np.argmax(run["normal_force"] > 0))
+    assert run.times_s[first] == pytest.approx(math.sqrt(4 * contact.clearance / fall), abs=2e-5)
+    assert run["onset_speed"][first] == pytest.approx(math.sqrt(4 * fall * contact.clearance), rel=2e-3)
+    assert run.times_s[first] == pytest.approx(25.6e-3, abs=0.05e-3)
+    assert run["onset_speed"][first] == pytest.approx(0.145, abs=0.001)
+
+
+def test_free_flight_follows_the_linear_solution() -> None:
+    from scipy.linalg import expm
+
+    # A ring wide enough to stay clear, spinning, small motion about the centre (no gravity), no unbalance.
+    scene = load_scene("stable-run", {
+        "gravity.acceleration": 0.0, "shaft.unbalance_eccentricity": 0.0, "ring.offset_y": 0.0, "initial.position": "given",
+        "initial.x_mm": 0.01, "initial.y_mm": -0.005, "drive.speed_hz": 12.0, "sensors.noise": False,
+    })  # fmt: skip
+    run = simulate(scene, duration_s=1.0)
+    c = run.simulation.model.constants
+    Ixx, Izz, lB, K = c.shaft.transverse_inertia, c.shaft.polar_inertia, c.shaft.arm_magnet, c.magnet.stiffness
+    spin = 2 * math.pi * 12.0
+    # Gamma, beta, rates: Ixx G'' = -K lB^2 G - Dy lB^2 G' - Izz w b', Ixx b'' = -K lB^2 b - Dx lB^2 b' + Izz w G'
+    stiff, dx, dy, gyro = K * lB**2 / Ixx, c.magnet.damping_x * lB**2 / Ixx, c.magnet.damping_y * lB**2 / Ixx, Izz * spin / Ixx
+    A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-stiff, 0, -dy, -gyro], [0, -stiff, gyro, -dx]])
+    start = run.signals[0, [0, 1, 7, 8]]
+    size = np.array([1.0, 1.0, math.sqrt(stiff), math.sqrt(stiff)]) * np.linalg.norm(start[:2])
+    for n in (1, 5_000, 19_999):
+        expected = expm(A * run.times_s[n]) @ start
+        # What is left is the magnets' hardening and the sines: of third order in the tilt.
+        assert np.abs((run.signals[n, [0, 1, 7, 8]] - expected) / size).max() < 1e-3
+    assert run["normal_force"].max() == 0.0
+
+
+@pytest.mark.parametrize("scene", ["hammer", "drop", "stable-run", "run-up"])
+def test_ledgers_close(scene: str) -> None:
+    simulation = Simulation(load_scene(scene, {"duration_s": 2.0}))
+    first = simulation._first
+    column = S.COLUMN
+    for frame in frames(simulation):
+        rows = frame.rows[:: len(frame.rows) // 10]
+        dissipated = sum(rows[-1, column[name]] for name in DISSIPATED)
+        energies = simulation.health()["energy"]
+        assert abs(energies["residual_j"]) <= 1e-6 * max(dissipated, 1e-6)
+        for axis in "xyz":
+            stored = rows[:, column[f"angular_momentum_{axis}"]] - first[column[f"angular_momentum_{axis}"]]
+            residual = stored - rows[:, column[f"angular_impulse_{axis}"]]
+            scale = max(np.abs(rows[:, column[f"angular_momentum_{axis}"]]).max(), 1e-3)
+            assert np.abs(residual).max() < 1e-6 * scale
+    for axis in "xy":
+        stored = rows[:, column[f"house_momentum_{axis}"]]
+        np.testing.assert_allclose(stored, rows[:, column[f"house_impulse_{axis}"]], atol=1e-9)
+
+
+def test_as_printed_gap_makes_energy_and_the_ledger_says_so() -> None:
+    run = simulate(load_scene("hammer", {"parameters": "as-printed"}), duration_s=0.3)
+    assert abs(run["gap_work"][-1]) > 1e-5
+    energy = run.energy()
+    assert abs(energy["residual"][-1]) < 1e-6 * energy["dissipated"][-1]
+
+
+def test_pivot_carries_its_share_at_rest() -> None:
+    run = simulate(load_scene("stable-run", {"drive.speed_hz": 0.0}), duration_s=0.01)
+    shaft = run.simulation.model.constants.shaft
+    weight = shaft.mass * shaft.gravity
+    # Lever rule about the magnets: R l0B = M g (l0B - l0C).
+    assert run["pivot_y"][-1] == pytest.approx(weight * (1 - shaft.arm_centre / shaft.arm_magnet), rel=1e-9)
+    assert run["magnet_y"][-1] == pytest.approx(weight * shaft.arm_centre / shaft.arm_magnet, rel=1e-9)
+
+
+@pytest.mark.parametrize(("engine", "steps"), [("rk4", [100, 50, 25, 20]), ("rk8", [500, 250, 200, 125])])
+def test_order_on_the_smooth_problem(engine: str, steps: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    # The order of the plain method: no step may be divided.
+    module = load_engine(engine)
+    monkeypatch.setattr(module, "TABLEAU", module.TABLEAU._replace(tolerance=math.inf))
+
+    # Undamped free flight on very stiff, hardening magnets, in a ring too wide to touch: smooth, nonlinear, fast (220 Hz).
+    def swing(name: str, step_us: int) -> np.ndarray:
+        scene = load_scene("stable-run", {
+            "ring.clearance": 15.0, "initial.position": "given", "initial.x_mm": 0.8, "initial.y_mm": 0.4,
+            "engine.name": name, "engine.step_us": step_us, "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000,
+            "magnet.stiffness": 1000.0, "shaft.damping_ratio_x": 0.0, "shaft.damping_ratio_y": 0.0, "drive.speed_hz": 8.0,
+        })  # fmt: skip
+        run = simulate(scene, duration_s=0.05)
+        assert run["normal_force"].max() == 0.0
+        assert run.simulation._memory[DIVIDED] == 0.0
+        return run.signals[:, [0, 1, 7, 8]] / np.array([1e-2, 1e-2, 10.0, 10.0])
+
+    exact = swing("rk8", 20)
+    errors = [float(np.linalg.norm(swing(engine, step) - exact)) for step in steps]
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(module.ORDER, abs=0.15)
+
+
+@pytest.mark.parametrize("restitution", [0.3, 0.5, 0.8, 0.9, 0.99])
+def test_exact_factor_returns_the_restitution_asked_for(restitution: float) -> None:
+    from scipy.integrate import solve_ivp
+
+    factor = restitution_factor(restitution)
+
+    def free_impact(_: float, y: np.ndarray) -> list[float]:
+        return [y[1], -max(0.0, y[0]) ** 1.5 * (1.0 + factor * y[1])]
+
+    def apart(_: float, y: np.ndarray) -> float:
+        return y[0]
+
+    apart.terminal, apart.direction = True, -1  # pyright: ignore[reportFunctionMemberAccess]
+    impact = solve_ivp(free_impact, (0.0, 50.0), [1e-12, 1.0], events=apart, rtol=1e-10, atol=1e-13)
+    assert -impact.y[1, -1] == pytest.approx(restitution, rel=1e-5)
+
+
+def test_restitution_of_zero_is_refused() -> None:
+    with pytest.raises(InputError, match=r"contact\.restitution must be"):
+        restitution_factor(0.0)
+
+
+def test_contact_stiffness_and_effective_mass_are_the_papers() -> None:
+    model = build_model(load_parameters())
+    assert model.constants.contact.stiffness == pytest.approx(2.86e10, rel=2e-3)
+    outside = build_model(load_parameters().override({"contact.stiffness": "external-sphere"}))
+    assert outside.constants.contact.stiffness == pytest.approx(5.40e9, rel=2e-3)
+    assert model.constants.shaft.transverse_inertia / model.constants.shaft.arm_ring**2 == pytest.approx(1.987, abs=1e-3)
+    assert model.constants.contact.damping_factor == pytest.approx(0.1665, abs=1e-4)
+    # A sagged shaft would lie outside a ring centred on the axis: hence the offset.
+    assert abs(model.sag) > model.constants.contact.clearance
+
+
+def whirl_of(run: Run, *, from_s: float) -> dict[str, float]:
+    """Figures of the whirl from the model's own signals: phase slope of the shaft in the ring."""
+    kept = run.times_s >= from_s
+    phase = np.unwrap(np.angle(run["ring_x"][kept] + 1j * run["ring_y"][kept]))
+    times = run.times_s[kept]
+    law = run.simulation.model.constants
+    return {
+        "hz": float(np.polyfit(times, phase, 1)[0] / (2 * math.pi)),
+        "law_hz": float(
+            -np.mean(run["theta_rate"][kept] * law.shaft.radius / (law.contact.clearance + run["penetration"][kept])) / (2 * math.pi)
+        ),
+        "spin_hz": float(run["theta_rate"][kept].mean() / (2 * math.pi)),
+        "force": float(run["normal_force"][kept].mean()),
+        "slip": float(np.abs(run["sliding_speed"][kept]).mean()),
+    }
+
+
+@pytest.mark.parametrize("speed_hz", [3.2, 4.2, 5.2, 6.2])
+def test_whirl_is_backward_and_rolls(speed_hz: float) -> None:
+    run = simulate(load_scene("hammer", {"drive.speed_hz": speed_hz, "sensors.noise": False}))
+    figures = whirl_of(run, from_s=1.5)
+    assert figures["hz"] < 0.0
+    assert figures["hz"] == pytest.approx(figures["law_hz"], rel=2e-3)
+    surface = 2 * math.pi * figures["spin_hz"] * run.simulation.model.constants.shaft.radius
+    assert figures["slip"] < 0.01 * surface
+
+
+def test_whirl_force_grows_as_spin_squared() -> None:
+    speeds, forces = [], []
+    for speed_hz in (3.2, 4.2, 5.2, 6.2):
+        figures = whirl_of(simulate(load_scene("hammer", {"drive.speed_hz": speed_hz})), from_s=1.5)
+        speeds.append(figures["spin_hz"])
+        forces.append(figures["force"])
+    slope = np.polyfit(np.log(speeds), np.log(forces), 1)[0]
+    # The magnets' pull inward lowers the smaller forces: a little above 2.
+    assert 1.95 < slope < 2.2
+    np.testing.assert_allclose(forces, [130, 230, 361, 523], rtol=0.08)
+
+
+def test_short_blow_dies_out() -> None:
+    scene = load_scene("hammer")
+    short = scene.commands[0].request.model_copy(update={"duration_ms": 2.0})
+    scene = scene.model_copy(update={"commands": (scene.commands[0].model_copy(update={"request": short}),)})
+    run = simulate(scene)
+    assert run["normal_force"].max() > 0.0, "it must have touched"
+    assert run["normal_force"][run.times_s > 1.0].max() == 0.0
+
+
+def test_spin_dips_and_recovers(whirl: Run) -> None:
+    spin = whirl["theta_rate"] / (2 * math.pi)
+    assert spin.min() < 5.9
+    assert 6.0 < spin[-1] < 6.2
+
+
+def test_transducer_pairs_carry_the_load_in_halves(whirl: Run) -> None:
+    preload = whirl.simulation.model.constants.house.preload
+    np.testing.assert_allclose(whirl["P_N"] - preload, -(whirl["P_S"] - preload), atol=1e-8)
+    amplitude = np.ptp((whirl["P_E"] - whirl["P_W"])[whirl.times_s > 1.5]) / 2
+    # The reaction carries the normal force and the inertia of the houses.
+    assert 500.0 < amplitude < 620.0
+
+
+def test_magnet_map_follows_the_field_sum() -> None:
+    model = build_model(load_parameters())
+    assert model.magnet_map.error < 0.08
+    assert model.magnet_map.stiffness == pytest.approx(1670.0, rel=0.02)
+    constants = model.constants.magnet
+    hardening = 1 + constants.a3 * REACH**2 + constants.a5 * REACH**4 + constants.a7 * REACH**6
+    assert hardening == pytest.approx(2.3, abs=0.15)
+    assert constants.stiffness * REACH * hardening == pytest.approx(40.0, abs=3.0)
+
+
+def test_field_sum_is_the_far_field_of_cylinders() -> None:
+    import magpylib as magpy
+
+    geometry = MagnetGeometry(3, 5e-3, 3e-3, 2e-3, 0.12, 705e3)
+    x = 4e-3
+    paper = field_sum_force(np.array([x]), np.array([0.0]), geometry)[0]
+    around = 2 * np.pi * np.arange(geometry.count) / geometry.count
+    bearing = magpy.Collection(*[
+        magpy.magnet.Cylinder(
+            magnetization=(0, 0, geometry.magnetisation), dimension=(2 * geometry.bearing_magnet_radius, geometry.length),
+            position=(geometry.bearing_radius * math.cos(a), geometry.bearing_radius * math.sin(a), 0),
+        )
+        for a in around
+    ])  # fmt: skip
+    # Force on the shaft magnet from its surface current M0 on thin loops along its length.
+    heights = (np.arange(9) - 4) / 9 * geometry.length
+    phi = 2 * np.pi * np.arange(90) / 90
+    force = np.zeros(2)
+    for z in heights:
+        points = np.stack([
+            x + geometry.shaft_magnet_radius * np.cos(phi), geometry.shaft_magnet_radius * np.sin(phi), np.full(90, z)
+        ], axis=-1)  # fmt: skip
+        field = bearing.getB(points)[:, 2]
+        weight = geometry.magnetisation * geometry.length / 9 * geometry.shaft_magnet_radius * 2 * np.pi / 90
+        force += weight * np.array([np.sum(field * np.cos(phi)), np.sum(field * np.sin(phi))])
+    np.testing.assert_allclose(paper[0], force[0], rtol=0.05)
+
+
+def test_fit_refuses_nothing_but_reports_its_error() -> None:
+    far = fit_map(MagnetGeometry(16, 16.9e-3, 6e-3, 8e-3, 40e-3, 705e3))
+    assert far.error < 1e-3, "many magnets far apart are rotationally symmetric"
