@@ -1,8 +1,10 @@
-"""The paper's magnet model (eqs. 26-38), and the radial map that the kernels use instead, with its error against the sum.
+"""The paper's magnet model (eqs. 26-38), and the radial map that the kernels use instead, with its error against the
+sum.
 
-Every magnet is a dipole loop of current M0 L (eq. 35); the force on the shaft magnet sums I dl x B around its own loop (eq. 38). All loops lie
-in one plane and repel. Unvalidated at this spacing: the far-field form overstates the force of real cylinders several times, which is why
-`magnet.stiffness` sets the scale of the map by itself and the sum gives only its shape.
+Every magnet is a dipole loop of current M0 L (eq. 35); the force on the shaft magnet sums I dl x B around its own
+loop (eq. 38). All loops lie in one plane and repel. Unvalidated at this spacing: the far-field form overstates the
+force of real cylinders several times, which is why `magnet.stiffness` sets the scale of the map by itself and the sum
+gives only its shape.
 """
 
 from __future__ import annotations
@@ -60,7 +62,8 @@ def field_sum_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry, *, p
     distance = np.linalg.norm(loop[:, :, None, :] - centres, axis=-1)
     # Eq. 35 in the plane of the loops (psi = 90 deg): the field of a dipole that points along +z is along -z beside it.
     field = -MU_0 * current * geometry.bearing_magnet_radius**2 / (4.0 * distance**3)
-    # dl x B with B = B z and dl = r_s dphi (-sin, cos) is r_s dphi B (cos, sin): inward where the field opposes, so it repels.
+    # dl x B with B = B z and dl = r_s dphi (-sin, cos) is r_s dphi B (cos, sin): inward where the field opposes, so
+    # it repels.
     width = geometry.shaft_magnet_radius * 2.0 * np.pi / points
     return current * width * np.einsum("npm,pk->nk", field, outward)
 

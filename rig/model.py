@@ -40,7 +40,8 @@ def restitution_factor(restitution: float) -> float:
 def contact_stiffness(parameters: ParameterSet, *, inside: bool) -> float:
     """K = 4/3 E* sqrt(R*) [N/m^1.5] of a sphere in a spherical seat (inside) or of two spheres (the Hertz formulas)."""
     compliance = sum(
-        (1.0 - parameters[f"{body}.poisson_ratio"] ** 2) / parameters[f"{body}.young_modulus"] for body in ("shaft", "ring")
+        (1.0 - parameters[f"{body}.poisson_ratio"] ** 2) / parameters[f"{body}.young_modulus"]
+        for body in ("shaft", "ring")
     )
     shaft = parameters["shaft.radius"]
     ring = shaft + parameters["ring.clearance"]
@@ -55,7 +56,8 @@ class Model:
     Attributes:
         parameters: Where its numbers come from.
         constants: What the kernels take.
-        magnet_map: The fitted map with its error (its stiffness is that of eq. 35, `constants.magnet.stiffness` the one used).
+        magnet_map: The fitted map with its error (its stiffness is that of eq. 35, `constants.magnet.stiffness` the
+            one used).
         resolved: Numbers behind the parameters that are rules, in each parameter's unit.
         sag: Shaft at the ring in static equilibrium with the magnets on [m], vertical.
     """
@@ -205,6 +207,8 @@ def _sag(shaft: Shaft, magnet: Magnet) -> float:
         return shaft.arm_magnet * lift - shaft.arm_centre * shaft.mass * shaft.gravity
 
     if torque(0.02 / shaft.arm_magnet) < 0.0:
-        raise InputError("magnet.stiffness", "enough to carry the shaft within 20 mm of the magnets' centre", magnet.stiffness)
+        raise InputError(
+            "magnet.stiffness", "enough to carry the shaft within 20 mm of the magnets' centre", magnet.stiffness
+        )
     gamma = float(brentq(torque, 0.0, 0.02 / shaft.arm_magnet, xtol=1e-16))
     return -shaft.arm_ring * math.sin(gamma)

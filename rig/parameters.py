@@ -1,7 +1,7 @@
 """Parameter sets: data files in, checked and frozen SI values out. The only module that knows units.
 
-A set is a TOML file of values with unit, symbol, source and kind. `corrected` lists every parameter; any other set names a
-`base` and the values in which it differs. A user's own file works the same way.
+A set is a TOML file of values with unit, symbol, source and kind. `corrected` lists every parameter; any other set
+names a `base` and the values in which it differs. A user's own file works the same way.
 """
 
 from __future__ import annotations
@@ -109,7 +109,9 @@ class ParameterSet:
         return {
             "set": self.name,
             "title": self.title,
-            "values": {key: entry.model_dump(mode="json", exclude={"range", "rules"}) for key, entry in self.entries.items()},
+            "values": {
+                key: entry.model_dump(mode="json", exclude={"range", "rules"}) for key, entry in self.entries.items()
+            },
         }
 
 
@@ -129,7 +131,9 @@ def load_parameters(name_or_path: str = DEFAULT_SET) -> ParameterSet:
     if not path.is_file():
         path = Path(name_or_path)
         if path.suffix != ".toml" or not path.is_file():
-            raise InputError("parameters", f"one of {', '.join(set_names())}, or the path of a .toml file", name_or_path)
+            raise InputError(
+                "parameters", f"one of {', '.join(set_names())}, or the path of a .toml file", name_or_path
+            )
     return _parse(name_or_path, read_toml(path), path)
 
 
@@ -164,7 +168,11 @@ def _parse(name: str, data: dict[str, Any], path: Path) -> ParameterSet:
             # A bare number is a user's short form of a table with only a value.
             given = fields if isinstance(fields, dict) else {"value": fields, "kind": "assumed", "source": path.name}
             if base is not None and key not in entries:
-                raise InputError(f"{path.name}: {key}", f"a parameter of the set {base} ({_nearest(key, entries)})", given.get("value"))
+                raise InputError(
+                    f"{path.name}: {key}",
+                    f"a parameter of the set {base} ({_nearest(key, entries)})",
+                    given.get("value"),
+                )
             known = entries[key].model_dump() if key in entries else {}
             if "unit" in given and known and given["unit"] != known["unit"]:
                 raise InputError(f"{path.name}: {key}.unit", known["unit"], given["unit"])
@@ -190,7 +198,7 @@ def input_error(error: ValidationError, where: str) -> InputError:
 
 def _accepts(entry: Parameter) -> str:
     low, high = entry.range
-    text = f"a number from {low:g} to {high:g} {entry.unit}"
+    text = f"a number from {low:g} to {high:g}" + (f" {entry.unit}" if entry.unit != "1" else "")
     return text + (f" or one of {', '.join(entry.rules)}" if entry.rules else "")
 
 

@@ -200,8 +200,8 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
 
     Args:
         name_or_path: One of `scene_names()`, or a .toml file.
-        overrides: Changes by dotted key, of the scene (`drive.speed_hz`) or of its parameters (`contact.friction`, in the
-            parameter's own unit). Strings are read as TOML values where they are such.
+        overrides: Changes by dotted key, of the scene (`drive.speed_hz`) or of its parameters (`contact.friction`, in
+            the parameter's own unit). Strings are read as TOML values where they are such.
 
     Raises:
         InputError: The one thing that is wrong, with its field.
@@ -210,10 +210,12 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
     if not path.is_file():
         path = Path(name_or_path)
         if path.suffix != ".toml" or not path.is_file():
-            raise InputError("scene", f"one of {', '.join(scene_names())}, or the path of a .toml file", str(name_or_path))
+            raise InputError(
+                "scene", f"one of {', '.join(scene_names())}, or the path of a .toml file", str(name_or_path)
+            )
     data = {"name": path.stem, **read_toml(path)}
     for key, value in (overrides or {}).items():
-        _override(data, key, _read_value(value) if isinstance(value, str) else value)
+        _override(data, key, read_value(value) if isinstance(value, str) else value)
     scene = parse_scene(data)
     # Parameters are checked here, so that a scene that loads can run.
     top = scene.load_parameters().entries["drive.top_speed"].value
@@ -259,7 +261,9 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
         if part not in known:
             keys = [*_scene_keys(), *load_parameters().entries]
             close = difflib.get_close_matches(key, keys, n=3, cutoff=0.4)
-            raise InputError(key, "a field of a scene or a parameter" + (f", such as {', '.join(close)}" if close else ""), value)
+            raise InputError(
+                key, "a field of a scene or a parameter" + (f", such as {', '.join(close)}" if close else ""), value
+            )
         fields = known[part].annotation
     place = data
     for part in path:
@@ -278,7 +282,8 @@ def _scene_keys() -> list[str]:
     return keys
 
 
-def _read_value(text: str) -> Any:
+def read_value(text: str) -> Any:
+    """A value from the command line: TOML where it is such, else the text itself."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -1,7 +1,7 @@
 """A running simulation: scene in, frames of samples and truth out, commands on the way. No clock, no threads, no I/O.
 
-`Simulation.advance` is the one stepper behind every way to run the rig: free, in lockstep, or in real time. Time is an integer tick of 1 us.
-How a run is cut into calls changes no bit of the result.
+`Simulation.advance` is the one stepper behind every way to run the rig: free, in lockstep, or in real time. Time is
+an integer tick of 1 us. How a run is cut into calls changes no bit of the result.
 """
 
 from __future__ import annotations
@@ -96,7 +96,9 @@ class Simulation:
         periods = [TICK_RATE_HZ // rate for rate in (sensors.rate_hz, sensors.truth_rate_hz)]
         # The coarsest grid up to ROW_TICKS that steps, samples and truth all fall on.
         grid = math.gcd(*periods)
-        self._stride = max(n for n in range(1, max(1, ROW_TICKS // self._step_ticks) + 1) if grid % (n * self._step_ticks) == 0)
+        self._stride = max(
+            n for n in range(1, max(1, ROW_TICKS // self._step_ticks) + 1) if grid % (n * self._step_ticks) == 0
+        )
         self.row_ticks = self._stride * self._step_ticks
         self.block_ticks = math.lcm(*periods)
         self.end_tick = math.ceil(round(scene.duration_s * TICK_RATE_HZ) / self.block_ticks) * self.block_ticks
@@ -146,7 +148,9 @@ class Simulation:
             self._run(rows[(self.tick - start) // self.row_ticks : (stop - start) // self.row_ticks], stop - self.tick)
         self._last = rows[-1].copy()
         if not np.isfinite(self._y).all():
-            raise SimulationError(f"the state is no longer finite at {self.tick / TICK_RATE_HZ:.6f} s; try a shorter engine.step_us")
+            raise SimulationError(
+                f"the state is no longer finite at {self.tick / TICK_RATE_HZ:.6f} s; try a shorter engine.step_us"
+            )
         return Frame(
             tick=start, ticks=ticks, samples=self._sample(rows, start), edges=self._edges(rows, start),
             truth=self._truth(rows, start), events=events, rows=rows,
@@ -163,7 +167,9 @@ class Simulation:
         """
         command = parse_command(name, request)
         if isinstance(command, HammerCommand) and self._blow is not None and self.tick < self._blow[2]:
-            raise InputError("hammer", f"idle (it is in a blow until {self._blow[2] / TICK_RATE_HZ:.6f} s)", "another blow")
+            raise InputError(
+                "hammer", f"idle (it is in a blow until {self._blow[2] / TICK_RATE_HZ:.6f} s)", "another blow"
+            )
         if isinstance(command, SpeedCommand):
             top = self.model.parameters.entries["drive.top_speed"].value
             if not isinstance(top, str) and command.speed_hz > top:
@@ -186,7 +192,9 @@ class Simulation:
         if abs(residual) > ENERGY_ALARM * max(dissipated, 1e-6):
             warnings.append(f"energy residual {residual:.2e} J is above {ENERGY_ALARM:g} of what was dissipated")
         if self._memory[engine.CLAMPS]:
-            warnings.append(f"the contact law would have pulled at {self._memory[engine.CLAMPS]:.0f} steps and was held at 0")
+            warnings.append(
+                f"the contact law would have pulled at {self._memory[engine.CLAMPS]:.0f} steps and was held at 0"
+            )
         if self._memory[engine.FLOORED]:
             warnings.append(f"{self._memory[engine.FLOORED]:.0f} contacts began slower than contact.speed_floor")
         return {
@@ -205,7 +213,10 @@ class Simulation:
             "tick_rate_hz": TICK_RATE_HZ,
             "table": self.table.model_dump(mode="json"),
             "truth": {
-                name: {"rate_hz": self.scene.sensors.truth_rate_hz, "columns": [signals[column]._asdict() for column in columns]}
+                name: {
+                    "rate_hz": self.scene.sensors.truth_rate_hz,
+                    "columns": [signals[column]._asdict() for column in columns],
+                }
                 for name, columns in S.TRUTH.items()
             },
         }
@@ -228,7 +239,9 @@ class Simulation:
             initial.position
         ]
         if math.hypot(x, y) > clearance:
-            raise InputError("initial.position", f"inside the ring (r0 = {clearance * 1e3:g} mm)", [initial.x_mm, initial.y_mm])
+            raise InputError(
+                "initial.position", f"inside the ring (r0 = {clearance * 1e3:g} mm)", [initial.x_mm, initial.y_mm]
+            )
         return self.model.state(ring_x=x, ring_y=y, spin=spin)
 
     def _on_grid(self, time_s: float) -> int:
@@ -245,7 +258,9 @@ class Simulation:
         return [*segments, _Segment(tick=points[-1][0], speed=points[-1][1], slope=0.0)]
 
     def _segment(self) -> _Segment:
-        return max((segment for segment in self._segments if segment.tick <= self.tick), key=lambda segment: segment.tick)
+        return max(
+            (segment for segment in self._segments if segment.tick <= self.tick), key=lambda segment: segment.tick
+        )
 
     def _take_effect(self, events: list[dict[str, Any]]) -> None:
         while self._pending and self._pending[0][0] <= self.tick:
@@ -308,7 +323,15 @@ class Simulation:
         """The row of the present instant."""
         row = np.empty((1, S.N_ROW))
         self._engine.advance(
-            self.model.constants, self._inputs(), self._y.copy(), self._memory.copy(), self.tick, self._step_ticks, 1, 1, row
+            self.model.constants,
+            self._inputs(),
+            self._y.copy(),
+            self._memory.copy(),
+            self.tick,
+            self._step_ticks,
+            1,
+            1,
+            row,
         )
         return row[0]
 
@@ -330,7 +353,9 @@ class Simulation:
         rate = self.scene.sensors.truth_rate_hz
         kept = rows[:: self._truth_every]
         index = start * rate // TICK_RATE_HZ
-        return {name: self._block(start, index, rate, kept[:, columns]) for name, columns in self._truth_columns.items()}
+        return {
+            name: self._block(start, index, rate, kept[:, columns]) for name, columns in self._truth_columns.items()
+        }
 
     def _block(self, tick: int, index: int, rate_hz: int, values: np.ndarray) -> Block:
         return Block(tick=tick, index=index, rate_hz=float(rate_hz), tick_rate_hz=float(TICK_RATE_HZ), values=values)
@@ -344,7 +369,8 @@ def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]
         first: Row at the start of the run, shape (N_ROW,).
 
     Returns:
-        stored (change since the start), supplied, dissipated, and residual = stored - supplied + dissipated [J], each shape (n,).
+        stored (change since the start), supplied, dissipated, and residual = stored - supplied + dissipated [J], each
+        shape (n,).
     """
 
     def total(names: tuple[str, ...], table: np.ndarray) -> np.ndarray:
@@ -352,6 +378,9 @@ def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]
 
     stored = total(STORED, rows) - total(STORED, first)
     supplied, dissipated = total(SUPPLIED, rows), total(DISSIPATED, rows)
-    return {"stored": stored, "supplied": supplied, "dissipated": dissipated, "residual": stored - supplied + dissipated}
-
-
+    return {
+        "stored": stored,
+        "supplied": supplied,
+        "dissipated": dissipated,
+        "residual": stored - supplied + dissipated,
+    }

@@ -1,8 +1,8 @@
 """Sans-IO codec: blocks of samples and documents to bytes and back, and the keys they travel under.
 
-A block is one CDR message (little-endian, ROS 2 message definitions below), so that any reader of ROS 2 messages decodes
-it without this project. A document is JSON. A stream is an event `start`, blocks, and an event `end` with a reason;
-any step of a block's index other than its length is a gap, counted by `Continuity` and never hidden.
+A block is one CDR message (little-endian, ROS 2 message definitions below), so that any reader of ROS 2 messages
+decodes it without this project. A document is JSON. A stream is an event `start`, blocks, and an event `end` with a
+reason; any step of a block's index other than its length is a gap, counted by `Continuity` and never hidden.
 """
 
 from __future__ import annotations
@@ -99,7 +99,9 @@ def encode_block(block: Block) -> bytes:
     """One block as a CDR message; the schema follows from the dtype of its values."""
     values = np.ascontiguousarray(block.values)
     if values.dtype not in (_DTYPES[SAMPLE_SCHEMA], _DTYPES[TRUTH_SCHEMA]) or values.ndim != 2:
-        raise TypeError(f"values must be int32 or float64 of two dimensions; instead received {values.dtype}, {values.ndim}")
+        raise TypeError(
+            f"values must be int32 or float64 of two dimensions; instead received {values.dtype}, {values.ndim}"
+        )
     head = _HEAD.pack(block.tick, block.index, block.rate_hz, block.tick_rate_hz, values.shape[1], values.size)
     return b"".join((_ENCAPSULATION, head, values.tobytes()))
 

@@ -25,8 +25,10 @@ def record(
     view_rate_hz: Annotated[
         float, typer.Option(help="Rate of the messages for plots, in Hz; 0 leaves them out.")
     ] = 500.0,
-    history: Annotated[bool, typer.Option(help="Also record what the rig's cache still holds from before.")] = False,
-    force: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
+    history: Annotated[
+        bool, typer.Option(help="From the start of the run on, as far as the rig's cache reaches.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Record all streams of a running rig to FILE.mcap, losslessly; Ctrl-C ends the recording well."""
     import os

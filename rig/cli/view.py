@@ -38,11 +38,17 @@ def view(
     Opens a window where there is a screen; otherwise serves the viewer on 127.0.0.1 and prints the address.
     """
     _check(file, live=live, web=web, save=save, screenshot=screenshot, at_s=at_s)
-    with _interruptible():
-        if live:
-            _view_live(connect, wait_s=wait_s, web=web, save=save)
-        elif file is not None:
-            _view_file(file, web=web, save=save, screenshot=screenshot, at_s=at_s)
+    _hush()
+    from recorder.viewer.window import WindowError
+
+    try:
+        with _interruptible():
+            if live:
+                _view_live(connect, wait_s=wait_s, web=web, save=save)
+            elif file is not None:
+                _view_file(file, web=web, save=save, screenshot=screenshot, at_s=at_s)
+    except WindowError as error:
+        raise RefusedError(str(error)) from None
 
 
 def _check(
@@ -63,12 +69,20 @@ def _check(
                 raise InputError(option, f"a file name that ends in {suffix}", str(path))
             if not path.absolute().parent.is_dir():
                 raise InputError(option, "in a folder that exists", str(path))
-            if path.is_dir():
-                raise InputError(option, "a file", str(path))
+            _check_writable(option, path)
+
+
+def _check_writable(option: str, path: Path) -> None:
+    new = not path.exists()
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        raise InputError(option, "a file that can be written", f"{path} ({error.strerror})") from None
+    if new:
+        path.unlink()
 
 
 def _view_file(file: Path, *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None) -> None:
-    _hush()
     from recorder.reader import Recording
     from recorder.viewer import blueprint, window
     from recorder.viewer.canvas import Canvas, new_stream
@@ -90,19 +104,20 @@ def _view_file(file: Path, *, web: bool, save: Path | None, screenshot: Path | N
         try:
             painted = paint(recording, Canvas(stream))
         finally:
-            _close(stream)
+            _close(stream, timeout_s=60.0)
         if screenshot is not None:
-            latest = painted.end_s if painted.last_contact_s is None else painted.last_contact_s
-            shown.picture(screenshot, at_s=latest if at_s is None else at_s, end_s=painted.end_s)
-            typer.echo(f"{screenshot}: at {latest if at_s is None else at_s:.3f} s")
+            if at_s is None:
+                at_s = painted.end_s if painted.last_contact_s is None else painted.last_contact_s
+            if not painted.start_s <= at_s <= painted.end_s:
+                raise InputError("--at-s", f"in the recording, {painted.start_s:g} to {painted.end_s:g} s", at_s)
+            shown.picture(screenshot, at_s=at_s, end_s=painted.end_s)
+            typer.echo(f"{screenshot}: at {at_s:.3f} s")
         else:
             _tell(shown, file.name)
-            while not shown.wait(0.5):
-                pass
+            _wait_for_the_end(shown)
 
 
 def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> None:
-    _hush()
     from recorder.viewer import blueprint, live, window
     from recorder.viewer.canvas import Canvas, new_stream
     from rig.transport import NoReplyError
@@ -137,9 +152,7 @@ def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> 
                 _close(stream)
             if shown.open:
                 typer.echo("the viewer stays open; end it with Ctrl-C")
-            sys.stdout.flush()
-            while not shown.wait(0.5):
-                pass
+            _wait_for_the_end(shown)
 
 
 def _kind(*, web: bool) -> Kind:
@@ -151,7 +164,16 @@ def _kind(*, web: bool) -> Kind:
 def _tell(shown: Window, what: str) -> None:
     typer.echo(f"viewing {what} at {shown.address}" if shown.address else f"viewing {what}")
     typer.echo("Ctrl-C ends the viewer")
+    sys.stdout.flush()  # the address is wanted now, also in a pipe
+
+
+def _wait_for_the_end(shown: Window) -> None:
+    """Until the user closes the viewer, or ends the command."""
     sys.stdout.flush()
+    while not shown.wait(0.5):
+        pass
+    if shown.failure:
+        raise RefusedError(f"the viewer failed: {shown.failure} (--web needs no graphics driver)")
 
 
 def _hush() -> None:
@@ -161,10 +183,10 @@ def _hush() -> None:
     os.environ.setdefault("RUST_LOG", "off")
 
 
-def _close(stream: rr.RecordingStream) -> None:
+def _close(stream: rr.RecordingStream, *, timeout_s: float = 5.0) -> None:
     """Send what is buffered, as long as there is somebody to take it."""
     with suppress(RuntimeError, ValueError):  # the viewer is gone: nobody misses the rest
-        stream.flush(timeout_sec=5.0)
+        stream.flush(timeout_sec=timeout_s)
     stream.disconnect()
 
 
@@ -176,7 +198,7 @@ def _interruptible() -> Iterator[None]:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     except KeyboardInterrupt:

@@ -1,11 +1,12 @@
-"""Explicit Runge-Kutta on a fixed step grid, divided inside a step where it has to be. `rk4` and `rk8` are its tableaus.
+"""Explicit Runge-Kutta on a fixed step grid, divided inside a step where it has to be. `rk4` and `rk8` are its
+tableaus.
 
 The grid is fixed; only what happens inside a step varies, by rules on the state alone:
 
-- A step in which the shaft meets or leaves the ring is cut at the crossing, found on the cubic Hermite interpolant of the gap. The impact
-  speed is latched there, not at the end of the step: that alone would cap the accuracy at about 3e-3. Since the force starts and ends as
-  t^1.5, the cut step is taken in parts that shrink toward the crossing, and the contact steps next to it in equal parts; without that the
-  order drops to 2.5.
+- A step in which the shaft meets or leaves the ring is cut at the crossing, found on the cubic Hermite interpolant of
+  the gap. The impact speed is latched there, not at the end of the step: that alone would cap the accuracy at about
+  3e-3. Since the force starts and ends as t^1.5, the cut step is taken in parts that shrink toward the crossing, and
+  the contact steps next to it in equal parts; without that the order drops to 2.5.
 - A step whose error estimate is above the tableau's tolerance is taken again in as many parts as the estimate asks for.
 
 The integrals of the ledger are part of the integrated vector: they share the quadrature.
@@ -23,8 +24,8 @@ from rig.kernels.dynamics import evaluate, gap
 
 ONSET, CONTACTS, CLAMPS, PEAK_FORCE, CONTACT_STEPS, FLOORED, STEPS, TOUCHING, DIVIDED = range(9)
 MEMORY = 9
-"""Impact speed of the running contact [m/s]; contacts begun; steps at whose start the law would have pulled; largest normal force
-[N]; steps in contact; onsets below the speed floor; steps taken; 1 in contact; steps taken in parts."""
+"""Impact speed of the running contact [m/s]; contacts begun; steps at whose start the law would have pulled; largest
+normal force [N]; steps in contact; onsets below the speed floor; steps taken; 1 in contact; steps taken in parts."""
 
 SCALES = np.array([5e-3, 5e-3, 1.0, 20e-6, 20e-6, 20e-6, 20e-6, 1.0, 1.0, 40.0, 0.04, 0.04, 0.04, 0.04])
 """What counts as 1 in each state when errors are added up: 5 mrad, 1 rad of spin, 20 um, 1 and 40 rad/s, 40 mm/s."""
@@ -150,8 +151,8 @@ def _crossing(d0, rate0, d1, rate1, h):
 def _cut_step(tableau, constants, inputs, tick, ticks, memory, y, k, z, end, out):
     """One step in which contact begins or ends, cut at the crossing.
 
-    Entered with the end of the uncut trial step in `end`, which only tells where to cut; the parts are then integrated anew. Leaves the end of
-    the step in `y` and `memory`.
+    Entered with the end of the uncut trial step in `end`, which only tells where to cut; the parts are then
+    integrated anew. Leaves the end of the step in `y` and `memory`.
     """
     d0, rate0 = gap(constants, y)
     d1, rate1 = gap(constants, end)
@@ -160,7 +161,8 @@ def _cut_step(tableau, constants, inputs, tick, ticks, memory, y, k, z, end, out
     fraction = 0.0
     if memory[TOUCHING] == 0.0:
         evaluate(constants, inputs, tick, fraction, memory[ONSET], False, False, y, k[0], out)
-        # The interpolant is of order 4 only: Newton on the flight itself puts the cut, and with it the impact speed, right.
+        # The interpolant is of order 4 only: Newton on the flight itself puts the cut, and with it the impact speed,
+        # right.
         for _ in range(3):
             _step(tableau, constants, inputs, tick, fraction, cut * ticks, memory[ONSET], False, y, k, z, end, out)
             miss, speed = gap(constants, end)
@@ -253,7 +255,8 @@ def advance(tableau, constants, inputs, y, memory, tick, step_ticks, steps, stri
             _divided_step(tableau, constants, inputs, now, ticks, parts, memory[ONSET], touching, y, k, z, end, out)
         else:
             _step(tableau, constants, inputs, now, 0.0, ticks, memory[ONSET], touching, y, k, z, end, out)
-        # The rates at the end are those at the start of the next step, and tell whether contact began or ended on the way.
+        # The rates at the end are those at the start of the next step, and tell whether contact began or ended on the
+        # way.
         observe = (n + 1) % stride == 0
         last = k[stages]
         evaluate(constants, inputs, now + step_ticks, 0.0, memory[ONSET], touching, observe, end, last, out)

@@ -1,8 +1,8 @@
 """Numba kernels: functions of floats, arrays and NamedTuples, nothing else.
 
-numba's own cache looks only at the file of the function it loads: it returns stale machine code when a kernel or a constant in
-*another* file has changed. So the cache folder is named by a digest of every kernel and engine file (unless the user set
-NUMBA_CACHE_DIR), before the first kernel is defined.
+numba's own cache looks only at the file of the function it loads: it returns stale machine code when a kernel or a
+constant in *another* file has changed. So the cache folder is named by a digest of every kernel and engine file
+(unless the user set NUMBA_CACHE_DIR), before the first kernel is defined.
 """
 
 from __future__ import annotations

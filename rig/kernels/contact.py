@@ -11,8 +11,8 @@ from numba import njit
 def normal_force(penetration, rate, onset_speed, stiffness, damping_factor):
     """Compliant normal force with hysteresis damping, eq. 44.
 
-    F = K delta^1.5 (1 + c delta'/v0), clamped at 0: a contact cannot pull. Trap: v0 -> 0 at grazing onsets blows the damping term up;
-    the caller floors v0.
+    F = K delta^1.5 (1 + c delta'/v0), clamped at 0: a contact cannot pull. Trap: v0 -> 0 at grazing onsets blows the
+    damping term up; the caller floors v0.
 
     Args:
         penetration: delta [m]; no force unless positive.
@@ -32,19 +32,24 @@ def normal_force(penetration, rate, onset_speed, stiffness, damping_factor):
 
 @njit(cache=True)
 def friction_force(force, sliding_speed, friction, smoothing_speed):
-    """Coulomb friction, regularised: mu F_n tanh(v_t / v_s), against the sliding speed of eq. 39 (not sgn(theta') of eq. 12).
+    """Coulomb friction, regularised: mu F_n tanh(v_t / v_s), against the sliding speed of eq. 39 (not sgn(theta') of
+    eq. 12).
 
-    Trap: below sliding at about v_s the contact creeps by v_s atanh(needed / mu), and an explicit step must stay below about
+    Trap: below sliding at about v_s the contact creeps by v_s atanh(needed / mu), and an explicit step must stay
+        below about
     2 m_t v_s / (mu F_n).
     """
     return friction * force * math.tanh(sliding_speed / smoothing_speed)
 
 
 @njit(cache=True)
-def ring_force(ex, ey, vx, vy, surface_speed, clearance, onset_speed, stiffness, damping_factor, friction, smoothing_speed):
+def ring_force(
+    ex, ey, vx, vy, surface_speed, clearance, onset_speed, stiffness, damping_factor, friction, smoothing_speed
+):
     """Force of the ring on the shaft, eqs. 12 and 44 in the plane of the ring.
 
-    Frame: n = e/|e| points from the ring's centre to the shaft's, t = (-n_y, n_x). F = -F_n n - F_t t acts on the shaft, the
+    Frame: n = e/|e| points from the ring's centre to the shaft's, t = (-n_y, n_x). F = -F_n n - F_t t acts on the
+        shaft, the
     opposite on the inner house; the shaft's spin feels -radius F_t.
 
     Args:
@@ -61,7 +66,8 @@ def ring_force(ex, ey, vx, vy, surface_speed, clearance, onset_speed, stiffness,
         smoothing_speed: v_s [m/s].
 
     Returns:
-        Force on the shaft x, y [N]; normal force, its elastic part, friction force [N]; penetration [m]; its rate, sliding speed [m/s].
+        Force on the shaft x, y [N]; normal force, its elastic part, friction force [N]; penetration [m]; its rate,
+        sliding speed [m/s].
     """
     distance = math.sqrt(ex * ex + ey * ey)
     penetration = distance - clearance

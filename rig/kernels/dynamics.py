@@ -1,7 +1,7 @@
 """The equations of motion of the whole rig, and everything that is read off them at one instant.
 
-Frames and signs: x horizontal (EAST +), y up, z along the shaft toward its free end; Gamma turns about x, beta about the turned y,
-theta is the spin. A point of the axis at arm l is at l u with u = (sin b, -sin G cos b, cos G cos b).
+Frames and signs: x horizontal (EAST +), y up, z along the shaft toward its free end; Gamma turns about x, beta about
+the turned y, theta is the spin. A point of the axis at arm l is at l u with u = (sin b, -sin G cos b, cos G cos b).
 
 Shaft: Euler's equations (15) in the frame B2 that follows the shaft but not its spin. With w = theta' + Gamma' sin b:
 
@@ -9,9 +9,10 @@ Shaft: Euler's equations (15) in the frame B2 that follows the shaft but not its
     Ixx beta'' + Ixx Gamma'^2 sin b cos b - Izz w Gamma' cos b = cos b L_x + sin b sin G L_y
     Izz w' = T_drive - R_S F_t
 
-where (L_x, L_y) is the sum of arm times lateral force. Both torques act along the shaft, so they do work on w and have no part in
-the first equation: this is eq. 17 with its signs, where a Lagrangian form has the torque's share sin b T in Q_Gamma. For the same
-reason the surface speed in eq. 39 is R_S w, which differs from R_S theta' by less than 1e-3 but closes the energy ledger.
+where (L_x, L_y) is the sum of arm times lateral force. Both torques act along the shaft, so they do work on w and
+have no part in the first equation: this is eq. 17 with its signs, where a Lagrangian form has the torque's share sin
+b T in Q_Gamma. For the same reason the surface speed in eq. 39 is R_S w, which differs from R_S theta' by less than
+1e-3 but closes the energy ledger.
 """
 
 from __future__ import annotations
@@ -80,7 +81,13 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     """
     # params:
     shaft, magnet, contact, house = constants.shaft, constants.magnet, constants.contact, constants.house
-    Ixx, Izz, lA, lB, lI = shaft.transverse_inertia, shaft.polar_inertia, shaft.arm_ring, shaft.arm_magnet, shaft.arm_disk
+    Ixx, Izz, lA, lB, lI = (
+        shaft.transverse_inertia,
+        shaft.polar_inertia,
+        shaft.arm_ring,
+        shaft.arm_magnet,
+        shaft.arm_disk,
+    )
     # state in:
     dG, db, dth = y[7], y[8], y[9]
     x_ih, y_ih, x_oh, y_oh = y[3], y[4], y[5], y[6]
@@ -204,7 +211,8 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     out[S.INNER_AY] = ay_ih
     out[S.OUTER_AX] = ax_oh
     out[S.OUTER_AY] = ay_oh
-    # Acceleration of the axis direction, for the reaction at the pivot: R = M a_C - sum of the applied forces (eqs. 20-21).
+    # Acceleration of the axis direction, for the reaction at the pivot: R = M a_C - sum of the applied forces (eqs.
+    # 20-21).
     spread = dG * dG + db * db
     ddux = cb * ddb - sb * db * db
     dduy = -cG * cb * ddG + sG * sb * ddb + sG * cb * spread + 2.0 * cG * sb * dG * db

@@ -9,8 +9,8 @@ from numba import njit
 def pair_readings(displacement, pair_stiffness, preload):
     """Readings of one opposed, pre-compressed pair of transducers.
 
-    The pair carries `pair_stiffness` times the displacement: one side loads by half of that, the other unloads by half. A
-    transducer that has lost its preload reads 0 and has dropped out of the stiffness.
+    The pair carries `pair_stiffness` times the displacement: one side loads by half of that, the other unloads by
+    half. A transducer that has lost its preload reads 0 and has dropped out of the stiffness.
 
     Args:
         displacement: Of the body between them, positive toward the first [m].

@@ -1,7 +1,8 @@
 """The row that an engine writes at every observed instant: its columns, their order, units and meaning.
 
-The first columns are the state; then what the laws make of it at that instant; then the ledger: the momenta and energies
-that are stored, and the running integral of every torque, force and power. Kernels address columns by the constants below.
+The first columns are the state; then what the laws make of it at that instant; then the ledger: the momenta and
+energies that are stored, and the running integral of every torque, force and power. Kernels address columns by the
+constants below.
 """
 
 from __future__ import annotations
@@ -115,8 +116,8 @@ N_ROW = len(ROW)
 
 TRUTH = {
     "state": tuple(signal.name for signal in STATE),
-    "contact": ("penetration", "normal_force", "friction_force", "sliding_speed", "onset_speed", "pivot_x", "pivot_y", "pivot_z",
-                "drive_torque"),
+    "contact": ("penetration", "penetration_rate", "normal_force", "friction_force", "sliding_speed", "onset_speed"),
+    "forces": ("P_N", "P_S", "P_E", "P_W", "pivot_x", "pivot_y", "pivot_z", "magnet_x", "magnet_y", "hammer_force", "drive_torque"),
     "energy": ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy", "drive_work", "hammer_work",
                "unbalance_work", "gap_work", "release_work", "bearing_loss", "house_loss", "contact_loss", "friction_loss"),
 }  # fmt: skip

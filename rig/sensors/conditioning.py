@@ -68,8 +68,8 @@ def _condition(rows, first, every, columns, gain, bias, low, high, sections, mem
 def channel_filter(channel: Channel, row_rate_hz: float) -> np.ndarray:
     """The channel's filter as second-order sections at the rate of the rows, shape (3, 6).
 
-    Fourth-order Butterworth low-pass at the channel's bandwidth (left out where that is no longer below the row rate's own limit),
-    and a first-order high-pass where the channel is AC-coupled.
+    Fourth-order Butterworth low-pass at the channel's bandwidth (left out where that is no longer below the row
+    rate's own limit), and a first-order high-pass where the channel is AC-coupled.
     """
     from scipy.signal import butter
 
@@ -84,7 +84,8 @@ def channel_filter(channel: Channel, row_rate_hz: float) -> np.ndarray:
 class Conditioner:
     """Turns rows into counts for one group, block by block; cutting a run into blocks in another way changes no bit.
 
-    Each channel draws its noise from a generator of its own, keyed by seed and name: leaving a channel out does not change the others.
+    Each channel draws its noise from a generator of its own, keyed by seed and name: leaving a channel out does not
+    change the others.
     """
 
     def __init__(self, group: Group, *, row_rate_hz: int, seed: int, noise: bool) -> None:

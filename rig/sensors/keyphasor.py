@@ -27,8 +27,8 @@ class Keyphasor:
             row_ticks: Ticks a row.
 
         Returns:
-            Instants in ticks from the first of these rows, with their fraction; negative ones lie between the last row of the call
-            before and the first of this one. Shape (edges,).
+            Instants in ticks from the first of these rows, with their fraction; negative ones lie between the last
+            row of the call before and the first of this one. Shape (edges,).
         """
         angle = rows[:, COLUMN["theta"]]
         rate = rows[:, COLUMN["theta_rate"]]
@@ -41,7 +41,9 @@ class Keyphasor:
         turns = np.floor(angle / TURN)
         for n in np.nonzero(turns[1:] > turns[:-1])[0]:
             step = row_ticks * 1e-6
-            found.append((first + n + _crossing(turns[n + 1] * TURN, angle[n : n + 2], rate[n : n + 2] * step)) * row_ticks)
+            found.append(
+                (first + n + _crossing(turns[n + 1] * TURN, angle[n : n + 2], rate[n : n + 2] * step)) * row_ticks
+            )
         self._angle, self._rate = float(angle[-1]), float(rate[-1])
         self.edges_seen += len(found)
         return np.array(found, dtype=np.float64)
@@ -52,7 +54,9 @@ def _crossing(target: float, angle: np.ndarray, slope: np.ndarray) -> float:
     (y0, y1), (m0, m1) = angle - target, slope
     s = -y0 / (y1 - y0)
     for _ in range(4):
-        value = y0 * (1 + 2 * s) * (1 - s) ** 2 + m0 * s * (1 - s) ** 2 + y1 * s * s * (3 - 2 * s) + m1 * s * s * (s - 1)
+        value = (
+            y0 * (1 + 2 * s) * (1 - s) ** 2 + m0 * s * (1 - s) ** 2 + y1 * s * s * (3 - 2 * s) + m1 * s * s * (s - 1)
+        )
         rate = 6 * s * (s - 1) * (y0 - y1) + m0 * (1 - s) * (1 - 3 * s) + m1 * s * (3 * s - 2)
         s -= value / rate
     return min(max(s, 0.0), 1.0)

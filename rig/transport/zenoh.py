@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import json
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -33,6 +34,9 @@ by its closed socket, not by the lease."""
 _PATIENCE_S = 20.0
 _HEARTBEAT_S = 0.25
 """How soon a subscriber learns that the last message of a key is missing."""
+_FIFO = 20_000
+"""Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops, and the
+rest is recovered. So many because history comes over the same link, which must not be blocked meanwhile."""
 _RING = 2000
 """Messages that a subscriber which may lose some holds: about 2 s of all streams."""
 
@@ -95,12 +99,25 @@ class _Session:
         self._closed = False
         atexit.register(self.close)
 
-    def drain(self, channel: Any, take: Callable[[Any], None], name: str) -> None:
-        """Give all that arrives in a channel to `take`, on a thread of its own."""
+    def drain(
+        self, channel: Any, take: Callable[[Any], None], name: str, *, first: Callable[[], None] | None = None
+    ) -> None:
+        """Give all that arrives in a channel to `take`, on a thread of its own, after calling `first` there."""
+        import zenoh
 
         def loop() -> None:
-            for item in channel:
-                take(item)
+            try:
+                if first is not None:
+                    first()
+                for item in channel:
+                    take(item)
+            except BaseException as error:
+                if self._closed and isinstance(error, zenoh.ZError):
+                    return
+                # A channel that nobody empties would in the end block the whole link, and hide that the rig has ended.
+                threading.excepthook(threading.ExceptHookArgs((type(error), error, error.__traceback__, thread)))
+                for _ in channel:
+                    pass
 
         thread = threading.Thread(target=loop, name=f"zenoh {name}", daemon=True)
         self._threads.append(thread)
@@ -141,6 +158,9 @@ class ZenohServer:
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, expose: bool = False, wait: bool = False) -> None:
         import zenoh
 
+        # A thread that sends a recovery waits for its link; the default of two leaves none for requests when two
+        # clients stall in the middle of theirs. Read when the first session of a process opens.
+        os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 8))")
         host, port = parse_endpoint(endpoint, field="listen")
         if host not in LOOPBACK_HOSTS and not expose:
             raise InputError("listen", "on 127.0.0.1 unless --expose is given as well", endpoint)
@@ -183,8 +203,6 @@ class ZenohServer:
             congestion_control=self._congestion_control,
             cache=ext.CacheConfig(round(_CACHE_S * _BLOCKS_A_SECOND)),
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
-            # Lets a subscriber that was there before the rig (or outlived one) fetch what was sent before they met.
-            publisher_detection=True,
         )
         self._publishers[key] = publisher
         return publisher
@@ -270,6 +288,80 @@ def _backlog(port: int) -> dict[int, int]:
     return found
 
 
+class _Stream:
+    """What one lossless subscription has received.
+
+    History is fetched here and not by zenoh's advanced subscriber, which lost most of it in 1.10.2: a live message that
+    arrives while the query of a heartbeat is open is delivered before the older ones, and those are then thrown away.
+    """
+
+    def __init__(
+        self,
+        session: Any,
+        key: str,
+        on_message: Callable[[str, bytes], None],
+        on_miss: Callable[[str, int], None] | None,
+    ) -> None:
+        self._session = session
+        self._key = key
+        self._on_message = on_message
+        self._on_miss = on_miss
+        self._lock = threading.Lock()
+        self._names: dict[tuple[str, int], str] = {}
+        """Key of each publisher, which is known by session and number."""
+        self._last: dict[tuple[str, int], int] = {}
+        """Number of the last message of each publisher."""
+        self._rigs: set[str] = set()
+        """Sessions whose history has been fetched."""
+
+    def take(self, sample: Any) -> None:
+        name = str(sample.key_expr)
+        if (info := sample.source_info) is not None:
+            self._names.setdefault(_source(info.source_id), name)
+        with self._lock:
+            self._on_message(name, sample.payload.to_bytes())
+
+    def take_with_history(self, sample: Any) -> None:
+        if sample.source_info is None:  # not from a rig
+            return
+        source = _source(sample.source_info.source_id)
+        if source[0] not in self._rigs:  # the rig has been started again
+            self.fetch_history(source[0])
+        if sample.source_info.source_sn > self._last.get(source, -1):
+            self.take(sample)
+
+    def fetch_history(self, rig: str = "*") -> None:
+        """Take what the caches of all publishers hold; what arrives meanwhile waits in the subscription's channel."""
+        import zenoh
+
+        # All is received before any of it is handed on: as long as a cache answers, its publisher waits.
+        replies = list(
+            self._session.get(
+                f"{self._key}/@adv/*/{rig}/**",
+                timeout=_LEASE_S,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+            )
+        )
+        self._rigs.add(rig)
+        for sample in (reply.ok for reply in replies if reply.ok is not None):
+            source = _source(sample.source_info.source_id)
+            self._rigs.add(source[0])
+            self._last[source] = sample.source_info.source_sn
+            self.take(sample)
+
+    def missed(self, miss: Any) -> None:
+        assert self._on_miss is not None
+        # A publisher that was never heard of: only the subscription's own key can be named.
+        name = self._names.get(_source(miss.source), self._key)
+        with self._lock:
+            self._on_miss(name, miss.nb)
+
+
+def _source(entity: Any) -> tuple[str, int]:
+    return str(entity.zid), entity.eid
+
+
 class ZenohClient:
     """A client's side: connects to one rig and listens on nothing. Reconnects by itself when that rig is started again.
 
@@ -322,52 +414,37 @@ class ZenohClient:
         """Receive payloads on a thread of this subscription.
 
         The messages of each key arrive in order; messages of different keys may arrive in another order than they
-        were sent in (after a stall each key is recovered for itself), so an `end` event can overtake blocks.
-        A callback that blocks stops only this subscription; the rig goes on, and what was missed is recovered.
-        `on_miss` and `on_message` are never called at the same time.
+        were sent in (after a stall each key is recovered for itself), so an `end` event can overtake blocks. A
+        callback that blocks stops only this subscription; the rig goes on, and what was missed is recovered.
+        `on_miss` and `on_message` are never called at the same time. Without `history`, a lossless subscription may
+        still begin with older messages of a key that is published rarely.
         """
         import zenoh
         from zenoh import ext
 
         session = self._session.session
-        lock = threading.Lock()
         if not lossless:
             subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_RING))
             self._declared.append(subscriber)
             self._session.drain(subscriber, lambda x: on_message(str(x.key_expr), x.payload.to_bytes()), f"takes {key}")
             return
 
-        sources: dict[str, str] = {}
-
-        def take(sample: Any) -> None:
-            name = str(sample.key_expr)
-            if on_miss is not None and name not in sources.values() and sample.source_info is not None:
-                sources[repr(sample.source_info.source_id)] = name
-            with lock:
-                on_message(name, sample.payload.to_bytes())
-
-        def missed(miss: Any) -> None:
-            # A miss names the publisher; which key that is, the messages told. A restarted rig has new publishers.
-            name = sources.get(repr(miss.source))
-            if name is None:
-                sources.clear()
-            with lock:
-                assert on_miss is not None
-                on_miss(name or key, miss.nb)
-
+        stream = _Stream(session, key, on_message, on_miss)
         subscriber = ext.declare_advanced_subscriber(
             session,
             key,
-            _fifo(),
-            history=ext.HistoryConfig(detect_late_publishers=True) if history else None,
+            zenoh.handlers.FifoChannel(_FIFO),
             recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
         self._declared.append(subscriber)
         if on_miss is not None:
             listener = subscriber.sample_miss_listener(_fifo())
             self._declared.append(listener)
-            self._session.drain(listener, missed, f"misses {key}")
-        self._session.drain(subscriber, take, f"takes {key}")
+            self._session.drain(listener, stream.missed, f"misses {key}")
+        if history:
+            self._session.drain(subscriber, stream.take_with_history, f"takes {key}", first=stream.fetch_history)
+        else:
+            self._session.drain(subscriber, stream.take, f"takes {key}")
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Ask the rig and return its reply.
@@ -412,7 +489,12 @@ class ZenohClient:
         import zenoh
 
         self._session.session.put(
-            key, payload, encoding="application/json", congestion_control=zenoh.CongestionControl.DROP
+            key,
+            payload,
+            encoding="application/json",
+            congestion_control=zenoh.CongestionControl.DROP,
+            # Not to the own subscriptions of this client.
+            allowed_destination=zenoh.Locality.REMOTE,
         )
 
     def close(self) -> None:

@@ -81,7 +81,9 @@ def test_first_impacts_against_independent_solver(scene: str, duration_s: float)
 
 def test_contact_force_is_frame_invariant() -> None:
     rng = np.random.default_rng(3)
-    law = dict(clearance=0.926e-3, onset_speed=0.1, stiffness=2.86e10, damping_factor=0.17, friction=0.25, smoothing_speed=5e-3)
+    law = dict(
+        clearance=0.926e-3, onset_speed=0.1, stiffness=2.86e10, damping_factor=0.17, friction=0.25, smoothing_speed=5e-3
+    )
     for _ in range(200):
         angle = rng.uniform(-math.pi, math.pi)
         e = rng.normal(size=2)
@@ -98,7 +100,10 @@ def test_contact_force_is_frame_invariant() -> None:
 
 
 def test_drop_hits_when_and_as_fast_as_a_falling_pendulum() -> None:
-    run = simulate(load_scene("drop", {"engine.step_us": 10, "sensors.rate_hz": 100_000, "sensors.truth_rate_hz": 100_000}), duration_s=0.03)
+    run = simulate(
+        load_scene("drop", {"engine.step_us": 10, "sensors.rate_hz": 100_000, "sensors.truth_rate_hz": 100_000}),
+        duration_s=0.03,
+    )
     shaft, contact = run.simulation.model.constants.shaft, run.simulation.model.constants.contact
     fall = shaft.mass * shaft.gravity * shaft.arm_centre * shaft.arm_ring / shaft.transverse_inertia
     first = int(np.argmax(run["normal_force"] > 0))
@@ -121,7 +126,12 @@ def test_free_flight_follows_the_linear_solution() -> None:
     Ixx, Izz, lB, K = c.shaft.transverse_inertia, c.shaft.polar_inertia, c.shaft.arm_magnet, c.magnet.stiffness
     spin = 2 * math.pi * 12.0
     # Gamma, beta, rates: Ixx G'' = -K lB^2 G - Dy lB^2 G' - Izz w b', Ixx b'' = -K lB^2 b - Dx lB^2 b' + Izz w G'
-    stiff, dx, dy, gyro = K * lB**2 / Ixx, c.magnet.damping_x * lB**2 / Ixx, c.magnet.damping_y * lB**2 / Ixx, Izz * spin / Ixx
+    stiff, dx, dy, gyro = (
+        K * lB**2 / Ixx,
+        c.magnet.damping_x * lB**2 / Ixx,
+        c.magnet.damping_y * lB**2 / Ixx,
+        Izz * spin / Ixx,
+    )
     A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-stiff, 0, -dy, -gyro], [0, -stiff, gyro, -dx]])
     start = run.signals[0, [0, 1, 7, 8]]
     size = np.array([1.0, 1.0, math.sqrt(stiff), math.sqrt(stiff)]) * np.linalg.norm(start[:2])
@@ -174,7 +184,8 @@ def test_order_on_the_smooth_problem(engine: str, steps: list[int], monkeypatch:
     module = load_engine(engine)
     monkeypatch.setattr(module, "TABLEAU", module.TABLEAU._replace(tolerance=math.inf))
 
-    # Undamped free flight on very stiff, hardening magnets, in a ring too wide to touch: smooth, nonlinear, fast (220 Hz).
+    # Undamped free flight on very stiff, hardening magnets, in a ring too wide to touch: smooth, nonlinear, fast (220
+    # Hz).
     def swing(name: str, step_us: int) -> np.ndarray:
         scene = load_scene("stable-run", {
             "ring.clearance": 15.0, "initial.position": "given", "initial.x_mm": 0.8, "initial.y_mm": 0.4,
@@ -199,7 +210,7 @@ def test_exact_factor_returns_the_restitution_asked_for(restitution: float) -> N
     factor = restitution_factor(restitution)
 
     def free_impact(_: float, y: np.ndarray) -> list[float]:
-        return [y[1], -max(0.0, y[0]) ** 1.5 * (1.0 + factor * y[1])]
+        return [y[1], -(max(0.0, y[0]) ** 1.5) * (1.0 + factor * y[1])]
 
     def apart(_: float, y: np.ndarray) -> float:
         return y[0]
@@ -219,7 +230,9 @@ def test_contact_stiffness_and_effective_mass_are_the_papers() -> None:
     assert model.constants.contact.stiffness == pytest.approx(2.86e10, rel=2e-3)
     outside = build_model(load_parameters().override({"contact.stiffness": "external-sphere"}))
     assert outside.constants.contact.stiffness == pytest.approx(5.40e9, rel=2e-3)
-    assert model.constants.shaft.transverse_inertia / model.constants.shaft.arm_ring**2 == pytest.approx(1.987, abs=1e-3)
+    assert model.constants.shaft.transverse_inertia / model.constants.shaft.arm_ring**2 == pytest.approx(
+        1.987, abs=1e-3
+    )
     assert model.constants.contact.damping_factor == pytest.approx(0.1665, abs=1e-4)
     # A sagged shaft would lie outside a ring centred on the axis: hence the offset.
     assert abs(model.sag) > model.constants.contact.clearance
@@ -234,7 +247,8 @@ def whirl_of(run: Run, *, from_s: float) -> dict[str, float]:
     return {
         "hz": float(np.polyfit(times, phase, 1)[0] / (2 * math.pi)),
         "law_hz": float(
-            -np.mean(run["theta_rate"][kept] * law.shaft.radius / (law.contact.clearance + run["penetration"][kept])) / (2 * math.pi)
+            -np.mean(run["theta_rate"][kept] * law.shaft.radius / (law.contact.clearance + run["penetration"][kept]))
+            / (2 * math.pi)
         ),
         "spin_hz": float(run["theta_rate"][kept].mean() / (2 * math.pi)),
         "force": float(run["normal_force"][kept].mean()),

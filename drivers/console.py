@@ -1,0 +1,108 @@
+"""The operator's console of a running rig: hammer, speed, magnet release, stop, lockstep, status."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from typing import Any
+
+from rig import wire
+from rig.errors import InputError, RefusedError
+from rig.transport import Client
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """The rig's reply to a command that it took.
+
+    Attributes:
+        command: Name of the command.
+        id: Number of the command in this run; the stream's event `command` carries it too.
+        tick: Simulated time at which it takes effect [ticks]; for a step, at which it was done.
+        time_s: The same [s].
+    """
+
+    command: str
+    id: int
+    tick: int
+    time_s: float
+
+
+class Console:
+    """Sends commands to one rig.
+
+    Args:
+        client: Transport to the rig.
+        name: Who asks; appears in the stream's events.
+        timeout_s: How long to wait for a reply [s].
+    """
+
+    def __init__(self, client: Client, *, name: str | None = None, timeout_s: float = 5.0) -> None:
+        self._client = client
+        self._name = name or f"console pid {os.getpid()}"
+        self._timeout_s = timeout_s
+
+    def hammer(self, *, force_n: float = 100.0, duration_ms: float = 5.0, direction: str | float = "x") -> Accepted:
+        """Hit the shaft at the disk.
+
+        Args:
+            force_n: Peak force [N].
+            duration_ms: Length of the half sine [ms].
+            direction: "x", "y", "-x", "-y" or an angle from x towards y [degrees].
+
+        Raises:
+            RefusedError: The rig refused, for the reason in the message.
+        """
+        return self._command("hammer", force_n=force_n, duration_ms=duration_ms, direction=direction)
+
+    def speed(self, hz: float) -> Accepted:
+        """Set the speed that the drive holds [Hz].
+
+        Raises:
+            RefusedError: The rig refused, for the reason in the message.
+        """
+        return self._command("speed", speed_hz=hz)
+
+    def release(self) -> Accepted:
+        """Release the magnet that holds the shaft.
+
+        Raises:
+            RefusedError: The rig refused, for the reason in the message.
+        """
+        return self._command("release")
+
+    def stop(self) -> Accepted:
+        """End the run.
+
+        Raises:
+            RefusedError: The rig refused, for the reason in the message.
+        """
+        return self._command("stop")
+
+    def step(self, ticks: int, *, timeout_s: float = 600.0) -> Accepted:
+        """Let a rig in lockstep run this many ticks; returns when they have been simulated and published.
+
+        Args:
+            ticks: A whole multiple of the simulation's block.
+            timeout_s: How long to wait for that [s].
+
+        Raises:
+            RefusedError: The rig refused, for the reason in the message.
+        """
+        return self._command("step", timeout_s, ticks=ticks)
+
+    def status(self) -> dict[str, Any]:
+        """The rig's status document, as published twice a second."""
+        return wire.decode_document(self._client.request(wire.STATUS, timeout_s=self._timeout_s))
+
+    def _command(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> Accepted:
+        for name, value in fields.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                raise InputError(name, "a finite number", value)
+        request = wire.encode_document({"from": self._name, **fields})
+        payload = self._client.request(wire.command_key(command), request, timeout_s=timeout_s or self._timeout_s)
+        reply = wire.decode_document(payload)
+        if not reply.get("accepted"):
+            raise RefusedError(str(reply.get("error", f"the rig refused {command} without a reason")))
+        return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"])

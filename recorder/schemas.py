@@ -1,0 +1,174 @@
+"""What stands in a recording besides the rig's own payloads: topics, message definitions, and their bytes.
+
+View messages are standard ROS 2 messages, so that a viewer which knows nothing of this project plots them with labels.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+
+from rig.wire import EVENTS, STATUS
+
+FORMAT = "rig-recording"
+VERSION = "1"
+PART_SUFFIX = ".part"
+GAPS = "recorder/gaps"
+CLOCK = "recorder/clock"
+VIEW = "view"
+VIEW_EVENTS = f"{VIEW}/events"
+
+
+_SEPARATOR = "=" * 80 + "\n"
+_TIME = _SEPARATOR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+JOINT_STATE_SCHEMA = "sensor_msgs/msg/JointState"
+JOINT_STATE_DEFINITION = (
+    "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
+    + _SEPARATOR
+    + "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    + _TIME
+)
+LOG_SCHEMA = "rcl_interfaces/msg/Log"
+LOG_DEFINITION = (
+    "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n"
+    + _TIME
+)
+LOG_INFO, LOG_WARN, LOG_ERROR = 20, 30, 40
+
+
+def _document_schema(title: str, **properties: str) -> bytes:
+    body = {name: {"type": kind} for name, kind in properties.items()}
+    return json.dumps({"title": title, "type": "object", "properties": body, "required": list(body)}).encode()
+
+
+DOCUMENT_SCHEMAS = {
+    EVENTS: ("rig.Event", _document_schema("rig.Event", event="string")),
+    STATUS: ("rig.Status", _document_schema("rig.Status")),
+    GAPS: (
+        "recorder.Gap",
+        _document_schema("recorder.Gap", kind="string", key="string", index="integer", size="integer"),
+    ),
+    CLOCK: ("recorder.Clock", _document_schema("recorder.Clock", tick="integer", time_s="number", wall_s="number")),
+}
+"""JSON schema of each document topic: name and definition."""
+ANY_DOCUMENT = ("rig.Document", _document_schema("rig.Document"))
+
+_ENCAPSULATION = b"\x00\x01\x00\x00"
+
+
+class _Cdr:
+    """Builds one little-endian CDR message; offsets count from behind the encapsulation header."""
+
+    def __init__(self) -> None:
+        self.body = bytearray()
+
+    def align(self, size: int) -> int:
+        self.body.extend(bytes(-len(self.body) % size))
+        return len(self.body)
+
+    def u32(self, value: int) -> None:
+        self.align(4)
+        self.body += struct.pack("<I", value)
+
+    def string(self, text: str) -> None:
+        data = text.encode() + b"\0"
+        self.u32(len(data))
+        self.body += data
+
+    def message(self) -> bytes:
+        return _ENCAPSULATION + bytes(self.body)
+
+
+SLOTS = ("position", "velocity", "effort")
+
+
+class JointStateRows:
+    """Encodes rows of values as `sensor_msgs/msg/JointState`, one message a row, in one numpy pass.
+
+    All messages of a topic have the same bytes but for the stamp and the values: a template and a few writes.
+    """
+
+    def __init__(self, names: tuple[str, ...], slots: tuple[str, ...]) -> None:
+        """Lay out the message.
+
+        Args:
+            names: Labels of the columns.
+            slots: Which of the arrays `SLOTS` are filled; each filled one has a value for every name.
+        """
+        start = len(_ENCAPSULATION)
+        fields: dict[str, tuple[str | tuple[str, tuple[int]], int]] = {
+            "sec": ("<i4", start),
+            "nanosec": ("<u4", start + 4),
+        }
+        cdr = _Cdr()
+        cdr.body += bytes(8)  # stamp
+        cdr.string("rig")  # frame_id
+        cdr.u32(len(names))
+        for name in names:
+            cdr.string(name)
+        for slot in SLOTS:
+            cdr.u32(len(names) if slot in slots else 0)
+            if slot in slots:
+                fields[slot] = (("<f8", (len(names),)), start + cdr.align(8))
+                cdr.body += bytes(8 * len(names))
+        template = cdr.message()
+        self._slots = slots
+        self._dtype = np.dtype(
+            {
+                "names": list(fields),
+                "formats": [kind for kind, _ in fields.values()],
+                "offsets": [offset for _, offset in fields.values()],
+                "itemsize": len(template),
+            }
+        )
+        self._template = np.frombuffer(template, np.uint8)
+
+    def encode(self, times_ns: np.ndarray, values: dict[str, np.ndarray]) -> list[bytes]:
+        """Encode rows.
+
+        Args:
+            times_ns: Simulated time of each row [ns], int64, shape (n,).
+            values: For each filled slot its values, shape (n, names); nan where a column has none.
+
+        Returns:
+            One CDR message a row.
+        """
+        size = self._dtype.itemsize
+        raw = np.tile(self._template, len(times_ns))
+        rows = raw.view(self._dtype)
+        rows["sec"] = times_ns // 1_000_000_000
+        rows["nanosec"] = times_ns % 1_000_000_000
+        for slot in self._slots:
+            rows[slot] = values[slot]
+        data = raw.tobytes()
+        return [data[start : start + size] for start in range(0, len(data), size)]
+
+
+def encode_log(time_ns: int, level: int, name: str, text: str) -> bytes:
+    """One `rcl_interfaces/msg/Log` message at a simulated time [ns]."""
+    cdr = _Cdr()
+    cdr.body += struct.pack("<iIB", time_ns // 1_000_000_000, time_ns % 1_000_000_000, level)
+    for field in (name, text, "", ""):
+        cdr.string(field)
+    cdr.u32(0)
+    return cdr.message()
+
+
+def event_text(event: dict[str, Any]) -> tuple[int, str]:
+    """Log level and one readable line of an event."""
+    kind = str(event.get("event", "event"))
+    reason = str(event.get("reason", ""))
+    if kind == "warning":
+        return LOG_WARN, str(event.get("text", "warning"))
+    level = LOG_ERROR if kind == "end" and reason.startswith("failed") else LOG_INFO
+    hidden = {"event", "tick", "time_s", "wall_s", "rows"}
+    details = ", ".join(f"{name} {_brief(value)}" for name, value in event.items() if name not in hidden)
+    return level, f"{kind}: {details}" if details else kind
+
+
+def _brief(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= 160 else text[:157] + "..."

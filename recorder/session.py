@@ -1,0 +1,385 @@
+"""One recording session: from the rig's streams, through a bounded inbox, to a file."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from recorder.writer import NS, RecordingError, RecordingWriter, check_destination, check_view_rate
+from rig.errors import InputError
+from rig.transport import Client
+from rig.wire import (
+    ALIVE,
+    CATALOGUE,
+    CLIENTS,
+    EVENTS,
+    PARAMETERS,
+    SCENE,
+    SENSORS,
+    STATUS,
+    TRUTH,
+    decode_document,
+    encode_document,
+    schema_of,
+    sensor_key,
+)
+
+RIG_LOST = "rig lost"
+"""End reason of a session whose rig vanished without an end event."""
+INBOX_BYTES = 256 << 20
+"""About a minute and a half of the default streams: longer than any stall of a disk that still works."""
+HEARTBEAT_S = 0.5
+QUIET_S = 0.3
+"""After the end of the stream, with all streams whole: silence after which nothing more is expected [s]."""
+RECOVERY_S = 2.0
+"""After the end of the stream, with blocks still missing: silence after which they are given up [s]."""
+PATIENCE_S = 30.0
+"""After the end of the stream: longest wait [s]."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State of a session, for display.
+
+    Attributes:
+        time_s: Simulated time recorded since its first row [s].
+        rows: Rows of sensor blocks received.
+        lost: Rows of all block streams that never arrived.
+        size_bytes: Size of the file.
+        waiting: Payloads in the inbox.
+    """
+
+    time_s: float
+    rows: int
+    lost: int
+    size_bytes: int
+    waiting: int
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Outcome of a session.
+
+    Attributes:
+        path: The file; the .part file if it could not be finished.
+        reason: Why the session ended.
+        error: What went wrong at the disk; empty if nothing did.
+        first_time_s: Simulated time of the first row [s].
+        duration_s: Simulated time from the first to the last row [s].
+        rows: Rows received by key.
+        lost: Rows lost by key, only keys that lost some.
+        gaps: Number of gaps that they are in.
+        missed: Messages that the transport gave up, by key.
+        dropped: Payloads that found the inbox full; they are among the lost.
+        malformed: Payloads that were not what their key promises; they are in the file as they came.
+        size_bytes: Size of the file.
+    """
+
+    path: Path
+    reason: str
+    error: str
+    first_time_s: float
+    duration_s: float
+    rows: dict[str, int]
+    lost: dict[str, int]
+    gaps: int
+    missed: dict[str, int]
+    dropped: int
+    malformed: int
+    size_bytes: int
+
+
+class _Inbox:
+    """Bounded by bytes; a full one refuses blocks rather than make the transport wait, for that would stall the rig.
+
+    What it refuses shows as a gap of the row numbers. Documents are small and rare, and always taken.
+    """
+
+    def __init__(self, capacity_bytes: int) -> None:
+        self._capacity = capacity_bytes
+        self._items: deque[tuple[str, bytes, int]] = deque()
+        self._bytes = 0
+        self._closed = False
+        self._ready = threading.Condition()
+        self.dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def put(self, key: str, payload: bytes, wall_ns: int) -> None:
+        with self._ready:
+            if self._closed:
+                return
+            if self._bytes + len(payload) > self._capacity and schema_of(key) is not None:
+                self.dropped += 1
+                return
+            self._items.append((key, payload, wall_ns))
+            self._bytes += len(payload)
+            self._ready.notify()
+
+    def take(self, timeout_s: float) -> list[tuple[str, bytes, int]] | None:
+        """Everything that waits, oldest first; None when it is closed and empty."""
+        with self._ready:
+            if not self._items and not self._closed:
+                self._ready.wait(timeout_s)
+            items = list(self._items)
+            self._items.clear()
+            self._bytes = 0
+            return None if self._closed and not items else items
+
+    def close(self) -> None:
+        with self._ready:
+            self._closed = True
+            self._ready.notify()
+
+
+class RecordingSession:
+    """Records what a rig publishes until the stream ends, somebody stops it, or the rig or the disk is gone.
+
+    Payloads are taken over on the transport's threads and written on one thread of the session; the thread that calls
+    `run` watches.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        path: Path,
+        *,
+        name: str = "recorder",
+        duration_s: float | None = None,
+        view_rate_hz: float = 500.0,
+        history: bool = False,
+        force: bool = False,
+        inbox_bytes: int = INBOX_BYTES,
+        wall_ns: Callable[[], int] = time.time_ns,
+        monotonic_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Check the options and the destination; nothing is asked of the rig yet.
+
+        Args:
+            client: Connection to the rig; remains the caller's to close.
+            path: File to write, ends in .mcap.
+            name: Name in the rig's list of clients.
+            duration_s: Simulated time to record [s]; None until something else ends the session.
+            view_rate_hz: Rate of the plottable messages [Hz]; 0 writes none.
+            history: Also record what the rig's cache still holds from before; rows since the start of the run that it
+                no longer holds count as lost.
+            force: Replace an existing file.
+            inbox_bytes: Capacity of the inbox between transport and disk.
+            wall_ns: Wall clock [unix ns].
+            monotonic_s: Clock of waits and deadlines [s].
+
+        Raises:
+            InputError: An option or the destination cannot be used.
+        """
+        if duration_s is not None and not duration_s > 0.0:
+            raise InputError("duration_s", "above 0", duration_s)
+        check_view_rate(view_rate_hz)
+        check_destination(path, force=force)
+        self.path = path
+        self._client = client
+        self._name = name
+        self._duration_ns = math.inf if duration_s is None else duration_s * NS
+        self._view_rate_hz = view_rate_hz
+        self._history = history
+        self._force = force
+        self._wall_ns = wall_ns
+        self._monotonic_s = monotonic_s
+        self._inbox = _Inbox(inbox_bytes)
+        self._misses: deque[tuple[str, int, int]] = deque()
+        self._wake = threading.Event()
+        self._stop_reason = ""
+        self._end_reason = ""
+        self._end_rows: dict[str, int] | None = None
+        """Number of the row after the last one published, by key, as the end event tells it."""
+        self._rig_lost = False
+        self._heard_s = 0.0
+        self._failure: BaseException | None = None
+
+    def stop(self, reason: str = "stopped") -> None:
+        """End the session from another thread or a signal handler; what was received is still written."""
+        # Only a flag: a signal handler that took the lock of an event could wait for its own thread.
+        self._stop_reason = self._stop_reason or reason
+
+    def run(self, on_progress: Callable[[Progress], None] | None = None) -> Summary:
+        """Record until the end.
+
+        Args:
+            on_progress: Called about five times a second on the calling thread.
+
+        Returns:
+            The outcome; a failure of the disk is in it, not raised.
+
+        Raises:
+            NoReplyError: No rig answers.
+            InputError: The file cannot be created.
+        """
+        catalogue, parameters, scene = (
+            decode_document(self._client.request(key)) for key in (CATALOGUE, PARAMETERS, SCENE)
+        )
+        writer = RecordingWriter(
+            self.path,
+            catalogue=catalogue,
+            parameters=parameters,
+            scene=scene,
+            view_rate_hz=self._view_rate_hz,
+            from_start=self._history,
+            force=self._force,
+            wall_ns=self._wall_ns,
+            monotonic_s=self._monotonic_s,
+        )
+        thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
+        thread.start()
+        reason = "failed"
+        try:
+            self._client.watch(ALIVE, self._on_alive)
+            for key in (f"{SENSORS}/**", f"{TRUTH}/**", EVENTS, STATUS):
+                self._client.subscribe(key, self._on_message, on_miss=self._on_miss, history=self._history)
+            reason = self._wait_for_end(writer, on_progress)
+        except BaseException as error:
+            reason = f"failed: {error or type(error).__name__}"
+            raise
+        finally:
+            self._inbox.close()
+            thread.join()
+            trouble = self._finish(writer, reason)
+        if not self._rig_lost:
+            self._report(writer)  # lets the rig drop its cache at once
+        return self._summary(writer, reason, trouble)
+
+    # On the transport's threads.
+
+    def _on_message(self, key: str, payload: bytes) -> None:
+        self._inbox.put(key, payload, self._wall_ns())
+        if schema_of(key) is not None:
+            self._heard_s = self._monotonic_s()
+
+    def _on_miss(self, key: str, messages: int) -> None:
+        self._misses.append((key, messages, self._wall_ns()))
+
+    def _on_alive(self, alive: bool) -> None:
+        if not alive:
+            self._rig_lost = True
+            self._wake.set()
+
+    # On the writer thread.
+
+    def _write_all(self, writer: RecordingWriter) -> None:
+        try:
+            while (items := self._inbox.take(0.1)) is not None:
+                for key, payload, wall_ns in items:
+                    document = writer.write(key, payload, wall_ns)
+                    if document is not None:
+                        self._follow(key, document)
+                while self._misses:
+                    writer.write_missed(*self._misses.popleft())
+                writer.sync_if_due()
+        except BaseException as error:  # handed over to the watching thread, which ends the session with it
+            self._failure = error
+            self._inbox.close()
+            self._wake.set()
+
+    def _follow(self, key: str, document: dict) -> None:
+        if key == EVENTS and document.get("event") == "end":
+            rows = document.get("rows")
+            self._end_rows = rows if isinstance(rows, dict) else None
+            self._end_reason = str(document.get("reason", "ended"))
+            self._wake.set()
+        elif key == STATUS and document.get("state") == "ended" and not self._end_reason:
+            self._end_reason = "ended before the recording began"
+            self._wake.set()
+
+    # On the calling thread.
+
+    def _wait_for_end(self, writer: RecordingWriter, on_progress: Callable[[Progress], None] | None) -> str:
+        """Watch, report and return why the session ends."""
+        heartbeat_s = -1e9
+        ended_s = None
+        while True:
+            now_s = self._monotonic_s()
+            if self._failure is not None:
+                return "disk error" if isinstance(self._failure, RecordingError) else f"failed: {self._failure}"
+            if self._stop_reason:
+                return self._stop_reason
+            first_ns = writer.first_time_ns
+            if first_ns is not None and writer.last_time_ns - first_ns >= self._duration_ns:
+                return "duration reached"
+            if ended_s is None and (self._end_reason or self._rig_lost):
+                ended_s = now_s
+            if ended_s is not None and self._nothing_left(writer, now_s, ended_s):
+                return self._end_reason or RIG_LOST
+            if now_s - heartbeat_s >= HEARTBEAT_S and not self._rig_lost:
+                heartbeat_s = now_s
+                self._report(writer)
+            if on_progress is not None:
+                on_progress(self._progress(writer))
+            self._wake.wait(0.2 if ended_s is None else 0.05)
+            self._wake.clear()
+
+    def _nothing_left(self, writer: RecordingWriter, now_s: float, ended_s: float) -> bool:
+        """After the end: whatever may still come has had its time."""
+        if now_s - ended_s > PATIENCE_S:
+            return True
+        # The `end` event can overtake blocks that are being recovered: while a stream is short of it, wait longer.
+        whole = self._end_rows is not None and not len(self._inbox) and not writer.short_of(self._end_rows)
+        quiet_s = now_s - max(ended_s, self._heard_s)
+        return quiet_s > (QUIET_S if whole or self._rig_lost else RECOVERY_S)
+
+    def _report(self, writer: RecordingWriter) -> None:
+        groups = list(writer.table.groups)
+        first = sensor_key("probes" if "probes" in groups or not groups else groups[0])
+        beat = {
+            "name": self._name,
+            "received_index": writer.next_index.get(first, 0),
+            "lost": sum(dict(writer.continuity.lost).values()),
+            "wall_s": self._wall_ns() / NS,
+        }
+        self._client.report(f"{CLIENTS}/{self._name}", encode_document(beat))
+
+    def _progress(self, writer: RecordingWriter) -> Progress:
+        received = dict(writer.continuity.received)
+        first_ns = writer.first_time_ns
+        return Progress(
+            time_s=0.0 if first_ns is None else (writer.last_time_ns - first_ns) / NS,
+            rows=sum(rows for key, rows in received.items() if key.startswith(SENSORS + "/")),
+            lost=sum(dict(writer.continuity.lost).values()),
+            size_bytes=writer.size_bytes,
+            waiting=len(self._inbox),
+        )
+
+    def _finish(self, writer: RecordingWriter, reason: str) -> str:
+        """Close the file; return what the disk had against it."""
+        if isinstance(self._failure, RecordingError):
+            return str(self._failure)
+        try:
+            while self._misses:
+                writer.write_missed(*self._misses.popleft())
+            if reason == self._end_reason and self._end_rows:
+                writer.note_short(self._end_rows, self._wall_ns())
+            writer.finish(reason, notes={"dropped_payloads": str(self._inbox.dropped)})
+        except RecordingError as error:
+            return str(error)
+        return ""
+
+    def _summary(self, writer: RecordingWriter, reason: str, trouble: str) -> Summary:
+        path = writer.part if trouble else writer.path
+        first_ns = writer.first_time_ns or 0
+        return Summary(
+            path=path,
+            reason=reason,
+            error=trouble,
+            first_time_s=first_ns / NS,
+            duration_s=(writer.last_time_ns - first_ns) / NS if writer.first_time_ns is not None else 0.0,
+            rows=dict(writer.continuity.received),
+            lost={key: lost for key, lost in writer.continuity.lost.items() if lost},
+            gaps=len(writer.gaps),
+            missed=dict(writer.missed),
+            dropped=self._inbox.dropped,
+            malformed=writer.malformed,
+            size_bytes=path.stat().st_size,
+        )

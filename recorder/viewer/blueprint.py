@@ -1,0 +1,161 @@
+"""The layout of the viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from recorder.viewer import canvas, contact, orbit, painter, scene3d, series, spectrum
+from recorder.viewer.geometry import Geometry
+from rig.channels import ChannelTable
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+LIVE_S = 10.0
+"""Time series of a live view show this much of the past [s]."""
+_BACKGROUND = (16, 18, 23)
+_SMALL = ("Spin speed [Hz]", "Hammer [N]")
+"""Plots that need little height."""
+
+
+def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Blueprint:
+    """The blueprint of a file's or a live view."""
+    import rerun.blueprint as rrb
+
+    curves = _curve_views(table, geometry, live=live)
+    small = [curves.pop(name) for name in _SMALL if name in curves]
+    motion = rrb.Vertical(
+        rrb.Horizontal(*(_orbit_view(plane, geometry) for plane in orbit.PLANES)),
+        _scene_view(),
+        *([rrb.Horizontal(*small)] if small else []),
+        row_shares=[5.2, 5, 2.6][: 3 if small else 2],
+    )
+    frequency = rrb.Vertical(
+        rrb.BarChartView(
+            origin=f"{spectrum.ROOT}/now",
+            name="Full spectrum of x + jy at the ring [mm] over [Hz]: backward < 0 < forward",
+            plot_legend=rrb.PlotLegend(visible=False),
+        ),
+        rrb.Spatial2DView(
+            origin=spectrum.WATERFALL,
+            name="Waterfall of the full spectrum [dB re 1 um]",
+            visual_bounds=rrb.VisualBounds2D(x_range=[-26, 220], y_range=[-16, spectrum.HEIGHT + 20]),
+            background=_BACKGROUND,
+        ),
+        _contact_view(live=live),
+        rrb.TextLogView(
+            origin=painter.EVENTS,
+            name="Events",
+            columns=rrb.TextLogColumns(timeline_columns=[canvas.SIMULATED], text_log_columns=["loglevel", "body"]),
+        ),
+        row_shares=[3.6, 5, 2.0, 3],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            motion, rrb.Vertical(*curves.values(), name="Time series"), frequency, column_shares=[5.2, 5, 4.6]
+        ),
+        rrb.TimePanel(
+            timeline=canvas.SIMULATED,
+            state="collapsed",
+            play_state="following" if live else "playing",
+            playback_speed=1.0,
+        ),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _orbit_view(plane: str, geometry: Geometry) -> rrb.Spatial2DView:
+    import rerun.blueprint as rrb
+
+    reach = 1.9 * geometry.clearance_mm(plane)
+    return rrb.Spatial2DView(
+        origin=f"{orbit.ROOT}/{plane}",
+        name=f"Orbit at the {plane} [mm]",
+        visual_bounds=rrb.VisualBounds2D(x_range=[-reach, reach], y_range=[-reach, reach]),
+        background=_BACKGROUND,
+    )
+
+
+def _scene_view() -> rrb.Spatial3DView:
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial3DView(
+        origin=scene3d.ROOT,
+        name=f"Rig, displacements x {scene3d.EXAGGERATION:g}",
+        background=_BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            kind="Orbital", position=(-0.32, 0.13, 0.43), look_target=(0.0, -0.004, 0.205), eye_up=(0.0, 1.0, 0.0)
+        ),
+    )
+
+
+def _curve_views(table: ChannelTable, geometry: Geometry, *, live: bool) -> dict[str, rrb.TimeSeriesView]:
+    """One plot a quantity by its title, those that the table has."""
+    plots = {
+        "Displacement at the ring [mm]": [f"{series.ROOT}/probes/ring"],
+        "Displacement at the disk [mm]": [f"{series.ROOT}/probes/disk"],
+        "Reaction of each direction [N]": [series.REACTION],
+        "Force transducers [N]": [f"{series.ROOT}/forces/P"],
+        "Accelerations of the houses [m/s^2]": [
+            f"{series.ROOT}/accelerations/inner",
+            f"{series.ROOT}/accelerations/outer",
+        ],
+        "Spin speed [Hz]": [f"{series.ROOT}/drive/speed"],
+        "Hammer [N]": [f"{series.ROOT}/hammer/hammer"],
+    }
+    ranges = {
+        "Displacement at the ring [mm]": 1.15 * geometry.clearance_mm("ring"),
+        "Displacement at the disk [mm]": 1.15 * geometry.clearance_mm("disk"),
+    }
+    there = series.paths_of(table)
+    planned = {path for paths in plots.values() for path in paths}
+    for path in there:
+        if path not in planned:
+            plots[path.removeprefix(f"{series.ROOT}/")] = [path]
+    return {
+        title: _curve_view(title, [path for path in paths if path in there], reach=ranges.get(title), live=live)
+        for title, paths in plots.items()
+        if set(paths) & set(there)
+    }
+
+
+def _curve_view(title: str, paths: Sequence[str], *, reach: float | None, live: bool) -> rrb.TimeSeriesView:
+    import rerun.blueprint as rrb
+
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[f"+ {path}" for path in paths],
+        name=title,
+        plot_legend=rrb.PlotLegend(corner="LeftTop"),
+        axis_x=_time_axis(live=live),
+        axis_y=None if reach is None else rrb.ScalarAxis(range=(-reach, reach)),
+    )
+
+
+def _contact_view(*, live: bool) -> rrb.StateTimelineView:
+    import rerun.blueprint as rrb
+
+    return rrb.StateTimelineView(
+        origin="/contact",
+        contents=[f"+ {contact.SENSED}", f"+ {contact.TRUTH}"],
+        name="Contact at the ring: sensed by the probes, and the model's truth where it is given",
+        time_view=_time_axis(live=live),
+    )
+
+
+def _time_axis(*, live: bool) -> rrb.TimeAxis:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    if not live:
+        return rrb.TimeAxis(link="LinkToGlobal")
+    past = rr.TimeRange(
+        start=rr.TimeRangeBoundary.cursor_relative(seconds=-LIVE_S),
+        end=rr.TimeRangeBoundary.cursor_relative(seconds=0.0),
+    )
+    return rrb.TimeAxis(view_range=past, zoom_lock=False)

@@ -1,0 +1,63 @@
+"""One rerun recording, with simulated and wall time under everything that is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from recorder.viewer.clock import WallClock
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+APPLICATION = "rig"
+SIMULATED = "simulated_time"
+WALL = "wall_time"
+
+
+def new_stream(name: str) -> rr.RecordingStream:
+    """A recording stream named `name` that is connected to nothing yet."""
+    import rerun as rr
+
+    stream = rr.RecordingStream(APPLICATION)
+    # rerun's own time of logging would stand as a third time line that means nothing to the reader.
+    stream.set_log_time_enabled(False)
+    stream.send_recording_name(name)
+    return stream
+
+
+def pixels(size: float) -> list[float]:
+    """A radius in points of the screen, whatever the zoom: rerun takes negative radii for that."""
+    return [-size]
+
+
+class Canvas:
+    """Logs to a stream; every time is simulated time [s]."""
+
+    def __init__(self, stream: rr.RecordingStream, clock: WallClock | None = None) -> None:
+        self.stream = stream
+        self.clock = clock or WallClock()
+
+    def fix(self, path: str, *what: Any) -> None:
+        """Draw something that holds for all times."""
+        self.stream.log(path, what[0], *what[1:], static=True)
+
+    def draw(self, path: str, time_s: float, *what: Any) -> None:
+        """Draw something that holds from an instant on."""
+        self.stream.set_time(SIMULATED, duration=time_s)
+        wall = self.clock.at(np.array([time_s]))
+        if wall is not None:
+            self.stream.set_time(WALL, timestamp=float(wall[0]))
+        self.stream.log(path, what[0], *what[1:])
+
+    def plot(self, path: str, times_s: np.ndarray, columns: Iterable[Any]) -> None:
+        """Draw many instants at once; `columns` comes from an archetype's `columns`."""
+        import rerun as rr
+
+        indexes = [rr.TimeColumn(SIMULATED, duration=np.round(times_s * 1e9).astype("timedelta64[ns]"))]
+        wall = self.clock.at(times_s)
+        if wall is not None:
+            indexes.append(rr.TimeColumn(WALL, timestamp=np.round(wall * 1e9).astype("datetime64[ns]")))
+        self.stream.send_columns(path, indexes=indexes, columns=columns)

@@ -1,0 +1,28 @@
+"""The last stretch of a signal, at full rate."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+class History:
+    """Keeps the last `capacity` values of a signal."""
+
+    def __init__(self, *, capacity: int, dtype: type = float) -> None:
+        self._capacity = capacity
+        self._rows = np.empty(0, dtype=dtype)
+
+    def add(self, rows: np.ndarray) -> None:
+        """Append values, shape (n,), and forget the oldest beyond the capacity."""
+        self._rows = np.concatenate((self._rows, rows))[-self._capacity :]
+
+    def clear(self) -> None:
+        """Forget everything: what follows does not join what went before."""
+        self._rows = self._rows[:0]
+
+    def last(self, count: int) -> np.ndarray:
+        """The last `count` values, or as many as there are."""
+        return self._rows[max(0, len(self._rows) - count) :]
+
+    def __len__(self) -> int:
+        return len(self._rows)

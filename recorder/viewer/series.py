@@ -1,0 +1,197 @@
+"""Time series: which curves there are, and how many points of them are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from recorder.viewer.canvas import Canvas
+from rig.channels import ChannelTable, Group
+
+ROOT = "/sensors"
+REACTION = "/derived/reaction"
+_NOT_DRAWN = {"keyphasor"}
+"""A pulse of a fraction of a millisecond, once per turn, is a row of meaningless spikes at a viewing rate."""
+
+_COLORS = {
+    "N": (86, 180, 233),
+    "S": (32, 120, 190),
+    "E": (240, 190, 70),
+    "W": (205, 125, 40),
+    "x": (86, 180, 233),
+    "y": (240, 190, 70),
+}
+_PLAIN = (200, 205, 215)
+_SHADES = {"outer": 0.6}
+"""Curves of the outer house stand in the plot of the inner one."""
+
+Window = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Curves that share a plot: one entity with a value per curve.
+
+    Attributes:
+        path: Entity path in the viewer.
+        labels: Legend of each curve, with its unit.
+        colors: RGB of each curve.
+        select: Takes engineering values of the whole group, shape (n, channels), to shape (n, curves).
+    """
+
+    path: str
+    labels: tuple[str, ...]
+    colors: tuple[tuple[int, int, int], ...]
+    select: Callable[[np.ndarray], np.ndarray]
+
+
+def series_of(group: Group) -> list[Series]:
+    """The curves of one sensor group: channels with a common first part of the name stand together."""
+    planes: dict[str, list[int]] = {}
+    for column, channel in enumerate(group.channels):
+        if channel.name not in _NOT_DRAWN:
+            planes.setdefault(channel.name.split("_")[0], []).append(column)
+    found = [
+        Series(
+            path=f"{ROOT}/{group.name}/{plane}",
+            labels=tuple(f"{group.channels[column].name} [{group.channels[column].unit}]" for column in columns),
+            colors=tuple(_color_of(group.channels[column].name) for column in columns),
+            select=_take(columns),
+        )
+        for plane, columns in planes.items()
+    ]
+    if {"P_N", "P_S", "P_E", "P_W"} <= set(group.names):
+        found.append(
+            Series(
+                path=REACTION,
+                labels=("x: P_E - P_W [N]", "y: P_N - P_S [N]"),
+                colors=(_color_of("x"), _color_of("y")),
+                select=reaction_of(group),
+            )
+        )
+    return found
+
+
+def _color_of(name: str) -> tuple[int, int, int]:
+    """The same colour for the same direction in all plots."""
+    red, green, blue = _COLORS.get(name.split("_")[-1], _PLAIN)
+    shade = _SHADES.get(name.split("_")[0], 1.0)
+    return round(shade * red), round(shade * green), round(shade * blue)
+
+
+def paths_of(table: ChannelTable) -> list[str]:
+    """Entity paths of all curves, in table order."""
+    return [series.path for group in table.groups.values() for series in series_of(group)]
+
+
+def reaction_of(group: Group) -> Callable[[np.ndarray], np.ndarray]:
+    """From rows of the force group to the reaction of each direction [N], shape (n, 2): the pairs' differences."""
+    east, west, north, south = (group.names.index(name) for name in ("P_E", "P_W", "P_N", "P_S"))
+    return lambda values: np.stack((values[:, east] - values[:, west], values[:, north] - values[:, south]), axis=1)
+
+
+def _take(columns: list[int]) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda values: values[:, columns]
+
+
+class Envelope:
+    """Keeps the extremes of each bucket of rows, and every row inside the given windows.
+
+    A bucket of `bucket` rows becomes two: the extreme that came first at the bucket's start, the other at its middle,
+    each curve by itself; so peaks survive at their height and within half a bucket of their time.
+    """
+
+    def __init__(self, *, bucket: int) -> None:
+        self._bucket = max(1, bucket)
+        self._times: list[np.ndarray] = []
+        self._values: list[np.ndarray] = []
+
+    def add(self, times_s: np.ndarray, values: np.ndarray) -> None:
+        """Take rows, shapes (n,) and (n, curves)."""
+        self._times.append(times_s)
+        self._values.append(values)
+
+    def take(self, *, until_s: float, windows: list[Window], rest: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Give the points of the buckets that end before `until_s`; with `rest`, also of the unfinished one."""
+        if not self._times:
+            return np.empty(0), np.empty((0, 0))
+        times_s, values = np.concatenate(self._times), np.concatenate(self._values)
+        whole = int(np.searchsorted(times_s, until_s)) // self._bucket
+        rows = whole * self._bucket
+        points = [(times_s[:0], values[:0])]
+        if whole:
+            bucket_times = times_s[:rows].reshape(whole, self._bucket)
+            bucket_values = values[:rows].reshape(whole, self._bucket, -1)
+            full = np.zeros(whole, dtype=bool)
+            for start, end in windows:
+                full |= (bucket_times[:, -1] >= start) & (bucket_times[:, 0] <= end)
+            for part in np.split(np.arange(whole), np.flatnonzero(np.diff(full)) + 1):
+                reduce = _flat if full[part[0]] or self._bucket <= 2 else _extremes
+                points.append(reduce(bucket_times[part], bucket_values[part]))
+        if rest and rows < len(times_s):
+            points.append(_extremes(times_s[None, rows:], values[None, rows:]))
+            rows = len(times_s)
+        self._times, self._values = [times_s[rows:]], [values[rows:]]
+        return np.concatenate([at for at, _ in points]), np.concatenate([value for _, value in points])
+
+
+def _flat(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return times.reshape(-1), values.reshape(times.size, -1)
+
+
+def _extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    low, high = values.min(axis=1), values.max(axis=1)
+    low_first = values.argmin(axis=1) <= values.argmax(axis=1)
+    first, second = np.where(low_first, low, high), np.where(low_first, high, low)
+    at = np.stack((times[:, 0], times[:, times.shape[1] // 2]), axis=1).reshape(-1)
+    return at, np.stack((first, second), axis=1).reshape(at.size, -1)
+
+
+class SeriesPlot:
+    """The curves of one sensor group on a canvas."""
+
+    def __init__(self, canvas: Canvas, group: Group, *, rows_per_s: float) -> None:
+        import rerun as rr
+
+        self._canvas = canvas
+        self._rate_hz = group.rate_hz
+        self._series = series_of(group)
+        self._bucket = max(1, round(2 * group.rate_hz / rows_per_s))
+        self._envelopes = [Envelope(bucket=self._bucket) for _ in self._series]
+        self.points = 0
+        for series in self._series:
+            canvas.fix(
+                series.path,
+                rr.SeriesLines(
+                    names=series.labels,
+                    colors=series.colors,
+                    widths=[1.2] * len(series.labels),
+                    aggregation_policy="MinMax",
+                ),
+            )
+
+    def add(self, times_s: np.ndarray, values: np.ndarray) -> None:
+        """Take consecutive engineering values of the whole group, shape (n, channels)."""
+        for series, envelope in zip(self._series, self._envelopes, strict=True):
+            envelope.add(times_s, series.select(values))
+
+    def flush(self, *, until_s: float, windows: list[Window], rest: bool = False) -> None:
+        """Draw what is complete before `until_s`."""
+        import rerun as rr
+
+        for series, envelope in zip(self._series, self._envelopes, strict=True):
+            times, values = envelope.take(until_s=until_s, windows=windows, rest=rest)
+            if len(times):
+                self._canvas.plot(series.path, times, rr.Scalars.columns(scalars=values))
+                self.points += values.size
+
+    def lift(self, *, at_s: float, windows: list[Window]) -> None:
+        """Draw what is held, then interrupt the curves at `at_s`: rows are missing from here on."""
+        import rerun as rr
+
+        self.flush(until_s=np.inf, windows=windows, rest=True)
+        for series in self._series:
+            hole = np.full((1, len(series.labels)), np.nan)
+            self._canvas.plot(series.path, np.array([at_s]), rr.Scalars.columns(scalars=hole))

@@ -1,0 +1,537 @@
+"""Writes one recording: an MCAP file that survives a kill, holds its own calibration and opens in foreign readers."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+from recorder import schemas
+from recorder.views import View, Views
+from rig.channels import ChannelTable, Group
+from rig.errors import InputError
+from rig.wire import (
+    EDGES,
+    EVENTS,
+    SCHEMAS,
+    SENSORS,
+    TRUTH,
+    Block,
+    Continuity,
+    Gap,
+    decode_block,
+    decode_document,
+    encode_document,
+    schema_of,
+    sensor_key,
+    truth_key,
+)
+
+NS = 1_000_000_000
+
+
+class RecordingError(RuntimeError):
+    """The disk ended the recording; everything written before is kept."""
+
+
+def check_destination(path: Path, *, force: bool = False) -> None:
+    """Refuse a file that cannot become a recording, before anything is subscribed or overwritten.
+
+    Args:
+        path: File to record to.
+        force: An existing file may be replaced.
+
+    Raises:
+        InputError: The name does not end in .mcap, the folder is missing or read-only, or the file exists.
+    """
+    if path.suffix != ".mcap":
+        raise InputError("output", "a file name that ends in .mcap", str(path))
+    if not path.parent.is_dir():
+        raise InputError("output", "in a folder that exists", str(path))
+    if path.is_dir():
+        raise InputError("output", "a file, not a folder", str(path))
+    for taken in (path, part_of(path)):
+        if taken.exists() and not force:
+            raise InputError("output", "a new file (--force replaces one)", f"{taken}, which exists")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError("output", "in a folder that can be written", str(path))
+
+
+def check_view_rate(view_rate_hz: float) -> None:
+    """Refuse a viewing rate [Hz] that means nothing.
+
+    Raises:
+        InputError: It is negative, infinite or no number.
+    """
+    if not 0.0 <= view_rate_hz <= 1e6:
+        raise InputError("view_rate_hz", "between 0 (none) and 1e6", view_rate_hz)
+
+
+def part_of(path: Path) -> Path:
+    """Name of a recording while it is being written."""
+    return path.with_name(path.name + schemas.PART_SUFFIX)
+
+
+@dataclass(slots=True)
+class _Topic:
+    """One topic of the file, with what is needed to derive view messages from it."""
+
+    channel: int
+    schema: str | None = None
+    sequence: int = 0
+    group: Group | None = None
+
+
+class RecordingWriter:
+    """Writes payloads as they came, the view messages derived from them, gaps and clock pairs.
+
+    `log_time` of every message is simulated time [ns], so that plots align with the physics and two recordings with
+    each other; `publish_time` is the wall time of arrival [unix ns]. Each message is thus a clock pair;
+    `recorder/clock` repeats two a second in plain JSON.
+
+    The file is FILE.mcap.part until `finish`, and is flushed to the disk so often that a kill loses less than 0.5 s.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        catalogue: dict[str, Any],
+        parameters: dict[str, Any],
+        scene: dict[str, Any],
+        view_rate_hz: float = 500.0,
+        from_start: bool = False,
+        force: bool = False,
+        sync_every_s: float = 0.25,
+        wall_ns: Callable[[], int] = time.time_ns,
+        monotonic_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Create the file and write calibration, parameters and scene to it.
+
+        Args:
+            path: File name, ends in .mcap.
+            catalogue: The rig's catalogue document: channel table, truth tables, tick rate.
+            parameters: The rig's parameter document.
+            scene: The rig's scene document.
+            view_rate_hz: Rate of the plottable messages [Hz of simulated time]; 0 writes none.
+            from_start: Every stream is meant to be recorded from its row 0: what is missing there is a gap, too.
+            force: Replace an existing file.
+            sync_every_s: Longest time between two flushes to the disk while messages arrive [s].
+            wall_ns: Wall clock [unix ns].
+            monotonic_s: Clock that times the flushes [s].
+
+        Raises:
+            InputError: The destination, the view rate or the catalogue cannot be used.
+        """
+        from mcap.writer import CompressionType, Writer
+
+        check_view_rate(view_rate_hz)
+        check_destination(path, force=force)
+        self.path = path
+        self.part = part_of(path)
+        try:
+            self.table = ChannelTable.model_validate(catalogue["table"])
+            self.tick_rate_hz = round(catalogue["tick_rate_hz"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError("catalogue", "a document with a channel table and a tick rate", str(error)) from None
+        self.view_rate_hz = view_rate_hz
+        self._views = Views(self.table, rate_hz=view_rate_hz)
+        self.continuity = Continuity()
+        self.gaps: list[Gap] = []
+        self.next_index: dict[str, int] = {}
+        """Number of the row that is due next, by key."""
+        self.missed: dict[str, int] = {}
+        """Messages that the transport reported as lost for good, by key."""
+        self.malformed = 0
+        self.first_time_ns: int | None = None
+        self.last_time_ns = 0
+        """Simulated time of the latest block's last row, or of the latest document [ns]."""
+        self.messages = 0
+        self.size_bytes = 0
+        """Size of the file at the last flush."""
+        self._from_start = from_start
+        self._force = force
+        self._truth = catalogue.get("truth", {})
+        self._sync_every_s = sync_every_s
+        self._wall_ns = wall_ns
+        self._monotonic_s = monotonic_s
+        self._synced_s = monotonic_s()
+        self._clock_ns = 0
+        self._topics: dict[str, _Topic] = {}
+        self._schema_ids: dict[str, int] = {}
+        try:
+            self._file = self.part.open("wb" if force else "xb")
+        except OSError as error:
+            raise InputError("output", "a file that can be written", f"{self.part} ({error.strerror})") from None
+        mcap = Writer(self._file, compression=CompressionType.ZSTD, chunk_size=1 << 20)
+        self._mcap: Writer | None = mcap
+        with self._guard():
+            mcap.start(profile="ros2", library="rotor-stator-rig recorder")
+            self._write_head(catalogue, parameters, scene)
+            for group in self.table.groups:
+                self._topic(sensor_key(group))
+            for table in self._truth:
+                self._topic(truth_key(table))
+            for key in (EDGES, EVENTS, schemas.GAPS, schemas.CLOCK):
+                self._topic(key)
+            for view in self._views.all:
+                about = {
+                    "sources": json.dumps([sensor_key(group) for group in view.groups]),
+                    "rate_hz": f"{view_rate_hz:g}",
+                    "filter": "none: every n-th row",
+                    "names": json.dumps(view.names),
+                    "arrays": json.dumps(view.slots),
+                }
+                self._topics[view.topic] = self._channel(view.topic, schemas.JOINT_STATE_SCHEMA, about)
+            if view_rate_hz:
+                self._view_events = self._channel(schemas.VIEW_EVENTS, schemas.LOG_SCHEMA, {"source": EVENTS})
+            self._sync()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if self._mcap is not None:
+            self.finish("closed" if kind is None else f"failed: {error or kind.__name__}")
+
+    @property
+    def closed(self) -> bool:
+        """Nothing more can be written: finished, or ended by the disk."""
+        return self._mcap is None
+
+    def write(self, key: str, payload: bytes, wall_ns: int) -> dict[str, Any] | None:
+        """Write one payload, byte for byte, and what derives from it.
+
+        Args:
+            key: Key that it came on.
+            payload: Its bytes.
+            wall_ns: Wall time of its arrival [unix ns].
+
+        Returns:
+            The document, if it is one.
+
+        Raises:
+            RecordingError: The disk refused; the file is closed and what stood in it is kept.
+        """
+        with self._guard():
+            topic = self._topic(key)
+            document = block = None
+            try:
+                if topic.schema is None:
+                    document = decode_document(payload)
+                else:
+                    block = decode_block(payload, topic.schema)
+            except ValueError:
+                # Not what the key promises: kept as it came, counted, and left to the reader to judge.
+                self.malformed += 1
+                self._add(topic, payload, self.last_time_ns, wall_ns)
+            if document is not None:
+                self._write_document(topic, key, payload, document, wall_ns)
+            elif block is not None:
+                self._write_block(topic, key, payload, block, wall_ns)
+            self._sync_if_due()
+        return document
+
+    def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
+        """Record that the transport lost messages for good.
+
+        Lost rows of block streams show as a step of the row number as well, and are counted there; this is the only
+        trace of lost documents and of blocks that were the last of their stream.
+
+        Args:
+            key: Key of the stream.
+            messages: Number of messages.
+            wall_ns: Wall time of the report [unix ns].
+        """
+        self.missed[key] = self.missed.get(key, 0) + messages
+        with self._guard():
+            self._write_gap({"kind": "messages", "key": key, "index": -1, "size": messages}, wall_ns)
+
+    def short_of(self, rows: dict[str, int]) -> dict[str, int]:
+        """Streams that have not come to the end of what was published.
+
+        Args:
+            rows: Number of the row after the last one published, by key.
+
+        Returns:
+            The same for the streams that were met and are short of it.
+        """
+        due = dict(self.next_index)
+        return {key: end for key, end in rows.items() if due.get(key, end) < end}
+
+    def note_short(self, rows: dict[str, int], wall_ns: int) -> None:
+        """Record as gaps what is missing at the end of streams.
+
+        Args:
+            rows: Number of the row after the last one published, by key.
+            wall_ns: Wall time [unix ns].
+        """
+        with self._guard():
+            for key, end in self.short_of(rows).items():
+                gap = self.continuity.follow(key, end, 0)
+                if gap is not None:
+                    self._note_gap(gap, wall_ns)
+
+    def sync_if_due(self) -> None:
+        """Flush to the disk if the last flush was long enough ago."""
+        with self._guard():
+            self._sync_if_due()
+
+    def finish(self, reason: str, *, notes: dict[str, str] | None = None) -> None:
+        """Write the closing counts, close the file and give it its final name.
+
+        Args:
+            reason: Why the recording ended.
+            notes: More entries for the closing metadata.
+
+        Raises:
+            RecordingError: The disk refused; the .part file is kept.
+        """
+        if self._mcap is None:
+            return
+        with self._guard():
+            for view in self._views.all:
+                self._add_view(view, view.rest(), self._wall_ns())
+            self._mcap.add_metadata("end", self._end_metadata(reason) | (notes or {}))
+            self._mcap.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            if self.path.exists() and not self._force:
+                raise FileExistsError(errno.EEXIST, f"{self.path} was created by someone else meanwhile")
+            self.part.replace(self.path)
+            self._mcap = None
+        with contextlib.suppress(OSError):  # the new name on the disk as well; not every file system can
+            folder = os.open(self.path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+
+    @contextlib.contextmanager
+    def _guard(self) -> Iterator[None]:
+        """Turn a refusal of the disk into one clear error, with the file closed behind it."""
+        if self._mcap is None:
+            raise RecordingError(f"recording {self.path} is closed")
+        try:
+            yield
+        except OSError as error:
+            self._mcap = None
+            with contextlib.suppress(OSError):
+                self._file.close()
+            raise RecordingError(
+                f"recording stopped by the disk: {error.strerror or error}; "
+                f"what was written before is kept in {self.part}"
+            ) from error
+
+    def _write_head(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> None:
+        assert self._mcap is not None
+        now = self._wall_ns()
+        attachments = {"catalogue.json": catalogue, "parameters.json": parameters, "scene.json": scene}
+        self._mcap.add_metadata(
+            "rig",
+            {
+                "format": schemas.FORMAT,
+                "version": schemas.VERSION,
+                "created": datetime.fromtimestamp(now / NS, tz=UTC).isoformat(),
+                "log_time": "simulated time [ns]",
+                "publish_time": "wall time of arrival [unix ns]",
+                "tick_rate_hz": str(self.tick_rate_hz),
+                "scene": str(scene.get("name", "")),
+                "seed": str(scene.get("seed", "")),
+                "parameter_set": str(parameters.get("set", "")),
+                "view_rate_hz": f"{self.view_rate_hz:g}",
+            },
+        )
+        self._mcap.add_attachment(now, 0, "README.txt", "text/plain", self._readme(catalogue).encode())
+        for name, document in attachments.items():
+            text = json.dumps(document, indent=1, allow_nan=False)
+            self._mcap.add_attachment(now, 0, name, "application/json", text.encode())
+
+    def _end_metadata(self, reason: str) -> dict[str, str]:
+        first = 0 if self.first_time_ns is None else self.first_time_ns
+        return {
+            "reason": reason,
+            "ended": datetime.fromtimestamp(self._wall_ns() / NS, tz=UTC).isoformat(),
+            "first_time_s": f"{first / NS:.9f}",
+            "last_time_s": f"{self.last_time_ns / NS:.9f}",
+            "rows": json.dumps(self.continuity.received),
+            "lost_rows": json.dumps({key: lost for key, lost in self.continuity.lost.items() if lost}),
+            "gaps": str(len(self.gaps)),
+            "missed_messages": json.dumps(self.missed),
+            "malformed": str(self.malformed),
+        }
+
+    def _schema_id(self, name: str, encoding: str, definition: bytes) -> int:
+        assert self._mcap is not None
+        if name not in self._schema_ids:
+            self._schema_ids[name] = self._mcap.register_schema(name, encoding, definition)
+        return self._schema_ids[name]
+
+    def _channel(self, topic: str, schema: str | None, metadata: dict[str, str]) -> _Topic:
+        assert self._mcap is not None
+        definitions = {
+            **SCHEMAS,
+            schemas.JOINT_STATE_SCHEMA: schemas.JOINT_STATE_DEFINITION,
+            schemas.LOG_SCHEMA: schemas.LOG_DEFINITION,
+        }
+        if schema is None:
+            name, definition = schemas.DOCUMENT_SCHEMAS.get(topic, schemas.ANY_DOCUMENT)
+            encoding, number = "json", self._schema_id(name, "jsonschema", definition)
+        else:
+            encoding, number = "cdr", self._schema_id(schema, "ros2msg", definitions[schema].encode())
+        return _Topic(channel=self._mcap.register_channel(topic, encoding, number, metadata), schema=schema)
+
+    def _topic(self, key: str) -> _Topic:
+        """The topic of a key, registered with its calibration when it is first met."""
+        topic = self._topics.get(key)
+        if topic is not None:
+            return topic
+        schema = schema_of(key)
+        group = self.table.groups.get(key.removeprefix(SENSORS + "/")) if key.startswith(SENSORS + "/") else None
+        if group is not None:
+            topic = self._channel(key, schema, _calibration(group))
+            topic.group = group
+        elif key == EDGES:
+            about = {"names": '["edge"]', "units": '["ticks after `tick`"]'}
+            topic = self._channel(key, schema, about)
+        elif schema is not None:
+            columns = self._truth.get(key.removeprefix(TRUTH + "/"), {}).get("columns", [])
+            about = {
+                field + "s": json.dumps([column.get(field, "") for column in columns])
+                for field in ("name", "unit", "label")
+            }
+            topic = self._channel(key, schema, about)
+        else:
+            topic = self._channel(key, None, {})
+        self._topics[key] = topic
+        return topic
+
+    def _add(self, topic: _Topic, payload: bytes, time_ns: int, wall_ns: int) -> None:
+        assert self._mcap is not None
+        self._mcap.add_message(topic.channel, time_ns, payload, wall_ns, topic.sequence)
+        topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
+        self.messages += 1
+
+    def _write_block(self, topic: _Topic, key: str, payload: bytes, block: Block, wall_ns: int) -> None:
+        time_ns = max(0, block.tick * NS // self.tick_rate_hz)
+        rows = len(block.values)
+        if self._from_start and key not in self.next_index:
+            self.continuity.follow(key, 0, 0)
+        gap = self.continuity.follow(key, block.index, rows)
+        if gap is not None:
+            self._note_gap(gap, wall_ns, time_ns=time_ns)
+        self.next_index[key] = block.index + rows
+        self._add(topic, payload, time_ns, wall_ns)
+        self.first_time_ns = time_ns if self.first_time_ns is None else min(time_ns, self.first_time_ns)
+        if key != EDGES and block.rate_hz > 0.0:
+            self.last_time_ns = max(self.last_time_ns, time_ns + round((rows - 1) * NS / block.rate_hz))
+        if topic.group is None:
+            return
+        if wall_ns - self._clock_ns >= NS // 2:
+            self._clock_ns = wall_ns
+            pair = {"tick": block.tick, "time_s": time_ns / NS, "wall_s": wall_ns / NS}
+            self._add(self._topics[schemas.CLOCK], encode_document(pair), time_ns, wall_ns)
+        shown = self._views.add(topic.group, block, time_ns)
+        if shown is not None:
+            self._add_view(*shown, wall_ns)
+
+    def _add_view(self, view: View, messages: list[tuple[int, bytes]], wall_ns: int) -> None:
+        topic = self._topics[view.topic]
+        for time_ns, message in messages:
+            self._add(topic, message, time_ns, wall_ns)
+
+    def _write_document(self, topic: _Topic, key: str, payload: bytes, document: dict[str, Any], wall_ns: int) -> None:
+        tick = document.get("tick")
+        time_ns = max(0, tick * NS // self.tick_rate_hz) if isinstance(tick, int) else self.last_time_ns
+        self._add(topic, payload, time_ns, wall_ns)
+        if key == EVENTS and self.view_rate_hz:
+            level, text = schemas.event_text(document)
+            self._add(self._view_events, schemas.encode_log(time_ns, level, key, text), time_ns, wall_ns)
+
+    def _note_gap(self, gap: Gap, wall_ns: int, *, time_ns: int | None = None) -> None:
+        self.gaps.append(gap)
+        about = {"kind": "rows", "key": gap.key, "index": gap.index, "size": gap.size}
+        self._write_gap(about, wall_ns, time_ns=time_ns)
+
+    def _write_gap(self, about: dict[str, Any], wall_ns: int, *, time_ns: int | None = None) -> None:
+        at_ns = self.last_time_ns if time_ns is None else time_ns
+        document = {**about, "time_s": at_ns / NS, "wall_s": wall_ns / NS}
+        self._add(self._topics[schemas.GAPS], encode_document(document), at_ns, wall_ns)
+
+    def _sync_if_due(self) -> None:
+        if self._monotonic_s() - self._synced_s >= self._sync_every_s:
+            self._sync()
+
+    def _sync(self) -> None:
+        assert self._mcap is not None
+        self._mcap.flush()
+        os.fsync(self._file.fileno())
+        self.size_bytes = self._file.tell()
+        self._synced_s = self._monotonic_s()
+
+    def _readme(self, catalogue: dict[str, Any]) -> str:
+        lines = [_README]
+        for group in self.table.groups.values():
+            lines.append(f"\n{sensor_key(group.name)}: {group.title}; {group.rate_hz} Hz")
+            lines += [
+                f"  {channel.name} [{channel.unit}] = counts * {channel.scale:.9g} + {channel.offset:.9g}"
+                f"   (volts = counts * {channel.lsb_v:.9g}; {channel.sensitivity_v:g} V per {channel.unit}, "
+                f"{channel.bias_v:g} V at 0)   {channel.label}"
+                for channel in group.channels
+            ]
+        for table, about in self._truth.items():
+            lines.append(f"\n{truth_key(table)}: {about.get('rate_hz', '?')} Hz")
+            lines += [
+                f"  {column.get('name', '?')} [{column.get('unit', '?')}]   {column.get('label', '')}"
+                for column in about.get("columns", [])
+            ]
+        reference = catalogue.get("reference", {})
+        lines += [f"\n{name}: {text}" for name, text in reference.items()]
+        return "\n".join(lines) + "\n"
+
+
+def _calibration(group: Group) -> dict[str, str]:
+    """Channel metadata: one JSON list a property, in column order."""
+    channels = group.channels
+    lists = {
+        "names": [channel.name for channel in channels],
+        "units": [channel.unit for channel in channels],
+        "scales": [channel.scale for channel in channels],
+        "offsets": [channel.offset for channel in channels],
+        "volts_per_count": [channel.lsb_v for channel in channels],
+        "labels": [channel.label for channel in channels],
+    }
+    about = {name: json.dumps(values) for name, values in lists.items()}
+    return {**about, "rate_hz": str(group.rate_hz), "formula": "value [unit] = counts * scale + offset"}
+
+
+_README = """\
+A recording of the virtual rotor-stator rig.
+
+log_time is simulated time in ns, publish_time the wall time of arrival in unix ns.
+
+rig/sensors/GROUP: rig_msgs/msg/SampleBlock (ROS 2 CDR, its definition is in the file). int32 ADC counts, row after row,
+    `columns` values a row, `rate_hz` rows a second; the first is number `index`, at `tick` / `tick_rate_hz` seconds.
+    value = counts * scale + offset, from the channel's metadata (JSON lists in column order) or the table below.
+rig/sensors/keyphasor_edges: rig_msgs/msg/TruthBlock of one column; edges at (`tick` + value) / `tick_rate_hz` seconds.
+rig/truth/TABLE: rig_msgs/msg/TruthBlock, float64 rows of the model's true state; units in the channel's metadata.
+rig/events, rig/status: JSON, as the rig published them.
+recorder/gaps: JSON, what never arrived: `size` rows from number `index` on, or `size` messages (kind "messages").
+    No message there means that nothing was lost.
+recorder/clock: JSON, pairs of simulated and wall time.
+view/GROUP+GROUP: sensor_msgs/msg/JointState in engineering units at the viewing rate, every n-th row without a filter:
+    for plots only. Lengths stand in `position`, forces in `effort`, all else in `velocity`; nan elsewhere.
+view/events: rcl_interfaces/msg/Log of rig/events.
+
+Attachments: catalogue.json (channel table with calibration), parameters.json, scene.json.
+Metadata "rig" opens the file; metadata "end" closes it with the end reason and the counts.
+A file without "end" was cut off; what stands in it is good.
+"""

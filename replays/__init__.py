@@ -1,0 +1,1 @@
+"""What is made of runs and recordings: verdicts, figures, exports."""

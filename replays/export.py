@@ -1,0 +1,237 @@
+"""Runs as files for other tools: MCAP, Parquet, CSV, by the suffix.
+
+Tables have one row a sample: `time [s]`, every signal of the model as `truth.NAME [unit]` (SI), and every sensor as
+`NAME [unit]`. A file is written beside its place and moved there when it is whole.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from rig import wire
+from rig.errors import InputError
+from rig.kernels.signals import ROW
+from rig.simulation import Frame, Simulation
+
+SUFFIXES = (".mcap", ".parquet", ".csv")
+
+
+class RunWriter(Protocol):
+    """Takes the frames of one run, in order; whole on a clean exit, nothing left behind on an error."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def write(self, frame: Frame) -> None:
+        """Take the next frame."""
+        ...
+
+
+def check_output(path: Path, *, force: bool) -> None:
+    """Refuse a file that cannot be written, before anything is simulated.
+
+    Raises:
+        InputError: Another suffix, a folder that is missing or read-only, or an existing file.
+    """
+    if path.suffix not in SUFFIXES:
+        raise InputError("output", f"a file name that ends in {', '.join(SUFFIXES)}", str(path))
+    if not path.parent.is_dir():
+        raise InputError("output", "in a folder that exists", str(path))
+    if path.is_dir() or (path.exists() and not force):
+        raise InputError("output", "a new file (--force replaces one)", f"{path}, which exists")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError("output", "in a folder that can be written", str(path))
+
+
+def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> RunWriter:
+    """The writer that the suffix asks for."""
+    check_output(path, force=force)
+    if path.suffix == ".mcap":
+        return _McapRun(path, simulation, force=force)
+    return _ParquetRun(path, simulation) if path.suffix == ".parquet" else _CsvRun(path, simulation)
+
+
+def table_columns(simulation: Simulation) -> list[str]:
+    """Column headings of a table of a run."""
+    channels = simulation.table.channels.values()
+    return [
+        "time [s]",
+        *(f"truth.{signal.name} [{signal.unit}]" for signal in ROW),
+        *(f"{channel.name} [{channel.unit}]" for channel in channels),
+    ]
+
+
+def table_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
+    """The rows of one frame, shape (samples, columns)."""
+    rate = simulation.scene.sensors.rate_hz
+    every = simulation.tick_rate_hz // rate // simulation.row_ticks
+    truth = frame.rows[::every]
+    first = frame.tick * rate // simulation.tick_rate_hz
+    times = (first + np.arange(len(truth)))[:, None] / rate
+    sensors = [simulation.table.groups[group].engineering(block.values) for group, block in frame.samples.items()]
+    return np.hstack([times, truth, *sensors])
+
+
+class _Background:
+    """One thread that formats and writes while the simulation goes on, a few frames behind at most."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._due: deque[Future[None]] = deque()
+
+    def call(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Do this next; raises what an earlier call raised."""
+        self._due.append(self._pool.submit(function, *arguments))
+        while len(self._due) > 4:
+            self._due.popleft().result()
+
+    def finish(self) -> None:
+        """Wait for everything; raises what a call raised."""
+        self._pool.shutdown()
+        while self._due:
+            self._due.popleft().result()
+
+
+class _TableRun:
+    """A table that grows frame by frame in a file of its own until it is whole."""
+
+    def __init__(self, path: Path, simulation: Simulation) -> None:
+        self.path = path
+        self.part = path.with_name(path.name + ".part")
+        self.simulation = simulation
+        self._background = _Background()
+
+    def __enter__(self) -> Self:
+        self._begin()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        whole = False
+        try:
+            self._background.finish()
+            self._end()
+            whole = kind is None
+        finally:
+            if whole:
+                self.part.replace(self.path)
+            else:
+                self.part.unlink(missing_ok=True)
+
+    def write(self, frame: Frame) -> None:
+        """Take the next frame."""
+        self._background.call(self._append, table_rows(self.simulation, frame))
+
+    def _begin(self) -> None:
+        raise NotImplementedError
+
+    def _append(self, rows: np.ndarray) -> None:
+        raise NotImplementedError
+
+    def _end(self) -> None:
+        raise NotImplementedError
+
+
+class _CsvRun(_TableRun):
+    def _begin(self) -> None:
+        from pyarrow import csv
+
+        self._schema = _schema(self.simulation)
+        self._writer = csv.CSVWriter(self.part, self._schema)
+
+    def _append(self, rows: np.ndarray) -> None:
+        self._writer.write_table(_table(rows, self._schema))
+
+    def _end(self) -> None:
+        self._writer.close()
+
+
+class _ParquetRun(_TableRun):
+    def _begin(self) -> None:
+        from pyarrow import parquet
+
+        self._schema = _schema(self.simulation)
+        # Dictionaries would be tried in vain on every column of a continuous quantity.
+        self._writer = parquet.ParquetWriter(self.part, self._schema, compression="lz4", use_dictionary=False)
+
+    def _append(self, rows: np.ndarray) -> None:
+        self._writer.write_table(_table(rows, self._schema))
+
+    def _end(self) -> None:
+        self._writer.close()
+
+
+def _schema(simulation: Simulation) -> Any:
+    import pyarrow
+
+    return pyarrow.schema([(name, pyarrow.float64()) for name in table_columns(simulation)])
+
+
+def _table(rows: np.ndarray, schema: Any) -> Any:
+    import pyarrow
+
+    return pyarrow.Table.from_arrays([pyarrow.array(np.ascontiguousarray(column)) for column in rows.T], schema=schema)
+
+
+class _McapRun:
+    """The same file as `rig record` would have made, with the simulated clock for the wall clock."""
+
+    def __init__(self, path: Path, simulation: Simulation, *, force: bool) -> None:
+        self.path, self.simulation, self._force = path, simulation, force
+        self._background = _Background()
+
+    def __enter__(self) -> Self:
+        from recorder.writer import RecordingWriter
+
+        self._wall_ns = time.time_ns()
+        simulation = self.simulation
+        self._writer = RecordingWriter(
+            self.path, catalogue=simulation.catalogue(), parameters=simulation.parameters_document(),
+            scene=simulation.scene_document(), force=self._force,
+        )  # fmt: skip
+        self._event({"event": "start", "scene": simulation.scene.name, "seed": simulation.scene.seed, "pace": "none"})
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        reason = "completed" if kind is None else f"failed: {error or kind.__name__}"
+        self._background.finish()
+        if not self._writer.closed:
+            self._event({"event": "end", "reason": reason})
+            self._writer.finish(reason)
+
+    def write(self, frame: Frame) -> None:
+        """Take the next frame."""
+        self._background.call(self._write, frame)
+
+    def _write(self, frame: Frame) -> None:
+        for event in frame.events:
+            self._event(event)
+        blocks = {wire.sensor_key(group): block for group, block in frame.samples.items()}
+        blocks |= {wire.truth_key(table): block for table, block in frame.truth.items()}
+        if frame.edges is not None:
+            blocks[wire.EDGES] = frame.edges
+        for key, block in blocks.items():
+            self._writer.write(key, wire.encode_block(block), self._wall(frame.tick))
+
+    def _event(self, event: dict[str, Any]) -> None:
+        tick = self.simulation.tick
+        stamp = {"tick": tick, "time_s": tick / self.simulation.tick_rate_hz}
+        self._writer.write(wire.EVENTS, wire.encode_document({**stamp, **event}), self._wall(stamp["tick"]))
+
+    def _wall(self, tick: int) -> int:
+        return self._wall_ns + tick * 1_000_000_000 // self.simulation.tick_rate_hz

@@ -1,0 +1,97 @@
+"""What the probes and transducers say about a whirl: frequency, sense, rolling, reactions, from samples alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from recorder.reader import Recording
+from rig.errors import InputError
+
+
+@dataclass(frozen=True)
+class WhirlFigures:
+    """Figures of a stretch of a recording in which the shaft whirls.
+
+    Attributes:
+        from_s: Start of the stretch, simulated [s].
+        to_s: End [s].
+        frequency_hz: Phase slope of x + j y of the shaft in the ring; negative is backward [Hz].
+        disk_frequency_hz: The same from the probes at the disk [Hz].
+        spin_hz: Mean spin from the keyphasor's edges [Hz].
+        radius_m: Mean radius of the orbit in the ring [m].
+        law_hz: -spin R_S / radius, rolling without slip [Hz].
+        slip: 1 - frequency / law; 0 rolls.
+        reaction_x_n: Amplitude of P_E - P_W, half of peak to peak [N].
+        reaction_y_n: Amplitude of P_N - P_S [N].
+    """
+
+    from_s: float
+    to_s: float
+    frequency_hz: float
+    disk_frequency_hz: float
+    spin_hz: float
+    radius_m: float
+    law_hz: float
+    slip: float
+    reaction_x_n: float
+    reaction_y_n: float
+
+
+def whirl_frequency(times_s: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
+    """Slope of the phase of x + j y about the orbit's centre [Hz]; forward (with the spin, from x to y) is positive.
+
+    Unlike the bin of a spectrum this has no resolution limit; the orbit must go round its centre.
+
+    Args:
+        times_s: Times [s], shape (n,).
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+    """
+    orbit = (x - x.mean()) + 1j * (y - y.mean())
+    return float(np.polyfit(times_s - times_s[0], np.unwrap(np.angle(orbit)), 1)[0] / (2 * math.pi))
+
+
+def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigures:
+    """Work out the figures of a stretch.
+
+    Raises:
+        InputError: The stretch holds too few samples or turns.
+    """
+    probes, forces = recording.samples("probes"), recording.samples("forces")
+    kept = (probes.times_s >= from_s) & (probes.times_s < to_s)
+    edges = recording.edges()
+    edges = edges[(edges >= from_s) & (edges < to_s)]
+    if kept.sum() < 1000 or len(edges) < 3:
+        raise InputError(
+            "recording", "long enough to judge a whirl (three turns of the shaft)", f"{from_s:.2f} to {to_s:.2f} s"
+        )
+    times = probes.times_s[kept]
+    ring_x, ring_y = (probes.column(name)[kept] * 1e-3 for name in ("ring_x", "ring_y"))
+    frequency = whirl_frequency(times, ring_x, ring_y)
+    spin = (len(edges) - 1) / (edges[-1] - edges[0])
+    radius = float(np.hypot(ring_x, ring_y).mean())
+    law = -spin * shaft_radius_m(recording) / radius
+    held = (forces.times_s >= from_s) & (forces.times_s < to_s)
+    pairs = [forces.column(a)[held] - forces.column(b)[held] for a, b in (("P_E", "P_W"), ("P_N", "P_S"))]
+    return WhirlFigures(
+        from_s=from_s, to_s=to_s, frequency_hz=frequency,
+        disk_frequency_hz=whirl_frequency(times, probes.column("disk_x")[kept], probes.column("disk_y")[kept]),
+        spin_hz=float(spin), radius_m=radius, law_hz=float(law), slip=1.0 - frequency / law,
+        reaction_x_n=float(np.ptp(pairs[0]) / 2), reaction_y_n=float(np.ptp(pairs[1]) / 2),
+    )  # fmt: skip
+
+
+def parameter_si(recording: Recording, key: str) -> float:
+    """A parameter of the recorded rig in SI."""
+    from rig.parameters import SI
+
+    entry = recording.parameters["values"][key]
+    return float(entry.get("resolved", entry["value"])) * SI[entry["unit"]]
+
+
+def shaft_radius_m(recording: Recording) -> float:
+    """R_S of the recorded rig [m]."""
+    return parameter_si(recording, "shaft.radius")

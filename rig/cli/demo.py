@@ -1,0 +1,181 @@
+"""`rig demo`: the whole rig once, from service to verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    import subprocess
+
+    from replays.verdict import Verdict
+
+    Process = subprocess.Popen[bytes]
+
+_STABLE_S = 3.0
+_READY_S = 300.0
+"""How long the first start on a slow machine may compile [s]."""
+_CLOSE_S = 60.0
+"""How long service and recorder may take to close [s]."""
+
+
+def demo(
+    *,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="New folder for the files.")
+    ] = None,
+    speed_hz: Annotated[float, typer.Option(min=1.0, max=15.0, help="Spin speed, in Hz.")] = 6.2,
+    whirl_s: Annotated[float, typer.Option(min=3.0, max=600.0, help="How long it whirls, in s.")] = 15.0,
+) -> None:
+    """Start the service, record, hit, let it whirl, stop; then judge the recording and draw it. About half a minute."""
+    import time
+    from datetime import datetime
+
+    from rig.errors import InputError
+
+    folder = output or Path(f"rig-demo-{datetime.now().astimezone():%Y%m%d-%H%M%S}")
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise InputError("--output", "a new folder", str(folder)) from None
+    except OSError as error:
+        raise InputError("--output", "a folder that can be made", f"{folder} ({error.strerror})") from None
+    begin = time.perf_counter()
+
+    def say(text: str) -> None:
+        typer.echo(f"[{time.perf_counter() - begin:5.1f} s] {text}")
+
+    file, picture = folder / "demo.mcap", folder / "demo.png"
+    _record_session(file, speed_hz=speed_hz, whirl_s=whirl_s, say=say)
+
+    say("reading the recording")
+    from recorder.reader import Recording
+    from replays.figure import draw
+    from replays.verdict import judge
+
+    recording = Recording.open(file)
+    verdict = judge(recording)
+    draw(recording, picture)
+    _show(verdict)
+    say(f"verdict: {'good' if verdict.good else 'NOT GOOD'}")
+    typer.echo(f"\nrecording   {file}\npicture     {picture}\nlook at it  rig view {file}   (or: rerun {file})")
+    if not verdict.good:
+        raise typer.Exit(1)
+
+
+def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callable[[str], None]) -> None:
+    """Service and recorder in processes of their own, commanded from here, until the file is closed."""
+    import time
+
+    from drivers.console import Console
+    from rig.kernels import compiled_before
+    from rig.transport.zenoh import ZenohClient
+
+    endpoint = f"127.0.0.1:{_free_port()}"
+    with _processes(file.with_name("processes.log")) as start:
+        say(f"starting the service: rig run stable-run --set drive.speed_hz={speed_hz:g} --listen {endpoint}")
+        if not compiled_before():
+            say("its kernels are compiled first, once on this machine (about half a minute)")
+        arguments = ("--set", f"drive.speed_hz={speed_hz}", "--duration-s", "3600", "--listen", endpoint)
+        service = start("run", "stable-run", *arguments)
+        _wait_until_up(endpoint, service)
+        recorder = start("record", "-o", str(file), "--connect", endpoint, "--history")
+        with ZenohClient(endpoint, wait_s=5.0) as client:
+            console = Console(client, name="rig demo")
+            say(f"service up, recording to {file}; spinning contact-free for {_STABLE_S:g} s")
+            time.sleep(_STABLE_S)
+            blow = console.hammer(force_n=100.0, duration_ms=5.0, direction="x")
+            say(
+                f"hammer: 100 N for 5 ms along x; command {blow.id}, takes effect at {blow.time_s:.3f} s of simulated time"
+            )
+            for _ in range(3):
+                time.sleep(whirl_s / 3)
+                status = console.status()
+                late = status["lateness_ms"]
+                say(
+                    f"spin {status['spin_hz']:.3f} Hz; blocks late by {late['p50']:.3f} ms (p50), {late['p99']:.3f} ms (p99)"
+                )
+            console.stop()
+        say("stopped; the recorder closes its file")
+        service.wait(_CLOSE_S)
+        if recorder.wait(_CLOSE_S) != 0:
+            raise typer.Exit(_complain(file.with_name("processes.log"), "the recorder failed"))
+
+
+@contextmanager
+def _processes(log: Path) -> Iterator[Callable[..., Process]]:
+    """Starts `rig` commands that write to a log and are ended with the block, whatever happens in it."""
+    import subprocess
+    import sys
+
+    started: list[Process] = []
+    file: IO[str] = log.open("w", encoding="utf-8")
+
+    def start(*arguments: str) -> Process:
+        command = [sys.executable, "-m", "rig.cli.main", *arguments]
+        started.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=file))
+        return started[-1]
+
+    try:
+        yield start
+    finally:
+        for process in reversed(started):
+            if process.poll() is None:
+                process.terminate()
+                try:
+                    process.wait(10)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+        file.close()
+
+
+def _wait_until_up(endpoint: str, service: Process) -> None:
+    import time
+
+    from rig.transport import NoReplyError
+    from rig.transport.zenoh import ZenohClient
+    from rig.wire import STATUS
+
+    deadline = time.monotonic() + _READY_S
+    while service.poll() is None and time.monotonic() < deadline:
+        try:
+            with ZenohClient(endpoint) as client:
+                client.request(STATUS)
+            return
+        except NoReplyError:
+            time.sleep(0.2)
+    raise typer.Exit(
+        _complain(None, f"the service did not come up (status {service.poll()}); see processes.log in the folder")
+    )
+
+
+def _complain(log: Path | None, text: str) -> int:
+    typer.echo(f"rig: {text}" + (f"; see {log}" if log else ""), err=True)
+    return 1
+
+
+def _free_port() -> int:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _show(verdict: Verdict) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="Verdict, from the recorded samples", title_justify="left", header_style="bold")
+    for heading in ("quantity", "measured", "expected", ""):
+        table.add_column(heading)
+    marks = {True: "[green]good[/]", False: "[bold red]NOT GOOD[/]", None: ""}
+    for row in verdict.rows:
+        table.add_row(row.quantity, row.measured, row.expected, marks[row.good])
+    options: dict[str, Any] = {} if Console().is_terminal else {"width": 150}
+    Console(**options).print(table)

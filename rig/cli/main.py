@@ -1,0 +1,82 @@
+"""Composition of the `rig` command: which subcommands there are, and how errors reach the user."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import typer
+
+from rig.cli import (
+    bench,
+    demo,
+    hammer,
+    info,
+    keys,
+    params,
+    record,
+    release,
+    run,
+    scenes,
+    simulate,
+    speed,
+    status,
+    step,
+    stop,
+    view,
+)
+from rig.errors import InputError
+
+# Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
+_UsageError: Any = typer.BadParameter.__base__
+
+app = typer.Typer(
+    name="rig",
+    help="A virtual rotor-stator test rig: simulate, serve, hit, record, view and judge it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+_PANELS: dict[str, dict[str, Any]] = {
+    "Start here": {"demo": demo.demo, "scenes": scenes.scenes, "params": params.params, "keys": keys.keys},
+    "The rig as a service": {
+        "run": run.run, "hammer": hammer.hammer, "speed": speed.speed, "release": release.release, "step": step.step,
+        "status": status.status, "stop": stop.stop,
+    },
+    "Recordings and pictures": {"record": record.record, "view": view.view, "info": info.info},
+    "Without a clock": {"simulate": simulate.simulate, "bench": bench.bench},
+}  # fmt: skip
+for _panel, _commands in _PANELS.items():
+    for _name, _function in _commands.items():
+        # A negative value such as `rig speed -1` is a value, not an option: the rig explains what is wrong with it.
+        _settings = {"ignore_unknown_options": True} if _name == "speed" else {}
+        app.command(_name, rich_help_panel=_panel, context_settings=_settings)(_function)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command: wrong input is one line on stderr and exit status 2, Ctrl-C is 130, a failed verdict is 1."""
+    try:
+        code = app(args=arguments, standalone_mode=False)
+    except InputError as error:
+        _fail(str(error))
+    except _UsageError as error:
+        command = error.ctx.command_path if error.ctx is not None else "rig"
+        _fail(f"{error.format_message()} (see `{command} --help`)")
+    except (typer.Abort, KeyboardInterrupt):
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        # The reader of our output has gone (`rig params | head`): nothing is wrong.
+        sys.stderr.close()
+        sys.exit(141)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str) -> None:
+    print("rig: " + " ".join(message.split()), file=sys.stderr)
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

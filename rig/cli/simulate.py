@@ -1,0 +1,64 @@
+"""`rig simulate`: a scene without a clock, into a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def simulate(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")],
+    *,
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .mcap, .parquet or .csv.")],
+    parameters: Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
+    ] = None,
+    engine: Annotated[str | None, typer.Option(help="Integration method.")] = None,
+    duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")] = None,
+    force: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
+) -> None:
+    """Simulate a scene as fast as it goes and write every state, force and sensor to a file, named and with units."""
+    import sys
+    import time
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from replays.export import check_output, writer_for
+    from rig.cli.run import scene_overrides
+    from rig.scenes import load_scene
+
+    check_output(output, force=force)
+    overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
+    loaded = load_scene(scene, overrides)
+
+    from rig.kernels import compiled_before
+    from rig.offline import frames
+    from rig.simulation import Simulation
+
+    if not compiled_before():
+        typer.echo("compiling the kernels, once on this machine (about 20 s) ...", err=True)
+    simulation = Simulation(loaded)
+    simulation.warm_up()
+    with (
+        Progress(console=Console(file=sys.stderr), transient=True) as progress,
+        writer_for(output, simulation, force=force) as writer,
+    ):
+        begin = time.perf_counter()
+        bar = progress.add_task(scene, total=simulation.end_tick)
+        for frame in frames(simulation):
+            writer.write(frame)
+            progress.update(bar, completed=simulation.tick)
+    seconds = simulation.tick / simulation.tick_rate_hz
+    health = simulation.health()
+    typer.echo(
+        f"{output}: {seconds:g} s simulated, {seconds / (time.perf_counter() - begin):.1f} times real time with the file, "
+        f"{output.stat().st_size / 1e6:.1f} MB; {health['contacts']} contacts, "
+        f"energy residual {health['energy']['residual_j']:.1e} J of {health['energy']['dissipated_j']:.3g} J dissipated"
+    )
+    for warning in health["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)

@@ -1,0 +1,124 @@
+"""The page on keys, messages and units, made from the channel table and the codec: `rig keys`, committed as rig/KEYS.md."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rig import wire
+from rig.channels import default_table
+from rig.kernels import signals
+from rig.scenes import COMMANDS, SensorChoice
+
+_DOCUMENTS = {
+    wire.EVENTS: "published: `event` (start, command, hammer, speed, release, warning, end), `tick`, `time_s`, `wall_s` and the event's own fields; `end` carries `reason` and is the last",
+    wire.STATUS: "published twice a second and on request: state, pace, lateness, overruns, real-time factor, queue, clients, spin, energy residual, warnings",
+    wire.CATALOGUE: "on request: the channel table with calibration, truth tables with units",
+    wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",
+    wire.SCENE: "on request: the scene as it runs, with its seed",
+    f"{wire.CLIENTS}/NAME": "sent by clients twice a second, shown in the status: how far they have come",
+}
+_OTHER_COMMANDS = {"stop": "no fields; ends the run", "step": "`ticks`: how far to go; only at `--pace lockstep`"}
+
+
+def page() -> str:
+    """The page as Markdown."""
+    table = default_table()
+    truth_hz = SensorChoice().truth_rate_hz
+    lines = [
+        "# Keys, messages and units",
+        "",
+        "Made from the channel table by `rig keys --markdown > rig/KEYS.md`; do not edit by hand.",
+        "",
+        "Everything travels over zenoh on 127.0.0.1 (port 7460 by default); no router, no multicast. Simulated time is an integer tick of 1 us.",
+        "",
+        "## Blocks",
+        "",
+        f"A block is one CDR message (little-endian). `{wire.SAMPLE_SCHEMA}` carries ADC counts, `{wire.TRUTH_SCHEMA}` values of the model:",
+        "",
+        "```",
+        *wire.SCHEMAS[wire.SAMPLE_SCHEMA].splitlines(),
+        "```",
+        "",
+        f"In `{wire.TRUTH_SCHEMA}` the last field is `float64[] values`. A step of `index` other than the rows of the block before is a gap.",
+        "volts = counts x 2 adc_v / 2^adc_bits; value = (volts - bias) / sensitivity. One dimension lies behind the other: row after row.",
+        "",
+    ]
+    for group in table.groups.values():
+        lines += [
+            f"### `{wire.sensor_key(group.name)}`: {group.title}",
+            "",
+            f"{group.rate_hz} Hz by default. Values: {group.channels[0].kind}.",
+            "",
+            "| column | channel | unit | V per unit | bias, V | range, V | low-pass, Hz | high-pass, Hz | noise, V rms | converter | what |",
+            "|---|---|---|---|---|---|---|---|---|---|---|",
+            *(
+                f"| {column} | `{c.name}` | {c.unit} | {c.sensitivity_v:g} | {c.bias_v:g} | {c.range_v[0]:g} to {c.range_v[1]:g} | "
+                f"{c.bandwidth_hz:g} | {c.highpass_hz:g} | {c.noise_v:g} | {c.adc_bits} bit, +-{c.adc_v:g} V | {c.label} |"
+                for column, c in enumerate(group.channels)
+            ),
+            "",
+        ]
+    lines += [
+        f"### `{wire.EDGES}`: exact keyphasor edges",
+        "",
+        f"`{wire.TRUTH_SCHEMA}` of one column: ticks from the block's `tick`, with their fraction. `index` counts edges; no block where there was none.",
+        "",
+        "## Truth",
+        "",
+        "What no instrument could know, on keys of its own: for method developers, never for a DAQ.",
+        "",
+    ]
+    known = {signal.name: signal for signal in signals.ROW}
+    for name, columns in signals.TRUTH.items():
+        lines += [
+            f"### `{wire.truth_key(name)}`",
+            "",
+            f"{truth_hz} Hz by default.",
+            "",
+            "| column | name | unit | what |",
+            "|---|---|---|---|",
+        ]
+        lines += [
+            f"| {n} | `{column}` | {known[column].unit} | {known[column].label} |" for n, column in enumerate(columns)
+        ]
+        lines.append("")
+    lines += [
+        "## Documents (JSON)",
+        "",
+        "| key | what |",
+        "|---|---|",
+        *(f"| `{key}` | {what} |" for key, what in _DOCUMENTS.items()),
+        "",
+    ]
+    lines += [
+        "## Commands",
+        "",
+        'Requests are JSON objects on their key; the reply is `{"accepted": true, "id", "command", "tick", "time_s"}` with the simulated time at which the '
+        'command takes effect, or `{"accepted": false, "error"}` with the limit in the text. `from` may name the sender.',
+        "",
+        "| key | fields |",
+        "|---|---|",
+    ]
+    for name, command in COMMANDS.items():
+        fields = "; ".join(_field(key, field) for key, field in command.model_fields.items() if key != "command")
+        lines.append(f"| `{wire.command_key(name)}` | {fields or 'no fields'} |")
+    lines += [f"| `{wire.command_key(name)}` | {what} |" for name, what in _OTHER_COMMANDS.items()]
+    lines += ["", f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.", ""]
+    return "\n".join(lines)
+
+
+def _field(key: str, field: Any) -> str:
+    limits = {
+        kind: value
+        for item in field.metadata
+        for kind in ("ge", "le")
+        if (value := getattr(item, kind, None)) is not None
+    }
+    text = f"`{key}`"
+    if limits:
+        text += " " + " ".join(f"{'from' if kind == 'ge' else 'to'} {value:g}" for kind, value in limits.items())
+    if key == "direction":
+        text += " x, y, -x, -y, or degrees from x toward y"
+    if not field.is_required():
+        text += f" (default {field.default})"
+    return text

@@ -1,0 +1,267 @@
+"""The recorder as a process of its own, over zenoh on loopback, with a publisher in the place of the rig."""
+
+from __future__ import annotations
+
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from recorder.reader import Recording
+from rig.transport.zenoh import ZenohServer
+from rig.wire import (
+    CLIENTS,
+    EVENTS,
+    Block,
+    decode_block,
+    decode_document,
+    encode_block,
+    encode_document,
+    schema_of,
+    sensor_key,
+)
+
+from ..unit.recorder_stream import documents, stream
+
+pytestmark = pytest.mark.wallclock
+PROBES = sensor_key("probes")
+BLOCK_S = 0.01
+CYCLE = list(stream(50))[1:-1]
+"""Half a second of all streams; later halves are the same with other ticks and row numbers."""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _later(key: str, payload: bytes, cycle: int) -> bytes:
+    schema = schema_of(key)
+    if schema is None:
+        return payload
+    block = decode_block(payload, schema)
+    rows = 50 if "edges" in key else 50 * len(block.values)
+    index = block.index + cycle * rows
+    return encode_block(Block(block.tick + cycle * 500_000, index, block.rate_hz, block.tick_rate_hz, block.values))
+
+
+class Publisher:
+    """Publishes at the pace of the wall clock and remembers when it published what."""
+
+    def __init__(self, port: int) -> None:
+        self.server = ZenohServer(f"127.0.0.1:{port}")
+        for key, document in documents().items():
+            self.server.answer(key, lambda _, document=document: encode_document(document))
+        self.beats: list[dict] = []
+        self.server.hear(f"{CLIENTS}/*", lambda _, payload: self.beats.append(decode_document(payload)))
+        self.server.announce()
+        self.sent: dict[str, list[bytes]] = {}
+        self.rows: dict[str, int] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        start_s = time.monotonic()
+        per_block = len(CYCLE) / 50
+        number = 0
+        while not self._stop.is_set():
+            due = (time.monotonic() - start_s) / BLOCK_S * per_block
+            while number < due and not self._stop.is_set():
+                cycle, place = divmod(number, len(CYCLE))
+                key, payload = CYCLE[place]
+                payload = _later(key, payload, cycle)
+                self.sent.setdefault(key, []).append(payload)
+                self.server.publish(key, payload)
+                number += 1
+            self._stop.wait(0.002)
+
+    def blocks(self, key: str = PROBES) -> int:
+        return len(self.sent.get(key, []))
+
+    def end(self) -> None:
+        """End the stream well."""
+        self._stop.set()
+        self._thread.join()
+        rows = {}
+        for key, payloads in self.sent.items():
+            schema = schema_of(key)
+            if schema is not None:
+                block = decode_block(payloads[-1], schema)
+                rows[key] = block.index + len(block.values)
+        tick = self.blocks() * 10_000
+        end = {"event": "end", "tick": tick, "time_s": tick / 1e6, "reason": "completed", "rows": rows}
+        self.server.publish(EVENTS, encode_document(end))
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.server.close()
+
+
+@contextmanager
+def publisher(port: int) -> Iterator[Publisher]:
+    rig = Publisher(port)
+    try:
+        yield rig
+    finally:
+        rig.close()
+
+
+@contextmanager
+def recorder(path: Path, port: int, options: str = "") -> Iterator[subprocess.Popen[str]]:
+    """`rig record` in a process of its own, ended by its own id whatever happens."""
+    code = (
+        "import sys; from pathlib import Path; from rig.cli.record import record; "
+        f"record(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[2],
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def wait_for(condition: Callable[[], bool], limit_s: float = 20.0) -> None:
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+def received(rig: Publisher) -> int:
+    return rig.beats[-1]["received_index"] if rig.beats else 0
+
+
+@pytest.mark.parametrize("history", [False, True])
+def test_a_whole_run_arrives_without_loss(tmp_path, history):
+    port = free_port()
+    path = tmp_path / "run.mcap"
+    with publisher(port) as rig, recorder(path, port, f"history={history}") as process:
+        wait_for(lambda: received(rig) > 0)
+        joined = {key: len(payloads) for key, payloads in rig.sent.items()}
+        wait_for(lambda: rig.blocks() > 150)
+        rig.end()
+        output, errors = process.communicate(timeout=20.0)
+        assert process.returncode == 0, errors
+        assert "ended: completed" in output
+        assert "lost: nothing" in output
+        recording = Recording.open(path)
+        assert recording.complete
+        for key, sent in rig.sent.items():
+            payloads = [payload for _, payload in recording.payloads(key)]
+            assert len(sent) - joined[key] <= len(payloads), key
+            assert payloads == (sent if history else sent[len(sent) - len(payloads) :]), key
+        # The last report lets the rig drop its cache.
+        wait_for(lambda: received(rig) == 200 * rig.blocks())
+
+
+def test_a_killed_recorder_loses_half_a_second_at_most_and_the_rest_reads(tmp_path):
+    port = free_port()
+    rng = random.Random(5)
+    with publisher(port) as rig:
+        for trial in range(4):
+            path = tmp_path / f"run{trial}.mcap"
+            rig.beats.clear()
+            with recorder(path, port) as process:
+                wait_for(lambda: received(rig) > 0)
+                first = rig.blocks()
+                time.sleep(0.3 + rng.random())
+                killed_at = rig.blocks()
+                process.send_signal(signal.SIGKILL)
+                process.wait()
+            assert not path.exists()
+            recording = Recording.open(path.with_name(path.name + ".part"))
+            assert not recording.complete
+            payloads = [payload for _, payload in recording.payloads(PROBES)]
+            start = rig.sent[PROBES].index(payloads[0])
+            assert payloads == rig.sent[PROBES][start : start + len(payloads)]
+            assert start < first
+            lost = killed_at - (start + len(payloads))
+            assert lost <= 0.5 / BLOCK_S + 1, f"trial {trial}: {lost} blocks lost of {killed_at - start}"
+            for key, stream_ in recording.streams.items():
+                assert stream_.lost == 0, key
+
+
+RIG = """
+import sys, threading
+from tests.system.test_recorder_processes import Publisher
+rig = Publisher(int(sys.argv[1]))
+print("ready", flush=True)
+threading.Event().wait()
+"""
+
+
+def test_a_killed_rig_leaves_a_file_that_is_closed_well(tmp_path):
+    port = free_port()
+    path = tmp_path / "run.mcap"
+    rig = subprocess.Popen(
+        [sys.executable, "-c", RIG, str(port)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
+    )
+    try:
+        assert rig.stdout is not None
+        assert rig.stdout.readline() == "ready\n"
+        with recorder(path, port) as process:
+            part = path.with_name(path.name + ".part")
+            wait_for(lambda: part.exists() and part.stat().st_size > 300_000)
+            rig.kill()
+            output, errors = process.communicate(timeout=20.0)
+        assert process.returncode == 1, errors
+        assert "ended: rig lost" in output
+    finally:
+        rig.kill()
+        rig.communicate()
+    recording = Recording.open(path)
+    assert recording.complete
+    assert recording.end_reason == "rig lost"
+    assert all(stream_.lost == 0 for stream_ in recording.streams.values())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_recording_well(tmp_path, number):
+    port = free_port()
+    path = tmp_path / "run.mcap"
+    with publisher(port) as rig, recorder(path, port) as process:
+        wait_for(lambda: received(rig) > 0)
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=20.0)
+    assert process.returncode == 0, errors
+    assert f"ended: interrupted by {number.name}" in output
+    assert Recording.open(path).complete
+
+
+def test_a_duration_ends_the_recording(tmp_path):
+    port = free_port()
+    path = tmp_path / "run.mcap"
+    with publisher(port), recorder(path, port, "duration_s=0.5") as process:
+        output, errors = process.communicate(timeout=20.0)
+    assert process.returncode == 0, errors
+    assert "ended: duration reached" in output
+    recording = Recording.open(path)
+    assert recording.streams[PROBES].rows >= 10_000
+
+
+def test_without_a_rig_one_line_and_no_file(tmp_path):
+    with recorder(tmp_path / "run.mcap", free_port()) as process:
+        output, errors = process.communicate(timeout=20.0)
+    assert process.returncode == 1
+    assert "no rig answers" in errors.splitlines()[-1]
+    assert output == ""
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,351 @@
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import recorder.session
+from recorder.reader import Recording
+from recorder.session import RIG_LOST, Progress, RecordingSession, Summary
+from rig.errors import InputError
+from rig.transport import NoReplyError
+from rig.transport.memory import MemoryClient, MemoryServer
+from rig.wire import (
+    ALIVE,
+    CATALOGUE,
+    CLIENTS,
+    EVENTS,
+    STATUS,
+    Gap,
+    decode_document,
+    encode_block,
+    encode_document,
+    sensor_key,
+    truth_key,
+)
+
+from .recorder_stream import ScriptedClient, block_of, documents, stream
+
+pytestmark = pytest.mark.wallclock
+PROBES = sensor_key("probes")
+
+
+@pytest.fixture(autouse=True)
+def _short_waits(monkeypatch):
+    monkeypatch.setattr(recorder.session, "QUIET_S", 0.05)
+    monkeypatch.setattr(recorder.session, "RECOVERY_S", 0.3)
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return tmp_path / "run.mcap"
+
+
+def play(client: ScriptedClient, items: list[tuple[str, bytes]]) -> Callable[[], None]:
+    """What the rig does: publish all that."""
+
+    def act() -> None:
+        for item in items:
+            client.publish(*item)
+
+    return act
+
+
+def record(
+    session: RecordingSession, client: ScriptedClient, act: Callable[[], None], progress: list[Progress] | None = None
+) -> Summary:
+    """Run a session while another thread acts as the rig, from the moment on which the session has subscribed."""
+
+    def wait_and_act() -> None:
+        deadline = time.monotonic() + 10.0
+        while STATUS not in client.subscribed and time.monotonic() < deadline:
+            time.sleep(0.002)
+        act()
+
+    thread = threading.Thread(target=wait_and_act)
+    thread.start()
+    try:
+        return session.run(None if progress is None else progress.append)
+    finally:
+        thread.join()
+
+
+def test_records_to_the_end_of_the_stream(path):
+    client = ScriptedClient()
+    items = list(stream(30))
+    progress: list[Progress] = []
+    summary = record(RecordingSession(client, path), client, play(client, items), progress)
+    assert (summary.reason, summary.error, summary.path) == ("completed", "", path)
+    assert summary.rows[PROBES] == 6000
+    assert summary.lost == summary.missed == {}
+    assert summary.gaps == summary.dropped == summary.malformed == 0
+    assert summary.duration_s == pytest.approx(0.3 - 50e-6)
+    assert summary.size_bytes == path.stat().st_size
+    recording = Recording.open(path)
+    assert recording.complete
+    for key in {key for key, _ in items}:
+        assert [p for _, p in recording.payloads(key)] == [p for k, p in items if k == key]
+    assert progress[-1].lost == 0
+
+
+def test_over_the_memory_transport(path):
+    server = MemoryServer()
+    for key, document in documents().items():
+        server.answer(key, lambda _, document=document: encode_document(document))
+    beats: list[dict] = []
+    server.hear(f"{CLIENTS}/*", lambda _, payload: beats.append(decode_document(payload)))
+    server.announce()
+    items = list(stream(20))
+    for item in items[:60]:
+        server.publish(*item)
+
+    def run() -> None:
+        for item in items[60:]:
+            server.publish(*item)
+
+    with MemoryClient(server) as client:
+        threading.Timer(0.2, run).start()
+        summary = RecordingSession(client, path, name="recorder-7", history=True).run()
+    assert summary.reason == "completed"
+    recording = Recording.open(path)
+    for key in {key for key, _ in items}:
+        assert [p for _, p in recording.payloads(key)] == [p for k, p in items if k == key]
+    assert {beat["name"] for beat in beats} == {"recorder-7"}
+    # The last one tells the rig that everything is here, so that it need not keep its cache.
+    assert (beats[-1]["received_index"], beats[-1]["lost"]) == (4000, 0)
+
+
+def test_blocks_that_the_end_event_overtook_are_waited_for(path):
+    client = ScriptedClient()
+    items = list(stream(10))
+    end = decode_document(items[-1][1]) | {"rows": {PROBES: 2000, truth_key("state"): 200}}
+    late = [item for item in items if item[0] == PROBES][5:]
+
+    def act() -> None:
+        for item in items[:-1]:
+            if item not in late:
+                client.publish(*item)
+        client.publish(EVENTS, encode_document(end))
+        time.sleep(0.15)  # longer than the silence after which a whole stream ends
+        for item in late:
+            client.publish(*item)
+
+    summary = record(RecordingSession(client, path), client, act)
+    assert summary.reason == "completed"
+    assert summary.rows[PROBES] == 2000
+    assert summary.lost == {}
+
+
+def test_blocks_that_never_come_are_a_gap_at_the_end(path):
+    client = ScriptedClient()
+    items = [item for item in stream(10) if item[0] in (PROBES, EVENTS)]
+    end = decode_document(items[-1][1]) | {"rows": {PROBES: 2000}}
+
+    def act() -> None:
+        for item in items[:-3]:
+            client.publish(*item)
+        client.publish(EVENTS, encode_document(end))
+
+    summary = record(RecordingSession(client, path), client, act)
+    assert (summary.reason, summary.lost, summary.gaps) == ("completed", {PROBES: 400}, 1)
+    assert Recording.open(path).gaps == [Gap(PROBES, 1600, 400)]
+
+
+def test_a_gap_and_what_the_transport_gave_up_are_in_the_summary_and_the_file(path):
+    client = ScriptedClient()
+    items = [item for number, item in enumerate(stream(10)) if number not in (10, 11, 12)]
+
+    def act() -> None:
+        assert client.on_miss is not None
+        for item in items[:-1]:
+            client.publish(*item)
+        client.on_miss(STATUS, 2)
+        client.publish(*items[-1])
+
+    summary = record(RecordingSession(client, path), client, act)
+    assert summary.lost
+    assert summary.missed == {STATUS: 2}
+    assert summary.gaps == len(summary.lost) == 3
+    gaps = Recording.open(path).gaps
+    assert Gap(STATUS, -1, 2) in gaps
+    assert {gap.key: gap.size for gap in gaps if gap.index >= 0} == summary.lost
+
+
+def test_ends_after_a_simulated_time(path):
+    client = ScriptedClient()
+    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(100, 150)]
+    summary = record(RecordingSession(client, path, duration_s=0.2), client, play(client, blocks))
+    assert summary.reason == "duration reached"
+    assert summary.first_time_s == pytest.approx(1.0)
+    assert summary.duration_s >= 0.2
+    assert Recording.open(path).complete
+
+
+def test_stop_keeps_everything_received(path):
+    client = ScriptedClient()
+    session = RecordingSession(client, path)
+    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(200)]
+
+    def act() -> None:
+        for block in blocks:
+            client.publish(*block)
+        session.stop("interrupted by SIGINT")
+
+    summary = record(session, client, act)
+    assert (summary.reason, summary.rows[PROBES]) == ("interrupted by SIGINT", 40_000)
+
+
+def test_a_lost_rig_closes_the_file_well(path):
+    client = ScriptedClient()
+
+    def act() -> None:
+        for item in list(stream(10))[:-1]:
+            client.publish(*item)
+        client.on_alive(False)
+
+    summary = record(RecordingSession(client, path), client, act)
+    assert summary.reason == RIG_LOST
+    recording = Recording.open(path)
+    assert recording.complete
+    assert recording.end_reason == RIG_LOST
+    assert recording.streams[PROBES].rows == 2000
+
+
+def test_the_end_event_counts_even_if_the_rig_is_gone_before_it_is_read(path):
+    client = ScriptedClient()
+
+    def act() -> None:
+        client.on_alive(False)
+        for item in stream(3):
+            client.publish(*item)
+
+    assert record(RecordingSession(client, path), client, act).reason == "completed"
+
+
+def test_a_run_that_is_over_is_recognised_by_its_status(path):
+    client = ScriptedClient()
+    summary = record(
+        RecordingSession(client, path),
+        client,
+        lambda: client.publish(STATUS, encode_document({"tick": 5, "time_s": 5e-6, "state": "ended"})),
+    )
+    assert summary.reason == "ended before the recording began"
+    assert summary.rows == {}
+
+
+def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypatch):
+    client = ScriptedClient()
+    session = RecordingSession(client, path, inbox_bytes=20_000)
+    gate = threading.Event()
+    real = recorder.session.RecordingWriter.write
+
+    def slow(self, key: str, payload: bytes, wall_ns: int):
+        gate.wait(10.0)
+        return real(self, key, payload, wall_ns)
+
+    monkeypatch.setattr(recorder.session.RecordingWriter, "write", slow)
+    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(50)]
+
+    def act() -> None:
+        for block in blocks[:-1]:
+            client.publish(*block)
+        gate.set()
+        deadline = time.monotonic() + 10.0
+        while len(session._inbox) and time.monotonic() < deadline:
+            time.sleep(0.002)
+        client.publish(*blocks[-1])
+        client.publish(EVENTS, encode_document({"event": "end", "tick": 0, "time_s": 0.0, "reason": "completed"}))
+
+    summary = record(session, client, act)
+    assert summary.dropped > 30
+    assert summary.lost == {PROBES: 200 * summary.dropped}
+    assert summary.rows[PROBES] == 200 * (50 - summary.dropped)
+    assert Recording.open(path).metadata["end"]["dropped_payloads"] == str(summary.dropped)
+
+
+def test_a_disk_error_ends_the_session_with_what_was_written(path, monkeypatch):
+    client = ScriptedClient()
+    calls = [0]
+    real = os.fsync
+
+    def full(number: int) -> None:
+        calls[0] += 1
+        if calls[0] > 2:
+            raise OSError(28, "No space left on device")
+        real(number)
+
+    monkeypatch.setattr(os, "fsync", full)
+    session = RecordingSession(client, path)
+    stop = threading.Event()
+
+    def act() -> None:
+        for number in range(1000):
+            client.publish(PROBES, encode_block(block_of(PROBES, number)))
+            if stop.wait(0.01):
+                return
+
+    thread = threading.Thread(target=act)
+    thread.start()
+    try:
+        summary = session.run()
+    finally:
+        stop.set()
+        thread.join()
+    assert summary.reason == "disk error"
+    assert "No space left on device" in summary.error
+    assert summary.path == path.with_name("run.mcap.part")
+    assert not path.exists()
+    assert Recording.open(summary.path).streams[PROBES].rows > 0
+
+
+def test_heartbeats_tell_the_rig_how_far_the_recorder_is(path):
+    client = ScriptedClient()
+    summary = record(
+        RecordingSession(client, path, name="recorder-1"),
+        client,
+        play(client, list(stream(10))),
+    )
+    assert summary.reason == "completed"
+    assert {key for key, _ in client.reported} == {f"{CLIENTS}/recorder-1"}
+    last = decode_document(client.reported[-1][1])
+    assert (last["name"], last["received_index"], last["lost"]) == ("recorder-1", 2000, 0)
+
+
+@pytest.mark.parametrize("duration_s", [0.0, -1.0, float("nan")])
+def test_impossible_durations_are_refused(path, duration_s):
+    with pytest.raises(InputError, match="duration_s must be above 0"):
+        RecordingSession(ScriptedClient(), path, duration_s=duration_s)
+
+
+def test_nothing_is_subscribed_before_the_destination_is_known_to_work(path):
+    path.write_text("precious")
+    client = ScriptedClient()
+    with pytest.raises(InputError, match="a new file"):
+        RecordingSession(client, path)
+    assert client.subscribed == []
+    assert path.read_text() == "precious"
+
+
+def test_without_a_rig_there_is_no_file(path):
+    client = ScriptedClient()
+    del client.replies[CATALOGUE]
+    with pytest.raises(NoReplyError):
+        RecordingSession(client, path).run()
+    assert list(path.parent.iterdir()) == []
+
+
+def test_an_error_of_the_transport_still_closes_the_file_well(path, monkeypatch):
+    client = ScriptedClient()
+
+    def fail(key: str, callback) -> None:
+        assert key == ALIVE
+        raise RuntimeError("the session is closed")
+
+    monkeypatch.setattr(client, "watch", fail)
+    with pytest.raises(RuntimeError, match="the session is closed"):
+        RecordingSession(client, path).run()
+    assert Recording.open(path).end_reason == "failed: the session is closed"
