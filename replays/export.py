@@ -199,9 +199,12 @@ class _McapRun:
         self._wall_ns = time.time_ns()
         simulation = self.simulation
         self._writer = RecordingWriter(
-            self.path, catalogue=simulation.catalogue(), parameters=simulation.parameters_document(),
-            scene=simulation.scene_document(), force=self._force,
-        )  # fmt: skip
+            self.path,
+            catalogue=simulation.catalogue(),
+            parameters=simulation.parameters_document(),
+            scene=simulation.scene_document(),
+            force=self._force,
+        )
         self._event({"event": "start", "scene": simulation.scene.name, "seed": simulation.scene.seed, "pace": "none"})
         return self
 

@@ -66,9 +66,9 @@ def draw(recording: Recording, path: Path) -> None:
     figures = whirl_figures(recording, max(blow_s + 0.5, end_s - 2.0), end_s)
     figure = Figure(figsize=(15, 10), layout="constrained")
     FigureCanvasAgg(figure)
-    scene = recording.scene
+    scene, parameters = recording.scene["name"], recording.parameters["set"]
     figure.suptitle(
-        f"Virtual rotor-stator rig: scene {scene['name']}, parameters {recording.parameters['set']}, hammer at {blow_s:.2f} s; "
+        f"Virtual rotor-stator rig: scene {scene}, parameters {parameters}, hammer at {blow_s:.2f} s; "
         f"whirl {figures.frequency_hz:.2f} Hz at {figures.spin_hz:.3f} Hz spin (from the recorded samples)",
         fontsize=13,
     )
@@ -85,8 +85,10 @@ def draw(recording: Recording, path: Path) -> None:
     )
     ax.plot(reach * np.cos(circle), reach * np.sin(circle), "k--", lw=1, label="clearance at rest")
     for label, color, low, high in (
-        ("whirl", _WHIRL, end_s - 0.2, end_s), ("impacts", _IMPACTS, blow_s, blow_s + 0.06), ("before", _BEFORE, blow_s - 0.5, blow_s),
-    ):  # fmt: skip
+        ("whirl", _WHIRL, end_s - 0.2, end_s),
+        ("impacts", _IMPACTS, blow_s, blow_s + 0.06),
+        ("before", _BEFORE, blow_s - 0.5, blow_s),
+    ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
         ax.plot(probes.column("disk_x")[kept], probes.column("disk_y")[kept], color=color, lw=0.8, label=label)
     ax.set(title="Orbit at the disk", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
@@ -98,14 +100,9 @@ def draw(recording: Recording, path: Path) -> None:
         (axes[0, 2], blow_s - 0.01, blow_s + 0.12, "First impacts"),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
+        width = 0.5 if high == end_s else 1.0
         for name, color in (("disk_x", _WHIRL), ("disk_y", _IMPACTS)):
-            ax.plot(
-                probes.times_s[kept],
-                probes.column(name)[kept],
-                color=color,
-                lw=0.5 if high == end_s else 1.0,
-                label=name,
-            )
+            ax.plot(probes.times_s[kept], probes.column(name)[kept], color=color, lw=width, label=name)
         ax.set(title=title, xlabel="time [s]", ylabel="[mm]", xlim=(low, high))
         ax.legend(loc="lower right", fontsize=8)
 
@@ -123,12 +120,9 @@ def draw(recording: Recording, path: Path) -> None:
         (axes[2, 0], end_s - 0.05, end_s, "Reactions, settled whirl"),
     ):
         kept = (forces.times_s >= low) & (forces.times_s < high)
-        ax.plot(
-            forces.times_s[kept], pair_x[kept], color=_WHIRL, lw=0.5 if title == "Reactions" else 1.0, label="E - W"
-        )
-        ax.plot(
-            forces.times_s[kept], pair_y[kept], color=_IMPACTS, lw=0.5 if title == "Reactions" else 1.0, label="N - S"
-        )
+        width = 0.5 if title == "Reactions" else 1.0
+        ax.plot(forces.times_s[kept], pair_x[kept], color=_WHIRL, lw=width, label="E - W")
+        ax.plot(forces.times_s[kept], pair_y[kept], color=_IMPACTS, lw=width, label="N - S")
         ax.set(title=title, xlabel="time [s]", ylabel="[N]", xlim=(low, high))
         ax.legend(loc="lower right", fontsize=8)
 

@@ -77,11 +77,17 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
     held = (forces.times_s >= from_s) & (forces.times_s < to_s)
     pairs = [forces.column(a)[held] - forces.column(b)[held] for a, b in (("P_E", "P_W"), ("P_N", "P_S"))]
     return WhirlFigures(
-        from_s=from_s, to_s=to_s, frequency_hz=frequency,
+        from_s=from_s,
+        to_s=to_s,
+        frequency_hz=frequency,
         disk_frequency_hz=whirl_frequency(times, probes.column("disk_x")[kept], probes.column("disk_y")[kept]),
-        spin_hz=float(spin), radius_m=radius, law_hz=float(law), slip=1.0 - frequency / law,
-        reaction_x_n=float(np.ptp(pairs[0]) / 2), reaction_y_n=float(np.ptp(pairs[1]) / 2),
-    )  # fmt: skip
+        spin_hz=float(spin),
+        radius_m=radius,
+        law_hz=float(law),
+        slip=float(1.0 - frequency / law),
+        reaction_x_n=float(np.ptp(pairs[0]) / 2),
+        reaction_y_n=float(np.ptp(pairs[1]) / 2),
+    )
 
 
 def parameter_si(recording: Recording, key: str) -> float:

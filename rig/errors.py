@@ -6,8 +6,8 @@ from __future__ import annotations
 class InputError(ValueError):
     """A field has a value it must not have.
 
-    The message always reads `FIELD must be MUST; instead received RECEIVED`, so that every command,
-    service reply and notebook shows the same three facts. The command line turns it into one line and exit status 2.
+    The message always reads `FIELD must be MUST; instead received RECEIVED`, so that every command, service reply and
+    notebook shows the same three facts. The command line turns it into one line and exit status 2.
     """
 
     def __init__(self, field: str, must: str, received: object) -> None:

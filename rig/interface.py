@@ -1,17 +1,26 @@
-"""The page on keys, messages and units, made from the channel table and the codec: `rig keys`, committed as rig/KEYS.md."""
+"""The page on keys, messages and units, made from the channel table and the codec.
+
+`rig keys` shows it; rig/KEYS.md is its committed copy.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 from rig import wire
-from rig.channels import default_table
+from rig.channels import Channel, default_table
 from rig.kernels import signals
 from rig.scenes import COMMANDS, SensorChoice
 
 _DOCUMENTS = {
-    wire.EVENTS: "published: `event` (start, command, hammer, speed, release, warning, end), `tick`, `time_s`, `wall_s` and the event's own fields; `end` carries `reason` and is the last",
-    wire.STATUS: "published twice a second and on request: state, pace, lateness, overruns, real-time factor, queue, clients, spin, energy residual, warnings",
+    wire.EVENTS: (
+        "published: `event` (start, command, hammer, speed, release, warning, end), `tick`, `time_s`, `wall_s` and the "
+        "event's own fields; `end` carries `reason` and is the last"
+    ),
+    wire.STATUS: (
+        "published twice a second and on request: state, pace, lateness, overruns, real-time factor, queue, clients, "
+        "spin, energy residual, warnings"
+    ),
     wire.CATALOGUE: "on request: the channel table with calibration, truth tables with units",
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",
     wire.SCENE: "on request: the scene as it runs, with its seed",
@@ -29,18 +38,22 @@ def page() -> str:
         "",
         "Made from the channel table by `rig keys --markdown > rig/KEYS.md`; do not edit by hand.",
         "",
-        "Everything travels over zenoh on 127.0.0.1 (port 7460 by default); no router, no multicast. Simulated time is an integer tick of 1 us.",
+        "Everything travels over zenoh on 127.0.0.1 (port 7460 by default); no router, no multicast. "
+        "Simulated time is an integer tick of 1 us.",
         "",
         "## Blocks",
         "",
-        f"A block is one CDR message (little-endian). `{wire.SAMPLE_SCHEMA}` carries ADC counts, `{wire.TRUTH_SCHEMA}` values of the model:",
+        f"A block is one CDR message (little-endian). `{wire.SAMPLE_SCHEMA}` carries ADC counts, "
+        f"`{wire.TRUTH_SCHEMA}` values of the model:",
         "",
         "```",
         *wire.SCHEMAS[wire.SAMPLE_SCHEMA].splitlines(),
         "```",
         "",
-        f"In `{wire.TRUTH_SCHEMA}` the last field is `float64[] values`. A step of `index` other than the rows of the block before is a gap.",
-        "volts = counts x 2 adc_v / 2^adc_bits; value = (volts - bias) / sensitivity. One dimension lies behind the other: row after row.",
+        f"In `{wire.TRUTH_SCHEMA}` the last field is `float64[] values`. "
+        "A step of `index` other than the rows of the block before is a gap.",
+        "volts = counts x 2 adc_v / 2^adc_bits; value = (volts - bias) / sensitivity. "
+        "One dimension lies behind the other: row after row.",
         "",
     ]
     for group in table.groups.values():
@@ -49,19 +62,17 @@ def page() -> str:
             "",
             f"{group.rate_hz} Hz by default. Values: {group.channels[0].kind}.",
             "",
-            "| column | channel | unit | V per unit | bias, V | range, V | low-pass, Hz | high-pass, Hz | noise, V rms | converter | what |",
+            "| column | channel | unit | V per unit | bias, V | range, V | low-pass, Hz | high-pass, Hz | noise, V rms "
+            "| converter | what |",
             "|---|---|---|---|---|---|---|---|---|---|---|",
-            *(
-                f"| {column} | `{c.name}` | {c.unit} | {c.sensitivity_v:g} | {c.bias_v:g} | {c.range_v[0]:g} to {c.range_v[1]:g} | "
-                f"{c.bandwidth_hz:g} | {c.highpass_hz:g} | {c.noise_v:g} | {c.adc_bits} bit, +-{c.adc_v:g} V | {c.label} |"
-                for column, c in enumerate(group.channels)
-            ),
+            *(_channel_row(column, channel) for column, channel in enumerate(group.channels)),
             "",
         ]
     lines += [
         f"### `{wire.EDGES}`: exact keyphasor edges",
         "",
-        f"`{wire.TRUTH_SCHEMA}` of one column: ticks from the block's `tick`, with their fraction. `index` counts edges; no block where there was none.",
+        f"`{wire.TRUTH_SCHEMA}` of one column: ticks from the block's `tick`, with their fraction. "
+        "`index` counts edges; no block where there was none.",
         "",
         "## Truth",
         "",
@@ -93,8 +104,10 @@ def page() -> str:
     lines += [
         "## Commands",
         "",
-        'Requests are JSON objects on their key; the reply is `{"accepted": true, "id", "command", "tick", "time_s"}` with the simulated time at which the '
-        'command takes effect, or `{"accepted": false, "error"}` with the limit in the text. `from` may name the sender.',
+        "Requests are JSON objects on their key; "
+        'the reply is `{"accepted": true, "id", "command", "tick", "time_s"}` with the simulated time at which the '
+        'command takes effect, or `{"accepted": false, "error"}` with the limit in the text. '
+        "`from` may name the sender.",
         "",
         "| key | fields |",
         "|---|---|",
@@ -105,6 +118,24 @@ def page() -> str:
     lines += [f"| `{wire.command_key(name)}` | {what} |" for name, what in _OTHER_COMMANDS.items()]
     lines += ["", f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.", ""]
     return "\n".join(lines)
+
+
+def _channel_row(column: int, channel: Channel) -> str:
+    low, high = channel.range_v
+    cells = (
+        column,
+        f"`{channel.name}`",
+        channel.unit,
+        f"{channel.sensitivity_v:g}",
+        f"{channel.bias_v:g}",
+        f"{low:g} to {high:g}",
+        f"{channel.bandwidth_hz:g}",
+        f"{channel.highpass_hz:g}",
+        f"{channel.noise_v:g}",
+        f"{channel.adc_bits} bit, +-{channel.adc_v:g} V",
+        channel.label,
+    )
+    return f"| {' | '.join(map(str, cells))} |"
 
 
 def _field(key: str, field: Any) -> str:

@@ -1,5 +1,4 @@
-"""The paper's magnet model (eqs. 26-38), and the radial map that the kernels use instead, with its error against the
-sum.
+"""The paper's magnet model (eqs. 26-38), and the radial map that the kernels use instead.
 
 Every magnet is a dipole loop of current M0 L (eq. 35); the force on the shaft magnet sums I dl x B around its own
 loop (eq. 38). All loops lie in one plane and repel. Unvalidated at this spacing: the far-field form overstates the
@@ -22,7 +21,7 @@ REACH = 0.010
 class MagnetGeometry(NamedTuple):
     """The magnets of Table 1, SI."""
 
-    count: int
+    number: int
     length: float
     bearing_magnet_radius: float
     shaft_magnet_radius: float
@@ -57,21 +56,21 @@ def field_sum_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry, *, p
     around = 2.0 * np.pi * np.arange(points) / points
     outward = np.stack([np.cos(around), np.sin(around)], axis=-1)
     loop = np.stack([x, y], axis=-1)[:, None, :] + geometry.shaft_magnet_radius * outward
-    place = 2.0 * np.pi * np.arange(geometry.count) / geometry.count
+    place = 2.0 * np.pi * np.arange(geometry.number) / geometry.number
     centres = geometry.bearing_radius * np.stack([np.cos(place), np.sin(place)], axis=-1)
     distance = np.linalg.norm(loop[:, :, None, :] - centres, axis=-1)
     # Eq. 35 in the plane of the loops (psi = 90 deg): the field of a dipole that points along +z is along -z beside it.
     field = -MU_0 * current * geometry.bearing_magnet_radius**2 / (4.0 * distance**3)
-    # dl x B with B = B z and dl = r_s dphi (-sin, cos) is r_s dphi B (cos, sin): inward where the field opposes, so
-    # it repels.
+    # dl x B with B = B z and dl = r_s dphi (-sin, cos) is r_s dphi B (cos, sin).
+    # That points inward where the field opposes: the magnets repel.
     width = geometry.shaft_magnet_radius * 2.0 * np.pi / points
     return current * width * np.einsum("npm,pk->nk", field, outward)
 
 
 def fit_map(geometry: MagnetGeometry) -> RadialMap:
-    """Fit the radial map to the field sum (least squares over the reach and over all directions between two magnets)."""
+    """Fit the radial map to the field sum, by least squares over the reach and all directions between two magnets."""
     radius = np.linspace(REACH / 40, REACH, 40)
-    angle = np.linspace(0.0, np.pi / geometry.count, 9)
+    angle = np.linspace(0.0, np.pi / geometry.number, 9)
     r, a = (grid.ravel() for grid in np.meshgrid(radius, angle))
     force = field_sum_force(r * np.cos(a), r * np.sin(a), geometry)
     radial = force[:, 0] * np.cos(a) + force[:, 1] * np.sin(a)

@@ -34,7 +34,8 @@ def restitution_factor(restitution: float) -> float:
         return c * (1.0 + restitution) - math.log((1.0 + c) / (1.0 - c * restitution))
 
     # c = 0 solves it as well; the wanted root lies between that and the pole at 1/e.
-    return float(brentq(residual, 1e-9 + 0.5 * (1.0 - restitution), (1.0 - 1e-12) / restitution, xtol=1e-14))
+    root: Any = brentq(residual, 1e-9 + 0.5 * (1.0 - restitution), (1.0 - 1e-12) / restitution, xtol=1e-14)
+    return float(root)
 
 
 def contact_stiffness(parameters: ParameterSet, *, inside: bool) -> float:
@@ -98,7 +99,7 @@ def build_model(parameters: ParameterSet) -> Model:
     """Resolve every rule, fit the magnet map, find the equilibrium."""
     p = parameters
     geometry = MagnetGeometry(
-        count=round(p["magnet.count"]),
+        number=round(p["magnet.count"]),
         length=p["magnet.length"],
         bearing_magnet_radius=p["magnet.bearing_magnet_radius"],
         shaft_magnet_radius=p["magnet.shaft_magnet_radius"],
@@ -196,7 +197,7 @@ def describe(model: Model) -> dict[str, Any]:
 
 
 def _sag(shaft: Shaft, magnet: Magnet) -> float:
-    """Height of the shaft at the ring at rest on the magnets [m] (negative): torque balance about the pivot, cos Gamma = 1 apart."""
+    """Height of the shaft at the ring at rest on the magnets [m], negative: torque balance about the pivot."""
     from scipy.optimize import brentq
 
     def torque(gamma: float) -> float:
@@ -210,5 +211,6 @@ def _sag(shaft: Shaft, magnet: Magnet) -> float:
         raise InputError(
             "magnet.stiffness", "enough to carry the shaft within 20 mm of the magnets' centre", magnet.stiffness
         )
-    gamma = float(brentq(torque, 0.0, 0.02 / shaft.arm_magnet, xtol=1e-16))
+    root: Any = brentq(torque, 0.0, 0.02 / shaft.arm_magnet, xtol=1e-16)
+    gamma = float(root)
     return -shaft.arm_ring * math.sin(gamma)

@@ -6,6 +6,7 @@ import difflib
 import json
 import math
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -118,7 +119,7 @@ class Drive(_Part):
     @classmethod
     def _ascending(cls, profile: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         times = [time for time, _ in profile]
-        if profile and (times[0] != 0.0 or any(b <= a for a, b in zip(times, times[1:], strict=False))):
+        if profile and (times[0] != 0.0 or any(b <= a for a, b in pairwise(times))):
             raise ValueError("points of ascending time, the first at 0")
         if any(speed < 0.0 for _, speed in profile):
             raise ValueError("points of speed >= 0")
@@ -176,8 +177,8 @@ class Scene(_Part):
             rate = getattr(self.sensors, field)
             # A sample is taken at the end of a step, never between two.
             if 1_000_000 % rate or (1_000_000 // rate) % self.engine.step_us:
-                rates = [r for r in (100_000, 50_000, 25_000, 20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
-                         if (1_000_000 // r) % self.engine.step_us == 0]  # fmt: skip
+                usual = (100_000, 50_000, 25_000, 20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
+                rates = [other for other in usual if (1_000_000 // other) % self.engine.step_us == 0]
                 raise ValueError(
                     f"sensors.{field}: a rate whose period is a whole number of steps of {self.engine.step_us} us"
                     f" (such as {', '.join(map(str, rates[:6]))} Hz), not {rate} Hz"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,10 @@ from rig.wire import ROOT, Block
 
 TICK_RATE_HZ = 1_000_000
 ROW_TICKS = 25
-"""Rows are observed every 25 us, more often where rates ask for it, or every step where that is longer: the sensors' filters run at this rate."""
+"""Rows are observed every 25 us, more often where rates ask for it, or every step where that is longer.
+
+The sensors' filters run at this rate.
+"""
 ENERGY_ALARM = 1e-3
 """Energy residual over dissipated energy above which a run is in doubt."""
 
@@ -152,9 +156,14 @@ class Simulation:
                 f"the state is no longer finite at {self.tick / TICK_RATE_HZ:.6f} s; try a shorter engine.step_us"
             )
         return Frame(
-            tick=start, ticks=ticks, samples=self._sample(rows, start), edges=self._edges(rows, start),
-            truth=self._truth(rows, start), events=events, rows=rows,
-        )  # fmt: skip
+            tick=start,
+            ticks=ticks,
+            samples=self._sample(rows, start),
+            edges=self._edges(rows, start),
+            truth=self._truth(rows, start),
+            events=events,
+            rows=rows,
+        )
 
     def submit(self, name: str, request: dict[str, Any]) -> int:
         """Check a command and schedule it for the present tick.
@@ -235,9 +244,8 @@ class Simulation:
             return self.model.state(spin=spin)
         # A hair inside the clearance, so that rounding does not make it a contact.
         inside = clearance * (1.0 - 1e-12)
-        x, y = {"top": (0.0, inside), "bottom": (0.0, -inside), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}[
-            initial.position
-        ]
+        places = {"top": (0.0, inside), "bottom": (0.0, -inside), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}
+        x, y = places[initial.position]
         if math.hypot(x, y) > clearance:
             raise InputError(
                 "initial.position", f"inside the ring (r0 = {clearance * 1e3:g} mm)", [initial.x_mm, initial.y_mm]
@@ -253,7 +261,7 @@ class Simulation:
         points = [(self._on_grid(time), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))]
         segments = [
             _Segment(tick=t0, speed=w0, slope=(w1 - w0) / (t1 - t0) * TICK_RATE_HZ)
-            for (t0, w0), (t1, w1) in zip(points, points[1:], strict=False)
+            for (t0, w0), (t1, w1) in pairwise(points)
         ]
         return [*segments, _Segment(tick=points[-1][0], speed=points[-1][1], slope=0.0)]
 
@@ -307,10 +315,18 @@ class Simulation:
             command, begin, end = self._blow
             force, (dx, dy) = float(command.force_n), command.cosines
         return Inputs(
-            tick_s=1.0 / TICK_RATE_HZ, hammer_force=force, hammer_x=dx, hammer_y=dy, hammer_start=begin, hammer_end=end,
-            speed=segment.speed, speed_slope=segment.slope, speed_tick=segment.tick,
-            ideal_drive=self.scene.drive.mode == "ideal", magnet_engaged=self._engaged,
-        )  # fmt: skip
+            tick_s=1.0 / TICK_RATE_HZ,
+            hammer_force=force,
+            hammer_x=dx,
+            hammer_y=dy,
+            hammer_start=begin,
+            hammer_end=end,
+            speed=segment.speed,
+            speed_slope=segment.slope,
+            speed_tick=segment.tick,
+            ideal_drive=self.scene.drive.mode == "ideal",
+            magnet_engaged=self._engaged,
+        )
 
     def _run(self, rows: np.ndarray, ticks: int) -> None:
         self._engine.advance(
@@ -323,16 +339,9 @@ class Simulation:
         """The row of the present instant."""
         row = np.empty((1, S.N_ROW))
         self._engine.advance(
-            self.model.constants,
-            self._inputs(),
-            self._y.copy(),
-            self._memory.copy(),
-            self.tick,
-            self._step_ticks,
-            1,
-            1,
-            row,
-        )
+            self.model.constants, self._inputs(), self._y.copy(), self._memory.copy(), self.tick, self._step_ticks,
+            1, 1, row,
+        )  # fmt: skip
         return row[0]
 
     def _sample(self, rows: np.ndarray, start: int) -> dict[str, Block]:

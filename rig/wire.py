@@ -56,7 +56,10 @@ SCHEMAS = {
     SAMPLE_SCHEMA: _HEADER_FIELDS + "int32[] values         # ADC counts, row after row\n",
     TRUTH_SCHEMA: _HEADER_FIELDS + "float64[] values       # row after row\n",
 }
-"""ROS 2 message definitions of the two blocks. Keyphasor edges travel as TruthBlock rows of one column: ticks from `tick`."""
+"""ROS 2 message definitions of the two blocks.
+
+Keyphasor edges travel as TruthBlock rows of one column: ticks from `tick`.
+"""
 
 _DTYPES = {SAMPLE_SCHEMA: np.dtype("<i4"), TRUTH_SCHEMA: np.dtype("<f8")}
 _ENCAPSULATION = b"\x00\x01\x00\x00"

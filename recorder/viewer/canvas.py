@@ -52,6 +52,14 @@ class Canvas:
             self.stream.set_time(WALL, timestamp=float(wall[0]))
         self.stream.log(path, what[0], *what[1:])
 
+    def keeps_up(self, *, timeout_s: float) -> bool:
+        """Whether all that was drawn so far leaves for the viewer within that time; what does not, piles up here."""
+        try:
+            self.stream.flush(timeout_sec=timeout_s)
+        except (RuntimeError, ValueError):
+            return False
+        return True
+
     def plot(self, path: str, times_s: np.ndarray, columns: Iterable[Any]) -> None:
         """Draw many instants at once; `columns` comes from an archetype's `columns`."""
         import rerun as rr

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 MOST_ROWS_PER_S = 2000.0
 MOST_ROWS = 60_000
 """Points of one curve, whatever the length of the file; full rate around hammer blows comes on top."""
+MOST_FRAMES = 6_000
+"""Orbits and places of the rotor; 25 Hz up to four minutes, fewer in longer files."""
 _FLUSH_EVERY = 100
 
 
@@ -44,6 +46,11 @@ def rows_per_s(duration_s: float) -> float:
     return min(MOST_ROWS_PER_S, MOST_ROWS / max(duration_s, 1e-3))
 
 
+def frame_s(duration_s: float) -> float:
+    """Time between two frames [s] for a file of that length."""
+    return max(FRAME_S, duration_s / MOST_FRAMES)
+
+
 def paint(recording: Recording, canvas: Canvas) -> Painted:
     """Draw a whole recording."""
     for simulated_s, wall_s in recording.clock:
@@ -60,7 +67,8 @@ def paint(recording: Recording, canvas: Canvas) -> Painted:
         start_s, end_s = min(start_s, float(times_s[0])), max(end_s, float(times_s[-1]))
         if painter is None:
             painter = _new_painter(recording, canvas, end_s - start_s)
-        for count, part in enumerate(_frames(times_s, samples.rate_hz)):
+        rows = max(1, round(frame_s(float(times_s[-1] - times_s[0])) * samples.rate_hz))
+        for count, part in enumerate(_frames(times_s, samples.rate_hz, rows=rows)):
             painter.add(name, times_s[part], values[part])
             painter.frame(name)
             if count % _FLUSH_EVERY == 0:
@@ -89,14 +97,13 @@ def _in_order(samples: Samples) -> tuple[np.ndarray, np.ndarray]:
     return samples.times_s[order], samples.values[order]
 
 
-def _frames(times_s: np.ndarray, rate_hz: float) -> Iterator[slice]:
+def _frames(times_s: np.ndarray, rate_hz: float, *, rows: int) -> Iterator[slice]:
     """Slices of one frame each, broken where rows are missing."""
-    length = max(1, round(FRAME_S * rate_hz))
     holes = np.flatnonzero(np.abs(np.diff(times_s) * rate_hz - 1.0) > 0.5) + 1
     edges = [0, *holes.tolist(), len(times_s)]
     for start, end in pairwise(edges):
-        for at in range(start, end, length):
-            yield slice(at, min(at + length, end))
+        for at in range(start, end, rows):
+            yield slice(at, min(at + rows, end))
 
 
 def _paint_truth(recording: Recording, painter: Painter) -> None:

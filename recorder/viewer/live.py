@@ -27,6 +27,8 @@ _HEARTBEAT_S = 0.5
 _INBOX = 4000
 """Payloads held at most, about 4 s of all streams; then the oldest go."""
 _QUIET_S = 0.3
+_CHECK_S = 1.0
+_PATIENCE_S = 0.3
 _CONTACT = wire.truth_key("contact")
 
 
@@ -45,13 +47,17 @@ class Described:
     contact_columns: tuple[str, ...]
 
 
-def ask(client: Client) -> Described:
+def ask(client: Client, *, wait_s: float = 2.0) -> Described:
     """Ask the rig that a client is connected to.
+
+    Args:
+        client: The rig.
+        wait_s: How long it may take to answer [s]: a rig that is being prepared listens already.
 
     Raises:
         NoReplyError: No rig answers.
     """
-    catalogue = wire.decode_document(client.request(wire.CATALOGUE))
+    catalogue = wire.decode_document(client.request(wire.CATALOGUE, timeout_s=max(wait_s, 0.5)))
     parameters = wire.decode_document(client.request(wire.PARAMETERS))
     contact = catalogue.get("truth", {}).get("contact", {}).get("columns", [])
     return Described(
@@ -90,11 +96,14 @@ class LiveView:
         self._there: bool | None = None
         self._gone_at_s = 0.0
         self._end: str | None = None
+        self._stalled = False
         self.malformed = 0
+        self.skipped = 0
+        """Sensor rows that arrived and were not drawn, because the viewer's window did not take them."""
 
     @property
     def received(self) -> int:
-        """Sensor rows drawn."""
+        """Sensor rows that arrived."""
         return sum(rows for key, rows in self._continuity.received.items() if key in self._groups)
 
     @property
@@ -114,7 +123,7 @@ class LiveView:
         # Events are few: those from before we came are fetched.
         self._client.subscribe(wire.EVENTS, self._take, history=True)
         self._client.watch(wire.ALIVE, self._watch)
-        count, heard_s, beat_s = 0, time.monotonic(), 0.0
+        count, heard_s, beat_s, check_s = 0, time.monotonic(), 0.0, 0.0
         while True:
             now_s = time.monotonic()
             if self._draw():
@@ -122,13 +131,18 @@ class LiveView:
             count += 1
             if count % _FLUSH_EVERY == 0:
                 self._painter.flush()
+            if now_s - check_s >= _CHECK_S:
+                self._check_canvas()
+                check_s = now_s
             if now_s - beat_s >= _HEARTBEAT_S:
                 self._report()
                 beat_s = now_s
             reason = self._reason(now_s, heard_s) or ("the viewer was closed" if stop() else None)
             if reason is not None:
-                self._painter.note(self._painter.now_s, reason, level="INFO" if self._end else "WARN")
+                if self._end is None:
+                    self._painter.note(self._painter.now_s, reason, level="WARN")
                 self._painter.close()
+                self._report()
                 return reason
             # An absolute grid is not needed here: a late picture is only late.
             time.sleep(max(0.0, _TICK_S - (time.monotonic() - now_s)))
@@ -157,6 +171,14 @@ class LiveView:
             "wall_s": self._wall(),
         }
         self._client.report(f"{wire.CLIENTS}/{NAME}", wire.encode_document(document))
+
+    def _check_canvas(self) -> None:
+        """Stop drawing for a viewer that takes nothing, or memory would fill with what it still has to get."""
+        stalled = not self._canvas.keeps_up(timeout_s=_PATIENCE_S)
+        if self._stalled and not stalled:
+            text = f"the viewer took nothing for a while: {self.skipped} rows in all were not drawn"
+            self._painter.note(self._painter.now_s, text, level="WARN")
+        self._stalled = stalled
 
     def _draw(self) -> bool:
         """Draw all that has arrived; whether anything had."""
@@ -205,12 +227,17 @@ class LiveView:
                     )
             run.append(block)
         self._draw_run(key, run)
-        if key in self._groups:
+        if key in self._groups and not self._stalled:
             self._painter.frame(self._groups[key])
 
     def _draw_run(self, key: str, run: list[wire.Block]) -> None:
         """Draw consecutive blocks."""
         if not run:
+            return
+        if key == self._beat_key:
+            self._received_index = run[-1].index + len(run[-1].values)
+        if self._stalled:
+            self.skipped += sum(len(block.values) for block in run) if key in self._groups else 0
             return
         values = np.concatenate([block.values for block in run])
         ticks_a_row = run[0].tick_rate_hz / run[0].rate_hz
@@ -225,6 +252,5 @@ class LiveView:
             self.malformed += len(run)
             return
         if key == self._beat_key:
-            self._received_index = run[-1].index + len(run[-1].values)
             self._canvas.clock.mark(float(times_s[-1]), self._wall())
         self._painter.add(name, times_s, group.engineering(values))

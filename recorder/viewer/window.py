@@ -102,8 +102,10 @@ class Window:
         try:
             for each in ports:
                 self._wait_for(each)
-            if kind == "headless":
-                # It listens before it looks for a graphics driver; where there is none it ends at its first picture.
+            # A viewer listens before it looks for a screen, and without one for a graphics driver at its first picture.
+            if kind == "native":
+                self._ask(lambda viewer: bool(viewer.get_state().viewer_version))
+            elif kind == "headless":
                 self._ask(lambda viewer: bool(viewer.take_screenshot(max_size=64)))
         except BaseException:
             self.close()

@@ -89,16 +89,14 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
             say(f"service up, recording to {file}; spinning contact-free for {_STABLE_S:g} s")
             time.sleep(_STABLE_S)
             blow = console.hammer(force_n=100.0, duration_ms=5.0, direction="x")
-            say(
-                f"hammer: 100 N for 5 ms along x; command {blow.id}, takes effect at {blow.time_s:.3f} s of simulated time"
-            )
+            effect = f"takes effect at {blow.time_s:.3f} s of simulated time"
+            say(f"hammer: 100 N for 5 ms along x; command {blow.id}, {effect}")
             for _ in range(3):
                 time.sleep(whirl_s / 3)
                 status = console.status()
                 late = status["lateness_ms"]
-                say(
-                    f"spin {status['spin_hz']:.3f} Hz; blocks late by {late['p50']:.3f} ms (p50), {late['p99']:.3f} ms (p99)"
-                )
+                lateness = f"{late['p50']:.3f} ms (p50), {late['p99']:.3f} ms (p99)"
+                say(f"spin {status['spin_hz']:.3f} Hz; blocks late by {lateness}")
             console.stop()
         say("stopped; the recorder closes its file")
         service.wait(_CLOSE_S)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import Any, NoReturn
 
 import typer
 
@@ -41,12 +41,17 @@ app = typer.Typer(
 _PANELS: dict[str, dict[str, Any]] = {
     "Start here": {"demo": demo.demo, "scenes": scenes.scenes, "params": params.params, "keys": keys.keys},
     "The rig as a service": {
-        "run": run.run, "hammer": hammer.hammer, "speed": speed.speed, "release": release.release, "step": step.step,
-        "status": status.status, "stop": stop.stop,
+        "run": run.run,
+        "hammer": hammer.hammer,
+        "speed": speed.speed,
+        "release": release.release,
+        "step": step.step,
+        "status": status.status,
+        "stop": stop.stop,
     },
     "Recordings and pictures": {"record": record.record, "view": view.view, "info": info.info},
     "Without a clock": {"simulate": simulate.simulate, "bench": bench.bench},
-}  # fmt: skip
+}
 for _panel, _commands in _PANELS.items():
     for _name, _function in _commands.items():
         # A negative value such as `rig speed -1` is a value, not an option: the rig explains what is wrong with it.
@@ -73,7 +78,7 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _fail(message: str) -> None:
+def _fail(message: str) -> NoReturn:
     print("rig: " + " ".join(message.split()), file=sys.stderr)
     sys.exit(2)
 

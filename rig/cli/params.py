@@ -32,11 +32,12 @@ def params(
         typer.echo(json.dumps(document, indent=2))
         return
     table = Table(title=f"{document['set']}: {document['title']}", box=None, header_style="bold", title_justify="left")
-    for heading, options in (
-        ("parameter", {"no_wrap": True}), ("symbol", {}), ("value", {"justify": "right"}), ("unit", {"no_wrap": True}),
-        ("kind", {"no_wrap": True}), ("source", {}),
-    ):  # fmt: skip
-        table.add_column(heading, **options)  # pyright: ignore[reportArgumentType]
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("symbol")
+    table.add_column("value", justify="right")
+    table.add_column("unit", no_wrap=True)
+    table.add_column("kind", no_wrap=True)
+    table.add_column("source")
     for key, entry in document["values"].items():
         value = entry["value"]
         shown = f"{value} = {entry['resolved']:.6g}" if isinstance(value, str) else f"{value:g}"

@@ -10,7 +10,7 @@ import typer
 def scenes(
     name: Annotated[str | None, typer.Argument(metavar="[SCENE]", help="Show this one in full.")] = None,
 ) -> None:
-    """List the scenes that come with the rig, or show one with every field; your own is a TOML file of the same form."""
+    """List the scenes that come with the rig, or show one with every field. Your own is a TOML file of that form."""
     import json
 
     from rich.console import Console

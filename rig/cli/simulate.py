@@ -54,11 +54,13 @@ def simulate(
             writer.write(frame)
             progress.update(bar, completed=simulation.tick)
     seconds = simulation.tick / simulation.tick_rate_hz
+    factor = seconds / (time.perf_counter() - begin)
     health = simulation.health()
+    energy = health["energy"]
     typer.echo(
-        f"{output}: {seconds:g} s simulated, {seconds / (time.perf_counter() - begin):.1f} times real time with the file, "
+        f"{output}: {seconds:g} s simulated, {factor:.1f} times real time with the file, "
         f"{output.stat().st_size / 1e6:.1f} MB; {health['contacts']} contacts, "
-        f"energy residual {health['energy']['residual_j']:.1e} J of {health['energy']['dissipated_j']:.3g} J dissipated"
+        f"energy residual {energy['residual_j']:.1e} J of {energy['dissipated_j']:.3g} J dissipated"
     )
     for warning in health["warnings"]:
         typer.echo(f"warning: {warning}", err=True)

@@ -11,7 +11,11 @@ from rig.cli.connection import Connect, console
 from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from rich.table import Table
+
+    from drivers.console import Console
 
 
 def status(
@@ -35,22 +39,35 @@ def status(
             return
 
 
-def _watch(rig: Any, as_json: bool) -> None:
-    import time
-
-    from rich.console import Console as Screen
+def _watch(rig: Console, as_json: bool) -> None:
     from rich.live import Live
 
     if as_json:
-        while (document := rig.status())["state"] == "running":
+        for document in _documents(rig):
             typer.echo(json.dumps(document))
-            time.sleep(0.5)
         return
-    with Live(status_table(rig.status()), console=Screen(), auto_refresh=False) as live:
-        while (document := rig.status())["state"] == "running":
+    with Live(auto_refresh=False) as live:
+        for document in _documents(rig):
             live.update(status_table(document), refresh=True)
-            time.sleep(0.5)
-        live.update(status_table(document), refresh=True)
+
+
+def _documents(rig: Console) -> Iterator[dict[str, Any]]:
+    """The status twice a second until the rig has ended."""
+    import time
+
+    from rig.transport import NoReplyError
+
+    document = rig.status()
+    while True:
+        yield document
+        if document["state"] != "running":
+            return
+        time.sleep(0.5)
+        try:
+            document = rig.status()
+        except NoReplyError:
+            # It ended, and was gone before it could be asked again.
+            return
 
 
 def _print(document: dict[str, Any]) -> None:

@@ -129,7 +129,7 @@ def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> 
         raise RefusedError(str(error)) from None
     with client:
         try:
-            described = live.ask(client)
+            described = live.ask(client, wait_s=wait_s)
         except NoReplyError as error:
             raise RefusedError(str(error)) from None
         stream = new_stream(f"rig at {connect}")

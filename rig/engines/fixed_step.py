@@ -1,7 +1,6 @@
-"""Explicit Runge-Kutta on a fixed step grid, divided inside a step where it has to be. `rk4` and `rk8` are its
-tableaus.
+"""Explicit Runge-Kutta on a fixed step grid, divided inside a step where it has to be.
 
-The grid is fixed; only what happens inside a step varies, by rules on the state alone:
+The methods are the tableaus of `rk4` and `rk8`. Only what happens inside a step varies, by rules on the state alone:
 
 - A step in which the shaft meets or leaves the ring is cut at the crossing, found on the cubic Hermite interpolant of
   the gap. The impact speed is latched there, not at the end of the step: that alone would cap the accuracy at about
@@ -119,7 +118,15 @@ def _divided_step(tableau, constants, inputs, tick, ticks, parts, onset_speed, t
 
 @njit(cache=True)
 def _crossing(d0, rate0, d1, rate1, h):
-    """Part of a step at which the gap crosses zero, on its cubic Hermite interpolant (d0 and d1 have opposite signs)."""
+    """Part of a step at which the gap crosses zero, on the gap's cubic Hermite interpolant.
+
+    Args:
+        d0: Penetration at the start [m].
+        rate0: Its rate [m/s].
+        d1: Penetration at the end [m], of the opposite sign.
+        rate1: Its rate [m/s].
+        h: Length of the step [s].
+    """
     low, high = 0.0, 1.0
     # Bisection guards Newton: the bracket always holds the crossing.
     s = d0 / (d0 - d1)
@@ -161,8 +168,8 @@ def _cut_step(tableau, constants, inputs, tick, ticks, memory, y, k, z, end, out
     fraction = 0.0
     if memory[TOUCHING] == 0.0:
         evaluate(constants, inputs, tick, fraction, memory[ONSET], False, False, y, k[0], out)
-        # The interpolant is of order 4 only: Newton on the flight itself puts the cut, and with it the impact speed,
-        # right.
+        # The interpolant is of order 4 only: Newton on the flight itself puts right the cut and the impact speed.
+        speed = rate0
         for _ in range(3):
             _step(tableau, constants, inputs, tick, fraction, cut * ticks, memory[ONSET], False, y, k, z, end, out)
             miss, speed = gap(constants, end)
@@ -255,8 +262,7 @@ def advance(tableau, constants, inputs, y, memory, tick, step_ticks, steps, stri
             _divided_step(tableau, constants, inputs, now, ticks, parts, memory[ONSET], touching, y, k, z, end, out)
         else:
             _step(tableau, constants, inputs, now, 0.0, ticks, memory[ONSET], touching, y, k, z, end, out)
-        # The rates at the end are those at the start of the next step, and tell whether contact began or ended on the
-        # way.
+        # The rates at the end are the next step's first, and tell whether contact began or ended on the way.
         observe = (n + 1) % stride == 0
         last = k[stages]
         evaluate(constants, inputs, now + step_ticks, 0.0, memory[ONSET], touching, observe, end, last, out)

@@ -1,8 +1,7 @@
-"""Dormand and Prince's Runge-Kutta of order 8, twelve stages, with its estimates of order 5 and 3 (DOP853;
-coefficients as scipy has them).
+"""Dormand and Prince's Runge-Kutta of order 8, twelve stages, with its estimates of order 5 and 3 (DOP853).
 
-The houses ring at 1.6 kHz with little damping, and each impact makes small errors larger: through the first impacts
-order 4 needs 2 us for what this does at 25 us, at a third of the work.
+The coefficients are scipy's. The houses ring at 1.6 kHz with little damping, and each impact makes small errors
+larger: through the first impacts order 4 needs 2 us for what this does at 25 us, at a third of the work.
 """
 
 from __future__ import annotations

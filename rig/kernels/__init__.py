@@ -12,9 +12,10 @@ import os
 import sys
 from pathlib import Path
 
-import numba
+from numba.core import config as numba_config
 
-_SOURCES = (Path(__file__).parent, Path(__file__).parent.parent / "engines", Path(__file__).parent.parent / "sensors")
+_KERNELS = Path(__file__).parent
+_SOURCES = (_KERNELS, _KERNELS.parent / "engines", _KERNELS.parent / "sensors")
 
 
 def source_digest() -> str:
@@ -34,10 +35,10 @@ def _cache_folder() -> Path:
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
-    numba.config.CACHE_DIR = str(_cache_folder())  # pyright: ignore[reportAttributeAccessIssue]
+    numba_config.CACHE_DIR = str(_cache_folder())  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def compiled_before() -> bool:
     """True where the cache already holds kernels of exactly these sources: the start will be quick."""
-    folder = Path(str(numba.config.CACHE_DIR))  # pyright: ignore[reportAttributeAccessIssue]
+    folder = Path(str(numba_config.CACHE_DIR))  # pyright: ignore[reportAttributeAccessIssue]
     return folder.is_dir() and any(folder.rglob("*.nbc"))

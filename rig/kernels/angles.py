@@ -12,7 +12,10 @@ SERIES_REACH = 0.06
 
 @njit(cache=True)
 def sin_cos(angle):
-    """Sine and cosine; by their series where those are exact to rounding, which costs a quarter of the library's functions."""
+    """Sine and cosine of an angle [rad].
+
+    By their series where those are exact to rounding, which costs a quarter of the library's functions.
+    """
     if abs(angle) > SERIES_REACH:
         return math.sin(angle), math.cos(angle)
     s = angle * angle

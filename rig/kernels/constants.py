@@ -22,7 +22,10 @@ class Shaft(NamedTuple):
 
 
 class Magnet(NamedTuple):
-    """Radial map of the magnets: F = -stiffness (r + a3 r^3 + a5 r^5 + a7 r^7), with viscous damping at the same point."""
+    """Radial map of the magnets, with viscous damping at the same point.
+
+    F = -stiffness (r + a3 r^3 + a5 r^5 + a7 r^7).
+    """
 
     stiffness: float  # [N/m]
     a3: float  # [1/m^2]

@@ -11,8 +11,9 @@ from numba import njit
 def normal_force(penetration, rate, onset_speed, stiffness, damping_factor):
     """Compliant normal force with hysteresis damping, eq. 44.
 
-    F = K delta^1.5 (1 + c delta'/v0), clamped at 0: a contact cannot pull. Trap: v0 -> 0 at grazing onsets blows the
-    damping term up; the caller floors v0.
+    F = K delta^1.5 (1 + c delta'/v0), clamped at 0: a contact cannot pull.
+
+    Trap: v0 -> 0 at grazing onsets blows the damping term up; the caller floors v0.
 
     Args:
         penetration: delta [m]; no force unless positive.
@@ -32,12 +33,21 @@ def normal_force(penetration, rate, onset_speed, stiffness, damping_factor):
 
 @njit(cache=True)
 def friction_force(force, sliding_speed, friction, smoothing_speed):
-    """Coulomb friction, regularised: mu F_n tanh(v_t / v_s), against the sliding speed of eq. 39 (not sgn(theta') of
-    eq. 12).
+    """Coulomb friction, regularised: mu F_n tanh(v_t / v_s).
 
-    Trap: below sliding at about v_s the contact creeps by v_s atanh(needed / mu), and an explicit step must stay
-        below about
-    2 m_t v_s / (mu F_n).
+    It acts against the sliding speed of eq. 39 (not sgn(theta') of eq. 12).
+
+    Trap: below sliding at about v_s the contact creeps by v_s atanh(needed / mu), and an explicit step must stay below
+    about 2 m_t v_s / (mu F_n).
+
+    Args:
+        force: F_n [N].
+        sliding_speed: v_t [m/s].
+        friction: mu [1].
+        smoothing_speed: v_s [m/s].
+
+    Returns:
+        Force [N], positive against a positive sliding speed.
     """
     return friction * force * math.tanh(sliding_speed / smoothing_speed)
 
@@ -49,8 +59,7 @@ def ring_force(
     """Force of the ring on the shaft, eqs. 12 and 44 in the plane of the ring.
 
     Frame: n = e/|e| points from the ring's centre to the shaft's, t = (-n_y, n_x). F = -F_n n - F_t t acts on the
-        shaft, the
-    opposite on the inner house; the shaft's spin feels -radius F_t.
+    shaft, the opposite on the inner house; the shaft's spin feels -radius F_t.
 
     Args:
         ex: Shaft centre minus ring centre, x [m].

@@ -10,9 +10,9 @@ Shaft: Euler's equations (15) in the frame B2 that follows the shaft but not its
     Izz w' = T_drive - R_S F_t
 
 where (L_x, L_y) is the sum of arm times lateral force. Both torques act along the shaft, so they do work on w and
-have no part in the first equation: this is eq. 17 with its signs, where a Lagrangian form has the torque's share sin
-b T in Q_Gamma. For the same reason the surface speed in eq. 39 is R_S w, which differs from R_S theta' by less than
-1e-3 but closes the energy ledger.
+have no part in the first equation: this is eq. 17 with its signs, where a Lagrangian form has the torque's share
+sin b T in Q_Gamma. For the same reason the surface speed in eq. 39 is R_S w, which differs from R_S theta' by less
+than 1e-3 but closes the energy ledger.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ KEYPHASOR_WIDTH = math.radians(10.0)
 
 @njit(cache=True)
 def hammer_force(inputs, tick, fraction):
-    """Half-sine pulse of the hammer [N] at `tick + fraction` (a whole tick and the part beyond, apart to stay exact)."""
+    """Half-sine pulse of the hammer [N] at `tick + fraction`: a whole tick and the part beyond, apart to stay exact."""
     if tick >= inputs.hammer_end or tick + fraction < inputs.hammer_start or inputs.hammer_end <= inputs.hammer_start:
         return 0.0
     phase = (float(tick - inputs.hammer_start) + fraction) / float(inputs.hammer_end - inputs.hammer_start)
@@ -81,13 +81,8 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     """
     # params:
     shaft, magnet, contact, house = constants.shaft, constants.magnet, constants.contact, constants.house
-    Ixx, Izz, lA, lB, lI = (
-        shaft.transverse_inertia,
-        shaft.polar_inertia,
-        shaft.arm_ring,
-        shaft.arm_magnet,
-        shaft.arm_disk,
-    )
+    Ixx, Izz = shaft.transverse_inertia, shaft.polar_inertia
+    lA, lB, lI = shaft.arm_ring, shaft.arm_magnet, shaft.arm_disk
     # state in:
     dG, db, dth = y[7], y[8], y[9]
     x_ih, y_ih, x_oh, y_oh = y[3], y[4], y[5], y[6]
@@ -211,8 +206,7 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     out[S.INNER_AY] = ay_ih
     out[S.OUTER_AX] = ax_oh
     out[S.OUTER_AY] = ay_oh
-    # Acceleration of the axis direction, for the reaction at the pivot: R = M a_C - sum of the applied forces (eqs.
-    # 20-21).
+    # Reaction at the pivot, R = M a_C - sum of the applied forces (eqs. 20-21), from the axis's acceleration.
     spread = dG * dG + db * db
     ddux = cb * ddb - sb * db * db
     dduy = -cG * cb * ddG + sG * sb * ddb + sG * cb * spread + 2.0 * cG * sb * dG * db

@@ -1,4 +1,4 @@
-"""Magnet force at the shaft's end: the radial map that the engines use (the field sum it is fitted to is in `rig.magnets`)."""
+"""Magnet force at the shaft's end: the radial map, fitted to the field sum that is in `rig.magnets`."""
 
 from __future__ import annotations
 

@@ -106,19 +106,29 @@ N_OBSERVED = len(OBSERVED)
 N_ROW = len(ROW)
 
 # Positions in the vector and in the observed part, for the kernels.
-(DRIVE_WORK, HAMMER_WORK, UNBALANCE_WORK, GAP_WORK, RELEASE_WORK, BEARING_LOSS, HOUSE_LOSS, CONTACT_LOSS, FRICTION_LOSS,
- CONTACT_IMPULSE, ANGULAR_IMPULSE_X, ANGULAR_IMPULSE_Y, ANGULAR_IMPULSE_Z, HOUSE_IMPULSE_X, HOUSE_IMPULSE_Y,
- ) = range(N_STATE, N_VECTOR)  # fmt: skip
-(PENETRATION, PENETRATION_RATE, NORMAL_FORCE, FRICTION_FORCE, SLIDING_SPEED, ONSET_SPEED, P_N, P_S, P_E, P_W, INNER_AX, INNER_AY, OUTER_AX, OUTER_AY,
- PIVOT_X, PIVOT_Y, PIVOT_Z, HAMMER_FORCE, DISK_X, DISK_Y, RING_X, RING_Y, SPIN_RATE, KEYPHASOR, DRIVE_TORQUE, MAGNET_X, MAGNET_Y,
- KINETIC, GRAVITY, MAGNETIC, HOUSE, CONTACT, ANGULAR_X, ANGULAR_Y, ANGULAR_Z, HOUSE_X, HOUSE_Y,
- ) = range(N_OBSERVED)  # fmt: skip
+(
+    DRIVE_WORK, HAMMER_WORK, UNBALANCE_WORK, GAP_WORK, RELEASE_WORK,
+    BEARING_LOSS, HOUSE_LOSS, CONTACT_LOSS, FRICTION_LOSS,
+    CONTACT_IMPULSE, ANGULAR_IMPULSE_X, ANGULAR_IMPULSE_Y, ANGULAR_IMPULSE_Z, HOUSE_IMPULSE_X, HOUSE_IMPULSE_Y,
+) = range(N_STATE, N_VECTOR)  # fmt: skip
+(
+    PENETRATION, PENETRATION_RATE, NORMAL_FORCE, FRICTION_FORCE, SLIDING_SPEED, ONSET_SPEED,
+    P_N, P_S, P_E, P_W, INNER_AX, INNER_AY, OUTER_AX, OUTER_AY, PIVOT_X, PIVOT_Y, PIVOT_Z, HAMMER_FORCE,
+    DISK_X, DISK_Y, RING_X, RING_Y, SPIN_RATE, KEYPHASOR, DRIVE_TORQUE, MAGNET_X, MAGNET_Y,
+    KINETIC, GRAVITY, MAGNETIC, HOUSE, CONTACT, ANGULAR_X, ANGULAR_Y, ANGULAR_Z, HOUSE_X, HOUSE_Y,
+) = range(N_OBSERVED)  # fmt: skip
 
 TRUTH = {
     "state": tuple(signal.name for signal in STATE),
     "contact": ("penetration", "penetration_rate", "normal_force", "friction_force", "sliding_speed", "onset_speed"),
-    "forces": ("P_N", "P_S", "P_E", "P_W", "pivot_x", "pivot_y", "pivot_z", "magnet_x", "magnet_y", "hammer_force", "drive_torque"),
-    "energy": ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy", "drive_work", "hammer_work",
-               "unbalance_work", "gap_work", "release_work", "bearing_loss", "house_loss", "contact_loss", "friction_loss"),
+    "forces": (
+        "P_N", "P_S", "P_E", "P_W", "pivot_x", "pivot_y", "pivot_z",
+        "magnet_x", "magnet_y", "hammer_force", "drive_torque",
+    ),
+    "energy": (
+        "kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy",
+        "drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work",
+        "bearing_loss", "house_loss", "contact_loss", "friction_loss",
+    ),
 }  # fmt: skip
 """Columns of each truth table that is published beside the sensors."""

@@ -77,7 +77,7 @@ def channel_filter(channel: Channel, row_rate_hz: float) -> np.ndarray:
     if channel.bandwidth_hz < 0.45 * row_rate_hz:
         sections[:2] = butter(4, channel.bandwidth_hz, fs=row_rate_hz, output="sos")
     if channel.highpass_hz > 0.0:
-        sections[2] = butter(1, channel.highpass_hz, "highpass", fs=row_rate_hz, output="sos")[0]
+        sections[2:] = butter(1, channel.highpass_hz, "highpass", fs=row_rate_hz, output="sos")
     return sections
 
 

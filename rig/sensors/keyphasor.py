@@ -41,16 +41,18 @@ class Keyphasor:
         turns = np.floor(angle / TURN)
         for n in np.nonzero(turns[1:] > turns[:-1])[0]:
             step = row_ticks * 1e-6
-            found.append(
-                (first + n + _crossing(turns[n + 1] * TURN, angle[n : n + 2], rate[n : n + 2] * step)) * row_ticks
-            )
+            part = _crossing(turns[n + 1] * TURN, angle[n : n + 2], rate[n : n + 2] * step)
+            found.append((first + n + part) * row_ticks)
         self._angle, self._rate = float(angle[-1]), float(rate[-1])
         self.edges_seen += len(found)
         return np.array(found, dtype=np.float64)
 
 
 def _crossing(target: float, angle: np.ndarray, slope: np.ndarray) -> float:
-    """Part of an interval at which the interpolant reaches the target (Newton; the angle is nearly straight over one row)."""
+    """Part of an interval at which the interpolant reaches the target, by Newton's method.
+
+    Four rounds are enough: the angle is nearly straight over one row.
+    """
     (y0, y1), (m0, m1) = angle - target, slope
     s = -y0 / (y1 - y0)
     for _ in range(4):

@@ -542,9 +542,8 @@ def solve(
             if event is not None:
                 root = event.time
                 z_root = landed(t_old, z_old, root)
-                for _ in range(
-                    3 if event.kink < 0 else 0
-                ):  # to the root of the integrated state, not the interpolant's
+                # To the root of the integrated state, not the interpolant's.
+                for _ in range(3 if event.kink < 0 else 0):
                     d, d_rate = (float(v) for v in gap(rig, z_root))
                     move = -d / d_rate if d_rate else 0.0
                     if abs(move) <= 2 * math.ulp(root) or not t_old < root + move <= solver.t:

@@ -1,23 +1,23 @@
 """What must agree with what, and why: the physics of the rig against things that are not its own code.
 
-| the rig's                        | must agree with                                    | because                                                |
-|----------------------------------|----------------------------------------------------|--------------------------------------------------------|
-| contact force, turned            | itself, turned by the same angle                   | the law knows no direction (frame invariance)          |
-| first impacts, 0.1 s of hammer   | DOP853 at 1e-11 on equations derived by Lagrange   | two derivations, two solvers; not chaotic              |
-| first impacts, 0.06 s of drop    | the same                                           | the same                                               |
-| drop: time and speed of impact   | rigid pendulum, closed form                        | free fall before contact                               |
-| free flight                      | matrix exponential of the linearised equations     | small motion is linear                                 |
-| energy ledger                    | zero residual                                      | first law                                              |
-| momentum ledger                  | zero residual                                      | Newton and Euler                                       |
-| pivot reaction                   | static lever rule                                  | statics                                                |
-| order of each engine             | 4 and 8                                            | Runge-Kutta on the smooth problem                      |
-| restitution of the exact factor  | what was asked for                                 | definition of e                                        |
-| contact stiffness                | Hertz, 2.86e10 / 5.40e9 N/m^1.5                    | elastostatics                                          |
-| whirl                            | backward, rolling, -spin R_S/(r0+delta)            | kinematics of rolling; the paper's eq. 41              |
-| mean whirl force                 | grows as spin squared                              | centrifugal force                                      |
-| 2 ms hammer                      | dies out                                           | too little energy to keep rolling                      |
-| magnet map                       | field sum of eqs. 35, 38                           | it is fitted to it                                     |
-| field sum, far apart             | exact cylinders (magpylib)                         | dipoles are the far field of cylinders                 |
+| the rig's                       | must agree with                         | because                                  |
+|---------------------------------|-----------------------------------------|------------------------------------------|
+| contact force, turned           | itself, turned by the same angle        | frame invariance: no special direction   |
+| first impacts, 0.1 s of hammer  | DOP853 at 1e-11 on Lagrange's equations | two derivations and solvers; not chaotic |
+| first impacts, 0.06 s of drop   | the same                                | the same                                 |
+| drop: time and speed of impact  | rigid pendulum, closed form             | free fall before contact                 |
+| free flight                     | matrix exponential, linear equations    | small motion is linear                   |
+| energy ledger                   | zero residual                           | first law                                |
+| momentum ledger                 | zero residual                           | Newton and Euler                         |
+| pivot reaction                  | static lever rule                       | statics                                  |
+| order of each engine            | 4 and 8                                 | Runge-Kutta on the smooth problem        |
+| restitution of the exact factor | what was asked for                      | definition of e                          |
+| contact stiffness               | Hertz, 2.86e10 / 5.40e9 N/m^1.5         | elastostatics                            |
+| whirl                           | backward, rolling, -spin R_S/(r0+delta) | kinematics of rolling; paper's eq. 41    |
+| mean whirl force                | grows as spin squared                   | centrifugal force                        |
+| 2 ms hammer                     | dies out                                | too little energy to keep rolling        |
+| magnet map                      | field sum of eqs. 35, 38                | it is fitted to it                       |
+| field sum, far apart            | exact cylinders (magpylib)              | dipoles are the far field of cylinders   |
 """
 
 from __future__ import annotations
@@ -46,13 +46,17 @@ def reference_rig(run: Run) -> reference.Rig:
     shaft, magnet, contact, house = c.shaft, c.magnet, c.contact, c.house
     engaged = run.simulation.scene.initial.magnets
     return reference.Rig(
-        M=shaft.mass, Ixx=shaft.transverse_inertia, Izz=shaft.polar_inertia, l0A=shaft.arm_ring, l0B=shaft.arm_magnet,
-        l0C=shaft.arm_centre, l0I=shaft.arm_disk, eps=shaft.unbalance / shaft.mass, phi=shaft.unbalance_phase, g=shaft.gravity,
-        K_mag=magnet.stiffness, a3=magnet.a3, a5=magnet.a5, a7=magnet.a7, D_x=magnet.damping_x if engaged else 0.0,
-        D_y=magnet.damping_y if engaged else 0.0, c_d=c.torque_gain, R_S=shaft.radius, r0=contact.clearance, x0=contact.offset_x,
-        y0=contact.offset_y, K=contact.stiffness, c=contact.damping_factor, mu=contact.friction, v_s=contact.smoothing_speed,
-        v_floor=contact.speed_floor, M_ih=house.inner_mass, M_oh=house.outer_mass, K_bv=house.inner_beam_stiffness,
-        K_bh=house.outer_beam_stiffness, D_bv=house.inner_beam_damping, D_bh=house.outer_beam_damping,
+        M=shaft.mass, Ixx=shaft.transverse_inertia, Izz=shaft.polar_inertia, g=shaft.gravity,
+        l0A=shaft.arm_ring, l0B=shaft.arm_magnet, l0C=shaft.arm_centre, l0I=shaft.arm_disk,
+        eps=shaft.unbalance / shaft.mass, phi=shaft.unbalance_phase, R_S=shaft.radius, c_d=c.torque_gain,
+        K_mag=magnet.stiffness, a3=magnet.a3, a5=magnet.a5, a7=magnet.a7,
+        D_x=magnet.damping_x if engaged else 0.0, D_y=magnet.damping_y if engaged else 0.0,
+        r0=contact.clearance, x0=contact.offset_x, y0=contact.offset_y,
+        K=contact.stiffness, c=contact.damping_factor, mu=contact.friction,
+        v_s=contact.smoothing_speed, v_floor=contact.speed_floor,
+        M_ih=house.inner_mass, M_oh=house.outer_mass,
+        K_bv=house.inner_beam_stiffness, K_bh=house.outer_beam_stiffness,
+        D_bv=house.inner_beam_damping, D_bh=house.outer_beam_damping,
         k_ns=house.pair_stiffness_vertical, k_ew=house.pair_stiffness_horizontal, P0=house.preload,
     )  # fmt: skip
 
@@ -68,11 +72,13 @@ def test_first_impacts_against_independent_solver(scene: str, duration_s: float)
     run = simulate(load_scene(scene, {"sensors.noise": False, "sensors.rate_hz": 10_000}), duration_s=duration_s)
     blow = next((event for event in run.events if event["event"] == "hammer"), None)
     solution = reference.solve(
-        reference_rig(run), run.signals[0, : S.N_STATE], run.times_s,
+        reference_rig(run),
+        run.signals[0, : S.N_STATE],
+        run.times_s,
         omega0=2 * math.pi * run.simulation.scene.drive.speed_hz,
         hammer=None if blow is None else (blow["time_s"], blow["duration_ms"] * 1e-3, blow["force_n"], 0.0),
         magnet=run.simulation.scene.initial.magnets,
-    )  # fmt: skip
+    )
     assert len(solution.onsets) >= 2, "the comparison must reach through impacts"
     error = np.abs(run.signals[:, : S.N_STATE] - solution.states) / SCALES
     assert np.sqrt(np.mean(error**2, axis=1)).max() < 1e-4
@@ -81,13 +87,19 @@ def test_first_impacts_against_independent_solver(scene: str, duration_s: float)
 
 def test_contact_force_is_frame_invariant() -> None:
     rng = np.random.default_rng(3)
-    law = dict(
-        clearance=0.926e-3, onset_speed=0.1, stiffness=2.86e10, damping_factor=0.17, friction=0.25, smoothing_speed=5e-3
-    )
+    clearance = 0.926e-3
+    law = {
+        "clearance": clearance,
+        "onset_speed": 0.1,
+        "stiffness": 2.86e10,
+        "damping_factor": 0.17,
+        "friction": 0.25,
+        "smoothing_speed": 5e-3,
+    }
     for _ in range(200):
         angle = rng.uniform(-math.pi, math.pi)
         e = rng.normal(size=2)
-        e *= (0.926e-3 + rng.uniform(0, 3e-5)) / np.hypot(*e)
+        e *= (clearance + rng.uniform(0, 3e-5)) / np.hypot(*e)
         v = rng.normal(size=2) * 0.1
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         surface = rng.normal() * 0.3
@@ -117,21 +129,23 @@ def test_free_flight_follows_the_linear_solution() -> None:
     from scipy.linalg import expm
 
     # A ring wide enough to stay clear, spinning, small motion about the centre (no gravity), no unbalance.
-    scene = load_scene("stable-run", {
-        "gravity.acceleration": 0.0, "shaft.unbalance_eccentricity": 0.0, "ring.offset_y": 0.0, "initial.position": "given",
-        "initial.x_mm": 0.01, "initial.y_mm": -0.005, "drive.speed_hz": 12.0, "sensors.noise": False,
-    })  # fmt: skip
-    run = simulate(scene, duration_s=1.0)
+    changes = {
+        "gravity.acceleration": 0.0,
+        "shaft.unbalance_eccentricity": 0.0,
+        "ring.offset_y": 0.0,
+        "initial.position": "given",
+        "initial.x_mm": 0.01,
+        "initial.y_mm": -0.005,
+        "drive.speed_hz": 12.0,
+        "sensors.noise": False,
+    }
+    run = simulate(load_scene("stable-run", changes), duration_s=1.0)
     c = run.simulation.model.constants
     Ixx, Izz, lB, K = c.shaft.transverse_inertia, c.shaft.polar_inertia, c.shaft.arm_magnet, c.magnet.stiffness
     spin = 2 * math.pi * 12.0
     # Gamma, beta, rates: Ixx G'' = -K lB^2 G - Dy lB^2 G' - Izz w b', Ixx b'' = -K lB^2 b - Dx lB^2 b' + Izz w G'
-    stiff, dx, dy, gyro = (
-        K * lB**2 / Ixx,
-        c.magnet.damping_x * lB**2 / Ixx,
-        c.magnet.damping_y * lB**2 / Ixx,
-        Izz * spin / Ixx,
-    )
+    stiff, gyro = K * lB**2 / Ixx, Izz * spin / Ixx
+    dx, dy = (damping * lB**2 / Ixx for damping in (c.magnet.damping_x, c.magnet.damping_y))
     A = np.array([[0, 0, 1, 0], [0, 0, 0, 1], [-stiff, 0, -dy, -gyro], [0, -stiff, gyro, -dx]])
     start = run.signals[0, [0, 1, 7, 8]]
     size = np.array([1.0, 1.0, math.sqrt(stiff), math.sqrt(stiff)]) * np.linalg.norm(start[:2])
@@ -184,14 +198,22 @@ def test_order_on_the_smooth_problem(engine: str, steps: list[int], monkeypatch:
     module = load_engine(engine)
     monkeypatch.setattr(module, "TABLEAU", module.TABLEAU._replace(tolerance=math.inf))
 
-    # Undamped free flight on very stiff, hardening magnets, in a ring too wide to touch: smooth, nonlinear, fast (220
-    # Hz).
+    # Undamped free flight at 220 Hz on stiff, hardening magnets, in a ring too wide to touch: smooth and nonlinear.
+    free_flight = {
+        "ring.clearance": 15.0,
+        "initial.position": "given",
+        "initial.x_mm": 0.8,
+        "initial.y_mm": 0.4,
+        "magnet.stiffness": 1000.0,
+        "shaft.damping_ratio_x": 0.0,
+        "shaft.damping_ratio_y": 0.0,
+        "drive.speed_hz": 8.0,
+        "sensors.rate_hz": 1000,
+        "sensors.truth_rate_hz": 1000,
+    }
+
     def swing(name: str, step_us: int) -> np.ndarray:
-        scene = load_scene("stable-run", {
-            "ring.clearance": 15.0, "initial.position": "given", "initial.x_mm": 0.8, "initial.y_mm": 0.4,
-            "engine.name": name, "engine.step_us": step_us, "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000,
-            "magnet.stiffness": 1000.0, "shaft.damping_ratio_x": 0.0, "shaft.damping_ratio_y": 0.0, "drive.speed_hz": 8.0,
-        })  # fmt: skip
+        scene = load_scene("stable-run", {**free_flight, "engine.name": name, "engine.step_us": step_us})
         run = simulate(scene, duration_s=0.05)
         assert run["normal_force"].max() == 0.0
         assert run.simulation._memory[DIVIDED] == 0.0
@@ -227,15 +249,14 @@ def test_restitution_of_zero_is_refused() -> None:
 
 def test_contact_stiffness_and_effective_mass_are_the_papers() -> None:
     model = build_model(load_parameters())
-    assert model.constants.contact.stiffness == pytest.approx(2.86e10, rel=2e-3)
+    shaft, contact = model.constants.shaft, model.constants.contact
+    assert contact.stiffness == pytest.approx(2.86e10, rel=2e-3)
     outside = build_model(load_parameters().override({"contact.stiffness": "external-sphere"}))
     assert outside.constants.contact.stiffness == pytest.approx(5.40e9, rel=2e-3)
-    assert model.constants.shaft.transverse_inertia / model.constants.shaft.arm_ring**2 == pytest.approx(
-        1.987, abs=1e-3
-    )
-    assert model.constants.contact.damping_factor == pytest.approx(0.1665, abs=1e-4)
+    assert shaft.transverse_inertia / shaft.arm_ring**2 == pytest.approx(1.987, abs=1e-3)
+    assert contact.damping_factor == pytest.approx(0.1665, abs=1e-4)
     # A sagged shaft would lie outside a ring centred on the axis: hence the offset.
-    assert abs(model.sag) > model.constants.contact.clearance
+    assert abs(model.sag) > contact.clearance
 
 
 def whirl_of(run: Run, *, from_s: float) -> dict[str, float]:
@@ -243,13 +264,12 @@ def whirl_of(run: Run, *, from_s: float) -> dict[str, float]:
     kept = run.times_s >= from_s
     phase = np.unwrap(np.angle(run["ring_x"][kept] + 1j * run["ring_y"][kept]))
     times = run.times_s[kept]
-    law = run.simulation.model.constants
+    constants = run.simulation.model.constants
+    orbit = constants.contact.clearance + run["penetration"][kept]
+    rolling = -np.mean(run["theta_rate"][kept] * constants.shaft.radius / orbit)
     return {
         "hz": float(np.polyfit(times, phase, 1)[0] / (2 * math.pi)),
-        "law_hz": float(
-            -np.mean(run["theta_rate"][kept] * law.shaft.radius / (law.contact.clearance + run["penetration"][kept]))
-            / (2 * math.pi)
-        ),
+        "law_hz": float(rolling / (2 * math.pi)),
         "spin_hz": float(run["theta_rate"][kept].mean() / (2 * math.pi)),
         "force": float(run["normal_force"][kept].mean()),
         "slip": float(np.abs(run["sliding_speed"][kept]).mean()),
@@ -317,24 +337,25 @@ def test_field_sum_is_the_far_field_of_cylinders() -> None:
     geometry = MagnetGeometry(3, 5e-3, 3e-3, 2e-3, 0.12, 705e3)
     x = 4e-3
     paper = field_sum_force(np.array([x]), np.array([0.0]), geometry)[0]
-    around = 2 * np.pi * np.arange(geometry.count) / geometry.count
-    bearing = magpy.Collection(*[
+    around = 2 * np.pi * np.arange(geometry.number) / geometry.number
+    cylinders = [
         magpy.magnet.Cylinder(
-            magnetization=(0, 0, geometry.magnetisation), dimension=(2 * geometry.bearing_magnet_radius, geometry.length),
+            magnetization=(0, 0, geometry.magnetisation),
+            dimension=(2 * geometry.bearing_magnet_radius, geometry.length),
             position=(geometry.bearing_radius * math.cos(a), geometry.bearing_radius * math.sin(a), 0),
         )
         for a in around
-    ])  # fmt: skip
+    ]
+    bearing = magpy.Collection(*cylinders)
     # Force on the shaft magnet from its surface current M0 on thin loops along its length.
     heights = (np.arange(9) - 4) / 9 * geometry.length
     phi = 2 * np.pi * np.arange(90) / 90
     force = np.zeros(2)
+    radius = geometry.shaft_magnet_radius
     for z in heights:
-        points = np.stack([
-            x + geometry.shaft_magnet_radius * np.cos(phi), geometry.shaft_magnet_radius * np.sin(phi), np.full(90, z)
-        ], axis=-1)  # fmt: skip
+        points = np.stack([x + radius * np.cos(phi), radius * np.sin(phi), np.full(90, z)], axis=-1)
         field = bearing.getB(points)[:, 2]
-        weight = geometry.magnetisation * geometry.length / 9 * geometry.shaft_magnet_radius * 2 * np.pi / 90
+        weight = geometry.magnetisation * geometry.length / 9 * radius * 2 * np.pi / 90
         force += weight * np.array([np.sum(field * np.cos(phi)), np.sum(field * np.sin(phi))])
     np.testing.assert_allclose(paper[0], force[0], rtol=0.05)
 

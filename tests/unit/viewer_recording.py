@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Samples
-from rig.channels import default_table
+from rig import wire
+from rig.channels import Group, default_table
 
 RATE_HZ = 20_000
 CLEARANCE_MM = 0.926
@@ -22,7 +24,7 @@ WALL = "wall_time"
 
 
 class Synthetic:
-    """Free for the first third, then a full annular whirl at `whirl_hz`; a hammer blow in between; answers as a `Recording`."""
+    """Free for the first third, then a hammer blow and a whirl at `whirl_hz`; answers as a `Recording` does."""
 
     def __init__(self, *, duration_s: float = 1.8, whirl_hz: float = -83.0, pace: float = 1.0, seed: int = 3) -> None:
         self.table = default_table()
@@ -154,3 +156,41 @@ class Saved:
 
     def __getitem__(self, key: tuple[str, str]) -> Column:
         return self.columns[key]
+
+
+def stream_of(recording: Synthetic, *, block_s: float = 0.01) -> Iterator[list[tuple[str, bytes]]]:
+    """What a rig would have published of a recording: keys and payloads, a list for each block time."""
+    rows = round(block_s * RATE_HZ)
+    counts = {name: _counts(group, recording.values[name]) for name, group in recording.table.groups.items()}
+    events = sorted(recording.events, key=lambda event: event["time_s"])
+    truth = recording.truth("contact").values
+    for number in range(len(recording.times_s) // rows):
+        start = number * rows
+        tick = round(start * 1e6 / RATE_HZ)
+        sent = []
+        while events and events[0]["time_s"] <= tick / 1e6:
+            sent.append((wire.EVENTS, wire.encode_document(events.pop(0))))
+        for name in recording.table.groups:
+            block = wire.Block(tick, start, float(RATE_HZ), 1e6, counts[name][start : start + rows])
+            sent.append((wire.sensor_key(name), wire.encode_block(block)))
+        true = wire.Block(tick, start // 10, 2000.0, 1e6, truth[start // 10 : (start + rows) // 10])
+        sent.append((wire.truth_key("contact"), wire.encode_block(true)))
+        yield sent
+    yield [(wire.EVENTS, wire.encode_document(event)) for event in events]
+
+
+def _counts(group: Group, values: np.ndarray) -> np.ndarray:
+    scale = np.array([channel.scale for channel in group.channels])
+    offset = np.array([channel.offset for channel in group.channels])
+    return np.round((values - offset) / scale).astype(np.int32)
+
+
+def documents_of(recording: Synthetic) -> dict[str, bytes]:
+    """Replies of the rig's queries."""
+    table = recording.table.model_dump(mode="json")
+    catalogue = {"root": "rig", "tick_rate_hz": 1e6, "table": table, **recording.catalogue}
+    return {
+        wire.CATALOGUE: wire.encode_document(catalogue),
+        wire.PARAMETERS: wire.encode_document(recording.parameters),
+        wire.SCENE: wire.encode_document({"name": "synthetic"}),
+    }

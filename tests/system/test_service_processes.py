@@ -1,0 +1,277 @@
+"""A rig, its clients and its commands as processes of their own, over loopback."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from rig import wire
+from rig.cli import hammer, release, speed, status, step, stop
+from rig.errors import InputError, RefusedError
+from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.unit.test_transport_zenoh import free_endpoint, until
+
+pytestmark = pytest.mark.wallclock
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """A Python process, ended for certain."""
+    command = [sys.executable, *arguments]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+@contextmanager
+def rig(pace: str, *duration_s: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    endpoint = free_endpoint()
+    with process("-m", "tests.unit.service_fake", endpoint.rpartition(":")[2], pace, *duration_s) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "ready\n"
+        yield child, endpoint
+
+
+class Listener:
+    """Follows a stream and notices gaps."""
+
+    def __init__(self, client: ZenohClient) -> None:
+        self.follow = wire.Continuity()
+        self.first: dict[str, int] = {}
+        self.gaps: list[wire.Gap] = []
+        self.missed = 0
+        self.events: list[dict[str, Any]] = []
+        self.alive: list[bool] = []
+        client.watch(wire.ALIVE, self.alive.append)
+        client.subscribe("rig/**", self._take, on_miss=self._miss, history=True)
+
+    def _take(self, key: str, payload: bytes) -> None:
+        schema = wire.schema_of(key)
+        if schema is not None:
+            block = wire.decode_block(payload, schema)
+            self.first.setdefault(key, block.index)
+            if (gap := self.follow.follow(key, block.index, len(block.values))) is not None:
+                self.gaps.append(gap)
+        elif key == wire.EVENTS:
+            self.events.append(wire.decode_document(payload))
+
+    def _miss(self, _: str, count: int) -> None:
+        self.missed += count
+
+    def complete(self) -> bool:
+        """Whether all rows that the rig says it has published are here."""
+        ends = [event for event in self.events if event["event"] == "end"]
+        return bool(ends) and self.follow.received == ends[0]["rows"] and not any(self.first.values())
+
+
+def test_a_paced_rig_keeps_time_and_loses_nothing() -> None:
+    with rig("real-time", "2") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
+        listener = Listener(client)
+        output, _ = child.communicate(timeout=30.0)
+        until(listener.complete)
+        summary = json.loads(output)
+    assert child.returncode == 0
+    assert summary["reason"] == "completed"
+    assert summary["real_time_factor"] == pytest.approx(1.0, abs=0.02)
+    assert summary["queue"]["dropped"] == 0
+    assert listener.gaps == []
+    assert listener.missed == 0
+    assert [event["event"] for event in listener.events] == ["start", "end"]
+
+
+def test_a_free_rig_waits_for_its_subscribers_and_loses_nothing() -> None:
+    with rig("free", "20") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
+        listener = Listener(client)
+        output, _ = child.communicate(timeout=60.0)
+        until(listener.complete)
+        summary = json.loads(output)
+    assert listener.gaps == []
+    assert summary["queue"]["dropped"] == 0
+    assert summary["real_time_factor"] > 1.0
+
+
+def test_a_signal_ends_the_stream_in_good_order() -> None:
+    with rig("real-time") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
+        listener = Listener(client)
+        until(lambda: bool(listener.follow.received))
+        child.send_signal(signal.SIGTERM)
+        output, _ = child.communicate(timeout=30.0)
+        until(listener.complete)
+        until(lambda: listener.alive == [True, False])
+    assert child.returncode == 0
+    assert json.loads(output)["reason"] == "stopped"
+    assert listener.events[-1]["reason"] == "stopped"
+
+
+def test_a_killed_rig_is_noticed_long_before_the_lease_ends() -> None:
+    with rig("real-time") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
+        listener = Listener(client)
+        until(lambda: bool(listener.follow.received) and listener.alive == [True])
+        child.kill()
+        until(lambda: listener.alive == [True, False], timeout_s=10.0)
+    assert listener.gaps == []
+    assert [event["event"] for event in listener.events] == ["start"]
+
+
+SUBSCRIBER = """
+import sys
+from rig.transport.zenoh import ZenohClient
+
+numbers, missed = [], []
+with ZenohClient(sys.argv[1], wait_s=10.0) as client:
+    client.subscribe("rig/sensors/a", lambda _, payload: numbers.append(int.from_bytes(payload[:8], "little")),
+                     on_miss=lambda key, count: missed.append((key, count)), history=True)
+    client.request("rig/ready", timeout_s=10.0)
+    sys.stdin.readline()
+print(len(numbers), numbers == sorted(set(numbers)), sum(count for _, count in missed))
+"""
+
+
+def stalled_subscriber(messages: int) -> tuple[str, dict[str, float], float]:
+    """Stop a subscriber, publish far more than its link holds, let it go on.
+
+    Returns its report, what the server saw meanwhile, and the longest put of all [ms].
+    """
+    ready = threading.Event()
+    with ZenohServer(free_endpoint()) as server:
+
+        def answer(_: bytes) -> bytes:
+            ready.set()
+            return b""
+
+        server.answer("rig/ready", answer)
+        server.publish("rig/sensors/a", (0).to_bytes(8, "little"))
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        with subprocess.Popen(
+            [sys.executable, "-c", SUBSCRIBER, server.endpoint],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment,
+        ) as child:  # fmt: skip
+            try:
+                assert ready.wait(20.0)
+                child.send_signal(signal.SIGSTOP)
+                for number in range(1, messages):
+                    server.publish("rig/sensors/a", number.to_bytes(8, "little") + bytes(20_000))
+                congestion = server.congestion()
+                child.send_signal(signal.SIGCONT)
+                until(lambda: server.congestion()["stalled_links"] == 0)
+                # Two heartbeats, so that the subscriber hears of the last message, and time to fetch the rest.
+                time.sleep(1.5)
+                report, _ = child.communicate("done\n", timeout=20.0)
+            finally:
+                child.kill()
+        return report, congestion, server.congestion()["longest_put_ms"]
+
+
+def test_a_stopped_subscriber_gets_everything_afterwards_and_is_seen_meanwhile() -> None:
+    # 50 MB, and sockets hold a tenth of it; within the cache.
+    report, congestion, longest_put_ms = stalled_subscriber(2500)
+    assert report.split() == ["2500", "True", "0"]
+    if congestion["backlog_bytes"]:
+        assert congestion["stalled_links"] == congestion["stalls"] == 1
+    assert congestion["slow_puts"] < 25, "a put does not wait for a stalled link"
+    assert longest_put_ms < 5_000
+
+
+def test_what_the_cache_no_longer_holds_is_reported_as_missed() -> None:
+    report, _, _ = stalled_subscriber(8000)
+    received, in_order, missed = report.split()
+    assert in_order == "True"
+    assert int(missed) > 0
+    assert int(received) + int(missed) == 8000
+
+
+def test_a_script_that_never_closes_its_client_still_ends() -> None:
+    script = (
+        "import sys; from rig.transport.zenoh import ZenohClient; client = ZenohClient(sys.argv[1], wait_s=10.0);"
+        "client.subscribe('rig/**', print); client.subscribe('rig/**', print, lossless=False);"
+        "client.watch('rig/alive', print)"
+    )
+    with ZenohServer(free_endpoint()) as server:
+        server.announce()
+        with process("-c", script, server.endpoint) as child:
+            assert child.wait(timeout=30.0) == 0
+
+
+APP = typer.Typer()
+for name, function in {
+    "hammer": hammer.hammer, "speed": speed.speed, "release": release.release,
+    "status": status.status, "step": step.step, "stop": stop.stop,
+}.items():  # fmt: skip
+    APP.command(name)(function)
+
+
+def invoke(endpoint: str, *arguments: str) -> str:
+    """What a command prints; raises what it raises."""
+    result = CliRunner().invoke(APP, [*arguments, "--connect", endpoint], catch_exceptions=False)
+    assert result.exit_code == 0
+    return result.output
+
+
+def test_the_commands_reach_a_rig_in_lockstep() -> None:
+    with rig("lockstep") as (child, endpoint):
+        assert invoke(endpoint, "step", "20000") == "stepped to 0.020000 s (tick 20000)\n"
+        assert (
+            invoke(endpoint, "hammer", "--force-n", "80") == "hammer accepted: number 2, at 0.020000 s (tick 20000)\n"
+        )
+        assert invoke(endpoint, "hammer", "--direction", "30").startswith("hammer accepted: number 3")
+        assert invoke(endpoint, "speed", "5.2").startswith("speed 5.2 Hz accepted: number 4")
+        assert invoke(endpoint, "release").startswith("release accepted: number 5")
+        with pytest.raises(
+            RefusedError, match=r"^force_n must be above 0 and at most 1000; instead received 1000000000"
+        ):
+            invoke(endpoint, "hammer", "--force-n", "1e9")
+        with pytest.raises(InputError, match="speed_hz must be a finite number"):
+            invoke(endpoint, "speed", "nan")
+        document = json.loads(invoke(endpoint, "status", "--json"))
+        assert document["tick"] == 20_000
+        assert document["commands"] == 5
+        table = invoke(endpoint, "status")
+        assert "lockstep" in table
+        with ZenohClient(endpoint) as client:
+            listener = Listener(client)
+            assert invoke(endpoint, "stop").startswith("stop accepted: number 6")
+            until(lambda: bool(listener.events) and listener.events[-1]["event"] == "end")
+            taken = [event for event in listener.events if event["event"] == "command"]
+        assert [event["command"] for event in taken] == ["step", "hammer", "hammer", "speed", "release", "stop"]
+        assert [event["request"].get("direction") for event in taken[1:3]] == ["x", 30.0]
+        assert all(event["from"].startswith(f"rig {event['command']} pid ") for event in taken)
+        assert child.wait(timeout=30.0) == 0
+
+
+@pytest.mark.parametrize("arguments", [("hammer",), ("status", "--json"), ("status", "--watch"), ("step", "1000")])
+def test_without_a_rig_every_command_says_so_in_one_line(arguments: tuple[str, ...]) -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(RefusedError) as caught:
+        invoke(endpoint, *arguments)
+    assert str(caught.value) == f"no rig answers at {endpoint}; start one with: rig run hammer (see rig run --help)"
+
+
+def test_a_malformed_endpoint_is_refused() -> None:
+    with pytest.raises(InputError, match=r"^connect must be HOST:PORT"):
+        invoke("nowhere", "stop")
+
+
+def test_watching_a_rig_ends_with_it() -> None:
+    with rig("real-time", "1.5") as (child, endpoint):
+        lines = invoke(endpoint, "status", "--watch", "--json").splitlines()
+        ticks = [json.loads(line)["tick"] for line in lines]
+        assert ticks == sorted(ticks)
+        assert len(ticks) >= 1
+        assert child.wait(timeout=30.0) == 0

@@ -1,0 +1,120 @@
+"""`rig run` on the real simulation, as a process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from drivers.console import Console
+from rig.cli.run import scene_overrides
+from rig.errors import InputError
+from rig.transport.zenoh import ZenohClient
+from tests.unit.test_transport_zenoh import free_endpoint, until
+
+ROOT = Path(__file__).parents[2]
+PROGRAM = """
+import sys, typer
+from rig.cli.run import run
+from rig.errors import InputError
+app = typer.Typer(add_completion=False)
+app.command()(run)
+try:
+    app()
+except InputError as error:
+    sys.exit(f"InputError: {error}")
+"""
+COMPILE_S = 240.0
+
+
+@contextmanager
+def rig_run(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    endpoint = free_endpoint()
+    listen = [] if "--listen" in arguments else ["--listen", endpoint]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *arguments, *listen],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment,
+    ) as child:  # fmt: skip
+        try:
+            yield child, endpoint
+        finally:
+            child.kill()
+
+
+@pytest.mark.wallclock
+def test_a_free_run_ends_with_a_summary() -> None:
+    with rig_run("hammer", "--pace", "free", "--duration-s", "0.5", "--seed", "7", "--set", "drive.speed_hz=5.2") as (
+        child,
+        _,
+    ):
+        output, errors = child.communicate(timeout=COMPILE_S)
+    assert child.returncode == 0, errors
+    assert output.startswith("scene hammer: completed at 0.500 s")
+    assert "10000 samples a channel published, blocks dropped 0" in output
+    assert "listening on 127.0.0.1" in errors
+
+
+@pytest.mark.wallclock
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_the_run_in_good_order(number: signal.Signals) -> None:
+    with (
+        rig_run("stable-run", "--duration-s", "3600") as (child, endpoint),
+        ZenohClient(endpoint, wait_s=COMPILE_S) as client,
+    ):
+        # Answered once everything is compiled.
+        assert Console(client, timeout_s=COMPILE_S).status()["state"] == "running"
+        until(lambda: Console(client).status()["tick"] > 0)
+        child.send_signal(number)
+        output, errors = child.communicate(timeout=60.0)
+    assert child.returncode == 0, errors
+    assert "scene stable-run: stopped at" in output
+    assert "Traceback" not in errors
+
+
+@pytest.mark.wallclock
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("hammer", "--listen", "0.0.0.0:7999"), "listen must be on 127.0.0.1 unless --expose is given as well"),
+        (("hammer", "--listen", "7999"), "listen must be HOST:PORT"),
+        (("hammer", "--block-ms", "0.3"), "--block-ms must be a positive whole multiple of"),
+        (("hammer", "--block-ms", "nan"), "--block-ms must be a positive whole multiple of"),
+        (("hammer", "--block-ms", "-10"), "--block-ms must be a positive whole multiple of"),
+        (("hammer", "--set", "drive.speed_hz"), "--set must be KEY=VALUE"),
+        (("nowhere",), "scene must be one of"),
+    ],
+)
+def test_malformed_options_are_one_line(arguments: tuple[str, ...], message: str) -> None:
+    with rig_run(*arguments) as (child, _):
+        output, errors = child.communicate(timeout=COMPILE_S)
+    assert child.returncode == 1
+    assert output == ""
+    assert errors.startswith(f"InputError: {message}")
+    assert errors.count("\n") == 1
+
+
+def test_options_become_changes_of_the_scene() -> None:
+    assert scene_overrides(["drive.speed_hz=5.2", " contact.friction = 0.3 ", "title=a=b"], seed=0, duration_s=1.5) == {
+        "drive.speed_hz": "5.2",
+        "contact.friction": "0.3",
+        "title": "a=b",
+        "seed": "0",
+        "duration_s": "1.5",
+    }
+    assert scene_overrides([], parameters="as-printed", engine="rk4") == {
+        "parameters": "as-printed",
+        "engine.name": "rk4",
+    }
+
+
+@pytest.mark.parametrize("text", ["", "=", "key", "key=", "=1", "key= "])
+def test_a_change_without_key_or_value_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="--set must be KEY=VALUE"):
+        scene_overrides([text])

@@ -1,0 +1,237 @@
+"""`rig view` as its users start it: a process, beside a rig that is another."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from recorder.viewer.window import Window, WindowError, environment, free_port
+from tests.unit.viewer_recording import Saved, Synthetic, documents_of, stream_of
+
+pytestmark = pytest.mark.wallclock
+
+ROOT = Path(__file__).parents[2]
+VIEW = [sys.executable, "-c", "from rig.cli.main import main; main()", "view"]
+
+
+def quiet() -> dict[str, str]:
+    """The environment of a machine without a screen."""
+    kept = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY", "CI")}
+    return {**kept, "PYTHONPATH": str(ROOT)}
+
+
+@contextlib.contextmanager
+def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
+    """A process of ours, ended afterwards."""
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=quiet(), text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=1
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+@contextlib.contextmanager
+def rig(*, duration_s: float) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with started([sys.executable, "-m", "tests.system.viewer_rig", str(port), str(duration_s)]) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield process, port
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording on disk."""
+    from recorder.session import RecordingSession
+    from rig.transport.memory import MemoryClient, MemoryServer
+
+    recording = Synthetic(duration_s=1.2)
+    path = tmp_path_factory.mktemp("recorded") / "whirl.mcap"
+    with MemoryServer() as server:
+        for key, reply in documents_of(recording).items():
+            server.answer(key, lambda _, reply=reply: reply)
+        server.announce()
+        for block in stream_of(recording):
+            for key, payload in block:
+                server.publish(key, payload)
+        summary = RecordingSession(MemoryClient(server), path, history=True).run()
+    assert summary.path == path
+    return path
+
+
+def test_a_recording_becomes_an_rrd(recorded: Path, tmp_path: Path) -> None:
+    target = tmp_path / "whirl.rrd"
+    done = subprocess.run(
+        [*VIEW, str(recorded), "--save", str(target)],
+        cwd=ROOT,
+        env=quiet(),
+        text=True,
+        capture_output=True,
+        timeout=120,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "MB" in done.stdout
+    first, _ = Saved(target)["/orbit/ring/reading", "Points2D:labels"].values[-1]
+    assert first == "BACKWARD whirl -83.0 Hz"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "either a FILE or --live"),
+        (["missing.mcap"], "file must be"),
+        ([__file__], "which is no MCAP file"),
+        ([str(ROOT)], "file must be"),
+        (["a.mcap", "--live"], "either a FILE or --live"),
+        (["a.mcap", "--save", "a.mcap"], "ends in .rrd"),
+        (["a.mcap", "--save", "/no/such/folder/a.rrd"], "in a folder that exists"),
+        (["a.mcap", "--screenshot", "/proc/a.png"], "can be written"),
+        (["a.mcap", "--web", "--save", "a.rrd"], "at most one of"),
+        (["--live", "--screenshot", "a.png"], "--screenshot must be used with a FILE"),
+        (["a.mcap", "--at-s", "1"], "--at-s must be used with --screenshot"),
+        (["--live", "--connect", "nowhere"], "HOST:PORT"),
+        (["--live", "--connect", "127.0.0.1:1", "--wait-s", "0.1"], "no rig answers"),
+    ],
+)
+def test_what_cannot_be_viewed_is_one_line(
+    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rig.cli.main import main
+
+    with pytest.raises(SystemExit) as ended:
+        main(["view", *arguments])
+    captured = capsys.readouterr()
+    assert ended.value.code == 2
+    assert captured.err.count("\n") == 1
+    assert expected in captured.err
+
+
+def test_live_view_until_the_rig_ends(tmp_path: Path) -> None:
+    target = tmp_path / "live.rrd"
+    with (
+        rig(duration_s=2.0) as (server, port),
+        started([*VIEW, "--live", "--connect", f"127.0.0.1:{port}", "--save", str(target)]) as viewer,
+    ):
+        out, _ = viewer.communicate(timeout=60)
+        assert (viewer.returncode, out) == (0, "the rig ended: completed\n")
+        heard = server.communicate(timeout=30)[0]
+    beats = re.findall(r'rig/clients/viewer .*"received_index":(\d+)', heard)
+    assert beats
+    saved = Saved(target)
+    first, _ = saved["/orbit/disk/reading", "Points2D:labels"].values[-1]
+    assert first == "BACKWARD whirl -83.0 Hz"
+    # Whatever part of the two seconds it saw, it saw at 25 Hz or less.
+    frames = saved["/orbit/ring/trace", "LineStrips2D:strips"].times_s
+    assert 2 <= len(frames) <= 30.0 * (frames[-1] - frames[0]) + 5
+
+
+def test_live_view_notices_that_the_rig_was_killed(tmp_path: Path) -> None:
+    target = tmp_path / "killed.rrd"
+    with (
+        rig(duration_s=30.0) as (server, port),
+        started([*VIEW, "--live", "--connect", f"127.0.0.1:{port}", "--save", str(target)]) as viewer,
+    ):
+        assert server.stdout is not None
+        assert server.stdout.readline().startswith("rig/clients/viewer")
+        server.send_signal(signal.SIGKILL)
+        out, _ = viewer.communicate(timeout=60)
+    assert viewer.returncode == 0
+    assert out.startswith("the rig is gone without ending its stream")
+    assert Saved(target)["/events", "TextLog:level"].values[-1] == ["WARN"]
+
+
+def test_the_web_viewer_is_on_loopback_only_and_goes_with_the_command(recorded: Path) -> None:
+    import psutil
+
+    with started([*VIEW, str(recorded)]) as viewer:
+        assert viewer.stdout is not None
+        address = re.search(r"http://127\.0\.0\.1:\d+/\S+", viewer.stdout.readline())
+        assert address is not None
+        assert "notebook=1" in address[0]
+        with urllib.request.urlopen(address[0], timeout=10) as page:
+            assert page.status == 200
+        children = psutil.Process(viewer.pid).children(recursive=True)
+        listening = [
+            connection.laddr
+            for child in children
+            for connection in child.net_connections()
+            if connection.status == psutil.CONN_LISTEN
+        ]
+        assert len(listening) == 2
+        assert {place.ip for place in listening} == {"127.0.0.1"}
+        for child in children:
+            assert child.environ().get("CI") == "true"
+            assert os.getpgid(child.pid) != os.getpgid(viewer.pid)
+        viewer.send_signal(signal.SIGTERM)
+        out, _ = viewer.communicate(timeout=30)
+        assert viewer.returncode == 0
+        assert "Traceback" not in out
+        _, alive = psutil.wait_procs(children, timeout=10)
+        assert [child for child in alive if child.status() != psutil.STATUS_ZOMBIE] == []
+
+
+def test_rerun_keeps_no_usage_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CI", raising=False)
+    monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("XDG_CONFIG_HOME", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert "FORCE_RERUN_ANALYTICS" not in environment()
+    with Window("web") as window:
+        assert window.open
+        time.sleep(1.0)
+    # Without the switch it writes a configuration and its first reports there within this time.
+    assert list(tmp_path.rglob("*rerun*")) == []
+
+
+def test_a_viewer_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":987")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(WindowError, match="could not start"):
+        Window("native")
+
+
+def test_a_taken_port_is_avoided() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert free_port(port) != port
+
+
+def test_a_picture_where_this_machine_can_draw(recorded: Path, tmp_path: Path) -> None:
+    try:
+        Window("headless").close()
+    except WindowError as error:
+        pytest.skip(f"no Vulkan driver here: {error}")
+    picture = tmp_path / "whirl.png"
+    done = subprocess.run(
+        [*VIEW, str(recorded), "--screenshot", str(picture)],
+        cwd=ROOT,
+        env=quiet(),
+        text=True,
+        capture_output=True,
+        timeout=180,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size > 100_000

@@ -1,0 +1,32 @@
+"""A rig without physics, paced in real time: `python -m tests.system.viewer_rig PORT DURATION_S`."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from rig import wire
+from rig.transport.zenoh import ZenohServer
+from tests.unit.viewer_recording import Synthetic, documents_of, stream_of
+
+
+def main(port: int, duration_s: float) -> None:
+    """Serve a synthetic recording, then stay for a second."""
+    recording = Synthetic(duration_s=duration_s)
+    blocks = list(stream_of(recording))
+    with ZenohServer(f"127.0.0.1:{port}") as server:
+        for key, reply in documents_of(recording).items():
+            server.answer(key, lambda _, reply=reply: reply)
+        server.hear(f"{wire.CLIENTS}/*", lambda key, payload: print(key, payload.decode(), flush=True))
+        server.announce()
+        print("ready", flush=True)
+        start = time.monotonic()
+        for number, block in enumerate(blocks):
+            time.sleep(max(0.0, start + 0.01 * number - time.monotonic()))
+            for key, payload in block:
+                server.publish(key, payload)
+        time.sleep(1.0)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), float(sys.argv[2]))

@@ -1,0 +1,148 @@
+"""The channel table: whole calibrations only, counts to engineering values and back, and what the model must offer it."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from rig.channels import TABLE, Channel, ChannelTable, default_table, parse_table
+from rig.kernels.signals import ROW
+from rig.scenes import HammerCommand
+
+TABLE_TEXT = TABLE.read_text()
+CHANNELS = list(default_table().channels.values())
+GOOD = CHANNELS[0].model_dump()
+
+
+def one_channel(defaults: str = "", row: str = "") -> str:
+    return f"""
+    [groups.g]
+    title = "t"
+    rate_hz = 1000
+    kind = "assumed"
+    defaults = {{ unit = "mm", si = 1e-3, sensitivity_v = 2.0, bias_v = -1.0, range_v = [-9.0, 9.0], bandwidth_hz = 100.0, \
+highpass_hz = 0.0, noise_v = 0.0, adc_v = 10.0, adc_bits = 16 {defaults} }}
+    channels = [{{ name = "c", label = "l", signal = "disk_x" {row} }}]
+    """
+
+
+def test_every_channel_feels_a_signal_of_the_model_in_a_unit_that_fits() -> None:
+    si = {"mm": ("m", 1e-3), "N": ("N", 1.0), "m/s^2": ("m/s^2", 1.0), "Hz": ("rad/s", 2 * math.pi), "1": ("1", 1.0)}
+    units = {signal.name: signal.unit for signal in ROW}
+    for channel in CHANNELS:
+        assert (units[channel.signal], channel.si) == (si[channel.unit][0], pytest.approx(si[channel.unit][1])), channel
+
+
+def test_names_are_unique_and_groups_whole() -> None:
+    table = default_table()
+    assert list(table.groups) == ["probes", "forces", "accelerations", "drive", "hammer"]
+    names = [name for group in table.groups.values() for name in group.names]
+    assert len(set(names)) == len(names) == len(table.channels) == 15
+    for group in table.groups.values():
+        assert {channel.group for channel in group.channels} == {group.name}
+        assert {channel.rate_hz for channel in group.channels} == {group.rate_hz}
+        # What the channel feels must not fold back: the corner lies below half the sample rate.
+        assert all(channel.bandwidth_hz < channel.rate_hz / 2 for channel in group.channels)
+
+
+def test_the_hardest_blow_that_is_accepted_can_be_measured() -> None:
+    hammer = default_table().channels["hammer"]
+    (limit,) = [item.le for item in HammerCommand.model_fields["force_n"].metadata if hasattr(item, "le")]
+    assert hammer.bias_v + hammer.sensitivity_v * limit < hammer.range_v[1]
+
+
+@given(channel=st.sampled_from(CHANNELS), count=st.integers(-(2**23), 2**23 - 1))
+def test_counts_are_volts_are_values(channel: Channel, count: int) -> None:
+    volts = count * 2.0 * channel.adc_v / 2**channel.adc_bits
+    value = (volts - channel.bias_v) / channel.sensitivity_v
+    assert count * channel.scale + channel.offset == pytest.approx(value, rel=1e-12, abs=1e-12)
+
+
+@given(st.data())
+def test_engineering_round_trip(data: st.DataObject) -> None:
+    group = data.draw(st.sampled_from(list(default_table().groups.values())))
+    row = st.tuples(*(st.integers(-(2 ** (c.adc_bits - 1)), 2 ** (c.adc_bits - 1) - 1) for c in group.channels))
+    counts = np.array(data.draw(st.lists(row, min_size=1, max_size=5)), dtype=np.int32)
+    values = group.engineering(counts)
+    assert values.shape == counts.shape
+    for c, channel in enumerate(group.channels):
+        back = (channel.bias_v + channel.sensitivity_v * values[:, c]) / channel.lsb_v
+        np.testing.assert_array_equal(np.rint(back).astype(np.int32), counts[:, c])
+        assert abs(back - counts[:, c]).max() < 1e-6
+
+
+def test_range_and_converter_of_the_small_table() -> None:
+    channel = parse_table(one_channel()).channels["c"]
+    assert channel.lsb_v == 20.0 / 65536
+    assert channel.scale == pytest.approx(20.0 / 65536 / 2.0)
+    assert channel.offset == 0.5
+
+
+@pytest.mark.parametrize("missing", sorted(set(GOOD)))
+def test_a_row_without_one_of_its_fields_is_refused(missing: str) -> None:
+    with pytest.raises(ValidationError, match=missing):
+        Channel(**{key: value for key, value in GOOD.items() if key != missing})
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("sensitivity_v", 0.0), ("range_v", (-2.0, -18.0)), ("range_v", (-21.0, 0.0)), ("range_v", (0.0, 20.5)), ("adc_v", 0.0),
+        ("adc_bits", 7), ("adc_bits", 33), ("bandwidth_hz", 0.0), ("highpass_hz", -1.0), ("noise_v", -1.0), ("rate_hz", 0),
+        ("si", 0.0), ("colour", "red"),
+    ],
+)  # fmt: skip
+def test_half_or_wrong_scale_is_refused(field: str, value: object) -> None:
+    with pytest.raises(ValidationError, match=field):
+        Channel(**{**GOOD, field: value})
+
+
+def test_rows_take_the_defaults_of_their_group_and_may_differ() -> None:
+    table = parse_table(one_channel(row=", sensitivity_v = -4.0, bandwidth_hz = 50.0"))
+    channel = table.channels["c"]
+    assert (channel.sensitivity_v, channel.bandwidth_hz, channel.bias_v) == (-4.0, 50.0, -1.0)
+    assert channel.scale < 0.0
+
+
+def test_a_name_stands_once() -> None:
+    twice = TABLE_TEXT.replace('name = "P_N"', 'name = "disk_x"')
+    assert twice != TABLE_TEXT
+    with pytest.raises(ValueError, match="disk_x stands twice"):
+        parse_table(twice)
+
+
+def test_unknown_field_in_a_row_is_refused() -> None:
+    with pytest.raises(ValidationError, match="colour"):
+        parse_table(one_channel(row=', colour = "red"'))
+
+
+@given(names=st.permutations(list(default_table().groups)), n=st.integers(0, 5), rate=st.none() | st.integers(1, 10**6))
+def test_only_keeps_the_groups_and_lowers_the_corner_with_the_rate(names: list[str], n: int, rate: int | None) -> None:
+    before = default_table().model_dump()
+    table = default_table().only(tuple(names[:n]), rate)
+    assert list(table.groups) == names[:n]
+    for name, group in table.groups.items():
+        original = default_table().groups[name]
+        assert group.names == original.names
+        assert group.rate_hz == (rate or original.rate_hz)
+        for channel, was in zip(group.channels, original.channels, strict=True):
+            assert channel.rate_hz == group.rate_hz
+            assert channel.bandwidth_hz == (was.bandwidth_hz if rate is None else min(was.bandwidth_hz, rate / 4))
+            assert (channel.scale, channel.offset) == (was.scale, was.offset)
+    assert default_table().model_dump() == before
+
+
+def test_table_travels_as_json() -> None:
+    document = json.loads(json.dumps(default_table().model_dump(mode="json"), allow_nan=False))
+    assert ChannelTable.model_validate(document) == default_table()
+
+
+def test_every_row_of_the_file_is_in_the_table() -> None:
+    assert re.findall(r'name = "(\w+)"', TABLE_TEXT) == list(default_table().channels)

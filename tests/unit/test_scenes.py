@@ -1,0 +1,273 @@
+"""Scenes: shipped ones, what a field accepts, overrides by dotted key, and the document that runs again."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.channels import default_table
+from rig.errors import InputError
+from rig.scenes import (
+    COMMANDS,
+    HammerCommand,
+    ReleaseCommand,
+    Scene,
+    SpeedCommand,
+    load_scene,
+    parse_command,
+    parse_scene,
+    read_value,
+    scene_document,
+    scene_names,
+)
+
+PERIODS = [n for n in range(1, 10_001) if 1_000_000 % n == 0]
+"""Whole numbers of ticks whose rates are whole as well [us]."""
+
+
+def numbers(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high, allow_nan=False)
+
+
+hammers = st.fixed_dictionaries(
+    {"command": st.just("hammer")},
+    optional={
+        "force_n": numbers(1.0, 1000.0),
+        "duration_ms": numbers(0.5, 50.0),
+        "direction": st.sampled_from(["x", "y", "-x", "-y"]) | numbers(-360.0, 360.0),
+    },
+)
+speeds = st.fixed_dictionaries({"command": st.just("speed"), "speed_hz": numbers(0.0, 15.0)})
+requests = hammers | speeds | st.just({"command": "release"})
+timed = st.builds(lambda at_s, request: {"at_s": at_s, **request}, numbers(0.0, 100.0), requests)
+profiles = st.lists(st.tuples(numbers(0.01, 10.0), numbers(0.0, 15.0)), min_size=1, max_size=5).map(
+    lambda steps: [[sum(step for step, _ in steps[1 : n + 1]), speed] for n, (_, speed) in enumerate(steps)]
+)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> dict[str, Any]:
+    """The data of a good scene, as TOML would give it."""
+    step = draw(st.sampled_from([1, 5, 10, 25, 50]))
+    rates = [1_000_000 // period for period in PERIODS if period % step == 0]
+    drive = {"mode": draw(st.sampled_from(["torque", "ideal"]))}
+    drive |= {"profile": draw(profiles)} if draw(st.booleans()) else {"speed_hz": draw(numbers(0.0, 15.0))}
+    return {
+        "title": draw(st.text(max_size=10)),
+        "parameters": draw(st.sampled_from(["corrected", "as-printed", "dtu-2019"])),
+        "set": draw(st.dictionaries(st.just("contact.friction"), numbers(0.0, 2.0), max_size=1)),
+        "duration_s": draw(numbers(1e-3, 86_400.0)),
+        "seed": draw(st.integers(0, 2**63 - 1)),
+        "drive": drive,
+        "commands": draw(st.lists(timed, max_size=3)),
+        "engine": {"name": draw(st.sampled_from(["rk4", "rk8"])), "step_us": step},
+        "sensors": {
+            "groups": draw(st.permutations(list(default_table().groups)).map(lambda names: names[:3])),
+            "rate_hz": draw(st.sampled_from([rate for rate in rates if rate >= 100])),
+            "truth_rate_hz": draw(st.sampled_from([rate for rate in rates if rate >= 10])),
+            "noise": draw(st.booleans()),
+        },
+    }
+
+
+@given(data=scenes())
+@settings(max_examples=60, deadline=None)
+def test_document_of_a_scene_is_the_scene(data: dict[str, Any]) -> None:
+    scene = parse_scene(data)
+    document = json.loads(json.dumps(scene_document(scene), allow_nan=False))
+    assert parse_scene(document) == scene
+    for command, given_command in zip(scene.commands, data["commands"], strict=True):
+        assert command.at_s == given_command["at_s"]
+        fields = {key: value for key, value in given_command.items() if key != "at_s"}
+        assert command.request == COMMANDS[fields["command"]](**fields)
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_shipped_scenes_load_and_say_what_happens(name: str) -> None:
+    scene = load_scene(name)
+    assert scene.name == name
+    assert scene.title
+    assert scene.parameters == "corrected"
+    assert scene.engine.name == "rk8"
+    assert parse_scene(scene_document(scene)) == scene
+
+
+def test_hammer_scene_is_the_papers() -> None:
+    scene = load_scene("hammer")
+    (blow,) = scene.commands
+    assert scene.drive.speed_hz == 6.2
+    assert blow.request == HammerCommand(force_n=100.0, duration_ms=5.0, direction="x")
+
+
+def test_file_gives_its_own_name_and_commands_stand_flat_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('[[commands]]\nat_s = 0.5\ncommand = "speed"\nspeed_hz = 3\n[set]\n"contact.friction" = 0.3\n')
+    scene = load_scene(path)
+    assert scene.name == "mine"
+    assert scene.commands[0].request == SpeedCommand(speed_hz=3.0)
+    assert scene.load_parameters()["contact.friction"] == 0.3
+    assert scene.load_parameters().entries["contact.friction"].source == "scene mine"
+
+
+@given(period=st.integers(1, 10_000), step=st.integers(1, 1000))
+def test_rates_divide_the_tick_rate_and_the_step_or_are_refused(period: int, step: int) -> None:
+    rate = 1_000_000 // period
+    fits = 1_000_000 % rate == 0 and (1_000_000 // rate) % step == 0
+    data = {"engine": {"step_us": step}, "sensors": {"rate_hz": rate, "truth_rate_hz": rate}}
+    if fits:
+        assert parse_scene(data).sensors.rate_hz == rate
+    else:
+        with pytest.raises(InputError, match=r"^sensors\.rate_hz must be a rate whose period is a whole number"):
+            parse_scene(data)
+
+
+def test_refusal_of_a_rate_names_rates_that_would_do() -> None:
+    with pytest.raises(InputError, match=r"such as 20000, 10000") as caught:
+        parse_scene({"sensors": {"rate_hz": 30_000}})
+    assert "30000" in str(caught.value)
+    with pytest.raises(InputError, match=r"^sensors\.truth_rate_hz must be"):
+        parse_scene({"sensors": {"truth_rate_hz": 3_000}})
+
+
+@pytest.mark.xfail(strict=True, reason="bug: says `such as Hz` where no round rate fits the step")
+def test_refusal_of_a_rate_suggests_none_where_there_is_none() -> None:
+    with pytest.raises(InputError) as caught:
+        parse_scene({"engine": {"step_us": 7}})
+    assert "such as  Hz" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "profile", [[[1.0, 1.0]], [[0.0, 1.0], [0.0, 2.0]], [[0.0, 1.0], [2.0, 1.0], [1.0, 1.0]], [[0.0, -1.0]]]
+)
+def test_profile_ascends_from_zero_and_never_turns_backward(profile: list[list[float]]) -> None:
+    with pytest.raises(InputError, match=r"^drive\.profile must be points of "):
+        parse_scene({"drive": {"profile": profile}})
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("5.2", 5.2), ("3", 3), ("true", True), ("[1, 2]", [1, 2]), ('"a b"', "a b"), ("internal-sphere", "internal-sphere"),
+        ("", ""), ("2026-01-01x", "2026-01-01x"),
+    ],
+)  # fmt: skip
+def test_values_on_the_command_line_are_toml_or_plain_text(text: str, value: object) -> None:
+    read = read_value(text)
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_overrides_reach_scene_and_parameters() -> None:
+    scene = load_scene("hammer", {
+        "drive.speed_hz": "5.2", "contact.friction": 0.3, "contact.stiffness": "external-sphere", "sensors.noise": "false",
+        "duration_s": 0.5, "sensors.groups": '["probes", "drive"]',
+    })  # fmt: skip
+    assert scene.drive.speed_hz == 5.2
+    assert scene.set == {"contact.friction": 0.3, "contact.stiffness": "external-sphere"}
+    assert scene.load_parameters()["contact.friction"] == 0.3
+    assert (scene.sensors.noise, scene.duration_s, scene.sensors.groups) == (False, 0.5, ("probes", "drive"))
+    assert scene.sensors.rate_hz == 20_000, "fields beside the changed one keep their values"
+    assert load_scene("hammer").set == {}, "the shipped scene stays as it is"
+
+
+def test_a_speed_from_outside_replaces_the_profile() -> None:
+    scene = load_scene("run-up", {"drive.speed_hz": 4.0})
+    assert (scene.drive.profile, scene.drive.speed_hz) == ((), 4.0)
+
+
+def test_overrides_do_not_touch_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("[drive]\nspeed_hz = 3.0\n")
+    assert load_scene(path, {"drive.speed_hz": 4.0}).drive.speed_hz == 4.0
+    assert load_scene(path).drive.speed_hz == 3.0
+
+
+@pytest.mark.parametrize("key", ["drive.speed", "contact.frictoin", "sensors", "nothing", "drive.speed_hz.x", "", "."])
+def test_unknown_or_whole_key_is_refused(key: str) -> None:
+    value: Any = 3
+    with pytest.raises(InputError) as caught:
+        load_scene("hammer", {key: value})
+    assert str(caught.value).startswith(f"{key} must be ")
+
+
+def test_unknown_key_names_its_neighbours() -> None:
+    with pytest.raises(InputError, match=r"drive\.speed_hz"):
+        load_scene("hammer", {"drive.sped_hz": 3})
+
+
+@pytest.mark.parametrize("text", ["drive = 3\n", 'drive = "fast"\n'])
+@pytest.mark.xfail(strict=True, reason="bug: a part that is no table, with an override inside it")
+def test_override_inside_what_is_no_table_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match="drive must be"):
+        load_scene(path, {"drive.speed_hz": 1.0})
+
+
+@pytest.mark.xfail(strict=True, reason="bug: `set` that is no table, with an override of a parameter")
+def test_override_of_a_parameter_beside_a_wrong_set_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("set = 4\n")
+    with pytest.raises(InputError, match="set must be"):
+        load_scene(path, {"contact.friction": 0.1})
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"drive.speed_hz": 15.1},
+        {"drive.speed_hz": 5.0, "drive.top_speed": 4.9},
+        {"drive.profile": "[[0.0, 1.0], [1.0, 16.0]]"},
+        {"commands": '[{ at_s = 0.1, command = "speed", speed_hz = 15.5 }]'},
+    ],
+)
+def test_no_speed_of_a_scene_is_above_the_drives(overrides: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"must be at most drive\.top_speed = "):
+        load_scene("stable-run", overrides)
+
+
+def test_the_drives_limit_itself_is_a_good_speed() -> None:
+    assert load_scene("stable-run", {"drive.speed_hz": 15.0}).drive.speed_hz == 15.0
+
+
+@given(direction=st.sampled_from(["x", "y", "-x", "-y"]) | numbers(-360.0, 360.0))
+def test_direction_of_a_blow_is_a_unit_vector(direction: str | float) -> None:
+    assert math.hypot(*HammerCommand(direction=direction).cosines) == pytest.approx(1.0, abs=1e-15)  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("direction", "cosines"),
+    [("x", (1, 0)), ("y", (0, 1)), ("-x", (-1, 0)), ("-y", (0, -1)), (90.0, (0, 1)), (-90.0, (0, -1)), (30.0, (math.sqrt(0.75), 0.5))],
+)  # fmt: skip
+def test_direction_turns_from_x_toward_y(direction: Any, cosines: tuple[float, float]) -> None:
+    assert HammerCommand(direction=direction).cosines == pytest.approx(cosines, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "request_", "command"),
+    [
+        ("hammer", {}, HammerCommand()),
+        ("hammer", {"force_n": 1.0, "duration_ms": 50.0, "direction": 360}, HammerCommand(force_n=1.0, duration_ms=50.0, direction=360.0)),
+        ("speed", {"speed_hz": 0}, SpeedCommand(speed_hz=0.0)),
+        ("release", {}, ReleaseCommand()),
+    ],
+)  # fmt: skip
+def test_good_commands(name: str, request_: dict[str, Any], command: object) -> None:
+    assert parse_command(name, request_) == command
+
+
+def test_a_request_cannot_become_another_command() -> None:
+    assert isinstance(parse_command("speed", {"speed_hz": 1.0, "command": "release"}), SpeedCommand)
+
+
+def test_scenes_are_frozen() -> None:
+    scene = load_scene("hammer")
+    with pytest.raises(ValueError, match="frozen"):
+        scene.seed = 2  # pyright: ignore[reportAttributeAccessIssue]
+    assert Scene() == Scene()

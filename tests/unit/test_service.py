@@ -1,0 +1,428 @@
+"""The service over the in-process transport, with clocks that do not wait."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.console import Accepted, Console
+from rig import wire
+from rig.errors import InputError, RefusedError
+from rig.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
+from rig.service import Service, _Entry, _Queue
+from rig.transport import NoReplyError
+from rig.transport.memory import MemoryClient, MemoryServer
+from tests.unit.service_fake import GROUPS, TRUTH, FakeFrame, FakeSimulation
+
+BLOCK = 10_000
+
+
+class Listener:
+    """Collects everything a rig publishes."""
+
+    def __init__(self, server: MemoryServer) -> None:
+        self.client = MemoryClient(server)
+        self.blocks: dict[str, list[wire.Block]] = {}
+        self.events: list[dict[str, Any]] = []
+        self.statuses: list[dict[str, Any]] = []
+        self.order: list[str] = []
+        self.client.subscribe("rig/**", self._take)
+
+    def _take(self, key: str, payload: bytes) -> None:
+        self.order.append(key)
+        schema = wire.schema_of(key)
+        if schema is not None:
+            self.blocks.setdefault(key, []).append(wire.decode_block(payload, schema))
+        elif key == wire.EVENTS:
+            self.events.append(wire.decode_document(payload))
+        elif key == wire.STATUS:
+            self.statuses.append(wire.decode_document(payload))
+
+    def named(self, name: str) -> list[dict[str, Any]]:
+        return [event for event in self.events if event["event"] == name]
+
+
+class Running:
+    """A service on a thread of its own, joined at the end."""
+
+    def __init__(self, simulation: FakeSimulation, clock: Clock, **options: Any) -> None:
+        self.server = MemoryServer()
+        self.listener = Listener(self.server)
+        self.service = Service(simulation, self.server, clock, block_ticks=BLOCK, **options)
+        self.summary: dict[str, Any] = {}
+        self.error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        try:
+            self.summary = self.service.run()
+        except BaseException as error:
+            self.error = error
+
+    def __enter__(self) -> Running:
+        self.service.prepare()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.service.stop()
+        self.join()
+
+    def join(self) -> None:
+        self._thread.join(30.0)
+        assert not self._thread.is_alive()
+
+    @property
+    def console(self) -> Console:
+        return Console(self.listener.client, name="a test")
+
+
+def run(simulation: FakeSimulation, clock: Clock | None = None, **options: Any) -> tuple[dict[str, Any], Listener]:
+    server = MemoryServer()
+    listener = Listener(server)
+    summary = Service(simulation, server, clock or FreeRun(), block_ticks=BLOCK, **options).run()
+    return summary, listener
+
+
+def until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.001)
+
+
+def test_every_row_is_published_once_and_in_order() -> None:
+    summary, listener = run(FakeSimulation(duration_s=1.0))
+    rows = {wire.sensor_key(name): 20_000 for name in GROUPS} | {wire.truth_key(name): 2_000 for name in TRUTH}
+    assert summary["rows"] == rows | {wire.EDGES: 7}
+    assert summary["reason"] == "completed"
+    assert summary["samples_published"] == 20_000
+    assert summary["queue"]["dropped"] == 0
+    for key, count in summary["rows"].items():
+        values = np.concatenate([block.values[:, 0] for block in listener.blocks[key]])
+        np.testing.assert_array_equal(values, np.arange(count))
+
+
+def test_the_stream_begins_with_start_and_ends_with_end_and_its_rows() -> None:
+    summary, listener = run(FakeSimulation(duration_s=0.1))
+    assert (
+        listener.events[0].items() >= {"event": "start", "scene": "fake", "seed": 1, "pace": "free", "tick": 0}.items()
+    )
+    end = listener.events[-1]
+    assert end.items() >= {"event": "end", "reason": "completed", "tick": 100_000, "time_s": 0.1}.items()
+    assert end["rows"] == summary["rows"]
+    assert all("wall_s" in event for event in listener.events)
+    assert [event["event"] for event in listener.events] == ["start", "end"]
+    assert listener.order.index(wire.EVENTS) < listener.order.index(wire.sensor_key("probes"))
+    last_event = len(listener.order) - listener.order[::-1].index(wire.EVENTS)
+    assert set(listener.order[last_event:]) == {wire.STATUS}
+    assert listener.statuses[-1]["state"] == "ended"
+
+
+def test_a_scene_that_is_not_a_whole_number_of_blocks_ends_where_it_should() -> None:
+    summary, listener = run(FakeSimulation(duration_s=0.033))
+    assert summary["tick"] == 33_000
+    assert [len(block.values) for block in listener.blocks[wire.sensor_key("probes")]] == [200, 200, 200, 60]
+
+
+def test_the_block_must_fit_the_simulation() -> None:
+    for ticks in (0, -BLOCK, 1_500):
+        with pytest.raises(InputError, match="block_ticks must be a whole multiple of 1000"):
+            Service(FakeSimulation(), MemoryServer(), FreeRun(), block_ticks=ticks)
+
+
+def test_documents_are_answered() -> None:
+    with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
+        client = rig.listener.client
+        assert wire.decode_document(client.request(wire.CATALOGUE))["tick_rate_hz"] == 1_000_000
+        assert wire.decode_document(client.request(wire.PARAMETERS))["set"] == "fake"
+        assert wire.decode_document(client.request(wire.SCENE))["seed"] == 1
+        status = wire.decode_document(client.request(wire.STATUS))
+        assert status["state"] == "running"
+        assert status["energy"]["residual_j"] is None, "a number that JSON cannot carry"
+
+
+def test_a_command_is_answered_with_its_tick_and_becomes_an_event() -> None:
+    with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
+        rig.console.step(20_000)
+        reply = rig.console.hammer(force_n=50.0, duration_ms=2.0, direction="y")
+        assert reply == Accepted(command="hammer", id=2, tick=20_000, time_s=0.02)
+        rig.console.step(BLOCK)
+        command = rig.listener.named("command")[1]
+        request = {"force_n": 50.0, "duration_ms": 2.0, "direction": "y"}
+        assert command.items() >= {"id": 2, "command": "hammer", "request": request, "from": "a test"}.items()
+        assert command["tick"] == 20_000
+        assert [event["tick"] for event in rig.listener.named("hammer")] == [20_000]
+
+
+@pytest.mark.parametrize(
+    ("name", "payload", "message"),
+    [
+        ("hammer", b"", "hammer must be a JSON object"),
+        ("hammer", b"{", "hammer must be a JSON object"),
+        ("hammer", b"[1]", "hammer must be a JSON object"),
+        ("hammer", b"\xff\xfe", "hammer must be a JSON object"),
+        ("hammer", b"[" * 9_999, "hammer must be a JSON object"),
+        ("hammer", b" " * 10_001, "at most 10000 bytes"),
+        ("hammer", b'{"force_n": 1e6}', "force_n must be above 0 and at most 1000; instead received 1000000.0"),
+        ("hammer", b"{}", "hammer must be readable"),
+        ("hammer", b'{"force_n": "much"}', "hammer must be readable"),
+        ("hammer", b'{"from": 7, "force_n": 1}', "from must be a name"),
+        ("hammer", b'{"from": "a\\nb", "force_n": 1}', "from must be a name"),
+        ("stop", b'{"now": 1}', "request must be without fields other than from"),
+        ("step", b'{"ticks": 0}', "ticks must be a positive whole multiple of 1000"),
+        ("step", b'{"ticks": 1500}', "ticks must be a positive whole multiple of 1000"),
+        ("step", b'{"ticks": true}', "ticks must be a positive whole multiple of 1000"),
+        ("step", b'{"ticks": 1000.0}', "ticks must be a positive whole multiple of 1000"),
+        ("step", b'{"ticks": 1000000000000000}', "ticks must be a positive whole multiple of 1000"),
+        ("step", b"{}", "ticks must be a positive whole multiple of 1000"),
+        ("step", b'{"ticks": 1000, "x": 1}', "request must be without fields other than ticks"),
+        ("step", b'{"ticks": 2000000}', "at most 1000000, the rest of the scene"),
+    ],
+)
+def test_a_malformed_command_is_refused_with_one_line(name: str, payload: bytes, message: str) -> None:
+    with Running(FakeSimulation(duration_s=1.0), Lockstep()) as rig:
+        reply = wire.decode_document(rig.listener.client.request(wire.command_key(name), payload))
+        assert reply["accepted"] is False
+        assert message in reply["error"]
+        assert "\n" not in reply["error"]
+        assert rig.console.step(BLOCK).tick == BLOCK, "the rig goes on"
+    assert [event["command"] for event in rig.listener.named("command")] == ["step"]
+
+
+def test_the_console_raises_the_rigs_own_line() -> None:
+    with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
+        with pytest.raises(RefusedError) as caught:
+            rig.console.hammer(force_n=5000.0)
+        assert str(caught.value) == "force_n must be above 0 and at most 1000; instead received 5000.0"
+        with pytest.raises(InputError, match="speed_hz must be a finite number"):
+            rig.console.speed(float("nan"))
+
+
+def test_step_is_refused_where_nothing_waits_for_it() -> None:
+    with (
+        Running(FakeSimulation(duration_s=None), RealTime()) as rig,
+        pytest.raises(RefusedError, match="--pace lockstep; instead received '--pace real-time'"),
+    ):
+        rig.console.step(BLOCK)
+
+
+def test_lockstep_runs_what_was_granted_and_answers_when_it_is_published() -> None:
+    simulation = FakeSimulation(duration_s=1.0)
+    with Running(simulation, Lockstep()) as rig:
+        key = wire.sensor_key("probes")
+        assert rig.console.step(25_000).tick == 25_000
+        assert sum(len(block.values) for block in rig.listener.blocks[key]) == 500
+        assert simulation.tick == 25_000
+        assert rig.console.step(1_000).tick == 26_000
+        assert sum(len(block.values) for block in rig.listener.blocks[key]) == 520
+        assert rig.console.step(974_000).time_s == 1.0
+        rig.join()
+        assert rig.summary["reason"] == "completed"
+        with pytest.raises(RefusedError, match="sent while the rig runs"):
+            rig.console.release()
+
+
+def test_steps_of_several_clients_add_up() -> None:
+    with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
+        done: list[int] = []
+        threads = [threading.Thread(target=lambda: done.append(rig.console.step(BLOCK).tick)) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(20.0)
+        assert sorted(done) == [n * BLOCK for n in range(1, 9)]
+
+
+def test_lockstep_without_a_partner_ends_as_a_failure() -> None:
+    server = MemoryServer()
+    listener = Listener(server)
+    service = Service(FakeSimulation(), server, Lockstep(timeout_s=0.01), block_ticks=BLOCK)
+    with pytest.raises(StepTimeoutError):
+        service.run()
+    assert listener.events[-1]["reason"] == "failed: no step was granted within 0.01 s"
+
+
+def test_stop_ends_the_run_and_refuses_what_comes_later() -> None:
+    with Running(FakeSimulation(duration_s=None), RealTime()) as rig:
+        assert rig.console.stop().command == "stop"
+        rig.join()
+        assert rig.summary["reason"] == "stopped"
+        assert [event["event"] for event in rig.listener.events] == ["start", "command", "end"]
+        with pytest.raises(RefusedError, match="must be sent while the rig runs"):
+            rig.console.stop()
+
+
+def test_a_step_that_can_no_longer_be_done_is_answered() -> None:
+    with Running(FakeSimulation(duration_s=None, fail_at_tick=50_000), Lockstep()) as rig:
+        with pytest.raises(RefusedError, match="a run that ended: failed"):
+            rig.console.step(100_000)
+        rig.join()
+
+
+def test_a_failing_simulation_ends_the_stream_and_raises() -> None:
+    server = MemoryServer()
+    listener = Listener(server)
+    service = Service(FakeSimulation(fail_at_tick=30_000), server, FreeRun(), block_ticks=BLOCK)
+    with pytest.raises(FloatingPointError):
+        service.run()
+    assert listener.events[-1]["event"] == "end"
+    assert listener.events[-1]["reason"] == "failed: FloatingPointError: the shaft left the rig"
+    assert listener.events[-1]["rows"][wire.sensor_key("probes")] == 600
+
+
+def test_a_failing_publisher_ends_the_run() -> None:
+    class Broken(MemoryServer):
+        def publish(self, key: str, payload: bytes) -> None:
+            if key == wire.sensor_key("forces"):
+                raise OSError("the link is gone")
+            super().publish(key, payload)
+
+    with pytest.raises(RuntimeError, match="the publisher failed"):
+        Service(FakeSimulation(duration_s=None), Broken(), FreeRun(), block_ticks=BLOCK).run()
+
+
+def test_each_kind_of_warning_becomes_one_event() -> None:
+    class Doubtful(FakeSimulation):
+        def health(self) -> dict[str, Any]:
+            return {"spin_hz": 1.0, "energy": {}, "warnings": [f"residual {self.tick}.5e-06 J"] if self.tick else []}
+
+    _, listener = run(Doubtful(duration_s=0.5), status_period_s=0.0)
+    assert len(listener.named("warning")) == 1
+    assert listener.statuses[-1]["warnings"] == ["residual 500000.5e-06 J"]
+
+
+class Gate(MemoryServer):
+    """Holds up every publication until it is opened."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open = threading.Event()
+
+    def publish(self, key: str, payload: bytes) -> None:
+        assert self.open.wait(20.0)
+        super().publish(key, payload)
+
+
+def test_a_paced_run_drops_whole_blocks_and_counts_them_while_it_keeps_every_event() -> None:
+    server = Gate()
+    listener = Listener(server)
+    now = [0]
+
+    def sleep(seconds: float) -> None:
+        now[0] += round(seconds * 1e9)
+
+    class Noted(FakeSimulation):
+        def advance(self, ticks: int) -> FakeFrame:
+            frame = super().advance(ticks)
+            frame.events = [{"event": "hammer", "tick": frame.tick, "time_s": 0.0}]
+            if self.tick >= 1_000_000:
+                server.open.set()
+            return frame
+
+    clock = RealTime(now_ns=lambda: now[0], sleep=sleep)
+    service = Service(Noted(duration_s=1.0), server, clock, block_ticks=BLOCK, queue_seconds=0.2)
+    summary = service.run()
+    assert summary["queue"]["high_water"] == summary["queue"]["capacity"] == 20
+    # 100 blocks; at most one was in the publisher's hands, and 20 in the queue.
+    dropped = summary["queue"]["dropped"]
+    assert dropped in (79, 80)
+    blocks = listener.blocks[wire.sensor_key("probes")]
+    assert len(blocks) == 100 - dropped
+    follow = wire.Continuity()
+    follow.follow("probes", 0, 0)
+    for block in blocks:
+        follow.follow("probes", block.index, len(block.values))
+    assert follow.lost["probes"] == 200 * dropped, "the gap shows in the row numbers"
+    assert [event["tick"] for event in listener.named("hammer")] == [BLOCK * n for n in range(100)]
+    assert len(listener.named("warning")) == 1
+    assert any("blocks dropped" in text for text in listener.statuses[-1]["warnings"])
+    assert listener.events[-1]["event"] == "end"
+
+
+def test_an_unpaced_run_waits_for_the_publisher() -> None:
+    server = Gate()
+    listener = Listener(server)
+    simulation = FakeSimulation(duration_s=1.0)
+    service = Service(simulation, server, FreeRun(), block_ticks=BLOCK, queue_seconds=0.2)
+    thread = threading.Thread(target=service.run)
+    thread.start()
+    until(lambda: simulation.tick >= 200_000)
+    time.sleep(0.05)
+    assert simulation.tick <= 220_000, "one block in the queue's 20 places, one in the publisher's hands"
+    server.open.set()
+    thread.join(20.0)
+    assert len(listener.blocks[wire.sensor_key("probes")]) == 100
+    assert listener.statuses[-1]["queue"]["dropped"] == 0
+
+
+def test_the_queue_gives_the_events_of_a_dropped_block_to_the_next() -> None:
+    queue = _Queue(1)
+    frame = FakeSimulation()
+    frame.warm_up()
+    assert queue.put(_Entry([{"event": "start"}])) == 0
+    assert queue.put(_Entry([{"event": "a"}], frame.advance(BLOCK), [{"event": "b"}])) == 0
+    assert queue.put(_Entry([{"event": "c"}], frame.advance(BLOCK))) == 1
+    queue.close()
+    entry = queue.take(0.0)
+    assert entry is not None
+    assert [event["event"] for event in entry.before] == ["start", "a", "b", "c"]
+    assert queue.take(0.0) is None
+    assert queue.finished
+
+
+def test_reports_of_clients_are_in_the_status_with_their_lag() -> None:
+    with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
+        rig.console.step(100_000)
+        client = rig.listener.client
+        client.report(f"{wire.CLIENTS}/recorder", json.dumps({"received_index": 1_000, "lost": 3}).encode())
+        for bad in (b"", b"{}", b"[]", b'{"received_index": "x"}', b'{"received_index": null}'):
+            client.report(f"{wire.CLIENTS}/broken", bad)
+        status = rig.console.status()
+        assert status["samples_published"] == 2_000
+        assert status["clients"].keys() == {"recorder"}
+        row = status["clients"]["recorder"]
+        assert (row["received_index"], row["lost"], row["lag_s"]) == (1_000, 3, 0.05)
+        assert "5 client reports could not be read" in status["warnings"]
+
+
+def test_the_number_of_clients_is_bounded() -> None:
+    with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
+        for n in range(200):
+            rig.listener.client.report(f"{wire.CLIENTS}/{n}", b'{"received_index": 1}')
+        assert len(rig.console.status()["clients"]) == 64
+
+
+class Slow(MemoryServer):
+    """Claims a link that is stalled until the clock of the test says otherwise."""
+
+    def __init__(self, stalled_calls: int) -> None:
+        super().__init__()
+        self.stalled_calls = stalled_calls
+        self.calls = 0
+
+    def congestion(self) -> dict[str, float]:
+        self.calls += 1
+        return {"links": 1, "stalled_links": int(self.calls < self.stalled_calls)}
+
+
+def test_at_the_end_the_rig_stays_for_a_stalled_link_but_not_for_ever() -> None:
+    server = Slow(stalled_calls=8)
+    Service(FakeSimulation(duration_s=0.1), server, FreeRun(), block_ticks=BLOCK).run()
+    assert server.calls >= 8
+    forever = Slow(stalled_calls=10**9)
+    Service(FakeSimulation(duration_s=0.1), forever, FreeRun(), block_ticks=BLOCK, linger_s=0.3).run()
+    assert forever.calls >= 2
+
+
+def test_commands_of_a_rig_that_is_not_prepared_are_not_answered() -> None:
+    server = MemoryServer()
+    Service(FakeSimulation(), server, FreeRun(), block_ticks=BLOCK)
+    with pytest.raises(NoReplyError):
+        Console(MemoryClient(server)).stop()
