@@ -175,9 +175,9 @@ def test_any_bytes_are_a_document_or_value_error(payload: bytes) -> None:
 
 
 @pytest.mark.xfail(strict=True, raises=RecursionError, reason="bug: deep nesting is no ValueError")
-@pytest.mark.parametrize("payload", [b"[" * 100_000, b'{"a":' * 100_000])
+@pytest.mark.parametrize("payload", [b"[" * 100_000, b'{"a":' * 100_000], ids=["lists", "objects"])
 def test_deep_nesting_is_refused(payload: bytes) -> None:
-    with pytest.raises(ValueError, match=""):
+    with pytest.raises(ValueError):  # noqa: PT011 any will do
         decode_document(payload)
 
 

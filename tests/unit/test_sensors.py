@@ -1,0 +1,258 @@
+"""Sensors against closed forms: scale, limits, noise, filters, settled start, keyphasor instants."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from rig.channels import Group, default_table
+from rig.kernels.signals import COLUMN, N_ROW
+from rig.scenes import load_scene
+from rig.sensors.conditioning import Conditioner
+from rig.sensors.keyphasor import Keyphasor
+from rig.simulation import Simulation
+
+ROW_RATE = 40_000
+"""Rows a second of a run at 25 us."""
+DC = [channel for channel in default_table().channels.values() if channel.highpass_hz == 0.0]
+
+
+def rows_of(signal: str, values: np.ndarray) -> np.ndarray:
+    rows = np.zeros((len(values), N_ROW))
+    rows[:, COLUMN[signal]] = values
+    return rows
+
+
+def group_of(name: str) -> Group:
+    return default_table().groups[name]
+
+
+def shown(name: str, signal_si: np.ndarray, *, seed: int = 1, noise: bool = False) -> np.ndarray:
+    """What one channel shows of its ideal signal, in its own unit, at its sample rate."""
+    channel = default_table().channels[name]
+    group = group_of(channel.group)
+    counts = Conditioner(group, row_rate_hz=ROW_RATE, seed=seed, noise=noise).counts(rows_of(channel.signal, signal_si))
+    return group.engineering(counts)[:, group.names.index(name)]
+
+
+@pytest.mark.parametrize("channel", DC, ids=lambda channel: channel.name)
+@pytest.mark.parametrize("part", [-0.9, -0.3, 0.0, 0.5, 0.95])
+def test_what_stands_still_is_shown_within_half_a_step(channel, part: float) -> None:
+    low, high = channel.range_v
+    volts = 0.5 * (low + high) + part * 0.5 * (high - low)
+    value = (volts - channel.bias_v) / channel.sensitivity_v
+    seen = shown(channel.name, np.full(40, value * channel.si))
+    # Half a step of the converter, and the rounding of a filter that runs on volts.
+    assert np.abs(seen - value).max() <= 0.5 * abs(channel.scale) * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("channel", DC, ids=lambda channel: channel.name)
+def test_output_is_limited_to_the_range_of_the_conditioner(channel) -> None:
+    for volts, limit in zip((-1e3, 1e3), channel.range_v, strict=True):
+        value = (volts - channel.bias_v) / channel.sensitivity_v
+        expected = (limit - channel.bias_v) / channel.sensitivity_v
+        seen = shown(channel.name, np.full(40, value * channel.si))
+        np.testing.assert_allclose(seen, expected, rtol=0, atol=abs(channel.scale))
+
+
+def test_counts_end_at_the_converter() -> None:
+    hammer = default_table().channels["hammer"]
+    # A conditioner that reaches the converter's limits, with noise that goes beyond them.
+    loud = hammer.model_copy(update={"range_v": (-5.0, 5.0), "noise_v": 1.0, "adc_bits": 16})
+    group = group_of("hammer").model_copy(update={"channels": (loud,)})
+    for sign, end in ((1.0, 2**15 - 1), (-1.0, -(2**15))):
+        rows = rows_of("hammer_force", np.full(400, sign * 1e4))
+        counts = Conditioner(group, row_rate_hz=ROW_RATE, seed=1, noise=True).counts(rows)[:, 0]
+        assert counts.max() <= 2**15 - 1
+        assert counts.min() >= -(2**15)
+        assert np.count_nonzero(counts == end) > 50, "about half of the samples lie beyond"
+
+
+@pytest.mark.parametrize("group", list(default_table().groups))
+def test_noise_is_as_loud_as_the_table_says(group: str) -> None:
+    samples = 20_000
+    counts = Conditioner(group_of(group), row_rate_hz=ROW_RATE, seed=7, noise=True).counts(np.zeros((2 * samples, N_ROW)))
+    assert counts.shape == (samples, len(group_of(group).channels))
+    for c, channel in enumerate(group_of(group).channels):
+        volts = counts[:, c] * channel.lsb_v
+        assert volts.std() == pytest.approx(channel.noise_v, rel=0.05)
+        # White: neighbours know nothing of each other (standard error 0.7 %), and centred on the quiet value.
+        assert abs(np.corrcoef(volts[1:], volts[:-1])[0, 1]) < 0.035
+        assert volts.mean() == pytest.approx(channel.bias_v if channel.highpass_hz == 0.0 else 0.0, abs=0.035 * channel.noise_v)
+
+
+def noisy(groups: str, seed: int) -> dict[str, np.ndarray]:
+    simulation = Simulation(load_scene("stable-run", {"sensors.groups": groups, "seed": seed}))
+    samples = simulation.advance(50_000).samples
+    return {name: samples[group].values[:, c] for group in samples for c, name in enumerate(group_of(group).names)}
+
+
+def test_noise_is_that_of_the_seed_and_of_the_channel_alone() -> None:
+    everything = '["probes", "forces", "accelerations", "drive", "hammer"]'
+    first, again, other = noisy(everything, 1), noisy(everything, 1), noisy(everything, 2)
+    alone = noisy('["hammer", "forces"]', 1)
+    assert set(alone) == {"hammer", "P_N", "P_S", "P_E", "P_W"}
+    for name, counts in first.items():
+        np.testing.assert_array_equal(again[name], counts)
+        assert np.mean(other[name] != counts) > 0.9
+        if name in alone:
+            np.testing.assert_array_equal(alone[name], counts)
+
+
+def test_channels_have_noise_of_their_own() -> None:
+    noise = {}
+    for name, group in default_table().groups.items():
+        counts = Conditioner(group, row_rate_hz=ROW_RATE, seed=1, noise=True).counts(np.zeros((8_000, N_ROW)))
+        noise |= {f"{name}.{channel}": counts[:, c].astype(float) for c, channel in enumerate(group.names)}
+    related = np.corrcoef(np.array(list(noise.values()))) - np.eye(len(noise))
+    # 4000 samples: standard error 1.6 %.
+    assert np.abs(related).max() < 0.08
+
+
+def test_without_noise_there_is_none() -> None:
+    counts = Conditioner(group_of("probes"), row_rate_hz=ROW_RATE, seed=1, noise=False).counts(np.zeros((400, N_ROW)))
+    assert len(np.unique(counts)) == 1
+
+
+def gain(name: str, frequency_hz: float, *, seconds: float, amplitude_si: float) -> float:
+    """Gain of a channel for a sine, fitted to its second half."""
+    channel = default_table().channels[name]
+    times = np.arange(round(seconds * ROW_RATE)) / ROW_RATE
+    seen = shown(name, amplitude_si * np.sin(2 * math.pi * frequency_hz * times))
+    at = np.arange(len(seen)) / channel.rate_hz
+    half = slice(len(seen) // 2, None)
+    waves = np.stack([np.sin(2 * math.pi * frequency_hz * at), np.cos(2 * math.pi * frequency_hz * at), np.ones_like(at)])
+    sine, cosine, _ = np.linalg.lstsq(waves[:, half].T, seen[half], rcond=None)[0]
+    return math.hypot(sine, cosine) / (amplitude_si / channel.si)
+
+
+def butterworth(frequency_hz: float, corner_hz: float, order: int) -> float:
+    """Magnitude of a low-pass made by the bilinear transform, warped so that its corner stays in place."""
+    warped = math.tan(math.pi * frequency_hz / ROW_RATE) / math.tan(math.pi * corner_hz / ROW_RATE)
+    return 1.0 / math.sqrt(1.0 + warped ** (2 * order))
+
+
+@pytest.mark.parametrize("frequency_hz", [2_500.0, 5_000.0, 7_500.0])
+def test_low_pass_is_butterworths(frequency_hz: float) -> None:
+    measured = gain("P_E", frequency_hz, seconds=0.1, amplitude_si=5_000.0)
+    assert measured == pytest.approx(butterworth(frequency_hz, 5_000.0, 4), rel=1e-4)
+
+
+def test_corner_is_at_minus_3_db_and_the_tachometers_is_lower() -> None:
+    assert gain("P_E", 5_000.0, seconds=0.1, amplitude_si=5_000.0) == pytest.approx(math.sqrt(0.5), rel=1e-4)
+    assert gain("speed", 200.0, seconds=0.3, amplitude_si=60.0) == pytest.approx(math.sqrt(0.5), rel=1e-3)
+    assert gain("speed", 400.0, seconds=0.3, amplitude_si=60.0) == pytest.approx(butterworth(400.0, 200.0, 4), rel=1e-3)
+
+
+def test_a_slower_rate_has_a_lower_corner() -> None:
+    group = default_table().only(("forces",), 2_000).groups["forces"]
+    times = np.arange(8_000) / ROW_RATE
+    rows = rows_of("P_E", 5_000.0 * np.sin(2 * math.pi * 5_000.0 * times))
+    seen = group.engineering(Conditioner(group, row_rate_hz=ROW_RATE, seed=1, noise=False).counts(rows))
+    assert len(seen) == 400
+    # 5 kHz would fold back to 1 kHz; the corner of 500 Hz holds it down by ten to the fourth.
+    assert np.abs(seen[200:]).max() < 5_000.0 * butterworth(5_000.0, 500.0, 4) * 1.1
+
+
+def test_ac_coupling_forgets_a_step_with_its_time_constant() -> None:
+    corner = default_table().channels["inner_x"].highpass_hz
+    step = np.where(np.arange(ROW_RATE) < 4_000, 0.0, 100.0)
+    seen = shown("inner_x", step)
+    at = np.arange(len(seen)) / 20_000 - 0.1
+    later = at > 0.01
+    np.testing.assert_allclose(seen[later], 100.0 * np.exp(-2 * math.pi * corner * at[later]), rtol=2e-3)
+    assert np.abs(seen[at < -1e-3]).max() < 0.01
+
+
+def test_ac_coupling_has_its_corner_where_the_table_says() -> None:
+    assert gain("inner_x", 0.5, seconds=12.0, amplitude_si=1_000.0) == pytest.approx(math.sqrt(0.5), rel=1e-3)
+
+
+@pytest.mark.parametrize("name", list(default_table().channels))
+def test_instruments_are_settled_at_sample_0(name: str) -> None:
+    channel = default_table().channels[name]
+    value = 0.7 * channel.si * (channel.range_v[1] - channel.bias_v) / abs(channel.sensitivity_v)
+    seen = shown(name, np.full(4_000, value))
+    expected = 0.0 if channel.highpass_hz else value / channel.si
+    np.testing.assert_allclose(seen, expected, rtol=0, atol=abs(channel.scale))
+
+
+def test_nothing_jumps_at_the_start_of_a_run() -> None:
+    frame = Simulation(load_scene("stable-run", {"sensors.noise": False})).advance(10_000)
+    for group, block in frame.samples.items():
+        if group == "drive":  # the keyphasor's mark may be under its sensor
+            continue
+        values = group_of(group).engineering(block.values)
+        change = np.abs(np.diff(values, axis=0))
+        for c, channel in enumerate(group_of(group).channels):
+            assert change[0, c] <= change.max(axis=0)[c] + abs(channel.scale)
+            assert change[:, c].max() < 0.02 * (channel.range_v[1] - channel.range_v[0]) / abs(channel.sensitivity_v)
+
+
+def keyphasor_rows(times_s: np.ndarray, angle: float, spin: float, acceleration: float) -> np.ndarray:
+    rows = np.zeros((len(times_s), N_ROW))
+    rows[:, COLUMN["theta"]] = angle + spin * times_s + 0.5 * acceleration * times_s**2
+    rows[:, COLUMN["theta_rate"]] = spin + acceleration * times_s
+    return rows
+
+
+TOLERANCE_S = 1e-13
+"""The interpolant is exact for constant acceleration, so only rounding is left: that of an angle of up to 700 rad
+(1.1e-13 rad) at 30 rad/s or more, and of row numbers up to 1e5 with their fraction (1.5e-11 rows of 25 us)."""
+
+
+@pytest.mark.parametrize(
+    ("angle", "spin", "acceleration"),
+    [(0.0, 40.0, 0.0), (0.1, 40.0, 60.0), (-3.0, 90.0, -20.0), (6.28, 30.0, 300.0), (1.0, 31.4, 0.3)],
+)
+@pytest.mark.parametrize("cut", [4_000, 997, 1])
+def test_keyphasor_edges_are_the_closed_form(angle: float, spin: float, acceleration: float, cut: int) -> None:
+    n = 4_000 if cut == 1 else 80_000
+    times = np.arange(n) / ROW_RATE
+    rows = keyphasor_rows(times, angle, spin, acceleration)
+    sensor = Keyphasor()
+    found = [
+        (25 * start + sensor.edges(rows[start : start + cut], 25)) * 1e-6 for start in range(0, n, cut)
+    ]
+    edges = np.concatenate(found)
+    marks = 2 * math.pi * np.arange(math.floor(angle / (2 * math.pi)) + 1, math.floor(rows[-1, COLUMN["theta"]] / (2 * math.pi)) + 1)
+    way = marks - angle
+    # The root of spin t + acceleration t^2 / 2 = way in the form that does not cancel.
+    expected = 2 * way / (spin + np.sqrt(spin**2 + 2 * acceleration * way))
+    assert len(edges) == len(expected) == sensor.edges_seen
+    assert len(edges) >= (1 if cut == 1 else 8) or angle < 0
+    assert np.abs(edges - expected).max(initial=0.0) < TOLERANCE_S
+
+
+def test_edges_of_a_run_lie_where_the_mark_passes() -> None:
+    simulation = Simulation(load_scene("run-up", {"drive.profile": "[[0.0, 6.0], [1.0, 8.0]]", "drive.mode": "ideal"}))
+    frames = [simulation.advance(10_000) for _ in range(100)]
+    blocks = [frame.edges for frame in frames if frame.edges is not None]
+    edges = np.concatenate([block.tick + block.values[:, 0] for block in blocks]) * 1e-6
+    assert [block.index for block in blocks] == list(range(len(blocks))), "one turn takes many blocks"
+    # A prescribed spin of 6 Hz that grows by 2 Hz a second turns 6 t + t^2 times.
+    turns = np.arange(1, len(edges) + 1)
+    assert len(edges) == 6
+    np.testing.assert_allclose(edges, np.sqrt(9.0 + turns) - 3.0, rtol=0, atol=1e-9)
+
+
+def test_a_backward_spin_has_no_forward_edges() -> None:
+    rows = keyphasor_rows(np.arange(40_000) / ROW_RATE, 20.0, -40.0, 0.0)
+    assert len(Keyphasor().edges(rows, 25)) == 0
+
+
+def test_pulse_rises_where_the_edge_is() -> None:
+    simulation = Simulation(load_scene("stable-run", {"sensors.noise": False}))
+    frame = simulation.advance(1_000_000)
+    drive = group_of("drive")
+    pulse = drive.engineering(frame.samples["drive"].values)[:, drive.names.index("keyphasor")]
+    rises = np.nonzero((pulse[1:] >= 0.5) & (pulse[:-1] < 0.5))[0] + 1
+    assert frame.edges is not None
+    edges = frame.edges.values[:, 0] * 1e-6
+    assert len(rises) == len(edges) == 6
+    # The filter of 5 kHz holds the pulse back by some 80 us; samples are 50 us apart.
+    late = rises / 20_000 - edges
+    assert late.min() > 0.0
+    assert late.max() < 2e-4
