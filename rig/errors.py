@@ -1,4 +1,4 @@
-"""The one exception that means: the user gave something that cannot be used."""
+"""Errors that a user meets: wrong input, a refusal by the rig, a run that failed."""
 
 from __future__ import annotations
 
@@ -25,3 +25,7 @@ class RefusedError(InputError):
         """Keep the whole line."""
         self.field, self.must, self.received = "request", "one that the rig accepts", None
         ValueError.__init__(self, line)
+
+
+class SimulationError(RuntimeError):
+    """The numbers have gone wrong: the state is no longer finite, and the run ends."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from rig.channels import ChannelTable, default_table
 from rig.engines import load_engine
-from rig.errors import InputError
+from rig.errors import InputError, SimulationError
 from rig.kernels import signals as S
 from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
@@ -38,10 +38,6 @@ ENERGY_ALARM = 1e-3
 STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy")
 SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
 DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
-
-
-class SimulationError(RuntimeError):
-    """The numbers have gone wrong: the state is no longer finite."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from rig.cli import (
     stop,
     view,
 )
-from rig.errors import InputError
+from rig.errors import InputError, SimulationError
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
@@ -60,11 +60,13 @@ for _panel, _commands in _PANELS.items():
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command: wrong input is one line on stderr and exit status 2, Ctrl-C is 130, a failed verdict is 1."""
+    """Run the command; exit status 2 and one line for wrong input, 1 for a run or verdict that failed, 130 for Ctrl-C."""
     try:
         code = app(args=arguments, standalone_mode=False)
     except InputError as error:
         _fail(str(error))
+    except SimulationError as error:
+        _fail(str(error), status=1)
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx is not None else "rig"
         _fail(f"{error.format_message()} (see `{command} --help`)")
@@ -78,9 +80,9 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _fail(message: str) -> NoReturn:
+def _fail(message: str, *, status: int = 2) -> NoReturn:
     print("rig: " + " ".join(message.split()), file=sys.stderr)
-    sys.exit(2)
+    sys.exit(status)
 
 
 if __name__ == "__main__":

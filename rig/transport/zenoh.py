@@ -99,18 +99,22 @@ class _Session:
         self._closed = False
         atexit.register(self.close)
 
-    def drain(
-        self, channel: Any, take: Callable[[Any], None], name: str, *, first: Callable[[], None] | None = None
-    ) -> None:
-        """Give all that arrives in a channel to `take`, on a thread of its own, after calling `first` there."""
-        import zenoh
+    def drain(self, channel: Any, take: Callable[[Any], None], name: str) -> None:
+        """Give all that arrives in a channel to `take`, on a thread of its own."""
 
         def loop() -> None:
+            for item in channel:
+                take(item)
+
+        self.follow(channel, loop, name)
+
+    def follow(self, channel: Any, loop: Callable[[], None], name: str) -> None:
+        """Run a loop that empties a channel, on a thread of its own."""
+        import zenoh
+
+        def run() -> None:
             try:
-                if first is not None:
-                    first()
-                for item in channel:
-                    take(item)
+                loop()
             except BaseException as error:
                 if self._closed and isinstance(error, zenoh.ZError):
                     return
@@ -119,7 +123,7 @@ class _Session:
                 for _ in channel:
                     pass
 
-        thread = threading.Thread(target=loop, name=f"zenoh {name}", daemon=True)
+        thread = threading.Thread(target=run, name=f"zenoh {name}", daemon=True)
         self._threads.append(thread)
         thread.start()
 
@@ -317,21 +321,26 @@ class _Stream:
     def take(self, sample: Any) -> None:
         name = str(sample.key_expr)
         if (info := sample.source_info) is not None:
-            self._names.setdefault(_source(info.source_id), name)
+            source = _source(info.source_id)
+            self._names.setdefault(source, name)
+            self._last[source] = info.source_sn
         with self._lock:
             self._on_message(name, sample.payload.to_bytes())
 
-    def take_with_history(self, sample: Any) -> None:
-        if sample.source_info is None:  # not from a rig
-            return
-        source = _source(sample.source_info.source_id)
-        if source[0] not in self._rigs:  # the rig has been started again
-            self.fetch_history(source[0])
-        if sample.source_info.source_sn > self._last.get(source, -1):
-            self.take(sample)
+    def follow_with_history(self, subscriber: Any) -> None:
+        """Take what the caches hold, then what arrives."""
+        self._catch_up(subscriber, "*", [])
+        for sample in subscriber:
+            if sample.source_info is None:  # not from a rig
+                continue
+            source = _source(sample.source_info.source_id)
+            if source[0] not in self._rigs:  # the rig has been started again
+                self._catch_up(subscriber, source[0], [sample])
+            elif sample.source_info.source_sn > self._last.get(source, -1):
+                self.take(sample)
 
-    def fetch_history(self, rig: str = "*") -> None:
-        """Take what the caches of all publishers hold; what arrives meanwhile waits in the subscription's channel."""
+    def _catch_up(self, subscriber: Any, rig: str, waiting: list[Any]) -> None:
+        """Take what the caches of a rig's publishers hold, and what arrived meanwhile, each publisher's in order."""
         import zenoh
 
         # All is received before any of it is handed on: as long as a cache answers, its publisher waits.
@@ -343,12 +352,22 @@ class _Stream:
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
             )
         )
+        # What waits can be older than all that the caches still hold, where this process was stopped meanwhile: it
+        # was sent before the replies, so it is all here, and goes first.
+        while (sample := subscriber.try_recv()) is not None:
+            waiting.append(sample)
+        numbered: dict[tuple[str, int], dict[int, Any]] = {}
+        for sample in (*waiting, *(reply.ok for reply in replies if reply.ok is not None)):
+            if sample.source_info is not None:
+                source = _source(sample.source_info.source_id)
+                numbered.setdefault(source, {})[sample.source_info.source_sn] = sample
         self._rigs.add(rig)
-        for sample in (reply.ok for reply in replies if reply.ok is not None):
-            source = _source(sample.source_info.source_id)
+        for source, samples in numbered.items():
             self._rigs.add(source[0])
-            self._last[source] = sample.source_info.source_sn
-            self.take(sample)
+            last = self._last.get(source, -1)
+            for number in sorted(samples):
+                if number > last:
+                    self.take(samples[number])
 
     def missed(self, miss: Any) -> None:
         assert self._on_miss is not None
@@ -442,7 +461,7 @@ class ZenohClient:
             self._declared.append(listener)
             self._session.drain(listener, stream.missed, f"misses {key}")
         if history:
-            self._session.drain(subscriber, stream.take_with_history, f"takes {key}", first=stream.fetch_history)
+            self._session.follow(subscriber, lambda: stream.follow_with_history(subscriber), f"takes {key}")
         else:
             self._session.drain(subscriber, stream.take, f"takes {key}")
 

@@ -6,12 +6,14 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from rig.errors import InputError
 from rig.transport import NoReplyError
-from rig.transport.zenoh import ZenohClient, ZenohServer, _backlog, parse_endpoint
+from rig.transport.zenoh import ZenohClient, ZenohServer, _backlog, _Stream, parse_endpoint
 
 pytestmark = pytest.mark.wallclock
 
@@ -177,6 +179,49 @@ def test_a_subscriber_with_history_misses_nothing_whenever_it_comes(server: Zeno
     finally:
         stop.set()
         thread.join()
+
+
+def sample(number: int, *, publisher: int = 1) -> Any:
+    info = SimpleNamespace(source_id=SimpleNamespace(zid="a", eid=publisher), source_sn=number)
+    return SimpleNamespace(
+        key_expr=f"rig/{publisher}", payload=SimpleNamespace(to_bytes=lambda: b"%d" % number), source_info=info
+    )
+
+
+class Channel:
+    """What waits while the history is fetched, and what comes later."""
+
+    def __init__(self, waiting: list[Any], later: list[Any]) -> None:
+        self.waiting = waiting
+        self.later = later
+
+    def try_recv(self) -> Any:
+        return self.waiting.pop(0) if self.waiting else None
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.later)
+
+
+@pytest.mark.parametrize(
+    ("waiting", "cached", "later", "expected"),
+    [
+        ([], [0, 1, 2], [3, 4], [0, 1, 2, 3, 4]),
+        ([2, 3], [0, 1, 2], [4], [0, 1, 2, 3, 4]),
+        # The process was stopped for longer than the cache holds: what waits is older, and nobody else has it.
+        ([1, 2], [7, 8, 9], [10], [1, 2, 7, 8, 9, 10]),
+        # Recovered meanwhile: the same again.
+        ([1, 2], [7, 8], [7, 8, 9], [1, 2, 7, 8, 9]),
+        ([], [], [0, 1], [0, 1]),
+    ],
+)
+def test_history_and_what_arrives_meanwhile_are_joined_in_order_without_loss(
+    waiting: list[int], cached: list[int], later: list[int], expected: list[int]
+) -> None:
+    got: list[int] = []
+    session = SimpleNamespace(get=lambda *_, **__: [SimpleNamespace(ok=sample(number)) for number in cached])
+    stream = _Stream(session, "rig/**", lambda _, payload: got.append(int(payload)), None)
+    stream.follow_with_history(Channel([sample(n) for n in waiting], [sample(n) for n in later]))
+    assert got == expected
 
 
 def test_the_history_of_a_restarted_rig_is_fetched_too() -> None:

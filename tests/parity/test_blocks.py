@@ -1,0 +1,165 @@
+"""How a run is cut into calls changes no bit of it, and neither does running it again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+
+END = 600_000
+COMMANDS: dict[int, list[tuple[str, dict[str, Any]]]] = {
+    150_000: [("speed", {"speed_hz": 5.0})],
+    200_500: [("hammer", {"force_n": 700.0, "duration_ms": 2.0, "direction": 200.0})],
+    400_000: [("release", {})],
+}
+"""Sent from outside, at these ticks whatever the cuts are; the scene's own blow at 20 ms comes beside them."""
+
+
+@dataclass(frozen=True)
+class Whole:
+    """Everything that a run published, as one piece."""
+
+    rows: np.ndarray
+    samples: dict[str, np.ndarray]
+    truth: dict[str, np.ndarray]
+    edges: np.ndarray
+    events: list[dict[str, Any]]
+    health: dict[str, Any]
+
+
+def run(*cuts: int, scene: str = "hammer", overrides: dict[str, Any] | None = None) -> Whole:
+    """Run with advances of these lengths in turn, each shortened where a command or the end comes first."""
+    simulation = Simulation(load_scene(scene, {"drive.speed_hz": 6.2, **(overrides or {})}))
+    lengths = cycle(cuts)
+    rows, edges, events = [], [], []
+    samples: dict[str, list[np.ndarray]] = {}
+    truth: dict[str, list[np.ndarray]] = {}
+    seen: dict[str, int] = {}
+    while simulation.tick < END:
+        tick = simulation.tick
+        for name, request in COMMANDS.get(tick, []):
+            assert simulation.submit(name, request) == tick
+        stop = min([END, *(at for at in COMMANDS if at > tick)])
+        frame = simulation.advance(min(next(lengths), stop - tick))
+        assert frame.tick == tick
+        assert frame.tick + frame.ticks == simulation.tick
+        rows.append(frame.rows.copy())
+        events += frame.events
+        for kept, made in ((samples, frame.samples), (truth, frame.truth)):
+            for name, block in made.items():
+                assert (block.tick, block.index) == (tick, seen.get(name, 0)), "no row is missing between two blocks"
+                seen[name] = block.index + len(block.values)
+                kept.setdefault(name, []).append(block.values)
+        if frame.edges is not None:
+            assert frame.edges.index == seen.get("edges", 0)
+            seen["edges"] = frame.edges.index + len(frame.edges.values)
+            edges.append(frame.edges.tick + frame.edges.values[:, 0])
+    return Whole(
+        rows=np.concatenate(rows),
+        samples={name: np.concatenate(blocks) for name, blocks in samples.items()},
+        truth={name: np.concatenate(blocks) for name, blocks in truth.items()},
+        edges=np.concatenate(edges) if edges else np.empty(0),
+        events=events,
+        health=simulation.health(),
+    )
+
+
+def assert_same(one: Whole, other: Whole) -> None:
+    assert one.rows.tobytes() == other.rows.tobytes()
+    for made, again in ((one.samples, other.samples), (one.truth, other.truth)):
+        assert made.keys() == again.keys()
+        for name in made:
+            assert made[name].dtype == again[name].dtype
+            assert made[name].shape == again[name].shape
+            assert made[name].tobytes() == again[name].tobytes(), name
+    assert one.events == other.events
+    assert one.health == other.health
+    # See test_edges_are_the_same_bits for the last of them.
+    np.testing.assert_allclose(one.edges, other.edges, rtol=0, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Whole:
+    """As few cuts as the commands allow."""
+    return run(END)
+
+
+def test_there_is_something_to_compare(whole: Whole) -> None:
+    assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "release"]
+    assert [event["tick"] for event in whole.events] == [20_000, 150_000, 200_500, 400_000]
+    assert whole.health["contacts"] > 10
+    assert len(whole.edges) == 3
+    assert len(whole.rows) == END // 25
+    assert {name: len(values) for name, values in whole.samples.items()} == dict.fromkeys(
+        ("probes", "forces", "accelerations", "drive", "hammer"), END // 50
+    )
+    assert {len(values) for values in whole.truth.values()} == {END // 500}
+
+
+@pytest.mark.parametrize("cuts", [(500,), (1_000,), (10_000,), (250_000,), (10_000, 1_000, 250_000), (500, 37_500, 99_500)])
+def test_cuts_change_no_bit(whole: Whole, cuts: tuple[int, ...]) -> None:
+    assert_same(whole, run(*cuts))
+
+
+@given(cuts=st.lists(st.integers(1, 400).map(lambda n: 500 * n), min_size=1, max_size=8))
+@settings(max_examples=8, deadline=None)
+def test_no_mix_of_cuts_changes_a_bit(whole: Whole, cuts: list[int]) -> None:
+    assert_same(whole, run(*cuts))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"engine.name": "rk4", "engine.step_us": 5},
+        {"engine.step_us": 50, "sensors.rate_hz": 2_000, "sensors.truth_rate_hz": 200},
+        {"drive.mode": "ideal", "parameters": "as-printed", "sensors.groups": '["drive", "forces"]'},
+    ],
+    ids=["rk4", "slow", "ideal"],
+)
+def test_cuts_change_no_bit_of_other_scenes(overrides: dict[str, Any]) -> None:
+    assert_same(
+        run(END, overrides=overrides), run(15_000, 5_000, overrides=overrides)
+    )  # fmt: skip
+
+
+@pytest.mark.xfail(strict=True, reason="bug: rounding of an edge depends on the block that it is counted from (1e-10 us)")
+def test_edges_are_the_same_bits(whole: Whole) -> None:
+    for cuts in ((500,), (10_000,), (250_000,)):
+        assert whole.edges.tobytes() == run(*cuts).edges.tobytes()
+
+
+@pytest.mark.xfail(strict=True, reason="bug: commands of one tick take effect last one first")
+def test_commands_of_one_tick_take_effect_in_order() -> None:
+    simulation = Simulation(load_scene("stable-run"))
+    for speed_hz in (3.0, 9.0, 5.0):
+        simulation.submit("speed", {"speed_hz": speed_hz})
+    frame = simulation.advance(simulation.block_ticks)
+    assert [event["speed_hz"] for event in frame.events] == [3.0, 9.0, 5.0]
+
+
+def test_same_seed_same_bits_and_another_seed_only_another_noise(whole: Whole) -> None:
+    assert_same(whole, run(END))
+    other = run(END, overrides={"seed": 2})
+    assert other.rows.tobytes() == whole.rows.tobytes()
+    assert other.events == whole.events
+    for name, counts in whole.samples.items():
+        assert np.mean(other.samples[name] != counts) > 0.9
+
+
+def test_a_command_of_the_scene_is_one_sent_at_that_tick() -> None:
+    scene = load_scene("hammer")
+    simulation = Simulation(scene.model_copy(update={"commands": ()}))
+    request = scene.commands[0].request.model_dump(exclude={"command"})
+    first = simulation.advance(20_000).rows.copy()
+    simulation.submit("hammer", request)
+    second = simulation.advance(80_000).rows
+    frame = Simulation(scene).advance(100_000)
+    assert np.concatenate([first, second]).tobytes() == frame.rows.tobytes()

@@ -1,0 +1,211 @@
+"""Compiled kernels against the same Python, in a process of its own; outputs that were full of nan before; the cache."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+import rig
+from rig.engines import NAMES, load_engine
+from rig.kernels import signals as S
+from rig.kernels.dynamics import evaluate
+from rig.scenes import load_scene
+from rig.sensors import conditioning
+from rig.simulation import Simulation
+
+PACKAGE = Path(rig.__file__).parent
+
+JIT_RUN = """
+import sys
+import numpy as np
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+
+def run(engine):
+    # A hair off the ring, hit hard toward it: flight, onset, contact and flight again within 2 ms.
+    simulation = Simulation(load_scene("hammer", {
+        "engine.name": engine, "initial.position": "given", "initial.x_mm": 0.92,
+        "commands": [{"at_s": 0.0, "command": "hammer", "force_n": 1000.0, "duration_ms": 1.0}],
+    }))
+    frame = simulation.advance(2_000)
+    arrays = {"rows": frame.rows.copy(), "memory": simulation._memory, "y": simulation._y}
+    return arrays | {group: block.values for group, block in frame.samples.items()}
+"""
+
+
+def process(code: str, *, place: Path = PACKAGE.parent, **environment: str) -> str:
+    """Run Python code in a process of its own with the package at a place, every warning an error; what it printed."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], env={**kept, "PYTHONPATH": str(place), **environment},
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=240, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def python_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, np.ndarray]]:
+    folder = tmp_path_factory.mktemp("python")
+    code = JIT_RUN + (
+        "import types\n"
+        "from rig.kernels.dynamics import evaluate\n"
+        "assert isinstance(evaluate, types.FunctionType), 'not plain Python'\n"
+        f"for engine in {NAMES!r}: np.savez({str(folder)!r} + '/' + engine + '.npz', **run(engine))\n"
+    )
+    process(code, NUMBA_DISABLE_JIT="1")
+    return {engine: dict(np.load(folder / f"{engine}.npz")) for engine in NAMES}
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing to compare: this process is plain Python")
+@pytest.mark.parametrize("engine", NAMES)
+def test_compiled_is_python_bit_for_bit(engine: str, python_runs: dict[str, dict[str, np.ndarray]]) -> None:
+    space: dict[str, Any] = {}
+    exec(JIT_RUN, space)
+    compiled, plain = space["run"](engine), python_runs[engine]
+    touched = compiled["rows"][:, S.COLUMN["normal_force"]] > 0.0
+    assert 0 < touched.sum() < len(touched), "flight and contact are both in it"
+    assert compiled.keys() == plain.keys()
+    for name, array in compiled.items():
+        assert array.dtype == plain[name].dtype
+        # Both use the C library's functions, and nothing is reordered without fastmath.
+        np.testing.assert_array_equal(array, plain[name], err_msg=name)
+
+
+def hit() -> Simulation:
+    simulation = Simulation(load_scene("hammer"))
+    simulation.advance(40_000)
+    return simulation
+
+
+@pytest.mark.parametrize("engine", NAMES)
+@pytest.mark.parametrize(("steps", "stride"), [(400, 1), (400, 2), (401, 4), (1, 1)])
+def test_engine_writes_every_value_of_every_row(engine: str, steps: int, stride: int) -> None:
+    simulation, module = hit(), load_engine(engine)
+    made = []
+    for poison in (np.nan, 1e300):
+        y, memory = simulation._y.copy(), simulation._memory.copy()
+        rows = np.full((-(-steps // stride), S.N_ROW), poison)
+        arguments = (simulation.model.constants, simulation._inputs(), y, memory, simulation.tick, 25, steps, stride)
+        module.advance(*arguments, rows)
+        made.append((rows, y, memory))
+    assert np.isfinite(made[0][0]).all()
+    for one, other in zip(*made, strict=True):
+        assert one.tobytes() == other.tobytes(), "what lay in the output leaks into the result"
+
+
+@pytest.mark.parametrize("touching", [False, True])
+def test_evaluation_writes_every_rate_and_every_observed_value(touching: bool) -> None:
+    simulation = hit()
+    rate, out = np.full(S.N_VECTOR, np.nan), np.full(S.N_OBSERVED, np.nan)
+    arguments = (simulation.model.constants, simulation._inputs(), simulation.tick, 0.0, 0.1, touching, True, simulation._y)
+    evaluate(*arguments, rate, out)
+    assert np.isfinite(rate).all()
+    assert np.isfinite(out).all()
+
+
+def test_conditioner_writes_every_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = Simulation(load_scene("stable-run"))
+    rows = simulation.advance(10_000).rows
+    made = []
+    for poison in (np.iinfo(np.int32).min, 12345):
+
+        def poisoned(shape: Any, dtype: Any = np.float64, fill: int = poison) -> np.ndarray:
+            return np.full(shape, fill if np.issubdtype(dtype, np.integer) else np.nan, dtype=dtype)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(conditioning.np, "empty", poisoned)
+            made += [
+                conditioning.Conditioner(group, row_rate_hz=40_000, seed=1, noise=True).counts(rows)
+                for group in simulation.table.groups.values()
+            ]
+    half = len(made) // 2
+    assert half == len(simulation.table.groups)
+    for one, other in zip(made[:half], made[half:], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_rows_of_a_simulation_are_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    clean, poisoned = Simulation(load_scene("hammer")), Simulation(load_scene("hammer"))
+    poisoned._rows = np.full((4_000, S.N_ROW), np.nan)
+    assert clean.advance(50_000).rows.tobytes() == poisoned.advance(50_000).rows.tobytes()
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """A copy of the package to change; its folder."""
+    shutil.copytree(PACKAGE, tmp_path / "rig", ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path
+
+
+DIGESTS = """
+import json
+from pathlib import Path
+import rig
+from rig.kernels import source_digest
+
+def compiled(path):
+    return "njit" in path.read_text() or path.parent.name == "kernels"
+
+package = Path(rig.__file__).parent
+digests = {"": source_digest()}
+for path in sorted(package.rglob("*.py")):
+    text = path.read_bytes()
+    path.write_bytes(text[:-1] + bytes([text[-1] ^ 1]) if text else b"#")
+    if compiled(path):
+        digests[path.relative_to(package).as_posix()] = source_digest()
+    path.write_bytes(text)
+digests["again"] = source_digest()
+print(json.dumps(digests))
+"""
+
+
+def test_a_changed_byte_of_any_kernel_file_changes_the_digest(copied: Path) -> None:
+    digests = json.loads(process(DIGESTS, place=copied))
+    assert digests.pop("again") == digests[""]
+    assert {"kernels/dynamics.py", "kernels/__init__.py", "engines/fixed_step.py", "sensors/conditioning.py"} <= set(digests)
+    assert len(set(digests.values())) == len(digests)
+
+
+CACHE = "import numba, rig.kernels as k; print(numba.config.CACHE_DIR); print(k.source_digest()); print(k.compiled_before())"
+
+
+def test_cache_folder_is_named_by_the_digest_unless_the_user_names_one(tmp_path: Path) -> None:
+    folder, digest, before = process(CACHE, XDG_CACHE_HOME=str(tmp_path)).split()
+    assert Path(folder) == tmp_path / "rotor-stator-rig" / "kernels" / digest
+    assert before == "False"
+    named, _, _ = process(CACHE, XDG_CACHE_HOME=str(tmp_path), NUMBA_CACHE_DIR=str(tmp_path / "mine")).split()
+    assert Path(named) == tmp_path / "mine"
+
+
+GAP = """
+import numpy as np
+from rig.kernels.constants import Constants, Contact, House, Magnet, Shaft
+from rig.kernels.dynamics import gap
+parts = [part(*np.ones(len(part._fields))) for part in (Shaft, Magnet, Contact, House)]
+print(repr(gap(Constants(*parts, 1.0), np.full(14, 0.01))))
+"""
+
+
+def test_a_change_in_a_file_that_a_kernel_calls_reaches_it(copied: Path) -> None:
+    # numba alone looks only at the file of `gap`, and would load its old machine code.
+    cache = copied / "cache"
+    angles = copied / "rig" / "kernels" / "angles.py"
+    text = angles.read_text()
+    before = process(GAP, place=copied, XDG_CACHE_HOME=str(cache))
+    assert list(cache.rglob("*.nbc")), "the machine code was kept"
+    changed = text.replace("return sine, cosine", "return 2.0 * sine, cosine")
+    assert changed != text
+    angles.write_text(changed)
+    assert process(GAP, place=copied, XDG_CACHE_HOME=str(cache)) != before
+    angles.write_text(text)
+    assert process(GAP, place=copied, XDG_CACHE_HOME=str(cache)) == before
