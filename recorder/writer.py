@@ -284,6 +284,14 @@ class RecordingWriter:
         with self._guard():
             self._sync_if_due()
 
+    def abandon(self) -> None:
+        """Close without finishing and remove what was written; a file that was to be replaced stays."""
+        if self._mcap is None:
+            return
+        self._mcap = None
+        self._file.close()
+        self.part.unlink(missing_ok=True)
+
     def finish(self, reason: str, *, notes: dict[str, str] | None = None) -> None:
         """Write the closing counts, close the file and give it its final name.
 

@@ -211,11 +211,16 @@ class _McapRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        reason = "completed" if kind is None else f"failed: {error or kind.__name__}"
-        self._background.finish()
-        if not self._writer.closed:
-            self._event({"event": "end", "reason": reason})
-            self._writer.finish(reason)
+        whole = False
+        try:
+            self._background.finish()
+            if kind is None and not self._writer.closed:
+                self._event({"event": "end", "reason": "completed"})
+                self._writer.finish("completed")
+                whole = True
+        finally:
+            if not whole:
+                self._writer.abandon()
 
     def write(self, frame: Frame) -> None:
         """Take the next frame."""

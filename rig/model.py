@@ -22,10 +22,10 @@ def restitution_factor(restitution: float) -> float:
     F = K delta^n (1 + c delta'/v0).
 
     Raises:
-        InputError: e is 0 or below, where no finite factor exists.
+        InputError: e is below 0.04, where the factor comes within rounding of its pole at 1/e, or above 1.
     """
-    if not 0.0 < restitution <= 1.0:
-        raise InputError("contact.restitution", "above 0 and at most 1", restitution)
+    if not 0.04 <= restitution <= 1.0:
+        raise InputError("contact.restitution", "from 0.04 to 1", restitution)
     if restitution == 1.0:
         return 0.0
     from scipy.optimize import brentq

@@ -10,7 +10,7 @@ import numpy as np
 
 from rig.channels import ChannelTable
 from rig.kernels.signals import COLUMN, ROW
-from rig.scenes import Scene
+from rig.scenes import Scene, parse_scene
 from rig.simulation import Frame, Simulation, energy_balance
 
 UNITS = {signal.name: signal.unit for signal in ROW}
@@ -45,8 +45,12 @@ class Run:
         return self.signals[:, COLUMN[name]]
 
     def unit(self, name: str) -> str:
-        """Unit of a signal or of a channel."""
-        return UNITS[name] if name in UNITS and name not in self.table.channels else self.table.channels[name].unit
+        """Unit of one signal of the model, `run[name]`."""
+        return UNITS[name]
+
+    def sample_unit(self, name: str) -> str:
+        """Unit of one channel, `run.samples[name]`."""
+        return self.table.channels[name].unit
 
     @property
     def table(self) -> ChannelTable:
@@ -80,9 +84,13 @@ def simulate(
 
     Returns:
         The run; signals are kept at the sensors' rate.
+
+    Raises:
+        InputError: The duration is none that a scene can have.
+        SimulationError: The state became non-finite.
     """
     if duration_s is not None:
-        scene = Scene(**{**scene.model_dump(), "duration_s": duration_s})
+        scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})
     simulation = Simulation(scene)
     every = simulation.tick_rate_hz // scene.sensors.rate_hz // simulation.row_ticks
     signals, edges, events = [], [], []

@@ -10,9 +10,18 @@ import math
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    StrictFloat,
+    StrictInt,
+    StrictStr,
+    ValidationError,
+    field_validator,
+)
 
 from rig.errors import InputError
 
@@ -29,12 +38,16 @@ SI = {
 Kind = Literal["paper", "corrected", "literature", "datasheet", "fitted", "assumed"]
 
 
+def _number(value: float | str) -> float | str:
+    return value if isinstance(value, str) else float(value)
+
+
 class Parameter(BaseModel):
     """One value with its unit, its place in the paper, its provenance and what the model accepts."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    value: float | str
+    value: Annotated[StrictFloat | StrictInt | StrictStr, AfterValidator(_number)]
     unit: str
     symbol: str
     source: str
@@ -120,21 +133,33 @@ def set_names() -> list[str]:
     return sorted((path.stem for path in SETS.glob("*.toml")), key=lambda name: (name != DEFAULT_SET, name))
 
 
-@cache
 def load_parameters(name_or_path: str = DEFAULT_SET) -> ParameterSet:
     """Load a set by name, or a user's file by path.
 
     Raises:
         InputError: No such set, not a set file, an unknown key, or a value outside what the model accepts.
     """
-    path = SETS / f"{name_or_path}.toml"
-    if not path.is_file():
-        path = Path(name_or_path)
-        if path.suffix != ".toml" or not path.is_file():
-            raise InputError(
-                "parameters", f"one of {', '.join(set_names())}, or the path of a .toml file", name_or_path
-            )
-    return _parse(name_or_path, read_toml(path), path)
+    return _load(name_or_path, "parameters", ())
+
+
+def _load(name: Any, field: str, loading: tuple[str, ...]) -> ParameterSet:
+    """Load a set for a field that names it; `loading` are the files that stand on it."""
+    if isinstance(name, str) and name in set_names():
+        return _own_set(name)
+    path = Path(name) if isinstance(name, str) else None
+    if path is None or path.suffix != ".toml" or not path.is_file():
+        known = f"one of {', '.join(set_names())}, or the path of a .toml file"
+        raise InputError(field, f"the set that the file changes, {known}" if name is None else known, name)
+    place = str(path.resolve())
+    if place in loading:
+        raise InputError(field, "another set than the file itself or one that stands on it", name)
+    return _parse(str(name), read_toml(path), path, (*loading, place))
+
+
+@cache
+def _own_set(name: str) -> ParameterSet:
+    path = SETS / f"{name}.toml"
+    return _parse(name, read_toml(path), path, ())
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -151,15 +176,12 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(str(path), "a readable file", error.strerror) from None
 
 
-def _parse(name: str, data: dict[str, Any], path: Path) -> ParameterSet:
+def _parse(name: str, data: dict[str, Any], path: Path, loading: tuple[str, ...]) -> ParameterSet:
     data = dict(data)
     title = data.pop("title", name)
     base = data.pop("base", None)
-    if base == name:
-        raise InputError(f"{path.name}: base", "another set", base)
-    if base is None and path.parent != SETS:
-        raise InputError(f"{path.name}: base", f"the set that the file changes, one of {', '.join(set_names())}", base)
-    entries = dict(load_parameters(base).entries) if base is not None else {}
+    foundation = name == DEFAULT_SET
+    entries = {} if foundation else dict(_load(base, f"{path.name}: base", loading).entries)
     for section, members in data.items():
         if not isinstance(members, dict):
             raise InputError(f"{path.name}: {section}", "a table of parameters", members)
@@ -167,13 +189,16 @@ def _parse(name: str, data: dict[str, Any], path: Path) -> ParameterSet:
             key = f"{section}.{member}"
             # A bare number is a user's short form of a table with only a value.
             given = fields if isinstance(fields, dict) else {"value": fields, "kind": "assumed", "source": path.name}
-            if base is not None and key not in entries:
+            if not foundation and key not in entries:
                 raise InputError(
                     f"{path.name}: {key}",
                     f"a parameter of the set {base} ({_nearest(key, entries)})",
                     given.get("value"),
                 )
             known = entries[key].model_dump() if key in entries else {}
+            for fixed in ("range", "rules"):
+                if fixed in given and known:
+                    raise InputError(f"{path.name}: {key}.{fixed}", "left as the model has it", given[fixed])
             if "unit" in given and known and given["unit"] != known["unit"]:
                 raise InputError(f"{path.name}: {key}.unit", known["unit"], given["unit"])
             try:
@@ -186,6 +211,9 @@ def _parse(name: str, data: dict[str, Any], path: Path) -> ParameterSet:
 def input_error(error: ValidationError, where: str) -> InputError:
     """The first complaint of a validation as the one line that users see."""
     first = error.errors()[0]
+    cause = first.get("ctx", {}).get("error")
+    if isinstance(cause, InputError):  # a rule over several fields names its own
+        return cause
     place = ".".join(str(part) for part in first["loc"] if not str(part).startswith(("function-", "constrained-")))
     field = ".".join(part for part in (where, place) if part)
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")

@@ -13,10 +13,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator, model_validator
 
 from rig.channels import default_table
+from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.parameters import DEFAULT_SET, ParameterSet, input_error, load_parameters, read_toml
 
 SCENES = Path(__file__).with_name("scenes")
+_APART_S = 0.01
+"""Least time between two points of a speed profile [s]: well above any step."""
 
 
 class _Part(BaseModel):
@@ -119,8 +122,8 @@ class Drive(_Part):
     @classmethod
     def _ascending(cls, profile: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         times = [time for time, _ in profile]
-        if profile and (times[0] != 0.0 or any(b <= a for a, b in pairwise(times))):
-            raise ValueError("points of ascending time, the first at 0")
+        if profile and (times[0] != 0.0 or any(b < a + _APART_S for a, b in pairwise(times))):
+            raise ValueError(f"points of ascending time, at least {_APART_S:g} s apart, the first at 0")
         if any(speed < 0.0 for _, speed in profile):
             raise ValueError("points of speed >= 0")
         return profile
@@ -132,6 +135,13 @@ class EngineChoice(_Part):
     name: str = "rk8"
     step_us: Annotated[int, Field(ge=1, le=1000)] = 25
     """Step [us], a whole number of ticks."""
+
+    @field_validator("name")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name not in ENGINES:
+            raise ValueError(f"one of {', '.join(ENGINES)}")
+        return name
 
 
 class SensorChoice(_Part):
@@ -161,7 +171,7 @@ class Scene(_Part):
     title: str = ""
     parameters: str = DEFAULT_SET
     """Name of a parameter set, or the path of a file."""
-    set: dict[str, FiniteFloat | str] = {}
+    set: dict[str, Any] = {}
     """Parameters changed for this scene, each in its own unit."""
     duration_s: Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)] = 2.0
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
@@ -171,6 +181,13 @@ class Scene(_Part):
     engine: EngineChoice = EngineChoice()
     sensors: SensorChoice = SensorChoice()
 
+    @field_validator("set")
+    @classmethod
+    def _parameters_exist(cls, changes: dict[str, Any]) -> dict[str, Any]:
+        # Every set has the same keys and limits, so any will do to check them.
+        load_parameters().override(changes)
+        return changes
+
     @model_validator(mode="after")
     def _whole_rates(self) -> Scene:
         for field in ("rate_hz", "truth_rate_hz"):
@@ -178,11 +195,26 @@ class Scene(_Part):
             # A sample is taken at the end of a step, never between two.
             if 1_000_000 % rate or (1_000_000 // rate) % self.engine.step_us:
                 usual = (100_000, 50_000, 25_000, 20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
-                rates = [other for other in usual if (1_000_000 // other) % self.engine.step_us == 0]
-                raise ValueError(
-                    f"sensors.{field}: a rate whose period is a whole number of steps of {self.engine.step_us} us"
-                    f" (such as {', '.join(map(str, rates[:6]))} Hz), not {rate} Hz"
-                )
+                rates = [f"{other}" for other in usual if (1_000_000 // other) % self.engine.step_us == 0]
+                must = f"a rate whose period is a whole number of steps of {self.engine.step_us} us"
+                hint = f" (such as {', '.join(rates[:6])} Hz)" if rates else ""
+                raise InputError(f"sensors.{field}", must + hint, rate)
+        return self
+
+    @model_validator(mode="after")
+    def _possible_commands(self) -> Scene:
+        held = self.initial.magnets
+        free_s = 0.0
+        for timed in sorted(self.commands, key=lambda timed: timed.at_s):
+            command = timed.request
+            if isinstance(command, ReleaseCommand):
+                if not held:
+                    raise InputError("release", "given once, while the magnets hold", f"another at {timed.at_s:g} s")
+                held = False
+            elif isinstance(command, HammerCommand):
+                if timed.at_s < free_s:
+                    raise InputError("hammer", f"idle (in a blow until {free_s:g} s)", f"a blow at {timed.at_s:g} s")
+                free_s = timed.at_s + command.duration_ms * 1e-3
         return self
 
     def load_parameters(self) -> ParameterSet:
@@ -236,24 +268,14 @@ def parse_scene(data: dict[str, Any]) -> Scene:
     try:
         return Scene(**data)
     except ValidationError as error:
-        raise _scene_error(error) from None
+        raise input_error(error, "") from None
     except TypeError:
         raise InputError("scene", "a table of named fields", list(data)) from None
 
 
-def _scene_error(error: ValidationError) -> InputError:
-    first = error.errors()[0]
-    text = first["msg"].removeprefix("Value error, ")
-    if not first["loc"] and ": " in text:  # a rule over several fields names its own
-        field, _, rest = text.partition(": ")
-        must, _, received = rest.rpartition(", not ")
-        return InputError(field, must, received)
-    return input_error(error, "")
-
-
 def _override(data: dict[str, Any], key: str, value: Any) -> None:
     if key in load_parameters().entries:
-        data["set"] = {**data.get("set", {}), key: value}
+        data["set"] = {**_table_in(data, "set"), key: value}
         return
     *path, last = key.split(".")
     fields: Any = Scene
@@ -268,11 +290,18 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
         fields = known[part].annotation
     place = data
     for part in path:
-        place[part] = dict(place.get(part, {}))
+        place[part] = dict(_table_in(place, part))
         place = place[part]
     place[last] = value
     if key == "drive.speed_hz":
         place.pop("profile", None)
+
+
+def _table_in(data: dict[str, Any], name: str) -> dict[str, Any]:
+    table = data.get(name, {})
+    if not isinstance(table, dict):
+        raise InputError(name, "a table of named fields", table)
+    return table
 
 
 def _scene_keys() -> list[str]:

@@ -7,7 +7,9 @@ an integer tick of 1 us. How a run is cut into calls changes no bit of the resul
 from __future__ import annotations
 
 import math
+from bisect import insort
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -122,10 +124,18 @@ class Simulation:
         speed = self._segments[0].speed
         self._y = self._initial_state(speed)
         self._memory = np.zeros(self._engine.MEMORY)
-        self._engine.start(self.model.constants, self._inputs(), self._y, self._memory)
         self._rows = np.empty((0, S.N_ROW))
-        self._first = self._look()
-        self._last = self._first
+        self._last: np.ndarray | None = None
+
+    @cached_property
+    def first_row(self) -> np.ndarray:
+        """The observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
+        row = np.empty((1, S.N_ROW))
+        constants, inputs = self.model.constants, self._inputs()
+        self._engine.start(constants, inputs, self._y, self._memory)
+        y, memory = self._y.copy(), self._memory.copy()
+        self._engine.advance(constants, inputs, y, memory, self.tick, self._step_ticks, 1, 1, row)
+        return row[0]
 
     def advance(self, ticks: int) -> Frame:
         """Move on by `ticks`.
@@ -136,6 +146,7 @@ class Simulation:
         """
         if ticks <= 0 or ticks % self.block_ticks:
             raise InputError("ticks", f"a positive multiple of {self.block_ticks}", ticks)
+        _ = self.first_row  # starts the engine
         start, end = self.tick, self.tick + ticks
         n = ticks // self.row_ticks
         if len(self._rows) < n:
@@ -171,17 +182,19 @@ class Simulation:
             InputError: Unknown, malformed, out of range, or not possible now.
         """
         command = parse_command(name, request)
-        if isinstance(command, HammerCommand) and self._blow is not None and self.tick < self._blow[2]:
-            raise InputError(
-                "hammer", f"idle (it is in a blow until {self._blow[2] / TICK_RATE_HZ:.6f} s)", "another blow"
-            )
-        if isinstance(command, SpeedCommand):
+        waiting = [other for tick, other in self._pending if tick <= self.tick]
+        if isinstance(command, HammerCommand):
+            busy_until = self._blow[2] if self._blow is not None else 0
+            if self.tick < busy_until or any(isinstance(other, HammerCommand) for other in waiting):
+                until = f"until {busy_until / TICK_RATE_HZ:.6f} s" if self.tick < busy_until else "from now on"
+                raise InputError("hammer", f"idle (it is in a blow {until})", "another blow")
+        elif isinstance(command, SpeedCommand):
             top = self.model.parameters.entries["drive.top_speed"].value
             if not isinstance(top, str) and command.speed_hz > top:
                 raise InputError("speed.speed_hz", f"at most drive.top_speed = {top:g} Hz", command.speed_hz)
-        if isinstance(command, ReleaseCommand) and not self._engaged:
+        elif not self._engaged or any(isinstance(other, ReleaseCommand) for other in waiting):
             raise InputError("release", "given once (the magnets have let go already)", "another release")
-        self._pending.insert(0, (self.tick, command))
+        insort(self._pending, (self.tick, command), key=lambda entry: entry[0])
         return self.tick
 
     def warm_up(self) -> None:
@@ -191,7 +204,9 @@ class Simulation:
 
     def health(self) -> dict[str, Any]:
         """Spin, energy ledger and doubts at the present tick, for the status."""
-        balance = energy_balance(self._last[None, :], self._first)
+        first = self.first_row
+        last = first if self._last is None else self._last
+        balance = energy_balance(last[None, :], first)
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
         engine, warnings = self._engine, []
         if abs(residual) > ENERGY_ALARM * max(dissipated, 1e-6):
@@ -203,7 +218,7 @@ class Simulation:
         if self._memory[engine.FLOORED]:
             warnings.append(f"{self._memory[engine.FLOORED]:.0f} contacts began slower than contact.speed_floor")
         return {
-            "spin_hz": float(self._last[COLUMN["theta_rate"]]) / (2.0 * math.pi),
+            "spin_hz": float(last[COLUMN["theta_rate"]]) / (2.0 * math.pi),
             "energy": {"residual_j": residual, "dissipated_j": dissipated},
             "contacts": int(self._memory[engine.CONTACTS]),
             "peak_normal_force_n": float(self._memory[engine.PEAK_FORCE]),
@@ -272,6 +287,11 @@ class Simulation:
             event: dict[str, Any] = {"event": command.command, "tick": self.tick, "time_s": self.tick / TICK_RATE_HZ}
             event |= command.model_dump(exclude={"command"})
             if isinstance(command, HammerCommand):
+                if self._blow is not None and self.tick < self._blow[2]:  # one sent by hand is under way
+                    events.append(
+                        event | {"event": "warning", "text": "a blow of the scene found the hammer in a blow"}
+                    )
+                    continue
                 length = max(1, round(command.duration_ms * 1e-3 * TICK_RATE_HZ / self.row_ticks)) * self.row_ticks
                 self._blow = (command, self.tick, self.tick + length)
             elif isinstance(command, SpeedCommand):
@@ -289,7 +309,10 @@ class Simulation:
         self._segments = [_Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
 
     def _release(self) -> None:
-        # What the magnets hold is gone with them: booked, so that the ledger closes.
+        # What the magnets hold is gone with them: booked, so that the ledger closes. A release that a scene has timed
+        # can find them released by hand.
+        if not self._engaged:
+            return
         shaft, magnet = self.model.constants.shaft, self.model.constants.magnet
         gamma, beta = self._y[0], self._y[1]
         x, y = math.sin(beta), -math.sin(gamma) * math.cos(beta)
@@ -330,15 +353,6 @@ class Simulation:
             ticks // self._step_ticks, self._stride, rows,
         )  # fmt: skip
         self.tick += ticks
-
-    def _look(self) -> np.ndarray:
-        """The row of the present instant."""
-        row = np.empty((1, S.N_ROW))
-        self._engine.advance(
-            self.model.constants, self._inputs(), self._y.copy(), self._memory.copy(), self.tick, self._step_ticks,
-            1, 1, row,
-        )  # fmt: skip
-        return row[0]
 
     def _sample(self, rows: np.ndarray, start: int) -> dict[str, Block]:
         blocks = {}

@@ -139,7 +139,10 @@ def decode_document(payload: bytes) -> dict[str, Any]:
     Raises:
         ValueError: The payload is not a JSON object.
     """
-    document = json.loads(payload)
+    try:
+        document = json.loads(payload)
+    except RecursionError:
+        raise ValueError("payload must be a JSON object; instead received one nested too deep") from None
     if not isinstance(document, dict):
         raise ValueError(f"payload must be a JSON object; instead received {type(document).__name__}")
     return document

@@ -60,7 +60,7 @@ for _panel, _commands in _PANELS.items():
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command; exit status 2 and one line for wrong input, 1 for a run or verdict that failed, 130 for Ctrl-C."""
+    """Run the command: exit status 2 and one line for wrong input, 1 for a failed run or verdict, 130 for Ctrl-C."""
     try:
         code = app(args=arguments, standalone_mode=False)
     except InputError as error:

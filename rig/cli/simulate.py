@@ -40,9 +40,9 @@ def simulate(
     from rig.offline import frames
     from rig.simulation import Simulation
 
+    simulation = Simulation(loaded)
     if not compiled_before():
         typer.echo("compiling the kernels, once on this machine (about 20 s) ...", err=True)
-    simulation = Simulation(loaded)
     simulation.warm_up()
     with (
         Progress(console=Console(file=sys.stderr), transient=True) as progress,

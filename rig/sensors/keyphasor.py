@@ -9,6 +9,8 @@ import numpy as np
 from rig.kernels.signals import COLUMN
 
 TURN = 2.0 * math.pi
+FRACTIONS = 2**20
+"""Parts of a tick (1 ps) that an edge is told in: added to whole ticks they are exact, whatever the block."""
 
 
 class Keyphasor:
@@ -42,7 +44,7 @@ class Keyphasor:
         for n in np.nonzero(turns[1:] > turns[:-1])[0]:
             step = row_ticks * 1e-6
             part = _crossing(turns[n + 1] * TURN, angle[n : n + 2], rate[n : n + 2] * step)
-            found.append((first + n + part) * row_ticks)
+            found.append((first + n) * row_ticks + round(part * row_ticks * FRACTIONS) / FRACTIONS)
         self._angle, self._rate = float(angle[-1]), float(rate[-1])
         self.edges_seen += len(found)
         return np.array(found, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Compiled kernels against the same Python, in a process of its own; outputs that were full of nan before; the cache."""
+"""Compiled kernels against the same Python, in a process of its own; outputs full of nan before; the cache."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import rig
-from rig.engines import NAMES, load_engine
+from rig.engines import ENGINES, load_engine
 from rig.kernels import signals as S
 from rig.kernels.dynamics import evaluate
 from rig.scenes import load_scene
@@ -46,9 +46,15 @@ def process(code: str, *, place: Path = PACKAGE.parent, **environment: str) -> s
     """Run Python code in a process of its own with the package at a place, every warning an error; what it printed."""
     kept = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")}
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], env={**kept, "PYTHONPATH": str(place), **environment},
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=240, check=False,
-    )  # fmt: skip
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=place,
+        env={**kept, "PYTHONPATH": str(place), **environment},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -60,14 +66,14 @@ def python_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str,
         "import types\n"
         "from rig.kernels.dynamics import evaluate\n"
         "assert isinstance(evaluate, types.FunctionType), 'not plain Python'\n"
-        f"for engine in {NAMES!r}: np.savez({str(folder)!r} + '/' + engine + '.npz', **run(engine))\n"
+        f"for engine in {ENGINES!r}: np.savez({str(folder)!r} + '/' + engine + '.npz', **run(engine))\n"
     )
     process(code, NUMBA_DISABLE_JIT="1")
-    return {engine: dict(np.load(folder / f"{engine}.npz")) for engine in NAMES}
+    return {engine: dict(np.load(folder / f"{engine}.npz")) for engine in ENGINES}
 
 
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing to compare: this process is plain Python")
-@pytest.mark.parametrize("engine", NAMES)
+@pytest.mark.parametrize("engine", ENGINES)
 def test_compiled_is_python_bit_for_bit(engine: str, python_runs: dict[str, dict[str, np.ndarray]]) -> None:
     space: dict[str, Any] = {}
     exec(JIT_RUN, space)
@@ -87,7 +93,7 @@ def hit() -> Simulation:
     return simulation
 
 
-@pytest.mark.parametrize("engine", NAMES)
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("steps", "stride"), [(400, 1), (400, 2), (401, 4), (1, 1)])
 def test_engine_writes_every_value_of_every_row(engine: str, steps: int, stride: int) -> None:
     simulation, module = hit(), load_engine(engine)
@@ -107,7 +113,16 @@ def test_engine_writes_every_value_of_every_row(engine: str, steps: int, stride:
 def test_evaluation_writes_every_rate_and_every_observed_value(touching: bool) -> None:
     simulation = hit()
     rate, out = np.full(S.N_VECTOR, np.nan), np.full(S.N_OBSERVED, np.nan)
-    arguments = (simulation.model.constants, simulation._inputs(), simulation.tick, 0.0, 0.1, touching, True, simulation._y)
+    arguments = (
+        simulation.model.constants,
+        simulation._inputs(),
+        simulation.tick,
+        0.0,
+        0.1,
+        touching,
+        True,
+        simulation._y,
+    )
     evaluate(*arguments, rate, out)
     assert np.isfinite(rate).all()
     assert np.isfinite(out).all()
@@ -116,11 +131,14 @@ def test_evaluation_writes_every_rate_and_every_observed_value(touching: bool) -
 def test_conditioner_writes_every_count(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation = Simulation(load_scene("stable-run"))
     rows = simulation.advance(10_000).rows
-    made = []
-    for poison in (np.iinfo(np.int32).min, 12345):
+    made, empty = [], np.empty
+    for poison in (-(2**31), 12345):
 
-        def poisoned(shape: Any, dtype: Any = np.float64, fill: int = poison) -> np.ndarray:
-            return np.full(shape, fill if np.issubdtype(dtype, np.integer) else np.nan, dtype=dtype)
+        def poisoned(shape: Any, dtype: Any = np.float64, *more: Any, fill: int = poison, **options: Any) -> np.ndarray:
+            array = empty(shape, dtype, *more, **options)
+            if array.dtype in (np.int32, np.float64):
+                array[...] = fill if array.dtype == np.int32 else np.nan
+            return array
 
         with monkeypatch.context() as patch:
             patch.setattr(conditioning.np, "empty", poisoned)
@@ -157,6 +175,7 @@ def compiled(path):
     return "njit" in path.read_text() or path.parent.name == "kernels"
 
 package = Path(rig.__file__).parent
+assert package.parent.samefile("."), "the copy, never the package itself"
 digests = {"": source_digest()}
 for path in sorted(package.rglob("*.py")):
     text = path.read_bytes()
@@ -172,11 +191,17 @@ print(json.dumps(digests))
 def test_a_changed_byte_of_any_kernel_file_changes_the_digest(copied: Path) -> None:
     digests = json.loads(process(DIGESTS, place=copied))
     assert digests.pop("again") == digests[""]
-    assert {"kernels/dynamics.py", "kernels/__init__.py", "engines/fixed_step.py", "sensors/conditioning.py"} <= set(digests)
+    assert {"kernels/dynamics.py", "kernels/__init__.py", "engines/fixed_step.py", "sensors/conditioning.py"} <= set(
+        digests
+    )
     assert len(set(digests.values())) == len(digests)
 
 
-CACHE = "import numba, rig.kernels as k; print(numba.config.CACHE_DIR); print(k.source_digest()); print(k.compiled_before())"
+CACHE = """
+import numba
+from rig.kernels import compiled_before, source_digest
+print(numba.config.CACHE_DIR, source_digest(), compiled_before())
+"""
 
 
 def test_cache_folder_is_named_by_the_digest_unless_the_user_names_one(tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ def test_free_flight_follows_the_linear_solution() -> None:
 @pytest.mark.parametrize("scene", ["hammer", "drop", "stable-run", "run-up"])
 def test_ledgers_close(scene: str) -> None:
     simulation = Simulation(load_scene(scene, {"duration_s": 2.0}))
-    first = simulation._first
+    first = simulation.first_row
     column = S.COLUMN
     for frame in frames(simulation):
         rows = frame.rows[:: len(frame.rows) // 10]

@@ -1,4 +1,4 @@
-"""The channel table: whole calibrations only, counts to engineering values and back, and what the model must offer it."""
+"""The channel table: whole calibrations only, counts to values and back, and what the model must offer it."""
 
 from __future__ import annotations
 
@@ -21,15 +21,28 @@ CHANNELS = list(default_table().channels.values())
 GOOD = CHANNELS[0].model_dump()
 
 
-def one_channel(defaults: str = "", row: str = "") -> str:
+def one_channel(row: str = "") -> str:
     return f"""
     [groups.g]
     title = "t"
     rate_hz = 1000
     kind = "assumed"
-    defaults = {{ unit = "mm", si = 1e-3, sensitivity_v = 2.0, bias_v = -1.0, range_v = [-9.0, 9.0], bandwidth_hz = 100.0, \
-highpass_hz = 0.0, noise_v = 0.0, adc_v = 10.0, adc_bits = 16 {defaults} }}
-    channels = [{{ name = "c", label = "l", signal = "disk_x" {row} }}]
+    [groups.g.defaults]
+    unit = "mm"
+    si = 1e-3
+    sensitivity_v = 2.0
+    bias_v = -1.0
+    range_v = [-9.0, 9.0]
+    bandwidth_hz = 100.0
+    highpass_hz = 0.0
+    noise_v = 0.0
+    adc_v = 10.0
+    adc_bits = 16
+    [[groups.g.channels]]
+    name = "c"
+    label = "l"
+    signal = "disk_x"
+    {row}
     """
 
 
@@ -94,18 +107,28 @@ def test_a_row_without_one_of_its_fields_is_refused(missing: str) -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("sensitivity_v", 0.0), ("range_v", (-2.0, -18.0)), ("range_v", (-21.0, 0.0)), ("range_v", (0.0, 20.5)), ("adc_v", 0.0),
-        ("adc_bits", 7), ("adc_bits", 33), ("bandwidth_hz", 0.0), ("highpass_hz", -1.0), ("noise_v", -1.0), ("rate_hz", 0),
-        ("si", 0.0), ("colour", "red"),
+        ("sensitivity_v", 0.0),
+        ("range_v", (-2.0, -18.0)),
+        ("range_v", (-21.0, 0.0)),
+        ("range_v", (0.0, 20.5)),
+        ("adc_v", 0.0),
+        ("adc_bits", 7),
+        ("adc_bits", 33),
+        ("bandwidth_hz", 0.0),
+        ("highpass_hz", -1.0),
+        ("noise_v", -1.0),
+        ("rate_hz", 0),
+        ("si", 0.0),
+        ("colour", "red"),
     ],
-)  # fmt: skip
+)
 def test_half_or_wrong_scale_is_refused(field: str, value: object) -> None:
     with pytest.raises(ValidationError, match=field):
         Channel(**{**GOOD, field: value})
 
 
 def test_rows_take_the_defaults_of_their_group_and_may_differ() -> None:
-    table = parse_table(one_channel(row=", sensitivity_v = -4.0, bandwidth_hz = 50.0"))
+    table = parse_table(one_channel("sensitivity_v = -4.0\nbandwidth_hz = 50.0"))
     channel = table.channels["c"]
     assert (channel.sensitivity_v, channel.bandwidth_hz, channel.bias_v) == (-4.0, 50.0, -1.0)
     assert channel.scale < 0.0
@@ -120,7 +143,7 @@ def test_a_name_stands_once() -> None:
 
 def test_unknown_field_in_a_row_is_refused() -> None:
     with pytest.raises(ValidationError, match="colour"):
-        parse_table(one_channel(row=', colour = "red"'))
+        parse_table(one_channel('colour = "red"'))
 
 
 @given(names=st.permutations(list(default_table().groups)), n=st.integers(0, 5), rate=st.none() | st.integers(1, 10**6))

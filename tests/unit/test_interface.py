@@ -31,7 +31,11 @@ def test_command_prints_the_page(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("channel", default_table().channels.values(), ids=lambda channel: channel.name)
 def test_every_channel_is_on_it_with_its_calibration(channel) -> None:
-    (row,) = [row for row in ROWS if row.startswith("|") and row.split("|")[2].strip() == f"`{channel.name}`" and channel.label in row]
+    (row,) = [
+        row
+        for row in ROWS
+        if row.startswith("|") and row.split("|")[2].strip() == f"`{channel.name}`" and channel.label in row
+    ]
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     group = default_table().groups[channel.group]
     assert cells[0] == str(group.names.index(channel.name))
@@ -49,7 +53,9 @@ def test_every_column_of_the_truth_is_on_it_in_order(table: str) -> None:
     assert cells == [[str(n), f"`{name}`", units[name]] for n, name in enumerate(TRUTH[table])]
 
 
-@pytest.mark.parametrize("key", [wire.EVENTS, wire.STATUS, wire.CATALOGUE, wire.PARAMETERS, wire.SCENE, wire.EDGES, wire.ALIVE])
+@pytest.mark.parametrize(
+    "key", [wire.EVENTS, wire.STATUS, wire.CATALOGUE, wire.PARAMETERS, wire.SCENE, wire.EDGES, wire.ALIVE]
+)
 def test_every_key_is_on_it(key: str) -> None:
     assert f"`{key}`" in page()
 

@@ -1,4 +1,4 @@
-"""What a user can get wrong: every one is one line on stderr that names the field and what it must be, and exit status 2.
+"""What a user can get wrong: each gives one line on stderr that names the field and what it must be, and status 2.
 
 Nothing is printed on stdout, no traceback is shown, and no file is made or changed.
 """
@@ -34,21 +34,19 @@ class Case:
     field: str
     must: str
     files: dict[str, str | bytes | None] = field(default_factory=dict)  # None: a folder
-    bug: str | None = None
 
 
-def scene(what: str, text: str | bytes, field: str, must: str, *options: str, bug: str | None = None) -> Case:
-    return Case(what, (*SCENE, *options), field, must, {"scene.toml": text}, bug)
+def scene(what: str, text: str | bytes, field: str, must: str, *options: str) -> Case:
+    return Case(what, (*SCENE, *options), field, must, {"scene.toml": text})
 
 
-def parameters(what: str, text: str, field: str, must: str, bug: str | None = None) -> Case:
-    # A folder of its own for each: the name of the file is part of what is cached.
+def parameters(what: str, text: str, field: str, must: str) -> Case:
     name = f"{what.replace(' ', '-')}.toml"
-    return Case(f"set: {what}", ("params", name), field, must, {name: text}, bug)
+    return Case(f"set: {what}", ("params", name), field, must, {name: text})
 
 
-def change(text: str, field: str, must: str, bug: str | None = None) -> Case:
-    return Case(f"--set {text}", (*DROP, "--set", text), field, must, bug=bug)
+def change(text: str, field: str, must: str) -> Case:
+    return Case(f"--set {text}", (*DROP, "--set", text), field, must)
 
 
 CASES = [
@@ -69,64 +67,137 @@ CASES = [
     scene("speed above the drive's", "[drive]\nspeed_hz = 99", "drive.speed_hz", "at most drive.top_speed = 15 Hz"),
     scene("speed is nan", "[drive]\nspeed_hz = nan", "drive.speed_hz", "a finite number"),
     scene("no such mode", '[drive]\nmode = "steam"', "drive.mode", "'torque' or 'ideal'"),
-    scene("profile not ascending", "[drive]\nprofile = [[0.0, 1.0], [2.0, 3.0], [1.0, 2.0]]", "drive.profile", "ascending time"),
+    scene(
+        "profile not ascending",
+        "[drive]\nprofile = [[0.0, 1.0], [2.0, 3.0], [1.0, 2.0]]",
+        "drive.profile",
+        "ascending time",
+    ),
     scene("profile begins late", "[drive]\nprofile = [[1.0, 1.0]]", "drive.profile", "the first at 0"),
     scene("profile backward", "[drive]\nprofile = [[0.0, -1.0]]", "drive.profile", "points of speed >= 0"),
     scene("profile of triples", "[drive]\nprofile = [[0.0, 1.0, 2.0]]", "drive.profile.0", "at most 2 items"),
     scene("profile too fast", "[drive]\nprofile = [[0.0, 99.0]]", "drive", "at most drive.top_speed = 15 Hz"),
-    scene("profile within a row", "[drive]\nprofile = [[0.0, 1.0], [1e-7, 3.0]]", "drive.profile", "",
-          bug="ZeroDivisionError: two points fall on one row"),
+    scene(
+        "profile within a row",
+        "[drive]\nprofile = [[0.0, 1.0], [1e-7, 3.0]]",
+        "drive.profile",
+        "",
+    ),
     scene("rate does not divide", "[sensors]\nrate_hz = 30000", "sensors.rate_hz", "a whole number of steps of 25 us"),
     scene("rate too low", "[sensors]\nrate_hz = 50", "sensors.rate_hz", "greater than or equal to 100"),
-    scene("truth rate does not divide", "[sensors]\ntruth_rate_hz = 300", "sensors.truth_rate_hz", "a whole number of steps"),
+    scene(
+        "truth rate does not divide",
+        "[sensors]\ntruth_rate_hz = 300",
+        "sensors.truth_rate_hz",
+        "a whole number of steps",
+    ),
     scene("no such group", '[sensors]\ngroups = ["probs"]', "sensors.groups", "names out of probes, forces"),
     scene("no group", "[sensors]\ngroups = []", "sensors.groups", "names out of probes, forces"),
     scene("noise maybe", '[sensors]\nnoise = "maybe"', "sensors.noise", "a valid boolean"),
     scene("no such engine", '[engine]\nname = "euler"', "engine.name", "one of rk8, rk4"),
     scene("step of zero", "[engine]\nstep_us = 0", "engine.step_us", "greater than or equal to 1"),
-    scene("no such position", '[initial]\nposition = "left"', "initial.position", "'equilibrium', 'top', 'bottom' or 'given'"),
-    scene("outside the ring", '[initial]\nposition = "given"\nx_mm = 5.0', "initial.position", "inside the ring (r0 = 0.926 mm)"),
+    scene(
+        "no such position",
+        '[initial]\nposition = "left"',
+        "initial.position",
+        "'equilibrium', 'top', 'bottom' or 'given'",
+    ),
+    scene(
+        "outside the ring",
+        '[initial]\nposition = "given"\nx_mm = 5.0',
+        "initial.position",
+        "inside the ring (r0 = 0.926 mm)",
+    ),
     scene("position is nan", '[initial]\nposition = "given"\ny_mm = nan', "initial.y_mm", "a finite number"),
     scene("blow too hard", HAMMER + "force_n = 1e6", "force_n", "less than or equal to 1000"),
     scene("blow too long", HAMMER + "duration_ms = 51", "duration_ms", "less than or equal to 50"),
     scene("blow to nowhere", HAMMER + 'direction = "up"', "direction", "'x', 'y', '-x' or '-y'"),
     scene("blow with a colour", HAMMER + "colour = 1", "colour", "left out (there is no such field)"),
-    scene("speed command above the drive's", '[[commands]]\nat_s = 0.1\ncommand = "speed"\nspeed_hz = 99', "speed_hz", "at most drive.top_speed"),
+    scene(
+        "speed command above the drive's",
+        '[[commands]]\nat_s = 0.1\ncommand = "speed"\nspeed_hz = 99',
+        "speed_hz",
+        "at most drive.top_speed",
+    ),
     scene("speed command without speed", '[[commands]]\nat_s = 0.1\ncommand = "speed"', "speed_hz", "given"),
     scene("no such command", '[[commands]]\nat_s = 0.1\ncommand = "kick"', "command", "'hammer', 'speed', 'release'"),
     scene("no command", "[[commands]]\nat_s = 0.1", "command", "must be"),
-    scene("command before the start", '[[commands]]\nat_s = -0.1\ncommand = "release"', "commands.0.at_s", "greater than or equal to 0"),
+    scene(
+        "command before the start",
+        '[[commands]]\nat_s = -0.1\ncommand = "release"',
+        "commands.0.at_s",
+        "greater than or equal to 0",
+    ),
     scene("command without time", '[[commands]]\ncommand = "release"', "commands.0.at_s", "a valid number"),
     scene("commands are no list", "commands = 3", "commands", "a valid tuple"),
     scene("command is no table", "commands = [3]", "commands.0", "a valid dictionary"),
-    scene("two releases", '[[commands]]\nat_s = 0.1\ncommand = "release"\n[[commands]]\nat_s = 0.2\ncommand = "release"', "release", "",
-          bug="taken; the second is booked in the energy ledger again"),
+    scene(
+        "two releases",
+        '[[commands]]\nat_s = 0.1\ncommand = "release"\n[[commands]]\nat_s = 0.2\ncommand = "release"',
+        "release",
+        "",
+    ),
     scene("no such set", 'parameters = "nosuch"', "parameters", "one of corrected, as-printed, dtu-2019"),
     scene("parameters are a number", "parameters = 4", "parameters", "a valid string"),
     scene("changes are a number", "set = 4", "set", "a valid dictionary"),
-    scene("changed parameter out of range", '[set]\n"contact.friction" = 9.0', "contact.friction", "a number from 0 to 2"),
+    scene(
+        "changed parameter out of range", '[set]\n"contact.friction" = 9.0', "contact.friction", "a number from 0 to 2"
+    ),
     scene("changed parameter unknown", '[set]\n"contact.frict" = 0.1', "contact.frict", "such as contact.friction"),
-    scene("changed parameter nan", '[set]\n"contact.friction" = nan', "contact.friction", "a finite number"),
-    scene("changed parameter true", '[set]\n"contact.friction" = true', "contact.friction", "a number from 0 to 2",
-          bug="pydantic makes 1.0 of it"),
-    scene("part is no table, changed inside", "drive = 3", "drive", "must be", "--set", "drive.speed_hz=1",
-          bug="TypeError"),
+    scene("changed parameter nan", '[set]\n"contact.friction" = nan', "contact.friction", "a number from 0 to 2"),
+    scene(
+        "changed parameter true",
+        '[set]\n"contact.friction" = true',
+        "contact.friction",
+        "a number from 0 to 2",
+    ),
+    scene(
+        "part is no table, changed inside",
+        "drive = 3",
+        "drive",
+        "must be",
+        "--set",
+        "drive.speed_hz=1",
+    ),
     # Parameter files.
     parameters("bad TOML", 'base = "corrected"\n[contact]\nfriction = [', ".toml", "a TOML file"),
-    parameters("missing base", "[contact]\nfriction = 0.1", "base", "the set that the file changes, one of corrected"),
-    parameters("unknown base", 'base = "nosuch"', "parameters", "one of corrected, as-printed, dtu-2019"),
-    parameters("base is a number", "base = 4", "base", "must be", bug="TypeError"),
+    parameters("missing base", "[contact]\nfriction = 0.1", "base", "one of corrected, as-printed, dtu-2019"),
+    parameters("unknown base", 'base = "nosuch"', "base", "one of corrected, as-printed, dtu-2019"),
+    parameters("base is a number", "base = 4", "base", "must be"),
     parameters("base is itself", 'base = "base-is-itself.toml"', "base", "another set"),
-    parameters("unknown key", 'base = "corrected"\n[contact]\nfrict = 0.1', "contact.frict", "such as contact.friction"),
-    parameters("wrong unit", 'base = "corrected"\n[shaft]\nmass = { value = 1.0, unit = "N" }', "shaft.mass.unit", "must be kg"),
-    parameters("bad kind", 'base = "corrected"\n[shaft]\nmass = { value = 1.0, kind = "guess" }', "shaft.mass.kind", "'paper'"),
-    parameters("bad rule", 'base = "corrected"\n[contact]\nstiffness = "hertz"', "contact.stiffness", "one of internal-sphere, external-sphere"),
-    parameters("rule where none is", 'base = "corrected"\n[contact]\nfriction = "slippery"', "contact.friction", "a number from 0 to 2"),
-    parameters("out of range", 'base = "corrected"\n[contact]\nfriction = 9.0', "contact.friction", "a number from 0 to 2"),
+    parameters(
+        "unknown key", 'base = "corrected"\n[contact]\nfrict = 0.1', "contact.frict", "such as contact.friction"
+    ),
+    parameters(
+        "wrong unit", 'base = "corrected"\n[shaft]\nmass = { value = 1.0, unit = "N" }', "shaft.mass.unit", "must be kg"
+    ),
+    parameters(
+        "bad kind", 'base = "corrected"\n[shaft]\nmass = { value = 1.0, kind = "guess" }', "shaft.mass.kind", "'paper'"
+    ),
+    parameters(
+        "bad rule",
+        'base = "corrected"\n[contact]\nstiffness = "hertz"',
+        "contact.stiffness",
+        "one of internal-sphere, external-sphere",
+    ),
+    parameters(
+        "rule where none is",
+        'base = "corrected"\n[contact]\nfriction = "slippery"',
+        "contact.friction",
+        "a number from 0 to 2",
+    ),
+    parameters(
+        "out of range", 'base = "corrected"\n[contact]\nfriction = 9.0', "contact.friction", "a number from 0 to 2"
+    ),
     parameters("nan", 'base = "corrected"\n[contact]\nfriction = nan', "contact.friction", "a number from 0 to 2"),
     parameters("inf", 'base = "corrected"\n[shaft]\nmass = inf', "shaft.mass", "a number from 0.01 to 100 kg"),
     parameters("list", 'base = "corrected"\n[contact]\nfriction = [0.1]', "contact.friction", "a valid number"),
-    parameters("unknown field", 'base = "corrected"\n[contact]\nfriction = { value = 0.1, colour = 1 }', "friction.colour", "left out"),
+    parameters(
+        "unknown field",
+        'base = "corrected"\n[contact]\nfriction = { value = 0.1, colour = 1 }',
+        "friction.colour",
+        "left out",
+    ),
     parameters("section is a number", 'base = "corrected"\ncontact = 3', "contact", "a table of parameters"),
     # Changes on the command line.
     change("novalue", "--set", "KEY=VALUE, such as drive.speed_hz=5.2"),
@@ -137,10 +208,10 @@ CASES = [
     change("contact.frictoin=0.1", "contact.frictoin", "such as contact.friction"),
     change("contact.friction=slippery", "contact.friction", "a number from 0 to 2"),
     change("contact.friction=9", "contact.friction", "a number from 0 to 2"),
-    change("contact.friction=inf", "contact.friction", "a finite number"),
-    change("contact.friction=[1]", "contact.friction", "a valid number"),
+    change("contact.friction=inf", "contact.friction", "a number from 0 to 2"),
+    change("contact.friction=[1]", "contact.friction", "a number from 0 to 2"),
     change("contact.stiffness=hertz", "contact.stiffness", "one of internal-sphere, external-sphere"),
-    change("contact.restitution=0.01", "contact.restitution", "must be", bug="ValueError of brentq below 0.04"),
+    change("contact.restitution=0.01", "contact.restitution", "must be"),
     change("magnet.stiffness=0.001", "magnet.stiffness", "enough to carry the shaft within 20 mm"),
     change("magnet.bearing_radius=10", "magnet.bearing_radius", "above the sum of both magnets' radii"),
     change("drive.speed_hz=fast", "drive.speed_hz", "a valid number"),
@@ -151,7 +222,13 @@ CASES = [
     # Options.
     Case("no such scene", ("simulate", "nosuch", "-o", "out.csv"), "scene", "one of drop, hammer, run-up, stable-run"),
     Case("scene is a folder", ("simulate", ".", "-o", "out.csv"), "scene", "the path of a .toml file"),
-    Case("scene of another suffix", ("simulate", "scene.txt", "-o", "out.csv"), "scene", "the path of a .toml file", {"scene.txt": "seed = 1"}),
+    Case(
+        "scene of another suffix",
+        ("simulate", "scene.txt", "-o", "out.csv"),
+        "scene",
+        "the path of a .toml file",
+        {"scene.txt": "seed = 1"},
+    ),
     Case("no such set in an option", (*DROP, "--parameters", "nosuch"), "parameters", "one of corrected"),
     Case("no such engine in an option", (*DROP, "--engine", "euler"), "engine.name", "one of rk8, rk4"),
     Case("duration of -1", (*DROP, "--duration-s", "-1"), "duration_s", "greater than 0"),
@@ -163,8 +240,12 @@ CASES = [
     Case("unknown command", ("fly",), "fly", "No such command"),
     Case("no such pace", ("run", "drop", "--pace", "warp"), "--pace", "lockstep"),
     Case("listen without port", ("run", "drop", "--listen", "abc"), "listen", "HOST:PORT with a port of 1 to 65535"),
-    Case("listen on another host", ("run", "drop", "--listen", "0.0.0.0:7460"), "listen", "on 127.0.0.1 unless --expose"),
-    Case("connect to no port", ("hammer", "--connect", "127.0.0.1:0"), "connect", "HOST:PORT with a port of 1 to 65535"),
+    Case(
+        "listen on another host", ("run", "drop", "--listen", "0.0.0.0:7460"), "listen", "on 127.0.0.1 unless --expose"
+    ),
+    Case(
+        "connect to no port", ("hammer", "--connect", "127.0.0.1:0"), "connect", "HOST:PORT with a port of 1 to 65535"
+    ),
     Case("force of x", ("hammer", "--force-n", "x"), "--force-n", "valid"),
     Case("speed of nothing", ("speed",), "HZ", "Missing"),
     Case("step of a half", ("step", "1.5"), "ticks", "valid integer"),
@@ -187,8 +268,14 @@ CASES = [
     Case("recording is empty", ("info", "empty.mcap"), "file", "a recording made by", {"empty.mcap": b""}),
     Case("recording is something else", ("info", "x.mcap"), "file", "a recording made by", {"x.mcap": b"junk" * 99}),
     Case("recording is only a magic", ("info", "x.mcap"), "file", "a recording made by", {"x.mcap": b"\x89MCAP0\r\n"}),
-    Case("view of something else", ("view", "x.mcap", "--save", "x.rrd"), "file", "a recording made by", {"x.mcap": b"junk" * 99}),
-]  # fmt: skip
+    Case(
+        "view of something else",
+        ("view", "x.mcap", "--save", "x.rrd"),
+        "file",
+        "a recording made by",
+        {"x.mcap": b"junk" * 99},
+    ),
+]
 
 
 def prepare(case: Case, folder: Path) -> dict[str, tuple[int, bytes]]:
@@ -222,13 +309,7 @@ def test_there_are_enough_of_them() -> None:
     assert len({case.what for case in CASES}) == len(CASES)
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(c, id=c.what, marks=pytest.mark.xfail(strict=True, reason=f"bug: {c.bug}") if c.bug else ())
-        for c in CASES
-    ],
-)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.what)
 def test_is_refused_in_one_line(
     case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -243,6 +324,21 @@ def test_is_refused_in_one_line(
     assert state(tmp_path) == before
 
 
+@pytest.mark.xfail(strict=True, reason="bug: math domain error, or a state that is not finite")
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"ring.offset_x": 5.0},
+        {"ring.offset_y": 0.0},
+        {"initial.position": "top", "shaft.arm_ring": 0.01, "ring.offset_y": 20.0},
+    ],
+    ids=["beside", "around the axis", "out of reach"],
+)
+def test_a_start_outside_the_ring_is_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"must be .*inside the ring"):
+        Simulation(load_scene("stable-run", changes)).advance(10_000)
+
+
 @pytest.mark.wallclock
 @pytest.mark.parametrize(
     "what", ["unknown field", "set: out of range", "--set novalue", "output exists", "recording is something else"]
@@ -253,9 +349,14 @@ def test_is_refused_by_the_command_itself(what: str, tmp_path: Path) -> None:
     place = os.pathsep.join([str(Path(rig.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     done = subprocess.run(
         [sys.executable, "-m", "rig.cli.main", *case.arguments],
-        cwd=tmp_path, env={**os.environ, "PYTHONPATH": place}, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-        timeout=120, check=False,
-    )  # fmt: skip
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": place},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert (done.returncode, done.stdout) == (2, "")
     check_line(done.stderr, case)
     assert state(tmp_path) == before
@@ -319,7 +420,6 @@ def test_commands_that_are_not_possible_now_are_refused() -> None:
 
 
 @pytest.mark.parametrize("command", ["hammer", "release"])
-@pytest.mark.xfail(strict=True, reason="bug: a command that is taken but has not begun is not looked at")
 def test_a_command_that_waits_refuses_its_like(command: str) -> None:
     simulation = Simulation(load_scene("stable-run"))
     simulation.submit(command, {})
@@ -329,6 +429,6 @@ def test_a_command_that_waits_refuses_its_like(command: str) -> None:
 
 @pytest.mark.parametrize("ticks", [0, -500, 1, 499, 501, 750])
 def test_advance_by_no_whole_block_is_refused(simulation: Simulation, ticks: int) -> None:
-    with pytest.raises(InputError, match="^ticks must be a positive multiple of 500"):
+    with pytest.raises(InputError, match=r"^ticks must be a positive multiple of 500"):
         simulation.advance(ticks)
     assert simulation.tick == 0

@@ -45,7 +45,10 @@ hammers = st.fixed_dictionaries(
 )
 speeds = st.fixed_dictionaries({"command": st.just("speed"), "speed_hz": numbers(0.0, 15.0)})
 requests = hammers | speeds | st.just({"command": "release"})
-timed = st.builds(lambda at_s, request: {"at_s": at_s, **request}, numbers(0.0, 100.0), requests)
+# A blow each half second at most, and the magnets let go once.
+timed = st.lists(requests, max_size=4, unique_by=lambda request: request["command"] == "release" or id(request)).map(
+    lambda found: [{"at_s": 0.5 * n, **request} for n, request in enumerate(found)]
+)
 profiles = st.lists(st.tuples(numbers(0.01, 10.0), numbers(0.0, 15.0)), min_size=1, max_size=5).map(
     lambda steps: [[sum(step for step, _ in steps[1 : n + 1]), speed] for n, (_, speed) in enumerate(steps)]
 )
@@ -65,7 +68,7 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
         "duration_s": draw(numbers(1e-3, 86_400.0)),
         "seed": draw(st.integers(0, 2**63 - 1)),
         "drive": drive,
-        "commands": draw(st.lists(timed, max_size=3)),
+        "commands": draw(timed.flatmap(st.permutations)),
         "engine": {"name": draw(st.sampled_from(["rk4", "rk8"])), "step_us": step},
         "sensors": {
             "groups": draw(st.permutations(list(default_table().groups)).map(lambda names: names[:3])),
@@ -135,7 +138,6 @@ def test_refusal_of_a_rate_names_rates_that_would_do() -> None:
         parse_scene({"sensors": {"truth_rate_hz": 3_000}})
 
 
-@pytest.mark.xfail(strict=True, reason="bug: says `such as Hz` where no round rate fits the step")
 def test_refusal_of_a_rate_suggests_none_where_there_is_none() -> None:
     with pytest.raises(InputError) as caught:
         parse_scene({"engine": {"step_us": 7}})
@@ -143,7 +145,14 @@ def test_refusal_of_a_rate_suggests_none_where_there_is_none() -> None:
 
 
 @pytest.mark.parametrize(
-    "profile", [[[1.0, 1.0]], [[0.0, 1.0], [0.0, 2.0]], [[0.0, 1.0], [2.0, 1.0], [1.0, 1.0]], [[0.0, -1.0]]]
+    "profile",
+    [
+        [[1.0, 1.0]],
+        [[0.0, 1.0], [0.0, 2.0]],
+        [[0.0, 1.0], [0.009, 2.0]],
+        [[0.0, 1.0], [2.0, 1.0], [1.0, 1.0]],
+        [[0.0, -1.0]],
+    ],
 )
 def test_profile_ascends_from_zero_and_never_turns_backward(profile: list[list[float]]) -> None:
     with pytest.raises(InputError, match=r"^drive\.profile must be points of "):
@@ -153,10 +162,16 @@ def test_profile_ascends_from_zero_and_never_turns_backward(profile: list[list[f
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        ("5.2", 5.2), ("3", 3), ("true", True), ("[1, 2]", [1, 2]), ('"a b"', "a b"), ("internal-sphere", "internal-sphere"),
-        ("", ""), ("2026-01-01x", "2026-01-01x"),
+        ("5.2", 5.2),
+        ("3", 3),
+        ("true", True),
+        ("[1, 2]", [1, 2]),
+        ('"a b"', "a b"),
+        ("internal-sphere", "internal-sphere"),
+        ("", ""),
+        ("2026-01-01x", "2026-01-01x"),
     ],
-)  # fmt: skip
+)
 def test_values_on_the_command_line_are_toml_or_plain_text(text: str, value: object) -> None:
     read = read_value(text)
     assert read == value
@@ -164,16 +179,54 @@ def test_values_on_the_command_line_are_toml_or_plain_text(text: str, value: obj
 
 
 def test_overrides_reach_scene_and_parameters() -> None:
-    scene = load_scene("hammer", {
-        "drive.speed_hz": "5.2", "contact.friction": 0.3, "contact.stiffness": "external-sphere", "sensors.noise": "false",
-        "duration_s": 0.5, "sensors.groups": '["probes", "drive"]',
-    })  # fmt: skip
+    scene = load_scene(
+        "hammer",
+        {
+            "drive.speed_hz": "5.2",
+            "contact.friction": 0.3,
+            "contact.stiffness": "external-sphere",
+            "sensors.noise": "false",
+            "duration_s": 0.5,
+            "sensors.groups": '["probes", "drive"]',
+        },
+    )
     assert scene.drive.speed_hz == 5.2
     assert scene.set == {"contact.friction": 0.3, "contact.stiffness": "external-sphere"}
     assert scene.load_parameters()["contact.friction"] == 0.3
     assert (scene.sensors.noise, scene.duration_s, scene.sensors.groups) == (False, 0.5, ("probes", "drive"))
     assert scene.sensors.rate_hz == 20_000, "fields beside the changed one keep their values"
     assert load_scene("hammer").set == {}, "the shipped scene stays as it is"
+
+
+@pytest.mark.xfail(strict=True, reason="bug: 0.28 + 0.01 > 0.29 in floating point")
+def test_points_of_a_profile_may_be_just_as_near_as_is_said() -> None:
+    profile = [[0.01 * n, 1.0] for n in range(100)]
+    assert len(parse_scene({"drive": {"profile": profile}}).drive.profile) == 100
+
+
+BLOW = {"command": "hammer", "duration_ms": 5.0}
+RELEASE = {"command": "release"}
+
+
+@pytest.mark.parametrize(
+    ("commands", "field"),
+    [
+        ([{"at_s": 0.1, **BLOW}, {"at_s": 0.1, **BLOW}], "hammer"),
+        ([{"at_s": 0.104, **BLOW}, {"at_s": 0.1, **BLOW}], "hammer"),
+        ([{"at_s": 0.1, **RELEASE}, {"at_s": 0.2, **RELEASE}], "release"),
+    ],
+)
+def test_commands_that_cannot_both_be_are_refused(commands: list[dict[str, Any]], field: str) -> None:
+    with pytest.raises(InputError, match=f"^{field} must be "):
+        parse_scene({"commands": commands})
+    apart = [{**command, "at_s": 0.3 * n} for n, command in enumerate(commands)]
+    if field == "hammer":
+        assert len(parse_scene({"commands": apart}).commands) == 2
+
+
+def test_magnets_that_have_let_go_are_not_released() -> None:
+    with pytest.raises(InputError, match=r"^release must be given once, while the magnets hold"):
+        parse_scene({"initial": {"magnets": False}, "commands": [{"at_s": 0.1, **RELEASE}]})
 
 
 def test_a_speed_from_outside_replaces_the_profile() -> None:
@@ -202,7 +255,6 @@ def test_unknown_key_names_its_neighbours() -> None:
 
 
 @pytest.mark.parametrize("text", ["drive = 3\n", 'drive = "fast"\n'])
-@pytest.mark.xfail(strict=True, reason="bug: a part that is no table, with an override inside it")
 def test_override_inside_what_is_no_table_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text)
@@ -210,7 +262,6 @@ def test_override_inside_what_is_no_table_is_refused(tmp_path: Path, text: str) 
         load_scene(path, {"drive.speed_hz": 1.0})
 
 
-@pytest.mark.xfail(strict=True, reason="bug: `set` that is no table, with an override of a parameter")
 def test_override_of_a_parameter_beside_a_wrong_set_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text("set = 4\n")
@@ -243,8 +294,16 @@ def test_direction_of_a_blow_is_a_unit_vector(direction: str | float) -> None:
 
 @pytest.mark.parametrize(
     ("direction", "cosines"),
-    [("x", (1, 0)), ("y", (0, 1)), ("-x", (-1, 0)), ("-y", (0, -1)), (90.0, (0, 1)), (-90.0, (0, -1)), (30.0, (math.sqrt(0.75), 0.5))],
-)  # fmt: skip
+    [
+        ("x", (1, 0)),
+        ("y", (0, 1)),
+        ("-x", (-1, 0)),
+        ("-y", (0, -1)),
+        (90.0, (0, 1)),
+        (-90.0, (0, -1)),
+        (30.0, (math.sqrt(0.75), 0.5)),
+    ],
+)
 def test_direction_turns_from_x_toward_y(direction: Any, cosines: tuple[float, float]) -> None:
     assert HammerCommand(direction=direction).cosines == pytest.approx(cosines, abs=1e-15)
 
@@ -253,11 +312,15 @@ def test_direction_turns_from_x_toward_y(direction: Any, cosines: tuple[float, f
     ("name", "request_", "command"),
     [
         ("hammer", {}, HammerCommand()),
-        ("hammer", {"force_n": 1.0, "duration_ms": 50.0, "direction": 360}, HammerCommand(force_n=1.0, duration_ms=50.0, direction=360.0)),
+        (
+            "hammer",
+            {"force_n": 1.0, "duration_ms": 50.0, "direction": 360},
+            HammerCommand(force_n=1.0, duration_ms=50.0, direction=360.0),
+        ),
         ("speed", {"speed_hz": 0}, SpeedCommand(speed_hz=0.0)),
         ("release", {}, ReleaseCommand()),
     ],
-)  # fmt: skip
+)
 def test_good_commands(name: str, request_: dict[str, Any], command: object) -> None:
     assert parse_command(name, request_) == command
 

@@ -1,0 +1,306 @@
+"""The verdict on hammer recordings: good on a good one, not on one that was turned, cut or thinned; and the picture."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import struct
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recorder.reader import Recording
+from recorder.writer import RecordingWriter
+from replays.export import writer_for
+from replays.figure import draw, full_spectrum
+from replays.verdict import Verdict, hammer_time_s, judge
+from replays.whirl import parameter_si, whirl_figures, whirl_frequency
+from rig import wire
+from rig.errors import InputError
+from rig.offline import frames
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+
+Change = Callable[[str, bytes], Iterable[bytes]]
+"""Payloads to write for one payload of a key: none, itself, others."""
+
+
+def simulated(path: Path, scene: str = "hammer", **changes: Any) -> Recording:
+    simulation = Simulation(load_scene(scene, {key.replace("__", "."): value for key, value in changes.items()}))
+    with writer_for(path, simulation) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+    return Recording.open(path)
+
+
+def unchanged(key: str, payload: bytes) -> list[bytes]:
+    return [payload]
+
+
+def rewritten(
+    good: Recording,
+    path: Path,
+    change: Change = unchanged,
+    *,
+    catalogue: dict[str, Any] | None = None,
+    status: bytes | None = None,
+) -> Recording:
+    """The same recording with some payloads changed, with another channel table, or with a status at its end."""
+    writer = RecordingWriter(
+        path, catalogue=catalogue or good.catalogue, parameters=good.parameters, scene=good.scene, view_rate_hz=0.0
+    )
+    for key in good.messages:
+        if not key.startswith("rig/"):
+            continue
+        for _, payload in good.payloads(key):
+            for kept in change(key, payload):
+                writer.write(key, kept, 1_700_000_000_000_000_000)
+    if status is not None:
+        writer.write(wire.STATUS, status, 1_700_000_000_000_000_000)
+    writer.finish("completed")
+    return Recording.open(path)
+
+
+def bad(verdict: Verdict) -> set[str]:
+    return {row.quantity for row in verdict.rows if row.good is False}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The hammer scene, two seconds of it."""
+    return simulated(tmp_path_factory.mktemp("verdict") / "hammer.mcap")
+
+
+WHIRL = {"whirl frequency, ring probes", "whirl frequency, disk probes", "sense of rotation"}
+
+
+def test_a_simulated_hammer_run_is_good(good: Recording) -> None:
+    verdict = judge(good)
+    assert verdict.good, verdict.rows
+    rows = {row.quantity: row for row in verdict.rows}
+    assert set(rows) >= WHIRL | {
+        "orbit in the ring",
+        "against the paper's Fig. 14",
+        "reaction E/W, whirl",
+        "samples lost",
+        "recording",
+    }
+    assert rows["sense of rotation"].measured == "backward"
+    assert rows["recording"].measured == "completed"
+    assert all(row.good for row in verdict.rows if row.quantity in WHIRL), "asked for, not merely shown"
+
+
+def test_figures_are_those_of_the_model(good: Recording) -> None:
+    figures = whirl_figures(good, 0.6, 2.0)
+    truth, contact = good.truth("state"), good.truth("contact")
+    settled = truth.times_s >= 0.6
+    spin_hz = truth.column("theta_rate")[settled].mean() / (2 * math.pi)
+    assert figures.spin_hz == pytest.approx(spin_hz, rel=2e-3)
+    radius = parameter_si(good, "ring.clearance") + contact.column("penetration")[settled].mean()
+    assert figures.radius_m == pytest.approx(radius, rel=2e-3)
+    assert figures.frequency_hz == pytest.approx(
+        -figures.spin_hz * parameter_si(good, "shaft.radius") / radius, rel=5e-3
+    )
+    forces = good.truth("forces")
+    pair = forces.column("P_E")[settled] - forces.column("P_W")[settled]
+    assert figures.reaction_x_n == pytest.approx(np.ptp(pair) / 2, rel=0.1)
+
+
+def test_the_same_recording_written_again_is_good(good: Recording, tmp_path: Path) -> None:
+    assert judge(rewritten(good, tmp_path / "again.mcap")) == judge(good)
+
+
+def test_probes_with_the_sign_of_y_wrong_in_the_table_are_not_good(good: Recording, tmp_path: Path) -> None:
+    catalogue = copy.deepcopy(good.catalogue)
+    flipped = 0
+    for channel in catalogue["table"]["groups"]["probes"]["channels"]:
+        if channel["name"].endswith("_y"):
+            channel["sensitivity_v"] *= -1.0
+            flipped += 1
+    assert flipped == 2
+    verdict = judge(rewritten(good, tmp_path / "flipped.mcap", catalogue=catalogue))
+    assert not verdict.good
+    assert bad(verdict) >= WHIRL
+    assert {row.measured for row in verdict.rows if row.quantity == "sense of rotation"} == {"forward"}
+
+
+def changed_block(payload: bytes, key: str, change: Callable[[np.ndarray], np.ndarray]) -> bytes:
+    block = wire.decode_block(payload, wire.schema_of(key) or "")
+    return wire.encode_block(dataclasses.replace(block, values=change(block.values)))
+
+
+def test_probes_with_crossed_cables_are_not_good(good: Recording, tmp_path: Path) -> None:
+    def crossed(key: str, payload: bytes) -> list[bytes]:
+        if key != wire.sensor_key("probes"):
+            return [payload]
+        return [changed_block(payload, key, lambda values: values[:, [1, 0, 3, 2]])]
+
+    assert bad(judge(rewritten(good, tmp_path / "crossed.mcap", crossed))) >= WHIRL
+
+
+def test_a_probe_pair_that_is_alone_wrong_is_found(good: Recording, tmp_path: Path) -> None:
+    def crossed(key: str, payload: bytes) -> list[bytes]:
+        if key != wire.sensor_key("probes"):
+            return [payload]
+        return [changed_block(payload, key, lambda values: values[:, [1, 0, 2, 3]])]
+
+    assert bad(judge(rewritten(good, tmp_path / "disk.mcap", crossed))) == {"whirl frequency, disk probes"}
+
+
+def test_a_lost_block_is_not_good(good: Recording, tmp_path: Path) -> None:
+    seen = {"blocks": 0}
+
+    def lossy(key: str, payload: bytes) -> list[bytes]:
+        if key != wire.sensor_key("forces"):
+            return [payload]
+        seen["blocks"] += 1
+        return [] if seen["blocks"] == 7 else [payload]
+
+    verdict = judge(rewritten(good, tmp_path / "lossy.mcap", lossy))
+    assert bad(verdict) == {"samples lost"}
+    # Blocks of 0.1 s.
+    assert next(row.measured for row in verdict.rows if row.quantity == "samples lost").startswith("2000 of ")
+
+
+def test_a_recording_that_was_cut_off_is_not_good(good: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    data = good.path.read_bytes()
+    path.write_bytes(data[: len(data) - 200])
+    assert bad(judge(Recording.open(path))) == {"recording"}
+
+
+def status(**changes: Any) -> bytes:
+    document = {
+        "lateness_ms": {"p50": 0.1, "p99": 1.0, "max": 3.0},
+        "block_ms": 10.0,
+        "real_time_factor": 1.0,
+        "energy": {"residual_j": 1e-12, "dissipated_j": 0.5},
+    }
+    return wire.encode_document(document | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, set()),
+        ({"lateness_ms": {"p50": 0.1, "p99": 10.5, "max": 30.0}}, {"lateness p50 / p99 / max"}),
+        ({"real_time_factor": 0.99}, {"real-time factor"}),
+        ({"energy": {"residual_j": 1e-6, "dissipated_j": 0.5}}, {"energy residual"}),
+    ],
+)
+def test_what_the_rig_said_of_itself_counts(
+    good: Recording, tmp_path: Path, changes: dict[str, Any], expected: set[str]
+) -> None:
+    verdict = judge(rewritten(good, tmp_path / "status.mcap", status=status(**changes)))
+    assert bad(verdict) == expected
+    assert len(verdict.rows) == len(judge(good).rows) + 3
+
+
+def test_a_recording_without_a_blow_is_refused(tmp_path: Path) -> None:
+    quiet = simulated(tmp_path / "quiet.mcap", "stable-run", duration_s=0.2)
+    for use in (hammer_time_s, judge, lambda recording: draw(recording, tmp_path / "quiet.png")):
+        with pytest.raises(InputError, match=r"^recording must be one with a hammer blow in it"):
+            use(quiet)
+    assert not (tmp_path / "quiet.png").exists()
+
+
+@pytest.mark.parametrize("duration_s", [0.03, 0.4, 0.9])
+def test_a_recording_that_is_too_short_is_refused(tmp_path: Path, duration_s: float) -> None:
+    short = simulated(tmp_path / "short.mcap", duration_s=duration_s)
+    with pytest.raises(InputError, match=r"^recording must be long enough to judge a whirl"):
+        judge(short)
+
+
+@pytest.mark.parametrize("groups", [["drive", "hammer"], ["probes", "drive"], ["probes", "forces"]])
+def test_a_recording_without_the_instruments_is_refused(tmp_path: Path, groups: list[str]) -> None:
+    with pytest.raises(InputError, match=" must be "):
+        judge(simulated(tmp_path / "few.mcap", sensors__groups=groups, duration_s=0.1))
+
+
+def test_a_blow_that_dies_out_is_not_good(tmp_path: Path) -> None:
+    command = '[{ at_s = 0.02, command = "hammer", duration_ms = 2.0 }]'
+    verdict = judge(simulated(tmp_path / "weak.mcap", commands=command))
+    assert bad(verdict) >= {"whirl frequency, ring probes", "orbit in the ring"}
+
+
+def orbit(
+    hz: float, *, n: int = 4_000, rate: float = 4_000.0, noise: float = 0.0, centre: complex = 0.0
+) -> tuple[np.ndarray, ...]:
+    times = np.arange(n) / rate
+    rng = np.random.default_rng(1)
+    z = centre + np.exp(2j * math.pi * (hz * times + 0.1)) + noise * (rng.normal(size=n) + 1j * rng.normal(size=n))
+    return times, z.real, z.imag
+
+
+@given(
+    hz=st.floats(3.0, 500.0),
+    forward=st.booleans(),
+    x=st.floats(-3.0, 3.0),
+    y=st.floats(-3.0, 3.0),
+    start_s=st.floats(0.0, 1e5),
+)
+def test_whirl_frequency_knows_sense_and_needs_no_centre(
+    hz: float, forward: bool, x: float, y: float, start_s: float
+) -> None:
+    sign = 1.0 if forward else -1.0
+    times, ox, oy = orbit(sign * hz, centre=complex(x, y))
+    found = whirl_frequency(times + start_s, ox, oy)
+    # A part of a turn left over moves the mean, and with it the centre, by up to 1 part in 2 pi turns.
+    assert found == pytest.approx(sign * hz, abs=0.2 / hz + 1e-6)
+    assert whirl_frequency(times + start_s, ox, -oy) == pytest.approx(-found, rel=1e-9)
+    assert whirl_frequency(times + start_s, oy, ox) == pytest.approx(-found, rel=1e-6)
+
+
+@pytest.mark.parametrize("hz", [-83.7, -20.0, 6.2])
+def test_whirl_frequency_reads_through_noise(hz: float) -> None:
+    times, x, y = orbit(hz, noise=0.1)
+    # Phase noise of 0.1 rad over 4000 samples of 1 s: sqrt(12 / 4000) x 0.1 / (2 pi) = 0.9 mHz.
+    assert whirl_frequency(times, x, y) == pytest.approx(hz, abs=5e-3 + 0.2 / abs(hz) ** 2)
+
+
+def test_whirl_frequency_is_not_bound_to_the_bins_of_a_spectrum() -> None:
+    for hz in (-83.70, -83.75, -83.80):
+        times, x, y = orbit(hz)
+        assert whirl_frequency(times, x, y) == pytest.approx(hz, abs=0.005)
+
+
+@pytest.mark.parametrize("hz", [-80.0, 6.0])
+def test_full_spectrum_shows_sense_and_amplitude(hz: float) -> None:
+    _, x, y = orbit(hz, centre=3 + 2j)
+    frequency, amplitude = full_spectrum(0.7 * x, 0.7 * y, 4_000.0)
+    top = int(np.argmax(amplitude))
+    assert frequency[top] == pytest.approx(hz)
+    assert amplitude[top] == pytest.approx(0.7, rel=1e-3)
+    assert amplitude[np.argmin(np.abs(frequency + hz))] < 1e-5, "nothing on the other side"
+
+
+def test_picture_is_drawn(good: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib.figure import Figure
+    from matplotlib.image import imread
+
+    drawn: list[Figure] = []
+    save = Figure.savefig
+
+    def kept(figure: Figure, *arguments: Any, **options: Any) -> None:
+        drawn.append(figure)
+        save(figure, *arguments, **options)
+
+    monkeypatch.setattr(Figure, "savefig", kept)
+    path = tmp_path / "hammer.png"
+    draw(good, path)
+    data = path.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    assert struct.unpack(">II", data[16:24]) == (1650, 1100)
+    assert len(data) > 100_000
+    assert imread(path)[..., :3].std() > 0.1
+    panels = [panel for panel in drawn[0].axes if panel.get_title()]
+    assert len(panels) == 9
+    for panel in panels:
+        assert panel.has_data(), panel.get_title()
+        assert "[" in panel.get_xlabel() + panel.get_ylabel() or "frequency" in panel.get_xlabel()
