@@ -69,10 +69,6 @@ class Model:
     resolved: dict[str, float]
     sag: float
 
-    def equilibrium(self) -> tuple[float, float]:
-        """Gamma and beta at rest on the magnets [rad]."""
-        return math.asin(-self.sag / self.constants.shaft.arm_ring), 0.0
-
     def state(self, *, ring_x: float | None = None, ring_y: float | None = None, spin: float = 0.0) -> np.ndarray:
         """A state at rest but for its spin, the houses at their rest.
 
@@ -83,13 +79,17 @@ class Model:
 
         Returns:
             Vector of state and integrals, shape (N_VECTOR,).
+
+        Raises:
+            InputError: The shaft is too short to reach there.
         """
         contact, arm = self.constants.contact, self.constants.shaft.arm_ring
-        gamma, beta = self.equilibrium()
-        if ring_x is not None:
-            beta = math.asin((ring_x + contact.offset_x) / arm)
-        if ring_y is not None:
-            gamma = math.asin(-(ring_y + contact.offset_y) / (arm * math.cos(beta)))
+        x = 0.0 if ring_x is None else ring_x + contact.offset_x
+        y = self.sag if ring_y is None else ring_y + contact.offset_y
+        if math.hypot(x, y) >= arm:
+            raise InputError("shaft.arm_ring", f"above {math.hypot(x, y):g} m, to reach where it starts", arm)
+        beta = math.asin(x / arm)
+        gamma = math.asin(-y / (arm * math.cos(beta)))
         vector = np.zeros(N_VECTOR)
         vector[0], vector[1], vector[9] = gamma, beta, spin
         return vector

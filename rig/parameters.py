@@ -7,6 +7,7 @@ names a `base` and the values in which it differs. A user's own file works the s
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -29,7 +30,7 @@ SETS = Path(__file__).with_name("sets")
 DEFAULT_SET = "corrected"
 
 SI = {
-    "1": 1.0, "kg": 1.0, "kg m^2": 1.0, "m": 1.0, "mm": 1e-3, "rad": 1.0, "Pa": 1.0, "N": 1.0,
+    "1": 1.0, "count": 1.0, "kg": 1.0, "kg m^2": 1.0, "m": 1.0, "mm": 1e-3, "rad": 1.0, "Pa": 1.0, "N": 1.0,
     "N/m": 1.0, "kN/m": 1e3, "N/m^1.5": 1.0, "N s/m": 1.0, "m/s": 1.0, "mm/s": 1e-3, "m/s^2": 1.0,
     "A/m": 1.0, "kA/m": 1e3, "N m s": 1.0, "Hz": 2.0 * math.pi, "Hz/s": 2.0 * math.pi,
 }  # fmt: skip
@@ -217,6 +218,11 @@ def input_error(error: ValidationError, where: str) -> InputError:
     place = ".".join(str(part) for part in first["loc"] if not str(part).startswith(("function-", "constrained-")))
     field = ".".join(part for part in (where, place) if part)
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    message = re.sub(r"^\w+ should have ", "a value of ", message)
+    if first["type"] == "union_tag_invalid":
+        context = first.get("ctx", {})
+        name = str(context.get("discriminator")).strip("'")
+        return InputError(f"{field}.{name}", f"one of {context.get('expected_tags')}", context.get("tag"))
     if first["type"] == "extra_forbidden":
         message = "left out (there is no such field)"
     elif first["type"] == "missing":
@@ -226,14 +232,19 @@ def input_error(error: ValidationError, where: str) -> InputError:
 
 def _accepts(entry: Parameter) -> str:
     low, high = entry.range
-    text = f"a number from {low:g} to {high:g}" + (f" {entry.unit}" if entry.unit != "1" else "")
+    whole = entry.unit == "count"
+    text = f"a {'whole ' if whole else ''}number from {low:g} to {high:g}"
+    text += "" if whole or entry.unit == "1" else f" {entry.unit}"
     return text + (f" or one of {', '.join(entry.rules)}" if entry.rules else "")
 
 
 def _check(key: str, entry: Parameter) -> None:
     value = entry.value
     low, high = entry.range
-    good = value in entry.rules if isinstance(value, str) else math.isfinite(value) and low <= value <= high
+    if isinstance(value, str):
+        good = value in entry.rules
+    else:
+        good = low <= value <= high and (entry.unit != "count" or value.is_integer())
     if not good:
         raise InputError(key, _accepts(entry), value)
 

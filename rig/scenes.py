@@ -10,7 +10,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from rig.channels import default_table
 from rig.engines import ENGINES
@@ -24,6 +32,15 @@ _APART_S = 0.01
 
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_truth_for_a_number(cls, data: Any) -> Any:
+        # Python takes true for 1; a file that says so means something else.
+        for name, value in data.items() if isinstance(data, dict) else ():
+            if isinstance(value, bool) and name in cls.model_fields and cls.model_fields[name].annotation is not bool:
+                raise InputError(name, "something else than true or false", value)
+        return data
 
 
 class HammerCommand(_Part):
@@ -122,7 +139,7 @@ class Drive(_Part):
     @classmethod
     def _ascending(cls, profile: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         times = [time for time, _ in profile]
-        if profile and (times[0] != 0.0 or any(b < a + _APART_S for a, b in pairwise(times))):
+        if profile and (times[0] != 0.0 or any(b < a + _APART_S - 1e-9 for a, b in pairwise(times))):
             raise ValueError(f"points of ascending time, at least {_APART_S:g} s apart, the first at 0")
         if any(speed < 0.0 for _, speed in profile):
             raise ValueError("points of speed >= 0")
@@ -252,10 +269,13 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
     scene = parse_scene(data)
     # Parameters are checked here, so that a scene that loads can run.
     top = scene.load_parameters().entries["drive.top_speed"].value
-    speeds = [scene.drive.speed_hz, *(speed for _, speed in scene.drive.profile)]
-    speeds += [timed.request.speed_hz for timed in scene.commands if isinstance(timed.request, SpeedCommand)]
-    if not isinstance(top, str) and max(speeds) > top:
-        raise InputError("drive.speed_hz", f"at most drive.top_speed = {top:g} Hz", max(speeds))
+    speeds = {"drive.speed_hz": [scene.drive.speed_hz], "drive.profile": [speed for _, speed in scene.drive.profile]}
+    speeds["speed.speed_hz"] = [
+        timed.request.speed_hz for timed in scene.commands if isinstance(timed.request, SpeedCommand)
+    ]
+    for field, values in speeds.items():
+        if not isinstance(top, str) and max(values, default=0.0) > top:
+            raise InputError(field, f"at most drive.top_speed = {top:g} Hz", max(values))
     return scene
 
 

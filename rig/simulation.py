@@ -252,6 +252,10 @@ class Simulation:
     def _initial_state(self, spin: float) -> np.ndarray:
         initial, clearance = self.scene.initial, self.model.constants.contact.clearance
         if initial.position == "equilibrium":
+            contact, sag = self.model.constants.contact, self.model.sag
+            if math.hypot(contact.offset_x, sag - contact.offset_y) > clearance:
+                place = f"within {clearance * 1e3:g} mm of the shaft at rest on its magnets, (0, {sag * 1e3:.4g}) mm"
+                raise InputError("ring.offset", place, [contact.offset_x * 1e3, contact.offset_y * 1e3])
             return self.model.state(spin=spin)
         # A hair inside the clearance, so that rounding does not make it a contact.
         inside = clearance * (1.0 - 1e-12)

@@ -101,10 +101,8 @@ class Block:
 def encode_block(block: Block) -> bytes:
     """One block as a CDR message; the schema follows from the dtype of its values."""
     values = np.ascontiguousarray(block.values)
-    if values.dtype not in (_DTYPES[SAMPLE_SCHEMA], _DTYPES[TRUTH_SCHEMA]) or values.ndim != 2:
-        raise TypeError(
-            f"values must be int32 or float64 of two dimensions; instead received {values.dtype}, {values.ndim}"
-        )
+    if values.dtype not in (_DTYPES[SAMPLE_SCHEMA], _DTYPES[TRUTH_SCHEMA]) or values.ndim != 2 or not values.shape[1]:
+        raise TypeError(f"values must be int32 or float64 in columns; instead received {values.dtype}, {values.shape}")
     head = _HEAD.pack(block.tick, block.index, block.rate_hz, block.tick_rate_hz, values.shape[1], values.size)
     return b"".join((_ENCAPSULATION, head, values.tobytes()))
 

@@ -77,6 +77,9 @@ def main(arguments: list[str] | None = None) -> None:
         # The reader of our output has gone (`rig params | head`): nothing is wrong.
         sys.stderr.close()
         sys.exit(141)
+    except OSError as error:
+        # A disk that is full, a file system that refuses: not a fault of the program.
+        _fail(f"{error.filename or 'the system'}: {error.strerror or error}", status=1)
     sys.exit(code if isinstance(code, int) else 0)
 
 

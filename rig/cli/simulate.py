@@ -45,7 +45,7 @@ def simulate(
         typer.echo("compiling the kernels, once on this machine (about 20 s) ...", err=True)
     simulation.warm_up()
     with (
-        Progress(console=Console(file=sys.stderr), transient=True) as progress,
+        Progress(console=Console(file=sys.stderr), transient=True, disable=not sys.stderr.isatty()) as progress,
         writer_for(output, simulation, force=force) as writer,
     ):
         begin = time.perf_counter()

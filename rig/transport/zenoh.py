@@ -1,8 +1,7 @@
 """Server and client over zenoh: loopback TCP between two peers, no router, no multicast, no gossip.
 
 The server publishes without waiting (a stalled subscriber must not delay it) and keeps the last messages of each key;
-a lossless client notices from the sequence numbers what it did not get and fetches it from there. Measured with a
-subscriber that was stopped for 8 s, and with one whose callback slept for 8 s: all messages arrived, in order.
+a lossless client notices from the numbers of the messages what it did not get, and fetches it from there.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 LOOPBACK_HOSTS = ("127.0.0.1", "localhost")
 
 _BLOCKS_A_SECOND = 100
-_CACHE_S = 30.0
+_CACHE = 30 * _BLOCKS_A_SECOND
+"""Messages of each key that the rig keeps for those who missed them."""
 _SLOW_PUT_S = 0.5e-3
 _STALLED_BYTES = 256 * 1024
 """Unread bytes that make a link stalled: about 0.1 s of all streams; one that keeps up leaves none."""
@@ -36,7 +36,11 @@ _HEARTBEAT_S = 0.25
 """How soon a subscriber learns that the last message of a key is missing."""
 _FIFO = 20_000
 """Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops, and the
-rest is recovered. So many because history comes over the same link, which must not be blocked meanwhile."""
+rest is recovered. So many because recovery comes over the same link, which must not be blocked meanwhile."""
+_PORTION = 200
+"""Messages asked for at a time, below 1 MB: while a cache answers its publisher waits, and sockets hold that much."""
+_ATTEMPTS = 4
+_RETRY_S = 0.25
 _RING = 2000
 """Messages that a subscriber which may lose some holds: about 2 s of all streams."""
 
@@ -75,12 +79,14 @@ def _config(**settings: Any) -> Any:
         # cache. After this time the link is closed instead, which can cost that client messages. It must be below the
         # time that the service can queue [us].
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(_PATIENCE_S * 1e6),
-        # A client that is stopped while its recovery is under way must not give it up when it goes on [ms].
-        "queries_default_timeout": round(_LEASE_S * 1e3),
     }
     for key, value in {**shared, **{name.replace("__", "/"): value for name, value in settings.items()}}.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+_Publisher = tuple[str, int]
+"""Session and number of a publisher: one a key, and new ones when a rig is started again."""
 
 
 class _Session:
@@ -101,20 +107,12 @@ class _Session:
 
     def drain(self, channel: Any, take: Callable[[Any], None], name: str) -> None:
         """Give all that arrives in a channel to `take`, on a thread of its own."""
-
-        def loop() -> None:
-            for item in channel:
-                take(item)
-
-        self.follow(channel, loop, name)
-
-    def follow(self, channel: Any, loop: Callable[[], None], name: str) -> None:
-        """Run a loop that empties a channel, on a thread of its own."""
         import zenoh
 
-        def run() -> None:
+        def loop() -> None:
             try:
-                loop()
+                for item in channel:
+                    take(item)
             except BaseException as error:
                 if self._closed and isinstance(error, zenoh.ZError):
                     return
@@ -123,7 +121,7 @@ class _Session:
                 for _ in channel:
                     pass
 
-        thread = threading.Thread(target=run, name=f"zenoh {name}", daemon=True)
+        thread = threading.Thread(target=loop, name=f"zenoh {name}", daemon=True)
         self._threads.append(thread)
         thread.start()
 
@@ -205,7 +203,7 @@ class ZenohServer:
             key,
             encoding="application/json" if schema is None else f"application/cdr;{schema}",
             congestion_control=self._congestion_control,
-            cache=ext.CacheConfig(round(_CACHE_S * _BLOCKS_A_SECOND)),
+            cache=ext.CacheConfig(_CACHE),
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
         )
         self._publishers[key] = publisher
@@ -293,91 +291,126 @@ def _backlog(port: int) -> dict[int, int]:
 
 
 class _Stream:
-    """What one lossless subscription has received.
+    """What one lossless subscription has received, and the recovery of what it has not.
 
-    History is fetched here and not by zenoh's advanced subscriber, which lost most of it in 1.10.2: a live message that
-    arrives while the query of a heartbeat is open is delivered before the older ones, and those are then thrown away.
+    Publishers number their messages, keep the last ones, and say their last number several times a second; all that is zenoh's.
+    Asking for what is missing is done here: zenoh's advanced subscriber (1.10.2) can declare a gap missed without having
+    asked for it, when the gap appears while the query of a heartbeat is open, and loses history in the same way.
+
+    Args:
+        ask: Fetches the messages first..last of a publisher from its cache: key, publisher, first, last -> samples.
+        on_message: Takes key and payload, in order, each once.
+        on_miss: Takes key and number of messages that are nowhere to be had.
+        history: Begin with what the caches hold, not with the first message that arrives.
+        pause: Waits for a number of seconds.
     """
 
     def __init__(
         self,
-        session: Any,
-        key: str,
+        ask: Callable[[str, _Publisher, int, int], list[Any]],
         on_message: Callable[[str, bytes], None],
         on_miss: Callable[[str, int], None] | None,
+        *,
+        history: bool,
+        pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._session = session
-        self._key = key
+        self._ask = ask
         self._on_message = on_message
         self._on_miss = on_miss
+        self._history = history
+        self._pause = pause
         self._lock = threading.Lock()
-        self._names: dict[tuple[str, int], str] = {}
-        """Key of each publisher, which is known by session and number."""
-        self._last: dict[tuple[str, int], int] = {}
-        """Number of the last message of each publisher."""
-        self._rigs: set[str] = set()
-        """Sessions whose history has been fetched."""
+        self._last: dict[_Publisher, int] = {}
+        """Number of the last message of each publisher that was taken, or given up."""
+        self._behind: dict[_Publisher, tuple[int | None, int]] = {}
+        """Where a publisher and we stood at its previous heartbeat, if we were behind."""
 
     def take(self, sample: Any) -> None:
-        name = str(sample.key_expr)
-        if (info := sample.source_info) is not None:
-            source = _source(info.source_id)
-            self._names.setdefault(source, name)
-            self._last[source] = info.source_sn
+        """Take the next message that arrived, after all that should have come before it."""
+        info = sample.source_info
+        if info is None:  # not from a rig
+            return
+        publisher, number = _publisher(info.source_id), info.source_sn
         with self._lock:
-            self._on_message(name, sample.payload.to_bytes())
+            last = self._last.get(publisher)
+            if last is not None and number <= last:
+                return
+            if last is not None or self._history:
+                self._recover(str(sample.key_expr), publisher, number - 1)
+            self._deliver(publisher, number, sample)
 
-    def follow_with_history(self, subscriber: Any) -> None:
-        """Take what the caches hold, then what arrives."""
-        self._catch_up(subscriber, "*", [])
-        for sample in subscriber:
-            if sample.source_info is None:  # not from a rig
-                continue
-            source = _source(sample.source_info.source_id)
-            if source[0] not in self._rigs:  # the rig has been started again
-                self._catch_up(subscriber, source[0], [sample])
-            elif sample.source_info.source_sn > self._last.get(source, -1):
-                self.take(sample)
+    def heartbeat(self, sample: Any) -> None:
+        """Notice that the last messages of a key are missing: no later one will show it."""
+        from zenoh import ext
 
-    def _catch_up(self, subscriber: Any, rig: str, waiting: list[Any]) -> None:
-        """Take what the caches of a rig's publishers hold, and what arrived meanwhile, each publisher's in order."""
-        import zenoh
+        key, _, rest = str(sample.key_expr).partition("/@adv/pub/")
+        zid, eid = rest.split("/")[:2]
+        publisher, number = (zid, int(eid)), int(ext.z_deserialize(ext.UInt32, sample.payload))
+        # While a message is being handed on, others wait in the channel, and nobody knows yet whether any is missing.
+        if not self._lock.acquire(blocking=False):
+            return
+        try:
+            last = self._last.get(publisher)
+            if last is None and not self._history:
+                # From here on this key is followed; what it published before is nobody's.
+                before = self._behind.setdefault(publisher, (None, number))
+                if number > before[1]:
+                    self._last[publisher] = before[1]
+                    self._recover(key, publisher, number)
+                return
+            if last is not None and number <= last:
+                self._behind.pop(publisher, None)
+                return
+            # Messages may be a little later than the heartbeat: they are missing where nothing came until the next.
+            if self._behind.get(publisher, (None, -1))[0] == last and publisher in self._behind:
+                self._recover(key, publisher, number)
+                del self._behind[publisher]
+            else:
+                self._behind[publisher] = (last, number)
+        finally:
+            self._lock.release()
 
-        # All is received before any of it is handed on: as long as a cache answers, its publisher waits.
-        replies = list(
-            self._session.get(
-                f"{self._key}/@adv/*/{rig}/**",
-                timeout=_LEASE_S,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                accept_replies=zenoh.ReplyKeyExpr.ANY,
-            )
-        )
-        # What waits can be older than all that the caches still hold, where this process was stopped meanwhile: it
-        # was sent before the replies, so it is all here, and goes first.
-        while (sample := subscriber.try_recv()) is not None:
-            waiting.append(sample)
-        numbered: dict[tuple[str, int], dict[int, Any]] = {}
-        for sample in (*waiting, *(reply.ok for reply in replies if reply.ok is not None)):
-            if sample.source_info is not None:
-                source = _source(sample.source_info.source_id)
-                numbered.setdefault(source, {})[sample.source_info.source_sn] = sample
-        self._rigs.add(rig)
-        for source, samples in numbered.items():
-            self._rigs.add(source[0])
-            last = self._last.get(source, -1)
-            for number in sorted(samples):
-                if number > last:
-                    self.take(samples[number])
+    def _recover(self, key: str, publisher: _Publisher, until: int) -> None:
+        """Take from the cache what is missing up to a number; what it does not have is reported and given up."""
+        last = self._last.get(publisher)
+        # Of a publisher that was never heard, whatever its cache still has is history; what it no longer has is no loss.
+        known = last is not None
+        first = last + 1 if last is not None else max(0, until + 1 - _CACHE)
+        missing = 0
+        while first <= until:
+            end = min(until, first + _PORTION - 1)
+            for number, sample in self._fetch(key, publisher, first, end, insist=known):
+                if known:
+                    missing += number - first
+                known = True
+                first = number + 1
+                self._deliver(publisher, number, sample)
+            if known:
+                missing += end + 1 - first
+            first = end + 1
+        self._last[publisher] = max(until, self._last.get(publisher, until))
+        if missing and self._on_miss is not None:
+            self._on_miss(key, missing)
 
-    def missed(self, miss: Any) -> None:
-        assert self._on_miss is not None
-        # A publisher that was never heard of: only the subscription's own key can be named.
-        name = self._names.get(_source(miss.source), self._key)
-        with self._lock:
-            self._on_miss(name, miss.nb)
+    def _fetch(self, key: str, publisher: _Publisher, first: int, end: int, *, insist: bool) -> list[tuple[int, Any]]:
+        """Numbers and samples that a cache has of a range, ascending."""
+        found: dict[int, Any] = {}
+        for attempt in range(_ATTEMPTS if insist else 1):
+            if attempt:
+                # The cache may have moved on, but the link may also have been lost, and back in a moment.
+                self._pause(_RETRY_S)
+            begin = next(number for number in range(first, end + 2) if number not in found)
+            found |= {reply.source_info.source_sn: reply for reply in self._ask(key, publisher, begin, end)}
+            if len(found) == end + 1 - first:
+                break
+        return sorted((number, sample) for number, sample in found.items() if first <= number <= end)
+
+    def _deliver(self, publisher: _Publisher, number: int, sample: Any) -> None:
+        self._last[publisher] = number
+        self._on_message(str(sample.key_expr), sample.payload.to_bytes())
 
 
-def _source(entity: Any) -> tuple[str, int]:
+def _publisher(entity: Any) -> _Publisher:
     return str(entity.zid), entity.eid
 
 
@@ -435,11 +468,9 @@ class ZenohClient:
         The messages of each key arrive in order; messages of different keys may arrive in another order than they
         were sent in (after a stall each key is recovered for itself), so an `end` event can overtake blocks. A
         callback that blocks stops only this subscription; the rig goes on, and what was missed is recovered.
-        `on_miss` and `on_message` are never called at the same time. Without `history`, a lossless subscription may
-        still begin with older messages of a key that is published rarely.
+        `on_miss` and `on_message` are never called at the same time.
         """
         import zenoh
-        from zenoh import ext
 
         session = self._session.session
         if not lossless:
@@ -448,22 +479,22 @@ class ZenohClient:
             self._session.drain(subscriber, lambda x: on_message(str(x.key_expr), x.payload.to_bytes()), f"takes {key}")
             return
 
-        stream = _Stream(session, key, on_message, on_miss)
-        subscriber = ext.declare_advanced_subscriber(
-            session,
-            key,
-            zenoh.handlers.FifoChannel(_FIFO),
-            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-        )
-        self._declared.append(subscriber)
-        if on_miss is not None:
-            listener = subscriber.sample_miss_listener(_fifo())
-            self._declared.append(listener)
-            self._session.drain(listener, stream.missed, f"misses {key}")
-        if history:
-            self._session.follow(subscriber, lambda: stream.follow_with_history(subscriber), f"takes {key}")
-        else:
-            self._session.drain(subscriber, stream.take, f"takes {key}")
+        def ask(name: str, publisher: _Publisher, first: int, last: int) -> list[Any]:
+            zid, eid = publisher
+            replies = session.get(
+                f"{name}/@adv/*/{zid}/{eid}/**?_sn={first}..{last}",
+                timeout=_LEASE_S,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+            )
+            return [reply.ok for reply in replies if reply.ok is not None]
+
+        stream = _Stream(ask, on_message, on_miss, history=history)
+        subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_FIFO))
+        heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", _fifo())
+        self._declared += [subscriber, heartbeats]
+        self._session.drain(subscriber, stream.take, f"takes {key}")
+        self._session.drain(heartbeats, stream.heartbeat, f"heartbeats {key}")
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Ask the rig and return its reply.

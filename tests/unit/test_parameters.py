@@ -71,6 +71,8 @@ def test_override_is_in_the_parameters_own_unit(key: str, part: float) -> None:
     entry = DEFAULT.entries[key]
     low, high = entry.range
     value = min(high, low + part * (high - low))
+    if entry.unit == "count":
+        value = float(round(value))
     changed = DEFAULT.override({key: value}, kind="fitted", source="here")
     assert changed[key] == pytest.approx(value * SI[entry.unit], rel=1e-15)
     assert (changed.entries[key].kind, changed.entries[key].source) == ("fitted", "here")
@@ -81,11 +83,14 @@ def test_override_is_in_the_parameters_own_unit(key: str, part: float) -> None:
 @given(key=st.sampled_from(list(DEFAULT.entries)), value=st.floats() | st.text(max_size=5))
 def test_override_accepts_just_what_the_entry_says(key: str, value: float | str) -> None:
     entry = DEFAULT.entries[key]
-    good = value in entry.rules if isinstance(value, str) else entry.range[0] <= value <= entry.range[1]
+    if isinstance(value, str):
+        good = value in entry.rules
+    else:
+        good = entry.range[0] <= value <= entry.range[1] and (entry.unit != "count" or value.is_integer())
     if good:
         assert DEFAULT.override({key: value}).entries[key].value == value
     else:
-        with pytest.raises(InputError, match=f"^{key} must be a number from "):
+        with pytest.raises(InputError, match=f"^{key} must be a (whole )?number from "):
             DEFAULT.override({key: value})
 
 

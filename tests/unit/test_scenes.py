@@ -198,7 +198,6 @@ def test_overrides_reach_scene_and_parameters() -> None:
     assert load_scene("hammer").set == {}, "the shipped scene stays as it is"
 
 
-@pytest.mark.xfail(strict=True, reason="bug: 0.28 + 0.01 > 0.29 in floating point")
 def test_points_of_a_profile_may_be_just_as_near_as_is_said() -> None:
     profile = [[0.01 * n, 1.0] for n in range(100)]
     assert len(parse_scene({"drive": {"profile": profile}}).drive.profile) == 100

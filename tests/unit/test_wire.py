@@ -80,7 +80,7 @@ def test_values_of_any_memory_order_are_sent_row_after_row() -> None:
 
 @pytest.mark.parametrize("values", [np.zeros((2, 2), np.float32), np.zeros((2, 2), np.int64), np.zeros(4, np.int32)])
 def test_values_of_another_kind_are_not_encoded(values: np.ndarray) -> None:
-    with pytest.raises(TypeError, match="int32 or float64 of two dimensions"):
+    with pytest.raises(TypeError, match="int32 or float64 in columns"):
         encode_block(Block(0, 0, 1.0, 1.0, values))
 
 
