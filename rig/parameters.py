@@ -244,7 +244,7 @@ def _check(key: str, entry: Parameter) -> None:
     if isinstance(value, str):
         good = value in entry.rules
     else:
-        good = low <= value <= high and (entry.unit != "count" or value.is_integer())
+        good = low <= value <= high and (entry.unit != "count" or float(value).is_integer())
     if not good:
         raise InputError(key, _accepts(entry), value)
 
