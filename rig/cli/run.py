@@ -34,7 +34,9 @@ def run(
     pace: Annotated[
         Pace, typer.Option(help="By the wall clock, by `rig step`, or as fast as everything attached keeps up.")
     ] = Pace.REAL_TIME,
-    block_ms: Annotated[float, typer.Option(help="Length of a published block, in ms.")] = 10.0,
+    block_ms: Annotated[
+        float, typer.Option(help="Length of a published block, in ms; the last 3000 are kept for clients that stall.")
+    ] = 10.0,
     listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = DEFAULT_ENDPOINT,
     expose: Annotated[bool, typer.Option("--expose", help="Allow --listen on a host other than 127.0.0.1.")] = False,
     parameters: Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")] = None,

@@ -105,12 +105,16 @@ class _Session:
         self._closed = False
         atexit.register(self.close)
 
-    def drain(self, channel: Any, take: Callable[[Any], None], name: str) -> None:
-        """Give all that arrives in a channel to `take`, on a thread of its own."""
+    def drain(
+        self, channel: Any, take: Callable[[Any], None], name: str, *, first: Callable[[], None] | None = None
+    ) -> None:
+        """Give all that arrives in a channel to `take`, on a thread of its own, after calling `first` there."""
         import zenoh
 
         def loop() -> None:
             try:
+                if first is not None:
+                    first()
                 for item in channel:
                     take(item)
             except BaseException as error:
@@ -293,37 +297,42 @@ def _backlog(port: int) -> dict[int, int]:
 class _Stream:
     """What one lossless subscription has received, and the recovery of what it has not.
 
-    Publishers number their messages, keep the last ones, and say their last number several times a second; all that is zenoh's.
-    Asking for what is missing is done here: zenoh's advanced subscriber (1.10.2) can declare a gap missed without having
-    asked for it, when the gap appears while the query of a heartbeat is open, and loses history in the same way.
+    Publishers number their messages, keep the last ones, and tell their last number several times a second; all that is
+    zenoh's. Asking for what is missing is done here: zenoh's advanced subscriber (1.10.2) can declare a gap missed
+    without having asked for it, when the gap appears while the query of a heartbeat is open, and loses history alike.
 
     Args:
-        ask: Fetches the messages first..last of a publisher from its cache: key, publisher, first, last -> samples.
+        ask: Selected messages of one publisher, from its cache: key, publisher, selection -> samples.
         on_message: Takes key and payload, in order, each once.
         on_miss: Takes key and number of messages that are nowhere to be had.
         history: Begin with what the caches hold, not with the first message that arrives.
+        cache: Number of newest messages that each publisher keeps.
         pause: Waits for a number of seconds.
     """
 
     def __init__(
         self,
-        ask: Callable[[str, _Publisher, int, int], list[Any]],
+        ask: Callable[[str, _Publisher, str], list[Any]],
         on_message: Callable[[str, bytes], None],
         on_miss: Callable[[str, int], None] | None,
         *,
         history: bool,
+        cache: int = _CACHE,
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
         self._ask = ask
         self._on_message = on_message
         self._on_miss = on_miss
         self._history = history
+        self._cache = cache
         self._pause = pause
         self._lock = threading.Lock()
         self._last: dict[_Publisher, int] = {}
         """Number of the last message of each publisher that was taken, or given up."""
-        self._behind: dict[_Publisher, tuple[int | None, int]] = {}
-        """Where a publisher and we stood at its previous heartbeat, if we were behind."""
+        self._floor: dict[_Publisher, int] = {}
+        """Without history: last number of a publisher when it was first heard of; what came later belongs to us."""
+        self._behind: dict[_Publisher, int | None] = {}
+        """Where we stood at a publisher's previous heartbeat, if that was behind it."""
 
     def take(self, sample: Any) -> None:
         """Take the next message that arrived, after all that should have come before it."""
@@ -333,77 +342,101 @@ class _Stream:
         publisher, number = _publisher(info.source_id), info.source_sn
         with self._lock:
             last = self._last.get(publisher)
+            if last is None and number > self._floor.get(publisher, number):
+                last = self._last[publisher] = self._floor[publisher]
             if last is not None and number <= last:
                 return
-            if last is not None or self._history:
+            if number > 0 and (self._history if last is None else number > last + 1):
                 self._recover(str(sample.key_expr), publisher, number - 1)
             self._deliver(publisher, number, sample)
 
+    def begin(self, heads: list[Any]) -> None:
+        """Take the history of publishers of which nothing has arrived, given the newest message that each cache has."""
+        for sample in heads:
+            publisher = _publisher(sample.source_info.source_id)
+            with self._lock:
+                if publisher not in self._last:
+                    self._recover(str(sample.key_expr), publisher, sample.source_info.source_sn)
+
     def heartbeat(self, sample: Any) -> None:
-        """Notice that the last messages of a key are missing: no later one will show it."""
+        """Notice that the last messages of a key are missing, which no later message would show."""
         from zenoh import ext
 
         key, _, rest = str(sample.key_expr).partition("/@adv/pub/")
         zid, eid = rest.split("/")[:2]
-        publisher, number = (zid, int(eid)), int(ext.z_deserialize(ext.UInt32, sample.payload))
+        self.at_least((zid, int(eid)), key, int(ext.z_deserialize(ext.UInt32, sample.payload)))
+
+    def at_least(self, publisher: _Publisher, key: str, number: int) -> None:
+        """Take note that a publisher has sent a message of this number."""
         # While a message is being handed on, others wait in the channel, and nobody knows yet whether any is missing.
         if not self._lock.acquire(blocking=False):
             return
         try:
             last = self._last.get(publisher)
             if last is None and not self._history:
-                # From here on this key is followed; what it published before is nobody's.
-                before = self._behind.setdefault(publisher, (None, number))
-                if number > before[1]:
-                    self._last[publisher] = before[1]
-                    self._recover(key, publisher, number)
-                return
+                last = self._floor.setdefault(publisher, number)
             if last is not None and number <= last:
                 self._behind.pop(publisher, None)
-                return
-            # Messages may be a little later than the heartbeat: they are missing where nothing came until the next.
-            if self._behind.get(publisher, (None, -1))[0] == last and publisher in self._behind:
-                self._recover(key, publisher, number)
+            elif publisher in self._behind and self._behind[publisher] == last:
+                # Nothing came since the previous heartbeat: it is not merely on its way.
                 del self._behind[publisher]
+                if last is not None:
+                    self._last[publisher] = last
+                self._recover(key, publisher, number)
             else:
-                self._behind[publisher] = (last, number)
+                self._behind[publisher] = last
         finally:
             self._lock.release()
 
     def _recover(self, key: str, publisher: _Publisher, until: int) -> None:
-        """Take from the cache what is missing up to a number; what it does not have is reported and given up."""
+        """Take from the cache what is missing up to a number; what it no longer has is reported and given up."""
         last = self._last.get(publisher)
-        # Of a publisher that was never heard, whatever its cache still has is history; what it no longer has is no loss.
+        # What a publisher sent before anything of it was known is history: what its cache no longer has is no loss.
         known = last is not None
-        first = last + 1 if last is not None else max(0, until + 1 - _CACHE)
         missing = 0
+        first = 0 if last is None else last + 1
+        oldest = max(first, until + 1 - self._cache)
+        if known:
+            missing += oldest - first
+        first = oldest
         while first <= until:
             end = min(until, first + _PORTION - 1)
-            for number, sample in self._fetch(key, publisher, first, end, insist=known):
+            found = self._fetch(key, publisher, first, end)
+            if found is None:
+                break
+            for number in sorted(found):
                 if known:
                     missing += number - first
                 known = True
                 first = number + 1
-                self._deliver(publisher, number, sample)
+                self._deliver(publisher, number, found[number])
             if known:
                 missing += end + 1 - first
             first = end + 1
-        self._last[publisher] = max(until, self._last.get(publisher, until))
+        if known:
+            missing += max(0, until + 1 - first)
+        self._last[publisher] = until
         if missing and self._on_miss is not None:
             self._on_miss(key, missing)
 
-    def _fetch(self, key: str, publisher: _Publisher, first: int, end: int, *, insist: bool) -> list[tuple[int, Any]]:
-        """Numbers and samples that a cache has of a range, ascending."""
+    def _fetch(self, key: str, publisher: _Publisher, first: int, end: int) -> dict[int, Any] | None:
+        """Samples by number that a cache has of a range; None where the cache does not answer at all."""
         found: dict[int, Any] = {}
-        for attempt in range(_ATTEMPTS if insist else 1):
+        for attempt in range(_ATTEMPTS):
             if attempt:
-                # The cache may have moved on, but the link may also have been lost, and back in a moment.
+                # The link may have been lost, and be back in a moment.
                 self._pause(_RETRY_S)
-            begin = next(number for number in range(first, end + 2) if number not in found)
-            found |= {reply.source_info.source_sn: reply for reply in self._ask(key, publisher, begin, end)}
-            if len(found) == end + 1 - first:
-                break
-        return sorted((number, sample) for number, sample in found.items() if first <= number <= end)
+            for reply in self._ask(key, publisher, f"_sn={first}..{end}"):
+                if first <= (number := reply.source_info.source_sn) <= end:
+                    found[number] = reply
+            if end in found:
+                # Replies come in order: what is lacking before this one is no longer kept.
+                return found
+            # An empty reply can be a lost one. That these are no longer kept follows from the newest number alone.
+            newest = max((reply.source_info.source_sn for reply in self._ask(key, publisher, "_max=1")), default=end)
+            if newest - end >= self._cache:
+                return found
+        return found or None
 
     def _deliver(self, publisher: _Publisher, number: int, sample: Any) -> None:
         self._last[publisher] = number
@@ -479,21 +512,32 @@ class ZenohClient:
             self._session.drain(subscriber, lambda x: on_message(str(x.key_expr), x.payload.to_bytes()), f"takes {key}")
             return
 
-        def ask(name: str, publisher: _Publisher, first: int, last: int) -> list[Any]:
-            zid, eid = publisher
+        def get(selector: str) -> list[Any]:
             replies = session.get(
-                f"{name}/@adv/*/{zid}/{eid}/**?_sn={first}..{last}",
+                selector,
                 timeout=_LEASE_S,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
             )
             return [reply.ok for reply in replies if reply.ok is not None]
 
+        def ask(name: str, publisher: _Publisher, selection: str) -> list[Any]:
+            zid, eid = publisher
+            return get(f"{name}/@adv/*/{zid}/{eid}/**?{selection}")
+
+        def begin() -> None:
+            if history:
+                heads = get(f"{key}/@adv/**?_max=1")
+                # What arrived before these replies goes first: it may be older than all that the caches still have.
+                while (sample := subscriber.try_recv()) is not None:
+                    stream.take(sample)
+                stream.begin(heads)
+
         stream = _Stream(ask, on_message, on_miss, history=history)
         subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_FIFO))
         heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", _fifo())
         self._declared += [subscriber, heartbeats]
-        self._session.drain(subscriber, stream.take, f"takes {key}")
+        self._session.drain(subscriber, stream.take, f"takes {key}", first=begin)
         self._session.drain(heartbeats, stream.heartbeat, f"heartbeats {key}")
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:

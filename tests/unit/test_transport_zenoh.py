@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import random
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -181,47 +183,192 @@ def test_a_subscriber_with_history_misses_nothing_whenever_it_comes(server: Zeno
         thread.join()
 
 
-def sample(number: int, *, publisher: int = 1) -> Any:
-    info = SimpleNamespace(source_id=SimpleNamespace(zid="a", eid=publisher), source_sn=number)
-    return SimpleNamespace(
-        key_expr=f"rig/{publisher}", payload=SimpleNamespace(to_bytes=lambda: b"%d" % number), source_info=info
-    )
+class Publisher:
+    """One key with its cache, as a subscription sees it."""
+
+    def __init__(self, cache: int = 3000) -> None:
+        self.cache = cache
+        self.kept: deque[int] = deque(maxlen=cache)
+        self.sent = 0
+        self.silent = 0
+        self.cut: int | None = None
+        self.asked: list[str] = []
+
+    def send(self) -> Any:
+        self.kept.append(self.sent)
+        self.sent += 1
+        return self.sample(self.sent - 1)
+
+    def sample(self, number: int) -> Any:
+        info = SimpleNamespace(source_id=SimpleNamespace(zid="a", eid=1), source_sn=number)
+        return SimpleNamespace(
+            key_expr="rig/x", payload=SimpleNamespace(to_bytes=lambda: b"%d" % number), source_info=info
+        )
+
+    def ask(self, key: str, publisher: tuple[str, int], selection: str) -> list[Any]:
+        assert (key, publisher) == ("rig/x", ("a", 1))
+        self.asked.append(selection)
+        if self.silent:
+            self.silent -= 1
+            return []
+        if selection == "_max=1":
+            return [self.sample(self.kept[-1])]
+        first, last = map(int, selection.removeprefix("_sn=").split(".."))
+        replies = [self.sample(number) for number in self.kept if first <= number <= last]
+        if self.cut is not None:  # the link is lost in the middle of the reply
+            replies, self.cut = replies[: self.cut], None
+        return replies
 
 
-class Channel:
-    """What waits while the history is fetched, and what comes later."""
+class Subscription:
+    """A stream under test, and what it gave."""
 
-    def __init__(self, waiting: list[Any], later: list[Any]) -> None:
-        self.waiting = waiting
-        self.later = later
+    def __init__(self, publisher: Publisher, *, history: bool) -> None:
+        self.got: list[int] = []
+        self.missed = 0
+        self.pauses = 0
+        self.publisher = publisher
+        self.stream = _Stream(
+            publisher.ask,
+            lambda _, payload: self.got.append(int(payload)),
+            self._miss,
+            history=history,
+            cache=publisher.cache,
+            pause=self._pause,
+        )
 
-    def try_recv(self) -> Any:
-        return self.waiting.pop(0) if self.waiting else None
+    def _miss(self, key: str, count: int) -> None:
+        assert key == "rig/x"
+        self.missed += count
 
-    def __iter__(self) -> Iterator[Any]:
-        return iter(self.later)
+    def _pause(self, _: float) -> None:
+        self.pauses += 1
+
+    def heartbeat(self) -> None:
+        self.stream.at_least(("a", 1), "rig/x", self.publisher.sent - 1)
 
 
-@pytest.mark.parametrize(
-    ("waiting", "cached", "later", "expected"),
-    [
-        ([], [0, 1, 2], [3, 4], [0, 1, 2, 3, 4]),
-        ([2, 3], [0, 1, 2], [4], [0, 1, 2, 3, 4]),
-        # The process was stopped for longer than the cache holds: what waits is older, and nobody else has it.
-        ([1, 2], [7, 8, 9], [10], [1, 2, 7, 8, 9, 10]),
-        # Recovered meanwhile: the same again.
-        ([1, 2], [7, 8], [7, 8, 9], [1, 2, 7, 8, 9]),
-        ([], [], [0, 1], [0, 1]),
-    ],
-)
-def test_history_and_what_arrives_meanwhile_are_joined_in_order_without_loss(
-    waiting: list[int], cached: list[int], later: list[int], expected: list[int]
-) -> None:
-    got: list[int] = []
-    session = SimpleNamespace(get=lambda *_, **__: [SimpleNamespace(ok=sample(number)) for number in cached])
-    stream = _Stream(session, "rig/**", lambda _, payload: got.append(int(payload)), None)
-    stream.follow_with_history(Channel([sample(n) for n in waiting], [sample(n) for n in later]))
-    assert got == expected
+@pytest.mark.parametrize("seed", range(60))
+def test_whatever_is_dropped_everything_is_delivered_once_in_order_or_reported(seed: int) -> None:
+    """Random drops, silences and heartbeats; caches that hold all, or too little."""
+    draw = random.Random(seed)
+    publisher = Publisher(cache=draw.choice((3000, 3000, 40)))
+    rows = Subscription(publisher, history=seed % 2 == 0)
+    waiting: deque[Any] = deque()
+    begin = draw.choice((0, 0, 500))
+    for _ in range(begin):
+        publisher.send()
+    for _ in range(2000):
+        if draw.random() < 0.01:  # a stall: the channel fills, then the link drops
+            for n in range(draw.randrange(400)):
+                sample = publisher.send()
+                if n < 50:
+                    waiting.append(sample)
+        sample = publisher.send()
+        if draw.random() < 0.9:
+            waiting.append(sample)
+        if draw.random() < 0.02:
+            publisher.silent = draw.randrange(3)
+        if draw.random() < 0.02:
+            publisher.cut = draw.randrange(5)
+        while waiting and draw.random() < 0.7:
+            rows.stream.take(waiting.popleft())
+        if draw.random() < 0.1:
+            rows.heartbeat()
+    for sample in waiting:
+        rows.stream.take(sample)
+    publisher.silent, publisher.cut = 0, None
+    for _ in range(3):
+        rows.heartbeat()
+    assert all(b > a for a, b in zip(rows.got, rows.got[1:], strict=False)), "in order, each once"
+    assert rows.got[-1] == publisher.sent - 1, "heartbeats tell of the last one"
+    assert rows.missed == publisher.sent - rows.got[0] - len(rows.got), "what is not delivered is reported, exactly"
+    if publisher.cache == 3000:
+        # Never further behind than the cache reaches: whatever was lost, and however often the cache was silent.
+        assert rows.missed == 0
+        if rows.stream._history:
+            assert rows.got == list(range(publisher.sent))
+
+
+def test_a_gap_is_always_asked_for_though_a_heartbeat_came_just_before_it() -> None:
+    publisher = Publisher()
+    rows = Subscription(publisher, history=False)
+    rows.stream.take(publisher.send())
+    for _ in range(3):
+        publisher.send()
+    rows.heartbeat()
+    for _ in range(500):
+        publisher.send()
+    rows.stream.take(publisher.send())
+    assert rows.got == list(range(505))
+    assert rows.missed == 0
+
+
+def test_what_waited_while_the_process_was_stopped_is_not_taken_for_a_duplicate() -> None:
+    """The messages in the channel are older than all that the cache still has."""
+    publisher = Publisher(cache=30)
+    rows = Subscription(publisher, history=True)
+    waiting = [publisher.send() for _ in range(20)]
+    for _ in range(100):
+        publisher.send()
+    for sample in [*waiting, publisher.send()]:
+        rows.stream.take(sample)
+    assert rows.got == [*range(20), *range(91, 121)]
+    assert rows.missed == 71
+
+
+def test_recovery_comes_in_portions_and_what_is_surely_gone_is_not_asked_for() -> None:
+    publisher = Publisher()
+    rows = Subscription(publisher, history=False)
+    rows.stream.take(publisher.send())
+    for _ in range(100_000):
+        publisher.send()
+    rows.stream.take(publisher.send())
+    assert len(publisher.asked) <= 4 * 15
+    assert (len(rows.got), rows.missed) == (3001, 97_001)
+    assert rows.pauses == 0
+
+
+def test_a_cache_that_is_silent_for_a_moment_is_asked_again() -> None:
+    publisher = Publisher()
+    rows = Subscription(publisher, history=False)
+    rows.stream.take(publisher.send())
+    for _ in range(10):
+        publisher.send()
+    publisher.silent = 3
+    rows.stream.take(publisher.send())
+    assert rows.got == list(range(12))
+    assert rows.pauses > 0
+
+
+def test_a_rig_that_is_gone_is_given_up_and_the_gap_is_reported() -> None:
+    publisher = Publisher()
+    rows = Subscription(publisher, history=False)
+    rows.stream.take(publisher.send())
+    for _ in range(2000):
+        publisher.send()
+    publisher.silent = 10**9
+    rows.stream.take(publisher.send())
+    assert rows.got == [0, 2001]
+    assert rows.missed == 2000
+    assert rows.pauses <= 3
+
+
+def test_without_history_nothing_from_before_is_taken_and_nothing_after_is_lost() -> None:
+    publisher = Publisher()
+    rows = Subscription(publisher, history=False)
+    for _ in range(10):
+        publisher.send()
+    rows.heartbeat()
+    publisher.send()  # lost
+    publisher.send()  # lost
+    rows.heartbeat()
+    rows.heartbeat()
+    assert rows.got == [10, 11]
+    overtaken = Subscription(publisher, history=False)
+    overtaken.heartbeat()
+    overtaken.stream.take(publisher.sample(11))
+    assert overtaken.got == [11]
 
 
 def test_the_history_of_a_restarted_rig_is_fetched_too() -> None:
