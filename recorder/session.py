@@ -249,7 +249,7 @@ class RecordingSession:
             thread.join()
             trouble = self._finish(writer, reason)
         if not self._rig_lost:
-            self._report(writer)  # lets the rig drop its cache at once
+            self._report(writer, done=True)  # lets the rig drop its cache at once
         return self._summary(writer, reason, trouble)
 
     # On the transport's threads.
@@ -330,7 +330,7 @@ class RecordingSession:
         quiet_s = now_s - max(ended_s, self._heard_s)
         return quiet_s > (QUIET_S if whole or self._rig_lost else RECOVERY_S)
 
-    def _report(self, writer: RecordingWriter) -> None:
+    def _report(self, writer: RecordingWriter, *, done: bool = False) -> None:
         groups = list(writer.table.groups)
         first = sensor_key("probes" if "probes" in groups or not groups else groups[0])
         beat = {
@@ -338,6 +338,7 @@ class RecordingSession:
             "received_index": writer.next_index.get(first, 0),
             "lost": sum(dict(writer.continuity.lost).values()),
             "wall_s": self._wall_ns() / NS,
+            "done": done,
         }
         self._client.report(f"{CLIENTS}/{self._name}", encode_document(beat))
 

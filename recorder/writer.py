@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 from recorder import schemas
 from recorder.views import View, Views
@@ -62,6 +62,32 @@ def check_destination(path: Path, *, force: bool = False) -> None:
             raise InputError("output", "a new file (--force replaces one)", f"{taken}, which exists")
     if not os.access(path.parent, os.W_OK):
         raise InputError("output", "in a folder that can be written", str(path))
+
+
+def _open_part(part: Path, *, replace: bool) -> BinaryIO:
+    """Create the file of a recording in the making, locked for as long as it is open.
+
+    Args:
+        part: The file.
+        replace: What another recording left there may go, but not what one is writing to.
+
+    Raises:
+        InputError: Another recording is writing to it.
+        OSError: The disk refused.
+    """
+    import fcntl
+
+    if replace and part.exists():
+        with part.open("rb+") as old:
+            try:
+                fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError("output", "a file that no other recording is writing to", str(part)) from None
+            # A new file under the name, not the old one emptied: nobody else can have it open.
+            part.unlink()
+    file = part.open("xb")
+    fcntl.flock(file, fcntl.LOCK_EX)
+    return file
 
 
 def check_view_rate(view_rate_hz: float) -> None:
@@ -167,7 +193,7 @@ class RecordingWriter:
         self._topics: dict[str, _Topic] = {}
         self._schema_ids: dict[str, int] = {}
         try:
-            self._file = self.part.open("wb" if force else "xb")
+            self._file = _open_part(self.part, replace=force)
         except OSError as error:
             raise InputError("output", "a file that can be written", f"{self.part} ({error.strerror})") from None
         mcap = Writer(self._file, compression=CompressionType.ZSTD, chunk_size=1 << 20)

@@ -85,14 +85,14 @@ def draw(recording: Recording, path: Path) -> None:
     )
     ax.plot(reach * np.cos(circle), reach * np.sin(circle), "k--", lw=1, label="clearance at rest")
     for label, color, low, high in (
-        ("whirl", _WHIRL, end_s - 0.2, end_s),
         ("impacts", _IMPACTS, blow_s, blow_s + 0.06),
+        ("whirl", _WHIRL, end_s - 0.2, end_s),
         ("before", _BEFORE, blow_s - 0.5, blow_s),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
         ax.plot(probes.column("disk_x")[kept], probes.column("disk_y")[kept], color=color, lw=0.8, label=label)
     ax.set(title="Orbit at the disk", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    ax.legend(loc="center", fontsize=8)
+    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), fontsize=8)
 
     # Displacement, whole run and first impacts.
     for ax, low, high, title in (
@@ -100,9 +100,10 @@ def draw(recording: Recording, path: Path) -> None:
         (axes[0, 2], blow_s - 0.01, blow_s + 0.12, "First impacts"),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
-        width = 0.5 if high == end_s else 1.0
+        # Over the whole run a whirl is a band: both must show through.
+        width, opacity = (0.5, 0.5) if high == end_s else (1.0, 1.0)
         for name, color in (("disk_x", _WHIRL), ("disk_y", _IMPACTS)):
-            ax.plot(probes.times_s[kept], probes.column(name)[kept], color=color, lw=width, label=name)
+            ax.plot(probes.times_s[kept], probes.column(name)[kept], color=color, lw=width, alpha=opacity, label=name)
         ax.set(title=title, xlabel="time [s]", ylabel="[mm]", xlim=(low, high))
         ax.legend(loc="lower right", fontsize=8)
 
@@ -120,9 +121,9 @@ def draw(recording: Recording, path: Path) -> None:
         (axes[2, 0], end_s - 0.05, end_s, "Reactions, settled whirl"),
     ):
         kept = (forces.times_s >= low) & (forces.times_s < high)
-        width = 0.5 if title == "Reactions" else 1.0
-        ax.plot(forces.times_s[kept], pair_x[kept], color=_WHIRL, lw=width, label="E - W")
-        ax.plot(forces.times_s[kept], pair_y[kept], color=_IMPACTS, lw=width, label="N - S")
+        width, opacity = (0.5, 0.5) if title == "Reactions" else (1.0, 1.0)
+        ax.plot(forces.times_s[kept], pair_x[kept], color=_WHIRL, lw=width, alpha=opacity, label="E - W")
+        ax.plot(forces.times_s[kept], pair_y[kept], color=_IMPACTS, lw=width, alpha=opacity, label="N - S")
         ax.set(title=title, xlabel="time [s]", ylabel="[N]", xlim=(low, high))
         ax.legend(loc="lower right", fontsize=8)
 
@@ -137,9 +138,9 @@ def draw(recording: Recording, path: Path) -> None:
 
     ax = axes[2, 2]
     times, frequency, amplitude = waterfall(probes)
-    level = 20 * np.log10(np.maximum(amplitude, 1e-5))
-    mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-80, vmax=5, rasterized=True)
-    figure.colorbar(mesh, ax=ax, label="[dB re 1 mm]")
+    level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
+    mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
+    figure.colorbar(mesh, ax=ax, label="[dB re 1 um]")
     ax.axhline(blow_s, color="w", lw=0.8, ls=":")
     ax.set(title="Full-spectrum waterfall", xlabel="backward  -  frequency [Hz]  -  forward", ylabel="time [s]")
     figure.savefig(path, dpi=110)

@@ -24,7 +24,8 @@ _DOCUMENTS = {
     wire.CATALOGUE: "on request: the channel table with calibration, truth tables with units",
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",
     wire.SCENE: "on request: the scene as it runs, with its seed",
-    f"{wire.CLIENTS}/NAME": "sent by clients twice a second, shown in the status: how far they have come",
+    f"{wire.CLIENTS}/NAME": "sent by clients twice a second, and with `done` when they leave; shown in the status: "
+    "how far they have come",
 }
 _OTHER_COMMANDS = {"stop": "no fields; ends the run", "step": "`ticks`: how far to go; only at `--pace lockstep`"}
 

@@ -209,16 +209,20 @@ def _parse(name: str, data: dict[str, Any], path: Path, loading: tuple[str, ...]
     return ParameterSet(name, title, entries)
 
 
+_NOT_IN_A_FILE = {"request", "float", "int", "str", "constrained-float"}
+
+
 def input_error(error: ValidationError, where: str) -> InputError:
     """The first complaint of a validation as the one line that users see."""
     first = error.errors()[0]
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, InputError):  # a rule over several fields names its own
         return cause
-    place = ".".join(str(part) for part in first["loc"] if not str(part).startswith(("function-", "constrained-")))
+    # Only what stands in the file: not the branches of a union, nor the part that holds a timed command's own fields.
+    place = ".".join(str(part) for part in first["loc"] if str(part) not in _NOT_IN_A_FILE and "[" not in str(part))
     field = ".".join(part for part in (where, place) if part)
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    message = re.sub(r"^\w+ should have ", "a value of ", message)
+    message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
     if first["type"] == "union_tag_invalid":
         context = first.get("ctx", {})
         name = str(context.get("discriminator")).strip("'")

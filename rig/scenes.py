@@ -43,6 +43,9 @@ class _Part(BaseModel):
         return data
 
 
+_DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0), "-x": (-1.0, 0.0), "-y": (0.0, -1.0)}
+
+
 class HammerCommand(_Part):
     """A blow of the pendulum hammer at the disk: a half-sine pulse."""
 
@@ -51,15 +54,22 @@ class HammerCommand(_Part):
     """Peak force [N]."""
     duration_ms: Annotated[FiniteFloat, Field(ge=0.5, le=50.0)] = 5.0
     """Length of the pulse [ms]; the paper gives none."""
-    direction: Literal["x", "y", "-x", "-y"] | Annotated[FiniteFloat, Field(ge=-360.0, le=360.0)] = "x"
+    direction: str | float = "x"
     """Along x (EAST), y (up), or at an angle from x toward y [degrees]."""
+
+    @field_validator("direction")
+    @classmethod
+    def _a_direction(cls, direction: str | float) -> str | float:
+        good = direction in _DIRECTIONS if isinstance(direction, str) else -360.0 <= direction <= 360.0
+        if not good:
+            raise ValueError(f"{', '.join(_DIRECTIONS)}, or an angle from -360 to 360 degrees")
+        return direction
 
     @property
     def cosines(self) -> tuple[float, float]:
         """Direction as a unit vector (x, y)."""
-        named = {"x": (1.0, 0.0), "y": (0.0, 1.0), "-x": (-1.0, 0.0), "-y": (0.0, -1.0)}
         if isinstance(self.direction, str):
-            return named[self.direction]
+            return _DIRECTIONS[self.direction]
         angle = math.radians(self.direction)
         return math.cos(angle), math.sin(angle)
 
@@ -149,9 +159,9 @@ class Drive(_Part):
 class EngineChoice(_Part):
     """How the equations are integrated."""
 
-    name: str = "rk8"
-    step_us: Annotated[int, Field(ge=1, le=1000)] = 25
-    """Step [us], a whole number of ticks."""
+    name: str = next(iter(ENGINES))
+    step_us: Annotated[int, Field(ge=1, le=1000)] = 0
+    """Step [us], a whole number of ticks; left out: the engine's own."""
 
     @field_validator("name")
     @classmethod
@@ -159,6 +169,13 @@ class EngineChoice(_Part):
         if name not in ENGINES:
             raise ValueError(f"one of {', '.join(ENGINES)}")
         return name
+
+    @model_validator(mode="before")
+    @classmethod
+    def _own_step(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "step_us" not in data:
+            return {**data, "step_us": ENGINES.get(data.get("name", next(iter(ENGINES))), 1)}
+        return data
 
 
 class SensorChoice(_Part):
@@ -197,6 +214,13 @@ class Scene(_Part):
     commands: tuple[TimedCommand, ...] = ()
     engine: EngineChoice = EngineChoice()
     sensors: SensorChoice = SensorChoice()
+
+    @field_validator("commands", mode="before")
+    @classmethod
+    def _tables(cls, commands: Any) -> Any:
+        if not isinstance(commands, list | tuple):
+            raise ValueError("a list of tables, each headed [[commands]]")
+        return commands
 
     @field_validator("set")
     @classmethod
@@ -245,6 +269,22 @@ def scene_names() -> list[str]:
     return sorted(path.stem for path in SCENES.glob("*.toml"))
 
 
+def scene_path(name_or_path: str | Path) -> Path:
+    """The file of a scene that comes with the rig, or of a user's own.
+
+    Raises:
+        InputError: There is none.
+    """
+    path = SCENES / f"{name_or_path}.toml"
+    if not path.is_file():
+        path = Path(name_or_path)
+        if path.suffix != ".toml" or not path.is_file():
+            raise InputError(
+                "scene", f"one of {', '.join(scene_names())}, or the path of a .toml file", str(name_or_path)
+            )
+    return path
+
+
 def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None) -> Scene:
     """Load a scene by name, or a user's file by path.
 
@@ -256,13 +296,7 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
     Raises:
         InputError: The one thing that is wrong, with its field.
     """
-    path = SCENES / f"{name_or_path}.toml"
-    if not path.is_file():
-        path = Path(name_or_path)
-        if path.suffix != ".toml" or not path.is_file():
-            raise InputError(
-                "scene", f"one of {', '.join(scene_names())}, or the path of a .toml file", str(name_or_path)
-            )
+    path = scene_path(name_or_path)
     data = {"name": path.stem, **read_toml(path)}
     for key, value in (overrides or {}).items():
         _override(data, key, read_value(value) if isinstance(value, str) else value)

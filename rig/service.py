@@ -293,7 +293,7 @@ class Service:
         self._clock.wake()
 
     def status(self) -> dict[str, Any]:
-        """The status document (see COMMANDS and keys in the README)."""
+        """The status document (see rig/KEYS.md)."""
         health = self._health
         warnings = list(health.get("warnings", []))
         if self._queue.dropped:
@@ -386,7 +386,9 @@ class Service:
         with self._clients_lock:
             for old in [key for key, old in self._clients.items() if row.heard_s - old.heard_s > _CLIENT_FORGOTTEN_S]:
                 del self._clients[old]
-            if name in self._clients or len(self._clients) < _CLIENTS:
+            if document.get("done") is True:
+                self._clients.pop(name, None)
+            elif name in self._clients or len(self._clients) < _CLIENTS:
                 self._clients[name] = row
 
     # ---- on the simulation thread ----

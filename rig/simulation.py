@@ -215,6 +215,9 @@ class Simulation:
             warnings.append(
                 f"the contact law would have pulled at {self._memory[engine.CLAMPS]:.0f} steps and was held at 0"
             )
+        late = sum(tick >= self.end_tick for tick, _ in self._pending)
+        if late:
+            warnings.append(f"{late} commands of the scene lie after its end and will not be given")
         if self._memory[engine.FLOORED]:
             warnings.append(f"{self._memory[engine.FLOORED]:.0f} contacts began slower than contact.speed_floor")
         return {

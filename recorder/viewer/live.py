@@ -142,7 +142,7 @@ class LiveView:
                 if self._end is None:
                     self._painter.note(self._painter.now_s, reason, level="WARN")
                 self._painter.close()
-                self._report()
+                self._report(done=True)
                 return reason
             # An absolute grid is not needed here: a late picture is only late.
             time.sleep(max(0.0, _TICK_S - (time.monotonic() - now_s)))
@@ -163,12 +163,13 @@ class LiveView:
         self._gone_at_s = time.monotonic()
         self._there = there
 
-    def _report(self) -> None:
+    def _report(self, *, done: bool = False) -> None:
         document = {
             "name": NAME,
             "received_index": self._received_index,
             "lost": self.lost,
             "wall_s": self._wall(),
+            "done": done,
         }
         self._client.report(f"{wire.CLIENTS}/{NAME}", wire.encode_document(document))
 

@@ -72,14 +72,14 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
     import time
 
     from drivers.console import Console
-    from rig.kernels import compiled_before
+    from rig.kernels import COMPILE_NOTICE, compiled_before
     from rig.transport.zenoh import ZenohClient
 
     endpoint = f"127.0.0.1:{_free_port()}"
     with _processes(file.with_name("processes.log")) as start:
         say(f"starting the service: rig run stable-run --set drive.speed_hz={speed_hz:g} --listen {endpoint}")
         if not compiled_before():
-            say("its kernels are compiled first, once on this machine (about half a minute)")
+            say(COMPILE_NOTICE)
         arguments = ("--set", f"drive.speed_hz={speed_hz}", "--duration-s", "3600", "--listen", endpoint)
         service = start("run", "stable-run", *arguments)
         _wait_until_up(endpoint, service)
@@ -114,7 +114,8 @@ def _processes(log: Path) -> Iterator[Callable[..., Process]]:
     file: IO[str] = log.open("w", encoding="utf-8")
 
     def start(*arguments: str) -> Process:
-        command = [sys.executable, "-m", "rig.cli.main", *arguments]
+        # -P: a file of the user's own in the present folder must not be taken for a package of ours.
+        command = [sys.executable, "-P", "-m", "rig.cli.main", *arguments]
         started.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=file))
         return started[-1]
 

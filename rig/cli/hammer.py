@@ -15,7 +15,7 @@ def hammer(
     force_n: Annotated[float, typer.Option(help="Peak force, in N.")] = 100.0,
     duration_ms: Annotated[float, typer.Option(help="Length of the half-sine pulse, in ms.")] = 5.0,
     direction: Annotated[
-        str, typer.Option(metavar="x|y|ANGLE", help="Along x or y, or at an angle from x towards y, in degrees.")
+        str, typer.Option(metavar="x|y|-x|-y|ANGLE", help="Along x or y, or at an angle from x towards y, in degrees.")
     ] = "x",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -30,9 +30,13 @@ from rig.errors import InputError, SimulationError
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
 
+_INTERRUPTED = 130
+"""What typer makes of Ctrl-C, and shells expect."""
+
 app = typer.Typer(
     name="rig",
     help="A virtual rotor-stator test rig: simulate, serve, hit, record, view and judge it.",
+    invoke_without_command=True,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -52,6 +56,22 @@ _PANELS: dict[str, dict[str, Any]] = {
     "Recordings and pictures": {"record": record.record, "view": view.view, "info": info.info},
     "Without a clock": {"simulate": simulate.simulate, "bench": bench.bench},
 }
+
+
+@app.callback()
+def _rig(
+    context: typer.Context,
+    *,
+    version: Annotated[bool, typer.Option("--version", is_eager=True, help="Show the version and end.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(f"rig {installed('rotor-stator-rig')}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
 for _panel, _commands in _PANELS.items():
     for _name, _function in _commands.items():
         # A negative value such as `rig speed -1` is a value, not an option: the rig explains what is wrong with it.
@@ -71,8 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
         command = error.ctx.command_path if error.ctx is not None else "rig"
         _fail(f"{error.format_message()} (see `{command} --help`)")
     except (typer.Abort, KeyboardInterrupt):
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
+        _fail("interrupted", status=_INTERRUPTED)
     except BrokenPipeError:
         # The reader of our output has gone (`rig params | head`): nothing is wrong.
         sys.stderr.close()
@@ -80,6 +99,8 @@ def main(arguments: list[str] | None = None) -> None:
     except OSError as error:
         # A disk that is full, a file system that refuses: not a fault of the program.
         _fail(f"{error.filename or 'the system'}: {error.strerror or error}", status=1)
+    if code == _INTERRUPTED:
+        print("rig: interrupted", file=sys.stderr)
     sys.exit(code if isinstance(code, int) else 0)
 
 

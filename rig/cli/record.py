@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.connection import Connect
-from rig.errors import RefusedError
+from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ def record(
 
     check_destination(output, force=force)
     check_view_rate(view_rate_hz)
+    if duration_s is not None and not duration_s > 0.0:
+        raise InputError("duration_s", "above 0", duration_s)
     try:
         with ZenohClient(connect) as client:
             session = RecordingSession(

@@ -50,6 +50,7 @@ def run(
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
     overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
 
+    from rig.kernels import COMPILE_NOTICE, compiled_before
     from rig.scenes import load_scene
     from rig.service import Service
     from rig.simulation import Simulation
@@ -60,7 +61,8 @@ def run(
         simulation = Simulation(loaded)
         block_ticks = _block_ticks(block_ms, simulation)
         service = Service(simulation, server, _clock(pace), block_ticks=block_ticks)
-        typer.echo(f"rig: scene {scene}, {pace}, preparing (the first run on a machine compiles for a while)", err=True)
+        notice = "preparing" if compiled_before() else COMPILE_NOTICE
+        typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
         service.prepare()
         typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
         with _stopping_on_signals(service.stop), _showing(service):

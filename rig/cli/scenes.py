@@ -8,18 +8,22 @@ import typer
 
 
 def scenes(
-    name: Annotated[str | None, typer.Argument(metavar="[SCENE]", help="Show this one in full.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="[SCENE]", help="Show the file of this one.")] = None,
+    *,
+    json_output: Annotated[bool, typer.Option("--json", help="With every field, as a JSON document.")] = False,
 ) -> None:
-    """List the scenes that come with the rig, or show one with every field. Your own is a TOML file of that form."""
+    """List the scenes that come with the rig, or show one. Your own is a TOML file of the same form."""
     import json
 
     from rich.console import Console
     from rich.table import Table
 
-    from rig.scenes import load_scene, scene_document, scene_names
+    from rig.scenes import load_scene, scene_document, scene_names, scene_path
 
     if name is not None:
-        typer.echo(json.dumps(scene_document(load_scene(name)), indent=2))
+        scene = load_scene(name)
+        text = json.dumps(scene_document(scene), indent=2) if json_output else scene_path(name).read_text("utf-8")
+        typer.echo(text.rstrip())
         return
     table = Table(box=None, header_style="bold")
     for heading in ("scene", "seconds", "what happens"):

@@ -36,13 +36,13 @@ def simulate(
     overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
     loaded = load_scene(scene, overrides)
 
-    from rig.kernels import compiled_before
+    from rig.kernels import COMPILE_NOTICE, compiled_before
     from rig.offline import frames
     from rig.simulation import Simulation
 
     simulation = Simulation(loaded)
     if not compiled_before():
-        typer.echo("compiling the kernels, once on this machine (about 20 s) ...", err=True)
+        typer.echo(COMPILE_NOTICE, err=True)
     simulation.warm_up()
     with (
         Progress(console=Console(file=sys.stderr), transient=True, disable=not sys.stderr.isatty()) as progress,

@@ -11,8 +11,8 @@ from __future__ import annotations
 from importlib import import_module
 from types import ModuleType
 
-ENGINES = ("rk8", "rk4")
-"""Names of the engines, the default first."""
+ENGINES = {"rk8": 25, "rk4": 5}
+"""Engines, the default first, and the step [us] at which each closes the energy ledger to 1e-6 in every scene."""
 
 
 def load_engine(name: str) -> ModuleType:

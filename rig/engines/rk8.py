@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rig.engines import fixed_step
-from rig.engines.fixed_step import CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, Tableau, start
+from rig.engines import runge_kutta
+from rig.engines.runge_kutta import CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, Tableau, start
 
 __all__ = ["CLAMPS", "CONTACTS", "FLOORED", "MEMORY", "PEAK_FORCE", "advance", "start"]
 
@@ -37,5 +37,5 @@ TABLEAU = _tableau()
 
 
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.fixed_step.advance`."""
-    fixed_step.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
+    """See `rig.engines` and `rig.engines.runge_kutta.advance`."""
+    runge_kutta.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

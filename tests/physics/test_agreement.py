@@ -29,7 +29,7 @@ import pytest
 
 from rig import InputError, Run, load_parameters, load_scene, simulate
 from rig.engines import load_engine
-from rig.engines.fixed_step import DIVIDED, SCALES
+from rig.engines.runge_kutta import DIVIDED, SCALES
 from rig.kernels import signals as S
 from rig.kernels.contact import ring_force
 from rig.magnets import REACH, MagnetGeometry, field_sum_force, fit_map

@@ -111,7 +111,7 @@ CASES = [
     scene("position is nan", '[initial]\nposition = "given"\ny_mm = nan', "initial.y_mm", "a finite number"),
     scene("blow too hard", HAMMER + "force_n = 1e6", "force_n", "less than or equal to 1000"),
     scene("blow too long", HAMMER + "duration_ms = 51", "duration_ms", "less than or equal to 50"),
-    scene("blow to nowhere", HAMMER + 'direction = "up"', "direction", "'x', 'y', '-x' or '-y'"),
+    scene("blow to nowhere", HAMMER + 'direction = "up"', "direction", "x, y, -x, -y, or an angle"),
     scene("blow with a colour", HAMMER + "colour = 1", "colour", "left out (there is no such field)"),
     scene(
         "speed command above the drive's",
@@ -129,7 +129,7 @@ CASES = [
         "greater than or equal to 0",
     ),
     scene("command without time", '[[commands]]\ncommand = "release"', "commands.0.at_s", "a valid number"),
-    scene("commands are no list", "commands = 3", "commands", "a valid tuple"),
+    scene("commands are no list", "commands = 3", "commands", "each headed [[commands]]"),
     scene("command is no table", "commands = [3]", "commands.0", "a valid dictionary"),
     scene(
         "two releases",
@@ -217,7 +217,7 @@ CASES = [
     change("drive.speed_hz=fast", "drive.speed_hz", "a valid number"),
     change("drive.speed_hz=1e9", "drive.speed_hz", "at most drive.top_speed = 15 Hz"),
     change("engine.step_us=3.5", "engine.step_us", "a valid integer"),
-    change("sensors.groups=probes", "sensors.groups", "a valid tuple"),
+    change("sensors.groups=probes", "sensors.groups", "a list"),
     change("set=3", "set", "a valid dictionary"),
     # Options.
     Case("no such scene", ("simulate", "nosuch", "-o", "out.csv"), "scene", "one of drop, hammer, run-up, stable-run"),
@@ -383,7 +383,7 @@ def simulation() -> Simulation:
         ("hammer", {"force_n": [1]}, "hammer.force_n", "a valid number"),
         ("hammer", {"duration_ms": 0.4}, "hammer.duration_ms", "greater than or equal to 0.5"),
         ("hammer", {"duration_ms": float("inf")}, "hammer.duration_ms", "a finite number"),
-        ("hammer", {"direction": "up"}, "hammer.direction", "'x', 'y', '-x' or '-y'"),
+        ("hammer", {"direction": "up"}, "hammer.direction", "x, y, -x, -y, or an angle"),
         ("hammer", {"direction": 361.0}, "hammer.direction", ""),
         ("hammer", {"colour": "red"}, "hammer.colour", "left out (there is no such field)"),
         ("hammer", {1: 2}, "hammer", "a set of named fields"),

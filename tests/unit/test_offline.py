@@ -151,3 +151,9 @@ def test_only_the_sensors_that_are_on() -> None:
     assert run.sample_unit("hammer") == "N"
     assert run.signals.shape == (100, len(ROW))
     assert len(run.samples["hammer"]) == 100
+
+
+def test_commands_behind_the_end_are_told() -> None:
+    run = simulate(load_scene("hammer"), duration_s=0.01)
+    assert run.events == []
+    assert run.simulation.health()["warnings"] == ["1 commands of the scene lie after its end and will not be given"]

@@ -426,3 +426,25 @@ def test_a_document_without_a_tick_takes_the_latest_time(tmp_path, items):
     write(path, [*items, (EVENTS, encode_document({"event": "warning", "text": "late"}))])
     times = [time_ns for time_ns, _ in Recording.open(path).payloads(EVENTS)]
     assert times == [0, 400_000_000, 399_950_000]
+
+
+def test_a_recording_in_the_making_is_not_replaced(tmp_path, items):
+    path = tmp_path / "run.mcap"
+    with writer(path) as first:
+        for number, (key, payload) in enumerate(items[:50]):
+            first.write(key, payload, number)
+        with pytest.raises(InputError, match="no other recording is writing to"):
+            writer(path, force=True)
+        for number, (key, payload) in enumerate(items[50:], 50):
+            first.write(key, payload, number)
+        first.finish("completed")
+    assert sum(Recording.open(path).messages[key] for key in {key for key, _ in items}) == len(items)
+
+
+def test_what_a_killed_recording_left_is_replaced_by_a_new_file(tmp_path, items):
+    path = tmp_path / "run.mcap"
+    left = path.with_name(path.name + ".part")
+    left.write_bytes(b"what a kill left")
+    write(path, items, force=True)
+    assert Recording.open(path).complete
+    assert not left.exists()

@@ -392,6 +392,14 @@ def test_reports_of_clients_are_in_the_status_with_their_lag() -> None:
         assert "5 client reports could not be read" in status["warnings"]
 
 
+def test_a_client_that_says_goodbye_is_not_one_that_lags() -> None:
+    with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
+        client = rig.listener.client
+        for document in ({"received_index": 5}, {"received_index": 5, "done": True}):
+            client.report(f"{wire.CLIENTS}/recorder", json.dumps(document).encode())
+            assert ("recorder" in rig.console.status()["clients"]) is ("done" not in document)
+
+
 def test_the_number_of_clients_is_bounded() -> None:
     with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
         for n in range(200):
