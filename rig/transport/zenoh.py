@@ -35,8 +35,8 @@ _PATIENCE_S = 20.0
 _HEARTBEAT_S = 0.25
 """How soon a subscriber learns that the last message of a key is missing."""
 _FIFO = 20_000
-"""Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops, and the
-rest is recovered. So many because recovery comes over the same link, which must not be blocked meanwhile."""
+"""Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops (or waits,
+where it is not paced), and the rest is recovered."""
 _PORTION = 200
 """Messages asked for at a time, below 1 MB: while a cache answers its publisher waits, and sockets hold that much."""
 _ATTEMPTS = 4
@@ -99,6 +99,9 @@ class _Session:
     def __init__(self, config: Any) -> None:
         import zenoh
 
+        # A receiving thread waits where it sends a recovery to a stalled link, or fills the channel of a slow callback.
+        # The default of two would leave none for the rest. Read when the first session of a process opens.
+        os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 16))")
         self.session = zenoh.open(config)
         self._threads: list[threading.Thread] = []
         self._closing = threading.Lock()
@@ -116,7 +119,8 @@ class _Session:
                 if first is not None:
                     first()
                 for item in channel:
-                    take(item)
+                    if not self._closed:
+                        take(item)
             except BaseException as error:
                 if self._closed and isinstance(error, zenoh.ZError):
                     return
@@ -130,12 +134,22 @@ class _Session:
         thread.start()
 
     def close(self) -> None:
+        import zenoh
+
         with self._closing:
             if self._closed:
                 return
             self._closed = True
         atexit.unregister(self.close)
-        self.session.close()
+
+        def close() -> None:
+            with contextlib.suppress(zenoh.ZError):
+                self.session.close()
+
+        # Takes 10 s and fails where a callback never returns; the link ends with the process then.
+        closing = threading.Thread(target=close, name="zenoh closes", daemon=True)
+        closing.start()
+        closing.join(timeout=2.0)
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(timeout=1.0)
@@ -164,9 +178,6 @@ class ZenohServer:
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, expose: bool = False, wait: bool = False) -> None:
         import zenoh
 
-        # A thread that sends a recovery waits for its link; the default of two leaves none for requests when two
-        # clients stall in the middle of theirs. Read when the first session of a process opens.
-        os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 8))")
         host, port = parse_endpoint(endpoint, field="listen")
         if host not in LOOPBACK_HOSTS and not expose:
             raise InputError("listen", "on 127.0.0.1 unless --expose is given as well", endpoint)
@@ -450,6 +461,9 @@ def _publisher(entity: Any) -> _Publisher:
 class ZenohClient:
     """A client's side: connects to one rig and listens on nothing. Reconnects by itself when that rig is started again.
 
+    Subscriptions have a link of their own. It backs up when a callback is slow, and then nothing on it is read, which
+    must not hold up requests and the token, and least of all the recovery that this very subscription waits for.
+
     Args:
         endpoint: HOST:PORT of the rig.
         wait_s: How long to wait for a rig to be there [s]; may be infinite.
@@ -460,16 +474,21 @@ class ZenohClient:
     """
 
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0) -> None:
+        self._host, self._port = parse_endpoint(endpoint, field="connect")
+        self.endpoint = endpoint
+        self._declared: list[Any] = []
+        self._streams: _Session | None = None
+        self._session = self._open(wait_s)
+
+    def _open(self, wait_s: float) -> _Session:
         import zenoh
 
-        host, port = parse_endpoint(endpoint, field="connect")
-        self.endpoint = endpoint
         deadline = time.monotonic() + wait_s
         while True:
             left = deadline - time.monotonic()
             config = _config(
                 listen__endpoints=[],
-                connect__endpoints=[_locator(host, port)],
+                connect__endpoints=[_locator(self._host, self._port)],
                 # Opening waits for the link, so that the first request cannot come too early; in slices, so that
                 # Ctrl-C works meanwhile.
                 connect__timeout_ms=round(1000 * min(0.5, max(left, 0.05))),
@@ -477,12 +496,10 @@ class ZenohClient:
                 connect__retry={"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
             )
             try:
-                self._session = _Session(config)
-                break
+                return _Session(config)
             except zenoh.ZError:
                 if time.monotonic() >= deadline:
                     raise self._no_reply() from None
-        self._declared: list[Any] = []
 
     def _no_reply(self) -> NoReplyError:
         return NoReplyError(f"no rig answers at {self.endpoint}; start one with: rig run hammer (see rig run --help)")
@@ -505,17 +522,19 @@ class ZenohClient:
         """
         import zenoh
 
-        session = self._session.session
+        if self._streams is None:
+            self._streams = self._open(5.0)
+        streams, session = self._streams, self._streams.session
         if not lossless:
             subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_RING))
             self._declared.append(subscriber)
-            self._session.drain(subscriber, lambda x: on_message(str(x.key_expr), x.payload.to_bytes()), f"takes {key}")
+            streams.drain(subscriber, lambda x: on_message(str(x.key_expr), x.payload.to_bytes()), f"takes {key}")
             return
 
-        def get(selector: str) -> list[Any]:
-            replies = session.get(
+        def get(link: _Session, selector: str) -> list[Any]:
+            replies = link.session.get(
                 selector,
-                timeout=_LEASE_S,
+                timeout=_PATIENCE_S,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
             )
@@ -523,22 +542,23 @@ class ZenohClient:
 
         def ask(name: str, publisher: _Publisher, selection: str) -> list[Any]:
             zid, eid = publisher
-            return get(f"{name}/@adv/*/{zid}/{eid}/**?{selection}")
+            return get(self._session, f"{name}/@adv/*/{zid}/{eid}/**?{selection}")
 
         def begin() -> None:
             if history:
-                heads = get(f"{key}/@adv/**?_max=1")
-                # What arrived before these replies goes first: it may be older than all that the caches still have.
+                heads = get(streams, f"{key}/@adv/**?_max=1")
+                # What came before these replies, over the same link, goes first: it may be older than all that the
+                # caches still have, where this process was stopped meanwhile.
                 while (sample := subscriber.try_recv()) is not None:
                     stream.take(sample)
                 stream.begin(heads)
 
         stream = _Stream(ask, on_message, on_miss, history=history)
         subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_FIFO))
-        heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", _fifo())
+        heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", zenoh.handlers.RingChannel(_FIFO))
         self._declared += [subscriber, heartbeats]
-        self._session.drain(subscriber, stream.take, f"takes {key}", first=begin)
-        self._session.drain(heartbeats, stream.heartbeat, f"heartbeats {key}")
+        streams.drain(subscriber, stream.take, f"takes {key}", first=begin)
+        streams.drain(heartbeats, stream.heartbeat, f"heartbeats {key}")
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Ask the rig and return its reply.
@@ -592,7 +612,9 @@ class ZenohClient:
         )
 
     def close(self) -> None:
-        """Close the session and with it all that was declared."""
+        """Close both links and with them all that was declared."""
+        if self._streams is not None:
+            self._streams.close()
         self._session.close()
 
     def __enter__(self) -> ZenohClient:

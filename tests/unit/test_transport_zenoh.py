@@ -382,10 +382,58 @@ def test_the_history_of_a_restarted_rig_is_fetched_too() -> None:
             # Before the client can have come back.
             second.publish("rig/events", b"second 0")
             second.publish("rig/sensors/a", b"second 1")
-            until(lambda: second.congestion()["links"] == 1)
+            until(lambda: second.congestion()["links"] == 2)
             second.publish("rig/status", b"second 2")
             until(lambda: len(got) == 4)
     assert sorted(got[1:]) == [b"second 0", b"second 1", b"second 2"]
+
+
+def test_a_callback_that_blocks_holds_up_neither_requests_nor_the_token_nor_its_own_recovery(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Small channel, fast heartbeats: with one link for everything, this never ended."""
+    monkeypatch.setattr("rig.transport.zenoh._FIFO", 50)
+    monkeypatch.setattr("rig.transport.zenoh._HEARTBEAT_S", 0.01)
+    keys, messages = [f"rig/sensors/g{n}" for n in range(6)], 2500
+    got: dict[str, list[int]] = {key: [] for key in keys}
+    seen: list[bool] = []
+    missed: list[int] = []
+    go = threading.Event()
+
+    def take(key: str, payload: bytes) -> None:
+        assert go.wait(60.0)
+        got[key].append(int.from_bytes(payload[:8], "little"))
+
+    with ZenohServer(free_endpoint()) as server, ZenohClient(server.endpoint) as client:
+        server.answer("rig/ping", lambda _: b"pong")
+        client.watch("rig/alive", seen.append)
+        client.subscribe("rig/sensors/*", take, on_miss=lambda _, count: missed.append(count), history=True)
+        for number in range(messages):
+            for key in keys:
+                server.publish(key, number.to_bytes(8, "little") + bytes(2000))
+        assert client.request("rig/ping", timeout_s=20.0) == b"pong"
+        server.announce()
+        until(lambda: seen == [True])
+        go.set()
+        until(lambda: all(len(numbers) == messages for numbers in got.values()), timeout_s=60.0)
+    assert all(numbers == list(range(messages)) for numbers in got.values())
+    assert missed == []
+
+
+def test_closing_does_not_fail_though_a_callback_never_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rig.transport.zenoh._FIFO", 10)
+    never = threading.Event()
+
+    def block(_: str, __: bytes) -> None:
+        never.wait(120.0)
+
+    try:
+        with ZenohServer(free_endpoint()) as server, ZenohClient(server.endpoint) as client:
+            client.subscribe("rig/**", block)
+            for _ in range(500):
+                server.publish("rig/status", bytes(1000))
+    finally:
+        never.set()
 
 
 def test_a_lossy_subscriber_that_stalls_keeps_the_newest(server: ZenohServer) -> None:
@@ -432,7 +480,7 @@ def test_congestion_counts_links_and_sees_no_stall_where_there_is_none(server: Z
     with ZenohClient(server.endpoint) as client:
         client.subscribe("rig/**", lambda *_: None)
         server.publish("rig/status", b"x")
-        until(lambda: server.congestion()["links"] == 1)
+        until(lambda: server.congestion()["links"] == 2)
         assert server.congestion()["stalls"] == 0
 
 
