@@ -8,46 +8,64 @@ from typing import Any
 
 import numpy as np
 
+from rig.contacts import ContactPair, ReferenceImpact, ResolvedLaw, resolve
 from rig.errors import InputError
 from rig.kernels.constants import Constants, Contact, House, Magnet, Shaft
 from rig.kernels.signals import N_VECTOR
-from rig.magnets import MagnetGeometry, RadialMap, fit_map
+from rig.levels import ModelLevels
+from rig.magnets import (
+    MagnetGeometry,
+    MagnetMap,
+    cylinder_stiffness,
+    fit_cylinder_map,
+    fit_map,
+    linear_map,
+    map_force,
+    model_errors,
+)
 from rig.parameters import ParameterSet
 
 
-def restitution_factor(restitution: float) -> float:
-    """Damping factor c that returns the restitution asked for in a free impact, for any exponent of the normal law.
-
-    Solves c (1+e) = ln[(1+c)/(1-c e)]; c = 0.1665 at e = 0.9. Follows from integrating dv/ddelta over one impact of
-    F = K delta^n (1 + c delta'/v0).
-
-    Raises:
-        InputError: e is below 0.04, where the factor comes within rounding of its pole at 1/e, or above 1.
-    """
-    if not 0.04 <= restitution <= 1.0:
-        raise InputError("contact.restitution", "from 0.04 to 1", restitution)
-    if restitution == 1.0:
-        return 0.0
-    from scipy.optimize import brentq
-
-    def residual(c: float) -> float:
-        return c * (1.0 + restitution) - math.log((1.0 + c) / (1.0 - c * restitution))
-
-    # c = 0 solves it as well; the wanted root lies between that and the pole at 1/e.
-    root: Any = brentq(residual, 1e-9 + 0.5 * (1.0 - restitution), (1.0 - 1e-12) / restitution, xtol=1e-14)
-    return float(root)
-
-
-def contact_stiffness(parameters: ParameterSet, *, inside: bool) -> float:
-    """K = 4/3 E* sqrt(R*) [N/m^1.5] of a sphere in a spherical seat (inside) or of two spheres (the Hertz formulas)."""
+def contact_pair(parameters: ParameterSet) -> ContactPair:
+    """Shaft and ring, as the stiffness laws take them."""
     compliance = sum(
         (1.0 - parameters[f"{body}.poisson_ratio"] ** 2) / parameters[f"{body}.young_modulus"]
         for body in ("shaft", "ring")
     )
-    shaft = parameters["shaft.radius"]
-    ring = shaft + parameters["ring.clearance"]
-    reduced = ring * shaft / (ring - shaft) if inside else ring * shaft / (ring + shaft)
-    return 4.0 / 3.0 / compliance * math.sqrt(reduced)
+    return ContactPair(
+        shaft_radius=parameters["shaft.radius"],
+        clearance=parameters["ring.clearance"],
+        width=parameters["ring.width"],
+        modulus=1.0 / compliance,
+    )
+
+
+def reference_impact(parameters: ParameterSet) -> ReferenceImpact:
+    """The shaft's mass at the ring against the inner house, as if both were free."""
+    return ReferenceImpact(
+        shaft_mass=parameters["shaft.transverse_inertia"] / parameters["shaft.arm_ring"] ** 2,
+        house_mass=parameters["house.inner_mass"],
+        speed=parameters["contact.reference_speed"],
+    )
+
+
+def normal_law(parameters: ParameterSet) -> ResolvedLaw:
+    """The normal contact law: rules and numbers resolved to K, n, c and D.
+
+    Raises:
+        InputError: A law does not hold here, or two of them exclude each other.
+    """
+    p = parameters
+    chosen = {
+        field: p.rule(f"contact.{key}") or p[f"contact.{key}"]
+        for field, key in (
+            ("stiffness", "stiffness"),
+            ("exponent", "exponent"),
+            ("damping", "damping_factor"),
+            ("viscous", "viscous_damping"),
+        )
+    }
+    return resolve(**chosen, restitution=p["contact.restitution"], pair=contact_pair(p), impact=reference_impact(p))
 
 
 @dataclass(frozen=True)
@@ -57,15 +75,19 @@ class Model:
     Attributes:
         parameters: Where its numbers come from.
         constants: What the kernels take.
-        magnet_map: The fitted map with its error (its stiffness is that of eq. 35, `constants.magnet.stiffness` the
-            one used).
+        magnets: The magnets behind the map.
+        magnet_map: The map of the level, with its error against the model that it was fitted to (its stiffness is that
+            model's, `constants.magnet.stiffness` the one used).
+        travel: Farthest that a ring at rest lets the shaft get from the magnets' centre [m].
         resolved: Numbers behind the parameters that are rules, in each parameter's unit.
         sag: Shaft at the ring in static equilibrium with the magnets on [m], vertical.
     """
 
     parameters: ParameterSet
     constants: Constants
-    magnet_map: RadialMap
+    magnets: MagnetGeometry
+    magnet_map: MagnetMap
+    travel: float
     resolved: dict[str, float]
     sag: float
 
@@ -88,15 +110,21 @@ class Model:
         y = self.sag if ring_y is None else ring_y + contact.offset_y
         if math.hypot(x, y) >= arm:
             raise InputError("shaft.arm_ring", f"above {math.hypot(x, y):g} m, to reach where it starts", arm)
-        beta = math.asin(x / arm)
-        gamma = math.asin(-y / (arm * math.cos(beta)))
+        beta, gamma = x / arm, -y / arm
+        if self.constants.levels.euler:
+            beta = math.asin(x / arm)
+            gamma = math.asin(-y / (arm * math.cos(beta)))
         vector = np.zeros(N_VECTOR)
         vector[0], vector[1], vector[9] = gamma, beta, spin
         return vector
 
 
-def build_model(parameters: ParameterSet) -> Model:
-    """Resolve every rule, fit the magnet map, find the equilibrium."""
+def magnet_geometry(parameters: ParameterSet) -> MagnetGeometry:
+    """The magnets of a parameter set.
+
+    Raises:
+        InputError: They overlap.
+    """
     p = parameters
     geometry = MagnetGeometry(
         number=round(p["magnet.count"]),
@@ -106,20 +134,46 @@ def build_model(parameters: ParameterSet) -> Model:
         bearing_radius=p["magnet.bearing_radius"],
         magnetisation=p["magnet.magnetisation"],
     )
-    if geometry.bearing_radius <= geometry.bearing_magnet_radius + geometry.shaft_magnet_radius:
+    if geometry.gap <= 0.0:
         raise InputError(
             "magnet.bearing_radius", "above the sum of both magnets' radii", p.entries["magnet.bearing_radius"].value
         )
-    radial = fit_map(geometry)
+    most = int(math.pi / math.asin(geometry.bearing_magnet_radius / geometry.bearing_radius))
+    if geometry.number > most:
+        raise InputError("magnet.count", f"at most {most}, or the magnets would overlap", geometry.number)
+    return geometry
+
+
+def build_model(parameters: ParameterSet, levels: ModelLevels | None = None) -> Model:
+    """Resolve every rule, fit the magnet map, find the equilibrium.
+
+    Args:
+        parameters: The numbers.
+        levels: How much of the model takes part; None for all of it.
+    """
+    levels = levels or ModelLevels()
+    p = parameters
+    geometry = magnet_geometry(p)
+    magnet_map = _MAPS[levels.magnet](geometry)
     resolved: dict[str, float] = {}
 
-    stiffness = radial.stiffness if p.rule("magnet.stiffness") else p["magnet.stiffness"]
+    rule = p.rule("magnet.stiffness")
+    if rule == "eq35":
+        stiffness = fit_map(geometry).stiffness
+    elif rule == "cylinders":
+        stiffness = cylinder_stiffness(geometry)
+    else:
+        stiffness = p["magnet.stiffness"]
     mass = p["shaft.mass"]
     magnet = Magnet(
+        terms=magnet_map.terms,
         stiffness=stiffness,
-        a3=radial.a3,
-        a5=radial.a5,
-        a7=radial.a7,
+        a3=magnet_map.a3,
+        a5=magnet_map.a5,
+        a7=magnet_map.a7,
+        ripple=magnet_map.ripple,
+        growth=magnet_map.growth,
+        number=magnet_map.number,
         damping_x=2.0 * p["shaft.damping_ratio_x"] * math.sqrt(stiffness * mass),
         damping_y=2.0 * p["shaft.damping_ratio_y"] * math.sqrt(stiffness * mass),
     )
@@ -138,23 +192,17 @@ def build_model(parameters: ParameterSet) -> Model:
     )
     sag = _sag(shaft, magnet)
 
-    rule = p.rule("contact.stiffness")
-    contact_k = contact_stiffness(p, inside=rule == "internal-sphere") if rule else p["contact.stiffness"]
-    restitution = p["contact.restitution"]
-    rule = p.rule("contact.damping_factor")
-    if rule == "exact":
-        factor = restitution_factor(restitution)
-    elif rule == "lankarani-nikravesh":
-        factor = 0.75 * (1.0 - restitution**2)
-    else:
-        factor = p["contact.damping_factor"]
+    law = normal_law(p).law
     offset_y = sag if p.rule("ring.offset_y") else p["ring.offset_y"]
     contact = Contact(
         clearance=p["ring.clearance"],
         offset_x=p["ring.offset_x"],
         offset_y=offset_y,
-        stiffness=contact_k,
-        damping_factor=factor,
+        stiffness=law.stiffness,
+        exponent=law.exponent,
+        damping_factor=law.damping_factor,
+        viscous_damping=law.viscous_damping,
+        restitution=p["contact.restitution"],
         friction=p["contact.friction"],
         smoothing_speed=p["contact.smoothing_speed"],
         speed_floor=p["contact.speed_floor"],
@@ -172,15 +220,32 @@ def build_model(parameters: ParameterSet) -> Model:
         preload=p["house.preload"],
     )
     for key, value, unit in (
-        ("contact.stiffness", contact_k, 1.0),
-        ("contact.damping_factor", factor, 1.0),
+        ("contact.stiffness", law.stiffness, 1.0),
+        ("contact.exponent", law.exponent, 1.0),
+        ("contact.damping_factor", law.damping_factor, 1.0),
+        ("contact.viscous_damping", law.viscous_damping, 1.0),
         ("ring.offset_y", offset_y, 1e-3),
         ("magnet.stiffness", stiffness, 1e3),
     ):
         if p.rule(key):
             resolved[key] = value / unit
-    constants = Constants(shaft=shaft, magnet=magnet, contact=contact, house=house, torque_gain=p["drive.torque_gain"])
-    return Model(parameters=p, constants=constants, magnet_map=radial, resolved=resolved, sag=sag)
+    constants = Constants(
+        levels=levels.constants(),
+        shaft=shaft,
+        magnet=magnet,
+        contact=contact,
+        house=house,
+        torque_gain=p["drive.torque_gain"],
+    )
+    return Model(
+        parameters=p,
+        constants=constants,
+        magnets=geometry,
+        magnet_map=magnet_map,
+        travel=(math.hypot(contact.offset_x, contact.offset_y) + contact.clearance) * shaft.arm_magnet / shaft.arm_ring,
+        resolved=resolved,
+        sag=sag,
+    )
 
 
 def describe(model: Model) -> dict[str, Any]:
@@ -190,10 +255,19 @@ def describe(model: Model) -> dict[str, Any]:
         document["values"][key]["resolved"] = value
     document["derived"] = {
         "magnet_map_error": model.magnet_map.error,
-        "magnet_stiffness_eq35_kn_m": model.magnet_map.stiffness * 1e-3,
+        "magnet_stiffness_eq35_kn_m": fit_map(model.magnets).stiffness * 1e-3,
+        "magnet_stiffness_cylinders_kn_m": cylinder_stiffness(model.magnets) * 1e-3,
+        "magnet_reach_mm": model.magnets.reach * 1e3,
+        "magnet_travel_mm": model.travel * 1e3,
+        "magnet_errors": [error._asdict() for error in model_errors(model.magnets, model.travel)],
         "sag_at_ring_mm": model.sag * 1e3,
+        "contact_fit_error": normal_law(model.parameters).fit_error,
     }
     return document
+
+
+_MAPS = {"linear": linear_map, "map": fit_map, "cylinders": fit_cylinder_map}
+"""By level."""
 
 
 def _sag(shaft: Shaft, magnet: Magnet) -> float:
@@ -201,10 +275,10 @@ def _sag(shaft: Shaft, magnet: Magnet) -> float:
     from scipy.optimize import brentq
 
     def torque(gamma: float) -> float:
-        # Both forces are vertical and share the lever cos(Gamma), which drops out.
-        r = shaft.arm_magnet * math.sin(gamma)
-        s = r * r
-        lift = magnet.stiffness * r * (1.0 + s * (magnet.a3 + s * (magnet.a5 + s * magnet.a7)))
+        # Both forces are vertical, one of the magnets being straight below, and share the lever cos(Gamma), which
+        # drops out.
+        depth = np.array([-shaft.arm_magnet * math.sin(gamma)])
+        lift = float(map_force(np.zeros(1), depth, magnet)[0, 1])
         return shaft.arm_magnet * lift - shaft.arm_centre * shaft.mass * shaft.gravity
 
     if torque(0.02 / shaft.arm_magnet) < 0.0:

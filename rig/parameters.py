@@ -31,7 +31,7 @@ DEFAULT_SET = "corrected"
 
 SI = {
     "1": 1.0, "count": 1.0, "kg": 1.0, "kg m^2": 1.0, "m": 1.0, "mm": 1e-3, "rad": 1.0, "Pa": 1.0, "N": 1.0,
-    "N/m": 1.0, "kN/m": 1e3, "N/m^1.5": 1.0, "N s/m": 1.0, "m/s": 1.0, "mm/s": 1e-3, "m/s^2": 1.0,
+    "N/m": 1.0, "kN/m": 1e3, "N/m^n": 1.0, "N s/m": 1.0, "m/s": 1.0, "mm/s": 1e-3, "m/s^2": 1.0,
     "A/m": 1.0, "kA/m": 1e3, "N m s": 1.0, "Hz": 2.0 * math.pi, "Hz/s": 2.0 * math.pi,
 }  # fmt: skip
 """Every unit that a set may use, in SI (a frequency becomes rad/s)."""

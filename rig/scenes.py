@@ -23,6 +23,7 @@ from pydantic import (
 from rig.channels import default_table
 from rig.engines import ENGINES
 from rig.errors import InputError
+from rig.levels import ModelLevels
 from rig.parameters import DEFAULT_SET, ParameterSet, input_error, load_parameters, read_toml
 
 SCENES = Path(__file__).with_name("scenes")
@@ -162,6 +163,8 @@ class EngineChoice(_Part):
     name: str = next(iter(ENGINES))
     step_us: Annotated[int, Field(ge=1, le=1000)] = 0
     """Step [us], a whole number of ticks; left out: the engine's own."""
+    tolerance: Annotated[FiniteFloat, Field(ge=0.0, le=0.1)] = 0.0
+    """Scaled error a step of an adaptive engine; left out: the engine's own."""
 
     @field_validator("name")
     @classmethod
@@ -173,9 +176,10 @@ class EngineChoice(_Part):
     @model_validator(mode="before")
     @classmethod
     def _own_step(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "step_us" not in data:
-            return {**data, "step_us": ENGINES.get(data.get("name", next(iter(ENGINES))), 1)}
-        return data
+        method = ENGINES.get(data.get("name", next(iter(ENGINES)))) if isinstance(data, dict) else None
+        if method is None:
+            return data
+        return {"step_us": method.step_us, "tolerance": method.tolerance, **data}
 
 
 class SensorChoice(_Part):
@@ -188,6 +192,8 @@ class SensorChoice(_Part):
     """Rate of the truth that is published beside the sensors [Hz]."""
     noise: bool = True
     """False leaves the sensors' noise out."""
+    chain: Literal["ideal", "full"] = "full"
+    """The full chain of filter, noise, offset and converter, or what the sensor measures and nothing else."""
 
     @field_validator("groups")
     @classmethod
@@ -212,6 +218,7 @@ class Scene(_Part):
     initial: Initial = Initial()
     drive: Drive = Drive()
     commands: tuple[TimedCommand, ...] = ()
+    model: ModelLevels = ModelLevels()
     engine: EngineChoice = EngineChoice()
     sensors: SensorChoice = SensorChoice()
 
@@ -228,6 +235,21 @@ class Scene(_Part):
         # Every set has the same keys and limits, so any will do to check them.
         load_parameters().override(changes)
         return changes
+
+    @model_validator(mode="after")
+    def _engine_takes_model(self) -> Scene:
+        method = ENGINES[self.engine.name]
+        for field, takes in (("friction", method.frictions), ("contact", method.contacts)):
+            if getattr(self.model, field) not in takes:
+                must = f"one of {', '.join(takes)} with engine {self.engine.name}"
+                raise InputError(f"model.{field}", must, getattr(self.model, field))
+        if self.engine.tolerance and not method.tolerance:
+            raise InputError(
+                "engine.tolerance",
+                f"left out with engine {self.engine.name}, whose steps are fixed",
+                self.engine.tolerance,
+            )
+        return self
 
     @model_validator(mode="after")
     def _whole_rates(self) -> Scene:

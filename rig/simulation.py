@@ -6,6 +6,7 @@ an integer tick of 1 us. How a run is cut into calls changes no bit of the resul
 
 from __future__ import annotations
 
+import copy
 import math
 from bisect import insort
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ import numpy as np
 
 from rig.channels import ChannelTable, default_table
 from rig.engines import load_engine
+from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE
 from rig.errors import InputError, SimulationError
 from rig.kernels import signals as S
 from rig.kernels.constants import Inputs
@@ -32,7 +34,7 @@ TICK_RATE_HZ = 1_000_000
 ROW_TICKS = 25
 """Rows are observed every 25 us, more often where rates ask for it, or every step where that is longer.
 
-The sensors' filters run at this rate.
+The sensors' filters run at this rate. Ideal sensors have none: their rows are as far apart as samples and truth.
 """
 ENERGY_ALARM = 1e-3
 """Energy residual over dissipated energy above which a run is in doubt."""
@@ -66,6 +68,20 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
+class Snapshot:
+    """State of a run at one tick, to be picked up again by `Simulation.restore`."""
+
+    scene: Scene
+    changing: dict[str, Any] = field(repr=False)
+
+
+_CHANGING = (
+    "tick", "first_row", "_segments", "_engaged", "_blow", "_pending", "_y", "_memory", "_last", "_conditioners",
+    "_keyphasor",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
 class _Segment:
     """The speed target from a tick on: `speed + slope (t - tick)` [rad/s]."""
 
@@ -91,15 +107,16 @@ class Simulation:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.tick_rate_hz = TICK_RATE_HZ
-        self.model = build_model(scene.load_parameters())
+        self.model = build_model(scene.load_parameters(), scene.model)
         self._engine = load_engine(scene.engine.name)
         self._step_ticks = scene.engine.step_us
         sensors = scene.sensors
         periods = [TICK_RATE_HZ // rate for rate in (sensors.rate_hz, sensors.truth_rate_hz)]
-        # The coarsest grid up to ROW_TICKS that steps, samples and truth all fall on.
+        # The coarsest grid that steps, samples and truth all fall on; filters need ROW_TICKS.
         grid = math.gcd(*periods)
+        longest = ROW_TICKS if sensors.chain == "full" else grid
         self._stride = max(
-            n for n in range(1, max(1, ROW_TICKS // self._step_ticks) + 1) if grid % (n * self._step_ticks) == 0
+            n for n in range(1, max(1, longest // self._step_ticks) + 1) if grid % (n * self._step_ticks) == 0
         )
         self.row_ticks = self._stride * self._step_ticks
         self.block_ticks = math.lcm(*periods)
@@ -107,7 +124,9 @@ class Simulation:
         self.table: ChannelTable = default_table().only(sensors.groups, sensors.rate_hz)
         row_rate = TICK_RATE_HZ // self.row_ticks
         self._conditioners = {
-            name: Conditioner(group, row_rate_hz=row_rate, seed=scene.seed, noise=sensors.noise)
+            name: Conditioner(
+                group, row_rate_hz=row_rate, seed=scene.seed, noise=sensors.noise, ideal=sensors.chain == "ideal"
+            )
             for name, group in self.table.groups.items()
         }
         self._keyphasor = Keyphasor() if "drive" in sensors.groups else None
@@ -123,7 +142,7 @@ class Simulation:
         )
         speed = self._segments[0].speed
         self._y = self._initial_state(speed)
-        self._memory = np.zeros(self._engine.MEMORY)
+        self._memory = np.zeros(MEMORY)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None
 
@@ -132,7 +151,9 @@ class Simulation:
         """The observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
         row = np.empty((1, S.N_ROW))
         constants, inputs = self.model.constants, self._inputs()
-        self._engine.start(constants, inputs, self._y, self._memory)
+        self._engine.start(
+            constants, inputs, self._y, self._memory, float(self._step_ticks), self.scene.engine.tolerance
+        )
         y, memory = self._y.copy(), self._memory.copy()
         self._engine.advance(constants, inputs, y, memory, self.tick, self._step_ticks, 1, 1, row)
         return row[0]
@@ -208,25 +229,46 @@ class Simulation:
         last = first if self._last is None else self._last
         balance = energy_balance(last[None, :], first)
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
-        engine, warnings = self._engine, []
+        warnings = []
         if abs(residual) > ENERGY_ALARM * max(dissipated, 1e-6):
             warnings.append(f"energy residual {residual:.2e} J is above {ENERGY_ALARM:g} of what was dissipated")
-        if self._memory[engine.CLAMPS]:
-            warnings.append(
-                f"the contact law would have pulled at {self._memory[engine.CLAMPS]:.0f} steps and was held at 0"
-            )
+        if self._memory[CLAMPS]:
+            warnings.append(f"the contact law would have pulled at {self._memory[CLAMPS]:.0f} steps and was held at 0")
         late = sum(tick >= self.end_tick for tick, _ in self._pending)
         if late:
             warnings.append(f"{late} commands of the scene lie after its end and will not be given")
-        if self._memory[engine.FLOORED]:
-            warnings.append(f"{self._memory[engine.FLOORED]:.0f} contacts began slower than contact.speed_floor")
+        if self._memory[CEILING]:
+            warnings.append(
+                f"{self._memory[CEILING]:.0f} steps stayed above engine.tolerance at the least length, or ran out of parts"
+            )
+        if self._memory[FLOORED]:
+            warnings.append(f"{self._memory[FLOORED]:.0f} contacts began slower than contact.speed_floor")
         return {
             "spin_hz": float(last[COLUMN["theta_rate"]]) / (2.0 * math.pi),
-            "energy": {"residual_j": residual, "dissipated_j": dissipated},
-            "contacts": int(self._memory[engine.CONTACTS]),
-            "peak_normal_force_n": float(self._memory[engine.PEAK_FORCE]),
+            "energy": {
+                "residual_j": residual,
+                "dissipated_j": dissipated,
+                "residual_share": residual / max(dissipated, 1e-6),
+            },
+            "contacts": int(self._memory[CONTACTS]),
+            "peak_normal_force_n": float(self._memory[PEAK_FORCE]),
             "warnings": warnings,
         }
+
+    def snapshot(self) -> Snapshot:
+        """All that changes in a run, so that `restore` goes on from here bit for bit, on this build."""
+        _ = self.first_row
+        return Snapshot(scene=self.scene, changing=copy.deepcopy({name: self.__dict__[name] for name in _CHANGING}))
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back, or over, to a snapshot of the same scene.
+
+        Raises:
+            InputError: It is of another scene.
+        """
+        if snapshot.scene != self.scene:
+            raise InputError("snapshot", f"one of this scene, {self.scene.name}", snapshot.scene.name)
+        self.__dict__.update(copy.deepcopy(snapshot.changing))
 
     def catalogue(self) -> dict[str, Any]:
         """Channel table with calibrations, and the columns of the truth tables, as a JSON document."""
@@ -322,10 +364,10 @@ class Simulation:
             return
         shaft, magnet = self.model.constants.shaft, self.model.constants.magnet
         gamma, beta = self._y[0], self._y[1]
-        x, y = math.sin(beta), -math.sin(gamma) * math.cos(beta)
-        _, _, stored = magnet_force(
-            shaft.arm_magnet * x, shaft.arm_magnet * y, magnet.stiffness, magnet.a3, magnet.a5, magnet.a7
-        )
+        x, y = beta, -gamma
+        if self.model.constants.levels.euler:
+            x, y = math.sin(beta), -math.sin(gamma) * math.cos(beta)
+        _, _, stored = magnet_force(shaft.arm_magnet * x, shaft.arm_magnet * y, magnet)
         self._y[S.RELEASE_WORK] -= stored
         self._engaged = False
 

@@ -13,6 +13,8 @@ from rig.cli import (
     hammer,
     info,
     keys,
+    laws,
+    magnets,
     params,
     record,
     release,
@@ -43,7 +45,14 @@ app = typer.Typer(
 )
 
 _PANELS: dict[str, dict[str, Any]] = {
-    "Start here": {"demo": demo.demo, "scenes": scenes.scenes, "params": params.params, "keys": keys.keys},
+    "Start here": {
+        "demo": demo.demo,
+        "scenes": scenes.scenes,
+        "params": params.params,
+        "laws": laws.laws,
+        "magnets": magnets.magnets,
+        "keys": keys.keys,
+    },
     "The rig as a service": {
         "run": run.run,
         "hammer": hammer.hammer,

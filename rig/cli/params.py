@@ -49,9 +49,24 @@ def params(
     console = Console(width=None if Console().is_terminal else 200)
     console.print(table)
     derived = document["derived"]
+    errors = {(error["model"], error["against"]): error for error in derived["magnet_errors"]}
+    fit, shape = errors["far-field map", "far-field sum"], errors["far-field map", "exact cylinders"]
     console.print(
-        f"\nderived: shaft sags {-derived['sag_at_ring_mm']:.3f} mm at the ring; eq. 35 with these magnets gives "
-        f"{derived['magnet_stiffness_eq35_kn_m']:.3f} kN/m at the centre; the radial map follows the field sum within "
-        f"{derived['magnet_map_error']:.1%} over 10 mm\nsets: {', '.join(set_names())}",
+        f"\nderived: shaft sags {-derived['sag_at_ring_mm']:.3f} mm at the ring; with these magnets eq. 35 gives "
+        f"{derived['magnet_stiffness_eq35_kn_m']:.3f} kN/m at the centre, exact cylinders "
+        f"{derived['magnet_stiffness_cylinders_kn_m']:.3f} kN/m; the radial map follows the field sum within "
+        f"{fit['over_reach']:.1%} over {derived['magnet_reach_mm']:.3g} mm and {fit['over_travel']:.1%} where the ring "
+        f"lets the shaft go, and exact cylinders as stiff within {shape['over_reach']:.0%} and "
+        f"{shape['over_travel']:.0%} (see `rig magnets`)",
+        highlight=False,
+    )
+    if derived["contact_fit_error"]:
+        console.print(
+            f"K and n stand for the contact's stiffness law within {derived['contact_fit_error']:.1%} of its force "
+            "(see `rig laws`)",
+            highlight=False,
+        )
+    console.print(
+        f"sets: {', '.join(set_names())}",
         highlight=False,
     )

@@ -1,18 +1,43 @@
 """Engines: one integration method a file, one protocol, chosen by name in a scene.
 
-An engine is a module with `MEMORY` (length of its memory), `start(constants, inputs, y, memory)` and
-`advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)`: it moves state `y` and `memory` on in
-place by `steps` steps of `step_ticks` and writes one row of `rig.kernels.signals.ROW` every `stride` steps, the first
-at the start. It knows no clock, no I/O and no threads, and its result does not depend on how a run is cut into calls.
+An engine is a module with `start(constants, inputs, y, memory, step_ticks, tolerance)` and
+`advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)`: it moves state `y` and `memory` (shape
+(MEMORY,), counters first, see `rig.engines.memory`) on in place by `steps` steps of `step_ticks` and writes one row of
+`rig.kernels.signals.ROW` every `stride` steps, the first at the start. It knows no clock, no I/O and no threads, and
+its result does not depend on how a run is cut into calls.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 from types import ModuleType
+from typing import NamedTuple
 
-ENGINES = {"rk8": 25, "rk4": 5}
-"""Engines, the default first, and the step [us] at which each closes the energy ledger to 1e-6 in every scene."""
+
+class Method(NamedTuple):
+    """What there is to know of an engine before it is loaded."""
+
+    title: str
+    step_us: int
+    """Its own step [us]; of an adaptive engine, the grid that its steps end on."""
+    tolerance: float
+    """Scaled error a step that an adaptive engine aims at; 0: fixed steps."""
+    frictions: tuple[str, ...]
+    """Friction laws it can take (`rig.levels`)."""
+    contacts: tuple[str, ...] = ("compliant",)
+
+
+_BY_STATE = ("none", "smoothed", "switch")
+
+ENGINES = {
+    "split": Method(
+        "exact linear flow and one contact kick a step, order 2", 25, 0.0, ("none", "exact"), ("impact", "compliant")
+    ),
+    "rk8": Method("Dormand-Prince 8(5,3), events located", 25, 1e-8, (*_BY_STATE, "exact")),
+    "tsit5": Method("Tsitouras 5(4), adaptive, events located", 500, 1e-6, (*_BY_STATE, "exact")),
+    "rk4": Method("classical Runge-Kutta, events located", 5, 0.0, (*_BY_STATE, "exact")),
+}
+"""Engines, the default first."""
 
 
 def load_engine(name: str) -> ModuleType:

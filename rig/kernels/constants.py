@@ -22,15 +22,16 @@ class Shaft(NamedTuple):
 
 
 class Magnet(NamedTuple):
-    """Radial map of the magnets, with viscous damping at the same point.
+    """Map of the magnets (`rig.kernels.magnet` has its formula), with viscous damping at the same point."""
 
-    F = -stiffness (r + a3 r^3 + a5 r^5 + a7 r^7).
-    """
-
-    stiffness: float  # [N/m]
+    terms: int  # LINEAR, RADIAL or RIPPLED of rig.kernels.magnet
+    stiffness: float  # [N/m] at the centre
     a3: float  # [1/m^2]
     a5: float  # [1/m^4]
     a7: float  # [1/m^6]
+    ripple: float  # [1/m^(number-2)]
+    growth: float  # [1/m^2]
+    number: int  # of magnets
     damping_x: float  # [N s/m]
     damping_y: float  # [N s/m]
 
@@ -41,8 +42,11 @@ class Contact(NamedTuple):
     clearance: float  # [m]
     offset_x: float  # [m]
     offset_y: float  # [m]
-    stiffness: float  # [N/m^1.5]
+    stiffness: float  # [N/m^exponent]
+    exponent: float  # [1]
     damping_factor: float  # [1]
+    viscous_damping: float  # [N s/m]
+    restitution: float  # [1] of the rigid impact law
     friction: float  # [1]
     smoothing_speed: float  # [m/s]
     speed_floor: float  # [m/s]
@@ -63,9 +67,20 @@ class House(NamedTuple):
     preload: float  # [N]
 
 
+class Levels(NamedTuple):
+    """How much of the model takes part; a level that is off costs a predicted branch."""
+
+    euler: bool  # exact rotations and gyroscopic coupling of large tilts; else small angles
+    inner_house: bool  # moves; else it is fixed and passes forces on
+    outer_house: bool  # the same; only with an inner house
+    compliant: bool  # contact force; else a rigid impact law
+    friction: int  # NO_FRICTION ... EXACT of rig.kernels.contact
+
+
 class Constants(NamedTuple):
     """All constants of a model."""
 
+    levels: Levels
     shaft: Shaft
     magnet: Magnet
     contact: Contact

@@ -6,12 +6,31 @@ import math
 
 from numba import njit
 
+NO_FRICTION, SMOOTHED, SWITCH, EXACT = range(4)
+"""Friction laws: none; mu F_n tanh(v_t/v_s); clamped linear law that aims at rolling within v_s; Coulomb's, set-valued.
+
+The set-valued law is a matter of phases: sliding forward, sliding backward, rolling. An engine has to keep them.
+"""
+FLIGHT, TOUCHING, FORWARD, BACKWARD, ROLLING = range(5)
+"""Phases: apart; touching, with a friction that the state alone decides; touching and sliding with v_t > 0, with
+v_t < 0; touching and rolling, the friction force being what keeps v_t at 0."""
+
 
 @njit(cache=True)
-def normal_force(penetration, rate, onset_speed, stiffness, damping_factor):
-    """Compliant normal force with hysteresis damping, eq. 44.
+def elastic_force(penetration, stiffness, exponent):
+    """Elastic part of the normal force, K delta^n [N], for a penetration >= 0 [m]."""
+    if exponent == 1.5:
+        return stiffness * penetration * math.sqrt(penetration)
+    if exponent == 1.0:
+        return stiffness * penetration
+    return stiffness * penetration**exponent
 
-    F = K delta^1.5 (1 + c delta'/v0), clamped at 0: a contact cannot pull.
+
+@njit(cache=True)
+def normal_force(penetration, rate, onset_speed, contact):
+    """Compliant normal force, eq. 44 and its family.
+
+    F = K delta^n (1 + c delta'/v0) + D delta', clamped at 0: a contact cannot pull.
 
     Trap: v0 -> 0 at grazing onsets blows the damping term up; the caller floors v0.
 
@@ -19,43 +38,49 @@ def normal_force(penetration, rate, onset_speed, stiffness, damping_factor):
         penetration: delta [m]; no force unless positive.
         rate: delta' [m/s], positive while the bodies approach.
         onset_speed: v0 [m/s], delta' at the onset of this contact, floored.
-        stiffness: K [N/m^1.5].
-        damping_factor: c [1].
+        contact: Constants of the contact: K, n, c, D.
 
     Returns:
         Force [N] and its elastic part [N], both >= 0.
     """
     if penetration <= 0.0:
         return 0.0, 0.0
-    elastic = stiffness * penetration * math.sqrt(penetration)
-    return max(0.0, elastic * (1.0 + damping_factor * rate / onset_speed)), elastic
+    elastic = elastic_force(penetration, contact.stiffness, contact.exponent)
+    force = elastic * (1.0 + contact.damping_factor * rate / onset_speed) + contact.viscous_damping * rate
+    return max(0.0, force), elastic
 
 
 @njit(cache=True)
-def friction_force(force, sliding_speed, friction, smoothing_speed):
-    """Coulomb friction, regularised: mu F_n tanh(v_t / v_s).
+def friction_force(law, phase, force, sliding_speed, contact):
+    """Friction against the sliding speed of eq. 39 (not sgn(theta') of eq. 12), where the state or the phase decides.
 
-    It acts against the sliding speed of eq. 39 (not sgn(theta') of eq. 12).
+    Smoothed: mu F_n tanh(v_t / v_s). Exact, while it slides: mu F_n with the sign of the phase.
 
-    Trap: below sliding at about v_s the contact creeps by v_s atanh(needed / mu), and an explicit step must stay below
-    about 2 m_t v_s / (mu F_n).
+    Trap: below sliding at about v_s the smoothed law creeps by v_s atanh(needed / mu), and an explicit step must stay
+    below about 2 m_t v_s / (mu F_n).
 
     Args:
+        law: One of the friction laws.
+        phase: One of the phases.
         force: F_n [N].
         sliding_speed: v_t [m/s].
-        friction: mu [1].
-        smoothing_speed: v_s [m/s].
+        contact: Constants of the contact: mu, v_s.
 
     Returns:
-        Force [N], positive against a positive sliding speed.
+        Force [N], positive against a positive sliding speed; 0 for a rolling phase and for the switch law, whose force
+        depends on the whole motion (`rig.kernels.dynamics`).
     """
-    return friction * force * math.tanh(sliding_speed / smoothing_speed)
+    if phase == FORWARD:
+        return contact.friction * force
+    if phase == BACKWARD:
+        return -contact.friction * force
+    if law == SMOOTHED and phase == TOUCHING:
+        return contact.friction * force * math.tanh(sliding_speed / contact.smoothing_speed)
+    return 0.0
 
 
 @njit(cache=True)
-def ring_force(
-    ex, ey, vx, vy, surface_speed, clearance, onset_speed, stiffness, damping_factor, friction, smoothing_speed
-):
+def ring_force(ex, ey, vx, vy, surface_speed, onset_speed, law, phase, contact):
     """Force of the ring on the shaft, eqs. 12 and 44 in the plane of the ring.
 
     Frame: n = e/|e| points from the ring's centre to the shaft's, t = (-n_y, n_x). F = -F_n n - F_t t acts on the
@@ -67,30 +92,30 @@ def ring_force(
         vx: Its rate, x [m/s].
         vy: Its rate, y [m/s].
         surface_speed: Speed of the shaft's surface from spin, R_S w [m/s].
-        clearance: r0 [m].
         onset_speed: v0 [m/s].
-        stiffness: K [N/m^1.5].
-        damping_factor: c [1].
-        friction: mu [1].
-        smoothing_speed: v_s [m/s].
+        law: Friction law.
+        phase: Phase of the contact; no force in flight.
+        contact: Constants of the contact.
 
     Returns:
         Force on the shaft x, y [N]; normal force, its elastic part, friction force [N]; penetration [m]; its rate,
-        sliding speed [m/s].
+        sliding speed [m/s]; n_x, n_y.
     """
     distance = math.sqrt(ex * ex + ey * ey)
-    penetration = distance - clearance
+    penetration = distance - contact.clearance
     if distance == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, penetration, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, penetration, 0.0, 0.0, 1.0, 0.0
     per_distance = 1.0 / distance
     nx = ex * per_distance
     ny = ey * per_distance
     rate = vx * nx + vy * ny
     sliding = vy * nx - vx * ny + surface_speed
-    force, elastic = normal_force(penetration, rate, onset_speed, stiffness, damping_factor)
+    if phase == FLIGHT:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, penetration, rate, sliding, nx, ny
+    force, elastic = normal_force(penetration, rate, onset_speed, contact)
     tangential = 0.0
     if force > 0.0:
-        tangential = friction_force(force, sliding, friction, smoothing_speed)
+        tangential = friction_force(law, phase, force, sliding, contact)
     return (
         -force * nx + tangential * ny,
         -force * ny - tangential * nx,
@@ -100,4 +125,6 @@ def ring_force(
         penetration,
         rate,
         sliding,
+        nx,
+        ny,
     )

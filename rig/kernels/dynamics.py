@@ -23,7 +23,7 @@ from numba import njit
 
 from rig.kernels import signals as S
 from rig.kernels.angles import sin_cos
-from rig.kernels.contact import ring_force
+from rig.kernels.contact import ROLLING, SWITCH, TOUCHING, ring_force
 from rig.kernels.house import pair_readings
 from rig.kernels.magnet import magnet_force
 
@@ -51,20 +51,44 @@ def gap(constants, y):
     """Penetration of the shaft into the ring [m] (negative: gap) and its rate [m/s]."""
     contact = constants.contact
     arm = constants.shaft.arm_ring
-    sin_g, cos_g = sin_cos(y[0])
-    sin_b, cos_b = sin_cos(y[1])
+    if constants.levels.euler:
+        sin_g, cos_g = sin_cos(y[0])
+        sin_b, cos_b = sin_cos(y[1])
+        turned = sin_g * sin_b * y[8]
+    else:
+        sin_g, cos_g, sin_b, cos_b, turned = y[0], 1.0, y[1], 1.0, 0.0
     ex = arm * sin_b - y[3] - contact.gap_counts_outer * y[5] - contact.offset_x
     ey = -arm * sin_g * cos_b - y[4] - contact.gap_counts_outer * y[6] - contact.offset_y
     vx = arm * cos_b * y[8] - y[10] - contact.gap_counts_outer * y[12]
-    vy = -arm * (cos_g * cos_b * y[7] - sin_g * sin_b * y[8]) - y[11] - contact.gap_counts_outer * y[13]
+    vy = -arm * (cos_g * cos_b * y[7] - turned) - y[11] - contact.gap_counts_outer * y[13]
     distance = math.sqrt(ex * ex + ey * ey)
     if distance == 0.0:
         return -contact.clearance, 0.0
     return distance - contact.clearance, (ex * vx + ey * vy) / distance
 
 
+@njit(cache=True)
+def unit_response(constants, inputs, sin_g, cos_g, sin_b, cos_b, nx, ny):
+    """Rate of the sliding speed for a friction force of 1 N [m/s^2 per N]: -(inverse mass along the ring), below 0."""
+    shaft = constants.shaft
+    force_x, force_y = shaft.arm_ring * ny, -shaft.arm_ring * nx
+    per_Ixx = 1.0 / shaft.transverse_inertia
+    ddG = -cos_g * force_y * per_Ixx / cos_b
+    ddb = (cos_b * force_x + sin_b * sin_g * force_y) * per_Ixx
+    ax = shaft.arm_ring * cos_b * ddb
+    ay = shaft.arm_ring * (-cos_g * cos_b * ddG + sin_g * sin_b * ddb)
+    response = ay * nx - ax * ny
+    if constants.levels.inner_house:
+        response -= 1.0 / constants.house.inner_mass
+    if not inputs.ideal_drive:
+        response -= shaft.radius * shaft.radius / shaft.polar_inertia
+    elif constants.levels.euler:
+        response += shaft.radius * ddG * sin_b
+    return response
+
+
 @njit(cache=True, forceinline=True)
-def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, y, dy, out):
+def evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy, out):
     """Rates of the state and of the integrals, and what is observed, at one instant.
 
     Args:
@@ -73,13 +97,14 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
         tick: Whole tick of the instant.
         fraction: Ticks beyond it.
         onset_speed: v0 of the running contact [m/s].
-        touching: False leaves the contact force out (free flight up to a located onset).
-        observe: False leaves `out` alone but for the penetration, its rate and the normal force.
+        phase: Phase of the contact (`rig.kernels.contact`); FLIGHT leaves its force out, up to a located onset.
+        observe: False leaves `out` alone but for the penetration, its rate, the sliding speed and the contact forces.
         y: State and integrals, shape (N_VECTOR,).
         dy: Their rates, out, shape (N_VECTOR,).
         out: Observed quantities, out, shape (N_OBSERVED,).
     """
     # params:
+    levels = constants.levels
     shaft, magnet, contact, house = constants.shaft, constants.magnet, constants.contact, constants.house
     Ixx, Izz = shaft.transverse_inertia, shaft.polar_inertia
     lA, lB, lI = shaft.arm_ring, shaft.arm_magnet, shaft.arm_disk
@@ -87,12 +112,22 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     dG, db, dth = y[7], y[8], y[9]
     x_ih, y_ih, x_oh, y_oh = y[3], y[4], y[5], y[6]
     vx_ih, vy_ih, vx_oh, vy_oh = y[10], y[11], y[12], y[13]
-    sG, cG = sin_cos(y[0])
-    sb, cb = sin_cos(y[1])
-    w = dth + dG * sb
+    if levels.euler:
+        sG, cG = sin_cos(y[0])
+        sb, cb = sin_cos(y[1])
+        w = dth + dG * sb
+        spread = dG * dG + db * db
+        turning = dG * db
+        drag = dG * dG * sb * cb
+    else:
+        sG, cG, sb, cb = y[0], 1.0, y[1], 1.0
+        w = dth
+        spread = turning = drag = 0.0
     # Direction of the axis and its rate.
     ux, uy, uz = sb, -sG * cb, cG * cb
-    dux, duy = cb * db, -(cG * cb * dG - sG * sb * db)
+    dux, duy = cb * db, -cG * cb * dG
+    if levels.euler:
+        duy += sG * sb * db
 
     # Contact at the ring.
     both = contact.gap_counts_outer
@@ -100,19 +135,14 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     ey = lA * uy - y_ih - both * y_oh - contact.offset_y
     vx = lA * dux - vx_ih - both * vx_oh
     vy = lA * duy - vy_ih - both * vy_oh
-    Fx, Fy, Fn, elastic, Ft, delta, rate, sliding = ring_force(
-        ex, ey, vx, vy, shaft.radius * w, contact.clearance, onset_speed, contact.stiffness, contact.damping_factor,
-        contact.friction, contact.smoothing_speed,
-    )  # fmt: skip
-    if not touching:
-        Fx, Fy, Fn, elastic, Ft = 0.0, 0.0, 0.0, 0.0, 0.0
+    Fx, Fy, Fn, elastic, Ft, delta, rate, sliding, nx, ny = ring_force(
+        ex, ey, vx, vy, shaft.radius * w, onset_speed, levels.friction, phase, contact
+    )
 
     # Magnets and their damping.
     magnet_x = magnet_y = magnet_energy = damping_x = damping_y = 0.0
     if inputs.magnet_engaged:
-        magnet_x, magnet_y, magnet_energy = magnet_force(
-            lB * ux, lB * uy, magnet.stiffness, magnet.a3, magnet.a5, magnet.a7
-        )
+        magnet_x, magnet_y, magnet_energy = magnet_force(lB * ux, lB * uy, magnet)
         damping_x = -magnet.damping_x * lB * dux
         damping_y = -magnet.damping_y * lB * duy
 
@@ -126,34 +156,85 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     hammer_y = hammer * inputs.hammer_y
     weight = -shaft.mass * shaft.gravity
 
-    Lx = lA * Fx + lB * (magnet_x + damping_x) + lI * (unbalance_x + hammer_x)
-    Ly = lA * Fy + lB * (magnet_y + damping_y) + lI * (unbalance_y + hammer_y) + shaft.arm_centre * weight
+    # Torques about the pivot by lateral forces, without the contact's.
+    Lx = lB * (magnet_x + damping_x) + lI * (unbalance_x + hammer_x)
+    Ly = lB * (magnet_y + damping_y) + lI * (unbalance_y + hammer_y) + shaft.arm_centre * weight
+
+    # Houses. What does not move passes its force on.
+    beam_x = beam_y = stored_v = stored_h = stretch = slip = 0.0
+    ax_ih = ay_ih = ax_oh = ay_oh = 0.0
+    north = south = east = west = house.preload
+    if levels.inner_house:
+        north, south, stored_v = pair_readings(y_ih - y_oh, house.pair_stiffness_vertical, house.preload)
+        stretch = x_ih - x_oh
+        slip = vx_ih - vx_oh
+        beam_x = house.inner_beam_stiffness * stretch + house.inner_beam_damping * slip
+        ax_ih = -beam_x / house.inner_mass
+        ay_ih = -(north - south) / house.inner_mass
+    if levels.outer_house:
+        east, west, stored_h = pair_readings(x_oh, house.pair_stiffness_horizontal, house.preload)
+        beam_y = house.outer_beam_stiffness * y_oh + house.outer_beam_damping * vy_oh
+        ax_oh = (beam_x - (east - west)) / house.outer_mass
+        ay_oh = ((north - south) - beam_y) / house.outer_mass
 
     # Euler's equations.
     # Reciprocals of constants leave the loop; divisions would not.
-    per_Ixx, per_Izz = 1.0 / Ixx, 1.0 / Izz
-    ddG = ((-cG * Ly - Izz * w * db) * per_Ixx + 2.0 * dG * db * sb) / cb
-    ddb = (cb * Lx + sb * sG * Ly + Izz * w * dG * cb) * per_Ixx - dG * dG * sb * cb
+    per_Ixx, per_Izz, per_inner = 1.0 / Ixx, 1.0 / Izz, 1.0 / house.inner_mass
+    drive = constants.torque_gain * (drive_speed(inputs, tick, fraction) - dth)
+    if phase == ROLLING or (phase == TOUCHING and levels.friction == SWITCH and Fn > 0.0):
+        # The friction that keeps the sliding speed from changing: its rate is linear in the force.
+        torque_x, torque_y = Lx + lA * Fx, Ly + lA * Fy
+        ddG = ((-cG * torque_y - Izz * w * db) * per_Ixx + 2.0 * turning * sb) / cb
+        ddb = (cb * torque_x + sb * sG * torque_y + Izz * w * dG * cb) * per_Ixx - drag
+        dw = drive * per_Izz
+        if inputs.ideal_drive:
+            dw = inputs.speed_slope
+            if levels.euler:
+                dw += ddG * sb + turning * cb
+        ax = lA * (cb * ddb - sb * db * db) if levels.euler else lA * ddb
+        ay = -lA * ddG
+        if levels.euler:
+            ay = lA * (-cG * cb * ddG + sG * sb * ddb + sG * cb * spread + 2.0 * cG * sb * turning)
+        if levels.inner_house:
+            ax -= ax_ih - Fx * per_inner
+            ay -= ay_ih - Fy * per_inner
+        ax -= both * ax_oh
+        ay -= both * ay_oh
+        along = vy * nx - vx * ny
+        change = ay * nx - ax * ny - along * rate / (delta + contact.clearance) + shaft.radius * dw
+        response = unit_response(constants, inputs, sG, cG, sb, cb, nx, ny)
+        if phase == ROLLING:
+            Ft = -change / response
+        else:
+            # Leine's switch model as a clamped law: it brings v_t to 0 within some v_s / (largest friction).
+            limit = contact.friction * Fn
+            Ft = -change / response + limit * sliding / contact.smoothing_speed
+            Ft = min(max(Ft, -limit), limit)
+        Fx += Ft * ny
+        Fy -= Ft * nx
+    Lx += lA * Fx
+    Ly += lA * Fy
+    ddG = ((-cG * Ly - Izz * w * db) * per_Ixx + 2.0 * turning * sb) / cb
+    ddb = (cb * Lx + sb * sG * Ly + Izz * w * dG * cb) * per_Ixx - drag
+    # theta' differs from the spin by the share of Gamma' along the shaft.
+    share = ddG * sb + turning * cb if levels.euler else 0.0
     if inputs.ideal_drive:
-        dw = inputs.speed_slope + ddG * sb + dG * db * cb
+        dw = inputs.speed_slope + share
         torque = Izz * dw + shaft.radius * Ft
     else:
-        torque = constants.torque_gain * (drive_speed(inputs, tick, fraction) - dth)
+        torque = drive
         dw = (torque - shaft.radius * Ft) * per_Izz
-    ddth = dw - ddG * sb - dG * db * cb
-
-    # Houses.
-    north, south, stored_v = pair_readings(y_ih - y_oh, house.pair_stiffness_vertical, house.preload)
-    east, west, stored_h = pair_readings(x_oh, house.pair_stiffness_horizontal, house.preload)
-    stretch = x_ih - x_oh
-    slip = vx_ih - vx_oh
-    beam_x = house.inner_beam_stiffness * stretch + house.inner_beam_damping * slip
-    beam_y = house.outer_beam_stiffness * y_oh + house.outer_beam_damping * vy_oh
-    per_inner, per_outer = 1.0 / house.inner_mass, 1.0 / house.outer_mass
-    ax_ih = (-Fx - beam_x) * per_inner
-    ay_ih = (-Fy - (north - south)) * per_inner
-    ax_oh = (beam_x - (east - west)) * per_outer
-    ay_oh = ((north - south) - beam_y) * per_outer
+    ddth = dw - share
+    if levels.inner_house:
+        ax_ih -= Fx * per_inner
+        ay_ih -= Fy * per_inner
+    if not levels.outer_house:
+        # The support carries what the inner house, or the ring itself, passes on.
+        across = beam_x if levels.inner_house else -Fx
+        beam_y = north - south if levels.inner_house else -Fy
+        east, west = house.preload + 0.5 * across, house.preload - 0.5 * across
+        if not levels.inner_house:
+            north, south = house.preload + 0.5 * beam_y, house.preload - 0.5 * beam_y
 
     # out: rates of the state
     dy[0] = dG
@@ -193,10 +274,10 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     out[S.PENETRATION] = delta
     out[S.PENETRATION_RATE] = rate
     out[S.NORMAL_FORCE] = Fn
-    if not observe:
-        return
     out[S.FRICTION_FORCE] = Ft
     out[S.SLIDING_SPEED] = sliding
+    if not observe:
+        return
     out[S.ONSET_SPEED] = onset_speed
     out[S.P_N] = north
     out[S.P_S] = south
@@ -207,10 +288,11 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
     out[S.OUTER_AX] = ax_oh
     out[S.OUTER_AY] = ay_oh
     # Reaction at the pivot, R = M a_C - sum of the applied forces (eqs. 20-21), from the axis's acceleration.
-    spread = dG * dG + db * db
-    ddux = cb * ddb - sb * db * db
-    dduy = -cG * cb * ddG + sG * sb * ddb + sG * cb * spread + 2.0 * cG * sb * dG * db
-    dduz = -sG * cb * ddG - cG * sb * ddb - cG * cb * spread + 2.0 * sG * sb * dG * db
+    ddux, dduy, dduz = ddb, -ddG, 0.0
+    if levels.euler:
+        ddux = cb * ddb - sb * db * db
+        dduy = -cG * cb * ddG + sG * sb * ddb + sG * cb * spread + 2.0 * cG * sb * turning
+        dduz = -sG * cb * ddG - cG * sb * ddb - cG * cb * spread + 2.0 * sG * sb * turning
     inertia = shaft.mass * shaft.arm_centre
     out[S.PIVOT_X] = inertia * ddux - (Fx + magnet_x + damping_x + unbalance_x + hammer_x)
     out[S.PIVOT_Y] = inertia * dduy - (Fy + magnet_y + damping_y + unbalance_y + hammer_y + weight)
@@ -236,7 +318,7 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, touching, observe, 
         + stored_v
         + stored_h
     )
-    out[S.CONTACT] = 0.4 * elastic * delta if delta > 0.0 else 0.0
+    out[S.CONTACT] = elastic * delta / (contact.exponent + 1.0) if delta > 0.0 else 0.0
     # Angular momentum about the pivot in the fixed frame: Ixx (G' cos b X + b' Y) + Izz w Z, with B2's axes X, Y, Z.
     out[S.ANGULAR_X] = Ixx * dG * cb * cb + Izz * w * ux
     out[S.ANGULAR_Y] = Ixx * (dG * cb * sG * sb + db * cG) + Izz * w * uy

@@ -1,28 +1,52 @@
-"""Magnet force at the shaft's end: the radial map, fitted to the field sum that is in `rig.magnets`."""
+"""Magnet force at the shaft's end: the map that is fitted to the models in `rig.magnets`."""
 
 from __future__ import annotations
 
 from numba import njit
 
+LINEAR, RADIAL, RIPPLED = range(3)
+"""How many terms of the map take part: a spring; hardening with the radius; the magnets one by one as well."""
 
-@njit(cache=True)
-def magnet_force(x, y, stiffness, a3, a5, a7):
-    """Restoring force and potential of the radial map.
 
-    F = -K (r + a3 r^3 + a5 r^5 + a7 r^7) r/|r|, with its potential, so that the energy ledger is exact.
+@njit(cache=True, forceinline=True)
+def magnet_force(x, y, magnet):
+    """Restoring force and potential of the map.
+
+    The potential is K [r^2/2 + a3 r^4/4 + a5 r^6/6 + a7 r^8/8 + ripple r^N (1 + growth r^2) cos(N angle)], the angle
+    counted from straight below, where one of the N magnets stands; the force is its exact gradient, so that the energy
+    ledger closes. r^N cos(N angle) is the real part of w^N with w = -y + i x: products, no angle.
+
+    Left as it is written, the function takes numpy arrays of places too (`rig.magnets`).
 
     Args:
         x: Shaft at the magnets, horizontal [m].
         y: Shaft at the magnets, vertical [m].
-        stiffness: K at the centre [N/m].
-        a3: Hardening [1/m^2].
-        a5: Hardening [1/m^4].
-        a7: Hardening [1/m^6].
+        magnet: Constants of the magnets.
 
     Returns:
         Force x, y [N] and potential [J], 0 at the centre.
     """
     s = x * x + y * y
-    gain = -stiffness * (1.0 + s * (a3 + s * (a5 + s * a7)))
-    potential = 0.5 * stiffness * s * (1.0 + s * (a3 / 2.0 + s * (a5 / 3.0 + s * a7 / 4.0)))
-    return gain * x, gain * y, potential
+    if magnet.terms == LINEAR:
+        return -magnet.stiffness * x, -magnet.stiffness * y, 0.5 * magnet.stiffness * s
+    gain = -magnet.stiffness * (1.0 + s * (magnet.a3 + s * (magnet.a5 + s * magnet.a7)))
+    potential = 0.5 * magnet.stiffness * s * (1.0 + s * (magnet.a3 / 2.0 + s * (magnet.a5 / 3.0 + s * magnet.a7 / 4.0)))
+    if magnet.terms == RADIAL:
+        return gain * x, gain * y, potential
+    # p = w^(N-1) by squaring: the bits of N-1 say which squares take part.
+    wx, wy = -y, x
+    px, py = 1.0, 0.0
+    qx, qy = wx, wy
+    bits = magnet.number - 1
+    while bits > 0:
+        if bits & 1:
+            px, py = px * qx - py * qy, px * qy + py * qx
+        qx, qy = qx * qx - qy * qy, 2.0 * qx * qy
+        bits >>= 1
+    amplitude = magnet.stiffness * magnet.ripple
+    wave = px * wx - py * wy
+    grown = amplitude * (1.0 + magnet.growth * s)
+    gain -= 2.0 * amplitude * magnet.growth * wave
+    # d(w^N)/dx = N p i and d(w^N)/dy = -N p.
+    side = magnet.number * grown
+    return gain * x + side * py, gain * y + side * px, potential + grown * wave

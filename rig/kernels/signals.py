@@ -87,7 +87,7 @@ OBSERVED = (
     Signal("gravity_energy", "J", "Shaft, from the level of the pivot"),
     Signal("magnet_energy", "J", "Stored in the magnets, from the centre"),
     Signal("house_energy", "J", "Stored in beams and transducers, from the preloaded rest"),
-    Signal("contact_energy", "J", "Stored in the contact, 2/5 K delta^2.5"),
+    Signal("contact_energy", "J", "Stored in the contact, K delta^(n+1)/(n+1)"),
     Signal("angular_momentum_x", "N m s", "Shaft about the pivot, x"),
     Signal("angular_momentum_y", "N m s", "Shaft about the pivot, y"),
     Signal("angular_momentum_z", "N m s", "Shaft about the pivot, z"),

@@ -84,12 +84,15 @@ def channel_filter(channel: Channel, row_rate_hz: float) -> np.ndarray:
 class Conditioner:
     """Turns rows into counts for one group, block by block; cutting a run into blocks in another way changes no bit.
 
+    An ideal one has range and converter only: no filter, no coupling, no noise.
+
     Each channel draws its noise from a generator of its own, keyed by seed and name: leaving a channel out does not
     change the others.
     """
 
-    def __init__(self, group: Group, *, row_rate_hz: int, seed: int, noise: bool) -> None:
+    def __init__(self, group: Group, *, row_rate_hz: int, seed: int, noise: bool, ideal: bool = False) -> None:
         self.group = group
+        self.ideal = ideal
         self.every = row_rate_hz // group.rate_hz
         self.rows_seen = 0
         channels = group.channels
@@ -120,6 +123,10 @@ class Conditioner:
         if self.rows_seen == 0:
             self._settle(rows[0])
         first = -self.rows_seen % self.every
+        if self.ideal:
+            self.rows_seen += len(rows)
+            volts = np.clip(self._bias + self._gain * rows[first :: self.every, self._columns], self._low, self._high)
+            return np.clip(np.rint(volts / self._lsb), -self._limit - 1.0, self._limit).astype(np.int32)
         samples = max(0, -(-(len(rows) - first) // self.every))
         noise = np.empty((samples, len(self._columns)))
         for c, generator in enumerate(self._generators):

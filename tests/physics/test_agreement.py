@@ -16,8 +16,6 @@
 | whirl                           | backward, rolling, -spin R_S/(r0+delta) | kinematics of rolling; paper's eq. 41    |
 | mean whirl force                | grows as spin squared                   | centrifugal force                        |
 | 2 ms hammer                     | dies out                                | too little energy to keep rolling        |
-| magnet map                      | field sum of eqs. 35, 38                | it is fitted to it                       |
-| field sum, far apart            | exact cylinders (magpylib)              | dipoles are the far field of cylinders   |
 """
 
 from __future__ import annotations
@@ -28,12 +26,12 @@ import numpy as np
 import pytest
 
 from rig import InputError, Run, load_parameters, load_scene, simulate
+from rig.contacts import restitution_factor
 from rig.engines import load_engine
 from rig.engines.runge_kutta import DIVIDED, SCALES
 from rig.kernels import signals as S
 from rig.kernels.contact import ring_force
-from rig.magnets import REACH, MagnetGeometry, field_sum_force, fit_map
-from rig.model import build_model, restitution_factor
+from rig.model import build_model
 from rig.offline import frames
 from rig.simulation import DISSIPATED, Simulation
 
@@ -331,47 +329,3 @@ def test_transducer_pairs_carry_the_load_in_halves(whirl: Run) -> None:
     amplitude = np.ptp((whirl["P_E"] - whirl["P_W"])[whirl.times_s > 1.5]) / 2
     # The reaction carries the normal force and the inertia of the houses.
     assert 500.0 < amplitude < 620.0
-
-
-def test_magnet_map_follows_the_field_sum() -> None:
-    model = build_model(load_parameters())
-    assert model.magnet_map.error < 0.08
-    assert model.magnet_map.stiffness == pytest.approx(1670.0, rel=0.02)
-    constants = model.constants.magnet
-    hardening = 1 + constants.a3 * REACH**2 + constants.a5 * REACH**4 + constants.a7 * REACH**6
-    assert hardening == pytest.approx(2.3, abs=0.15)
-    assert constants.stiffness * REACH * hardening == pytest.approx(40.0, abs=3.0)
-
-
-def test_field_sum_is_the_far_field_of_cylinders() -> None:
-    import magpylib as magpy
-
-    geometry = MagnetGeometry(3, 5e-3, 3e-3, 2e-3, 0.12, 705e3)
-    x = 4e-3
-    paper = field_sum_force(np.array([x]), np.array([0.0]), geometry)[0]
-    around = 2 * np.pi * np.arange(geometry.number) / geometry.number
-    cylinders = [
-        magpy.magnet.Cylinder(
-            magnetization=(0, 0, geometry.magnetisation),
-            dimension=(2 * geometry.bearing_magnet_radius, geometry.length),
-            position=(geometry.bearing_radius * math.cos(a), geometry.bearing_radius * math.sin(a), 0),
-        )
-        for a in around
-    ]
-    bearing = magpy.Collection(*cylinders)
-    # Force on the shaft magnet from its surface current M0 on thin loops along its length.
-    heights = (np.arange(9) - 4) / 9 * geometry.length
-    phi = 2 * np.pi * np.arange(90) / 90
-    force = np.zeros(2)
-    radius = geometry.shaft_magnet_radius
-    for z in heights:
-        points = np.stack([x + radius * np.cos(phi), radius * np.sin(phi), np.full(90, z)], axis=-1)
-        field = bearing.getB(points)[:, 2]
-        weight = geometry.magnetisation * geometry.length / 9 * radius * 2 * np.pi / 90
-        force += weight * np.array([np.sum(field * np.cos(phi)), np.sum(field * np.sin(phi))])
-    np.testing.assert_allclose(paper[0], force[0], rtol=0.05)
-
-
-def test_fit_refuses_nothing_but_reports_its_error() -> None:
-    far = fit_map(MagnetGeometry(16, 16.9e-3, 6e-3, 8e-3, 40e-3, 705e3))
-    assert far.error < 1e-3, "many magnets far apart are rotationally symmetric"

@@ -1,0 +1,148 @@
+"""`rig laws`: the normal contact laws side by side, and which restitution each really returns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_ROOM = 140
+"""Columns from which formulas and sources stand in the tables."""
+
+
+def laws(
+    name: Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, by name or path.")] = "corrected",
+    *,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
+    ] = None,
+    restitution: Annotated[
+        float | None, typer.Option("--restitution", metavar="E", help="Restitution asked for, instead of the set's.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="As a JSON document.")] = False,
+) -> None:
+    """Compare all normal contact laws: restitution asked for and returned, force, time of contact, stiffness."""
+    import json
+
+    from replays.laws import compare, draw
+    from rig.cli.run import scene_overrides
+    from rig.parameters import load_parameters
+    from rig.scenes import read_value
+
+    values: dict[str, Any] = {key: read_value(text) for key, text in scene_overrides(changes or []).items()}
+    if restitution is not None:
+        values["contact.restitution"] = restitution
+    parameters = load_parameters(name).override(values, source="--set")
+    if plot is not None:
+        draw(parameters, plot)
+    document = compare(parameters)
+    if json_output:
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        return
+    _show(document)
+    if plot is not None:
+        typer.echo(f"\npicture  {plot}")
+
+
+def _show(document: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    # Into a pipe the tables keep their whole width; on a terminal they fit it.
+    console = Console(width=None if Console().is_terminal else 200)
+    # Beside the numbers, formulas and sources need room.
+    notes = console.width >= _ROOM
+    impact, used = document["impact"], document["in_use"]
+    console.print(_damping_table(document, notes=notes))
+    console.print(
+        f"\none free impact: {impact['shaft_mass_kg']:.3f} kg (Ixx / l0A^2) against the inner house's "
+        f"{impact['house_mass_kg']:.2f} kg at {impact['speed_m_s']:.3f} m/s, no friction; > in use. A c depends on e "
+        "alone, so what it returns does not depend on mass, speed, K or n, down to the floor of v0 at "
+        f"{document['speed_floor_m_s']:g} m/s. Kelvin-Voigt's D is right for these two masses only, and its force "
+        "jumps to D v0 at the onset.\n",
+        highlight=False,
+    )
+    console.print(_stiffness_table(document, notes=notes))
+    lean = document["lean"]
+    console.print(
+        "\nfit: largest error of K delta^n over 5 N to 3 kN, for laws that are no power. Cylinder laws take the axes "
+        f"for parallel; here the shaft leans by up to r0 / l0A = {lean['angle_mrad']:.1f} mrad, "
+        f"{lean['over_width_um']:.0f} um over the ring's assumed width: none is validated on this rig.",
+        highlight=False,
+    )
+    if not notes:
+        console.print(f"formulas, sources, ranges: in a terminal of {_ROOM} columns, or with --json", highlight=False)
+    damping = used["damping_law"] or "given number"
+    console.print(
+        f"in use: {used['stiffness_law'] or 'given number'} with {damping}: K = {used['stiffness']:.4g} N/m^n, "
+        f"n = {used['exponent']:.4g}, c = {used['damping_factor']:.4g}, D = {used['viscous_damping']:.4g} N s/m, "
+        f"returns {used['returned']:.3f} where {document['restitution']:g} is asked",
+        highlight=False,
+    )
+
+
+def _table(title: str) -> Table:
+    from rich.table import Table
+
+    return Table(title=title, box=None, header_style="bold", title_justify="left")
+
+
+def _damping_table(document: dict[str, Any], *, notes: bool) -> Table:
+    from rich.text import Text  # brackets are units here, not markup
+
+    table = _table(f"damping laws at e = {document['restitution']:g} ({document['set']})")
+    for heading in ("", "law"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("c", "D [N s/m]", "returned", "off by", "peak [N]", "contact [ms]"):
+        table.add_column(Text(heading), justify="right", no_wrap=True)
+    if notes:
+        table.add_column("formula and source")
+    for law in document["damping"]:
+        table.add_row(
+            ">" if law["in_use"] else "",
+            law["name"],
+            f"{law['damping_factor']:.4f}",
+            f"{law['viscous_damping']:.0f}" if law["viscous_damping"] else "-",
+            f"{law['returned']:.4f}",
+            f"{round(law['returned'] - law['wanted'], 4) + 0.0:+.4f}",
+            f"{law['peak_force_n']:.0f}",
+            f"{law['contact_time_ms']:.4f}",
+            *([Text(f"{law['formula']}; {law['source']}")] if notes else []),
+            style="bold" if law["in_use"] else None,
+        )
+    return table
+
+
+def _stiffness_table(document: dict[str, Any], *, notes: bool) -> Table:
+    from rich.text import Text
+
+    table = _table("stiffness laws")
+    for heading in ("", "law"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("K [N/m^n]", "n", "fit", "from - to [um]", "5 um [N]", "10 um [N]"):
+        table.add_column(Text(heading), justify="right", no_wrap=True)
+    if notes:
+        table.add_column("holds for; source")
+    for law in document["stiffness"]:
+        if law["refused"]:
+            table.add_row("", law["name"], *["-"] * 6, *([Text(law["refused"])] if notes else []))
+            continue
+        forces = ("-" if law[f"force_{um}um_n"] is None else f"{law[f'force_{um}um_n']:.0f}" for um in (5, 10))
+        table.add_row(
+            ">" if law["in_use"] else "",
+            law["name"],
+            f"{law['stiffness']:.3e}",
+            f"{law['exponent']:.4f}",
+            f"{law['fit_error']:.1%}" if law["fit_error"] else "exact",
+            f"{law['from_um']:.2f} - {law['to_um']:.1f}",
+            *forces,
+            *([Text(f"{law['valid']}; {law['source']}")] if notes else []),
+            style="bold" if law["in_use"] else None,
+        )
+    return table

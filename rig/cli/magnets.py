@@ -1,0 +1,104 @@
+"""`rig magnets`: the magnet models side by side, and how far each is from the next better one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def magnets(
+    name: Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, by name or path.")] = "corrected",
+    *,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="As a JSON document.")] = False,
+) -> None:
+    """Compare the magnet models: spring, far-field sum, exact cylinders, and the maps that stand for them in a run."""
+    import json
+
+    from replays.magnets import compare, draw
+    from rig.cli.run import scene_overrides
+    from rig.model import build_model
+    from rig.parameters import load_parameters
+    from rig.scenes import read_value
+
+    values = {key: read_value(text) for key, text in scene_overrides(changes or []).items()}
+    model = build_model(load_parameters(name).override(values, source="--set"))
+    if plot is not None:
+        draw(model, plot)
+    document = compare(model)
+    if json_output:
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        return
+    _show(document)
+    if plot is not None:
+        typer.echo(f"\npicture  {plot}")
+
+
+def _show(document: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    # Into a pipe the tables keep their whole width; on a terminal they fit it.
+    console = Console(width=None if Console().is_terminal else 200)
+    geometry, overstated = document["geometry"], document["overstated"]
+    console.print(
+        _force_table(document, "force_toward_a_magnet_n", f"force toward the centre, same magnets ({document['set']})")
+    )
+    console.print(
+        f"\n{geometry['number']} magnets of {geometry['length'] * 1e3:g} mm: number and length are assumed. Displaced "
+        f"toward a magnet. The far-field sum overstates the force of the cylinders {overstated['at_centre']:.2f} times "
+        f"at the centre and {overstated['toward_a_magnet'][-1]:.2f} times at {document['reach_mm']:.3g} mm.\n",
+        highlight=False,
+    )
+    used = document["stiffness_used_n_m"] / 1e3
+    console.print(_force_table(document, "force_at_stiffness_used_n", f"the same at {used:.3g} kN/m, as the rig runs"))
+    console.print()
+    console.print(_error_table(document))
+    console.print(
+        "\nerror: largest deviation over largest force of the better model, in any direction. The ring lets the shaft "
+        f"get {document['travel_mm']:.2f} mm from the magnets' centre. Exact: for rigid, uniform magnetisation, "
+        f"parallel axes, no iron (quadrature to {document['quadrature_error']:.0e}); no measured force is known to us.",
+        highlight=False,
+    )
+
+
+def _force_table(document: dict[str, Any], column: str, title: str) -> Table:
+    from rich.table import Table
+    from rich.text import Text  # brackets are units here, not markup
+
+    table = Table(title=title, box=None, header_style="bold", title_justify="left")
+    table.add_column("model", no_wrap=True)
+    table.add_column("runs as", no_wrap=True)
+    table.add_column(Text("K [kN/m]"), justify="right", no_wrap=True)
+    for place in document["displacement_mm"]:
+        table.add_column(Text(f"{place:.3g} mm [N]"), justify="right", no_wrap=True)
+    scaled = column == "force_at_stiffness_used_n"
+    for model in document["models"]:
+        stiffness = document["stiffness_used_n_m"] if scaled else model["stiffness_n_m"]
+        forces = (f"{force:.3f}" for force in model[column])
+        table.add_row(model["name"], model["runs_as"], f"{stiffness / 1e3:.3f}", *forces)
+    return table
+
+
+def _error_table(document: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table(title="errors", box=None, header_style="bold", title_justify="left")
+    for heading in ("model", "against", "with the same"):
+        table.add_column(heading, no_wrap=True)
+    travel = min(document["travel_mm"], document["reach_mm"])
+    for radius in (travel, document["reach_mm"]):
+        table.add_column(f"over {radius:.3g} mm", justify="right", no_wrap=True)
+    for error in document["errors"]:
+        numbers = (f"{error[key]:.3%}" for key in ("over_travel", "over_reach"))
+        table.add_row(error["model"], error["against"], error["equal"], *numbers)
+    return table

@@ -1,0 +1,39 @@
+"""The ladder of models: how much of the rig's physics a scene asks for, each rung by name, the simplest first."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from rig.kernels.constants import Levels
+from rig.kernels.contact import EXACT, NO_FRICTION, SMOOTHED, SWITCH
+
+FRICTION_LAWS = {"none": NO_FRICTION, "smoothed": SMOOTHED, "switch": SWITCH, "exact": EXACT}
+
+
+class ModelLevels(BaseModel):
+    """How much of the model takes part. What is left out costs nothing."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    magnet: Literal["linear", "map", "cylinders"] = "map"
+    """A spring; the radial map of the paper's far-field sum; exact finite cylinders."""
+    shaft: Literal["planar", "euler"] = "euler"
+    """Small angles, or Euler's equations."""
+    stator: Literal["rigid", "inner-house", "two-houses"] = "two-houses"
+    """Bodies that move; those that do not pass forces on."""
+    contact: Literal["impact", "compliant"] = "compliant"
+    """A rigid impact law (restitution, no force over time), or a compliant normal law."""
+    friction: Literal["none", "smoothed", "switch", "exact"] = "exact"
+    """None; tanh of the sliding speed; clamped linear; Coulomb's set-valued law."""
+
+    def constants(self) -> Levels:
+        """The rungs as the kernels take them."""
+        return Levels(
+            euler=self.shaft == "euler",
+            inner_house=self.stator != "rigid",
+            outer_house=self.stator == "two-houses",
+            compliant=self.contact == "compliant",
+            friction=FRICTION_LAWS[self.friction],
+        )

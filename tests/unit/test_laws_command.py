@@ -1,0 +1,158 @@
+"""`rig laws`: the comparison as a table, as JSON and as a picture; what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from replays.laws import compare, draw, over_speed
+from rig.cli.main import main
+from rig.contacts import DAMPING, KELVIN_VOIGT, STIFFNESS
+from rig.parameters import load_parameters
+
+DEFAULT = load_parameters()
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    with pytest.raises(SystemExit) as end:
+        main(["laws", *arguments])
+    captured = capsys.readouterr()
+    assert end.value.code == 0, captured.err
+    return captured.out
+
+
+def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    return json.loads(run(capsys, "--json", *arguments))
+
+
+def test_table_names_every_law_and_marks_those_in_use(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = run(capsys, "as-printed").splitlines()
+    for name in (*DAMPING, *STIFFNESS):
+        assert any(f" {name} " in line for line in lines), name
+    marked = [line.split()[1] for line in lines if line.startswith(" > ")]
+    assert marked == ["lankarani-nikravesh", "internal-sphere"]
+    # A unit in brackets is no markup.
+    assert "contact [ms]" in lines[1]
+    assert "returns 0.913 where 0.9 is asked" in lines[-1]
+
+
+def test_document_holds_both_families(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys)
+    assert [law["name"] for law in found["damping"]] == list(DAMPING)
+    assert [law["name"] for law in found["stiffness"]] == list(STIFFNESS)
+    assert found["wanted"][0] == 0.05
+    assert found["wanted"][-1] == 1.0
+    assert all(len(values) == len(found["wanted"]) for values in found["returned"].values())
+    assert all(len(values) == len(found["speed"]) for values in found["returned_over_speed"].values())
+    assert found["returned"]["exact"] == pytest.approx(found["wanted"], abs=1e-9)
+    assert found["impact"]["reduced_mass_kg"] == pytest.approx(0.9161, abs=1e-4)
+    assert [law["name"] for law in found["damping"] + found["stiffness"] if law["in_use"]] == [
+        "exact",
+        "internal-sphere",
+    ]
+
+
+def test_restitution_can_be_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "--restitution", "0.5")
+    assert found["restitution"] == 0.5
+    returned = {law["name"]: law["returned"] for law in found["damping"]}
+    assert returned["exact"] == pytest.approx(0.5, abs=1e-6)
+    assert returned[KELVIN_VOIGT] == pytest.approx(0.5, abs=1e-6)
+    assert returned["lankarani-nikravesh"] == pytest.approx(0.725, abs=5e-4)
+
+
+def test_parameters_can_be_changed(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "--set", "ring.width=20", "--set", "contact.stiffness=johnson-cylinder")
+    assert found["in_use"]["stiffness_law"] == "johnson-cylinder"
+    assert found["lean"]["over_width_um"] == pytest.approx(94.0, abs=0.1)
+    entry = next(law for law in found["stiffness"] if law["name"] == "johnson-cylinder")
+    assert found["in_use"]["fit_error"] == entry["fit_error"] > 0.0
+
+
+def test_given_numbers_are_compared_as_deep(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "--set", "contact.stiffness=2e10", "--set", "contact.damping_factor=0.3")
+    assert found["in_use"]["stiffness_law"] is None
+    assert not any(law["in_use"] for law in found["damping"] + found["stiffness"])
+    linear = next(law for law in found["damping"] if law["name"] == KELVIN_VOIGT)
+    hertz = next(law for law in found["damping"] if law["name"] == "none")
+    assert linear["exponent"] == 1.0
+    assert linear["depth_um"] == pytest.approx(hertz["depth_um"], rel=0.1)
+
+
+def test_law_that_does_not_hold_is_shown_as_such(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "--set", "ring.clearance=15")
+    refused = {law["name"]: law["refused"] for law in found["stiffness"] if law["refused"]}
+    assert list(refused) == ["pereira-cylinder"]
+    assert "ring.clearance" in refused["pereira-cylinder"]
+    assert "ring.clearance" in run(capsys, "--set", "ring.clearance=15")
+
+
+def test_only_memory_of_v0_and_linear_laws_forget_the_speed() -> None:
+    over = over_speed(DEFAULT, [1e-4, 1e-2, 0.145, 1.0])
+    assert over["memory of v0 (exact)"][1:] == pytest.approx([0.9] * 3, abs=1e-9)
+    assert over["memory of v0 (exact)"][0] > 0.98
+    assert over["Kelvin-Voigt"] == pytest.approx([0.9] * 4, abs=1e-6)
+    constant = over["constant D on Hertz"]
+    assert constant[2] == pytest.approx(0.9, abs=1e-5)
+    assert constant == sorted(constant)
+    assert constant[0] < 0.7
+
+
+@pytest.mark.parametrize("name", ["laws.png", "laws.svg"])
+def test_picture_is_drawn_the_same_each_time(name: str, tmp_path: Path) -> None:
+    first, second = tmp_path / name, tmp_path / f"again-{name}"
+    draw(DEFAULT, first)
+    draw(DEFAULT, second)
+    assert first.read_bytes().startswith(b"\x89PNG" if name.endswith("png") else b"<?xml")
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_picture_labels_every_axis_and_law(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    draw(DEFAULT.override({"contact.restitution": 1.0}), tmp_path / "laws.png")
+    panels = drawn[0].axes
+    assert all("[" in axes.get_xlabel() and "[" in axes.get_ylabel() and axes.get_title() for axes in panels)
+    legends = [{text.get_text() for text in legend.get_texts()} for axes in panels if (legend := axes.get_legend())]
+    assert set(DAMPING) in legends
+    assert any(set(STIFFNESS) < legend for legend in legends)
+    styles = [(line.get_color(), line.get_linestyle(), line._unscaled_dash_pattern) for line in panels[0].lines[:11]]  # pyright: ignore[reportAttributeAccessIssue]
+    assert len(set(map(str, styles))) == len(DAMPING)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--restitution", "0.01"], "contact.restitution must be"),
+        (["--set", "contact.damping_factor=hertz"], "contact.damping_factor must be"),
+        (["--set", "contact.exponent=1.5", "--set", "contact.damping_factor=kelvin-voigt"], "contact.exponent must be"),
+        (["--plot", "laws.pdf"], "--plot must be a .png or .svg file"),
+        (["nonsense"], "parameters must be one of"),
+    ],
+)
+def test_wrong_input_ends_in_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["laws", *arguments])
+    assert end.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"rig: {message}")
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_params_tells_how_far_the_fit_is_off(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["params", "--set", "contact.stiffness=johnson-cylinder"])
+    shown = capsys.readouterr().out
+    assert "johnson-cylinder = 8.9" in shown
+    assert "within 3.3% of its force" in shown
+    assert "law = 1.118" in shown
+
+
+def test_compare_needs_no_terminal_and_is_json() -> None:
+    json.dumps(compare(load_parameters("dtu-2019")), allow_nan=False)

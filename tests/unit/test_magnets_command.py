@@ -1,0 +1,142 @@
+"""`rig magnets`: the comparison as tables, JSON and a picture; what it refuses; what `rig params` says of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from replays.magnets import compare, draw
+from rig.cli.main import main
+from rig.model import build_model
+from rig.parameters import load_parameters
+
+FAMILY = ["linear", "far-field map", "far-field sum", "cylinder map", "exact cylinders"]
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    with pytest.raises(SystemExit) as end:
+        main([*arguments])
+    captured = capsys.readouterr()
+    assert end.value.code == 0, captured.err
+    return captured.out
+
+
+def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    return json.loads(run(capsys, "magnets", "--json", *arguments))
+
+
+def numbers(lines: list[str], title: str) -> dict[str, list[float]]:
+    """Rows of the table of forces under a title: the columns of numbers by model."""
+    start = next(n for n, line in enumerate(lines) if line.startswith(title)) + 2
+    rows = {name: lines[start + n] for n, name in enumerate(FAMILY)}
+    assert all(line.strip().startswith(name) for name, line in rows.items())
+    return {name: [float(text) for text in line.split()[-7:]] for name, line in rows.items()}
+
+
+def test_document_holds_the_family_and_its_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys)
+    assert [model["name"] for model in found["models"]] == FAMILY
+    assert found["displacement_mm"] == pytest.approx([1, 2, 4, 6, 8, 10])
+    assert found["overstated"]["at_centre"] == pytest.approx(2.27, abs=0.01)
+    assert found["overstated"]["toward_a_magnet"][-1] == pytest.approx(3.61, abs=0.01)
+    assert found["quadrature_error"] < 1e-6
+    for model in found["models"]:
+        toward, between = model["force_toward_a_magnet_n"], model["force_between_two_n"]
+        scale = found["stiffness_used_n_m"] / model["stiffness_n_m"]
+        assert model["force_at_stiffness_used_n"] == pytest.approx([force * scale for force in toward])
+        assert all(force > 0.0 for force in toward), "they repel"
+        if model["name"] in ("far-field sum", "cylinder map", "exact cylinders"):
+            assert toward[-1] > 1.05 * between[-1], "harder toward a magnet than between two"
+        else:
+            assert toward == pytest.approx(between), "round"
+    assert len(found["errors"]) == 7
+    assert all(0.0 < error["over_travel"] <= error["over_reach"] for error in found["errors"])
+
+
+def test_tables_show_what_the_document_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    found, lines = document(capsys), run(capsys, "magnets").splitlines()
+    same_magnets = numbers(lines, "force toward the centre, same magnets (corrected)")
+    same_stiffness = numbers(lines, "the same at 1.7 kN/m")
+    for model in found["models"]:
+        name = model["name"]
+        assert same_magnets[name] == pytest.approx(
+            [model["stiffness_n_m"] / 1e3, *model["force_toward_a_magnet_n"]], abs=5.1e-4
+        )
+        assert same_stiffness[name] == pytest.approx([1.7, *model["force_at_stiffness_used_n"]], abs=5.1e-4)
+    text = " ".join(lines)
+    # A unit in brackets is no markup.
+    assert "K [kN/m]" in text
+    assert "8 magnets of 16.9 mm: number and length are assumed" in text
+    assert "no measured force is known to us" in text
+    chain = next(line for line in lines if line.startswith(" cylinder map") and "exact cylinders" in line)
+    assert float(chain.split()[-1].rstrip("%")) < 0.2
+
+
+def test_parameters_can_be_changed(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "--set", "magnet.count=12", "--set", "magnet.stiffness=cylinders")
+    exact = found["models"][-1]
+    assert found["geometry"]["number"] == 12
+    assert found["stiffness_used_n_m"] == exact["stiffness_n_m"]
+    assert exact["force_at_stiffness_used_n"] == pytest.approx(exact["force_toward_a_magnet_n"])
+
+
+def test_tight_magnets_are_compared_over_the_room_they_leave(capsys: pytest.CaptureFixture[str]) -> None:
+    found = document(capsys, "--set", "magnet.bearing_radius=19")
+    assert found["reach_mm"] == pytest.approx(0.92 * 5)
+    assert found["displacement_mm"][-1] == pytest.approx(found["reach_mm"])
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+def test_picture_is_drawn_the_same_each_time(capsys: pytest.CaptureFixture[str], tmp_path: Path, suffix: str) -> None:
+    one, other = tmp_path / f"one{suffix}", tmp_path / f"other{suffix}"
+    assert f"picture  {one}" in run(capsys, "magnets", "--plot", str(one))
+    draw(build_model(load_parameters()), other)
+    assert one.read_bytes() == other.read_bytes()
+    assert one.stat().st_size > 10_000
+    changed = build_model(load_parameters().override({"magnet.length": 10.0}))
+    draw(changed, other)
+    assert one.read_bytes() != other.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--plot", "magnets.pdf"], "--plot must be a .png or .svg file"),
+        (["--set", "magnet.count=13"], "magnet.count must be at most 12, or the magnets would overlap"),
+        (["--set", "magnet.stiffness=magpylib"], "or one of eq35, cylinders"),
+        (["nowhere"], "parameters must be one of corrected"),
+    ],
+)
+def test_wrong_input_is_told_in_a_line(
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["magnets", *arguments])
+    captured = capsys.readouterr()
+    assert end.value.code == 2
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_params_tells_the_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    found = " ".join(run(capsys, "params").split())
+    assert "eq. 35 gives 1.659 kN/m at the centre, exact cylinders 0.735 kN/m" in found
+    assert "follows the field sum within 6.5% over 10 mm and 0.2% where the ring lets the shaft go" in found
+    assert "exact cylinders as stiff within 57% and 10%" in found
+    derived = json.loads(run(capsys, "params", "--json"))["derived"]
+    model = build_model(load_parameters())
+    assert derived["magnet_errors"] == compare(model)["errors"]
+
+
+def test_command_is_listed_with_its_fellows(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "Compare the magnet models" in run(capsys, "--help")
