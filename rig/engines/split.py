@@ -48,7 +48,7 @@ from rig.engines.memory import (
     STEPS,
 )
 from rig.kernels import signals as S
-from rig.kernels.angles import sin_cos
+from rig.kernels.angles import arc_sine, sin_cos
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, NO_FRICTION, ROLLING, elastic_force
 from rig.kernels.dynamics import drive_speed, evaluate
 from rig.kernels.magnet import magnet_force
@@ -67,7 +67,8 @@ _WANTED, _SETTLED, _BOUNCE = OWN + 20, OWN + 21, OWN + 22
 _REST, _SPRING_X, _SPRING_Y = OWN + 23, OWN + 24, OWN + 25
 _KICKED, _CONJUGATE, _H_LAST, _S = OWN + 26, OWN + 27, OWN + 28, OWN + 29
 _BEGUN, _ENGAGED = OWN + 37, OWN + 38
-_FLOWS = OWN + 40
+_COS, _SIN, _ANGLE = OWN + 39, OWN + 40, OWN + 41
+_FLOWS = OWN + 42
 _GRID = 5
 """Level of the grid's own step: level l lasts 2**(l - _GRID) steps of the grid."""
 _LEVELS = _GRID + 8
@@ -86,6 +87,10 @@ _DRIFT = 0.01
 """Weight of the gap's slow motion, squared, against its acceleration."""
 _PATIENCE = 16
 """Calm kicks in a row before the step is doubled."""
+_SLOP = 1e-7
+"""Depth that a rigid ring keeps in lasting contact [m], so that rounding does not make a flight of it."""
+_RETURN = 0.1
+"""Part of a depth beyond it that is taken back in a step."""
 
 
 @njit(cache=True)
@@ -191,7 +196,10 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
         memory[_SPIN] = y[9] + y[7] * sb
     else:
         memory[_UX], memory[_UY], memory[_PX], memory[_PY], memory[_SPIN] = y[1], -y[0], y[8], -y[7], y[9]
-    memory[_THETA] = y[2]
+    memory[_THETA] = memory[_ANGLE] = y[2]
+    memory[_COS], memory[_SIN] = math.cos(y[2] + constants.shaft.unbalance_phase), math.sin(
+        y[2] + constants.shaft.unbalance_phase
+    )
     memory[_X : _X + 4] = np.array([y[3], y[10], y[5], y[12]])
     memory[_Y : _Y + 4] = np.array([y[4], y[11], y[6], y[13]])
     memory[_SLID] = np.nan
@@ -227,8 +235,8 @@ def _coordinates(constants, ux, uy, px, py, w, theta, x0, x1, x2, x3, y0, y1, y2
         cb = math.sqrt(cb2)
         uz = math.sqrt(cb2 - uy * uy)
         pz = -(ux * px + uy * py) / uz
-        y[0] = math.atan2(-uy, uz)
-        y[1] = math.asin(ux)
+        y[0] = arc_sine(-uy / cb)
+        y[1] = arc_sine(ux)
         y[7] = (uy * pz - uz * py) / cb2
         y[8] = px / cb
         y[9] = w - ux * y[7]
@@ -340,7 +348,6 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     spin_mobility = 0.0 if ideal else R * R * per_Izz
     per_w = 1.0 / (mobility + per_inner + spin_mobility)
     weight_torque = -shaft.mass * shaft.gravity * shaft.arm_centre
-    cos_phi, sin_phi = math.cos(shaft.unbalance_phase), math.sin(shaft.unbalance_phase)
     rest, spring_x, spring_y = 0.0, 0.0, 0.0
     if engaged:
         rest, spring_x, spring_y = memory[_REST], memory[_SPRING_X], memory[_SPRING_Y]
@@ -351,6 +358,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     h0 = step_ticks * inputs.tick_s
     loose_v = 2.0 * house.preload / house.pair_stiffness_vertical
     loose_h = 2.0 * house.preload / house.pair_stiffness_horizontal
+    # Root of twice the houses' energy at which a transducer can come loose.
+    tightest = min(loose_v * math.sqrt(house.pair_stiffness_vertical), loose_h * math.sqrt(house.pair_stiffness_horizontal))
     # Flows of the shaft and the drive, for every length that a half step can have.
     flows = np.empty((_LEVELS, 14))
     for level in range(_LEVELS):
@@ -383,6 +392,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     kicked, conjugate, h_last = int(memory[_KICKED]), memory[_CONJUGATE], memory[_H_LAST]
     sx, sy, dsx, dsy = memory[_S], memory[_S + 1], memory[_S + 2], memory[_S + 3]
     cx, cy, dcx, dcy = memory[_S + 4], memory[_S + 5], memory[_S + 6], memory[_S + 7]
+    cos_a, sin_a, angle = memory[_COS], memory[_SIN], memory[_ANGLE]
     arm = lA * per_Ixx
     begun = int(memory[_BEGUN])
     if engaged != (memory[_ENGAGED] == 1.0):
@@ -411,7 +421,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
             x0 + conjugate * per_inner * cx, x1 - conjugate * per_inner * dcx, x2, x3,
             y0 + conjugate * per_inner * cy, y1 - conjugate * per_inner * dcy, y2, y3, y,
         )  # fmt: skip
-        evaluate(constants, inputs, now, 0.0, onset_speed, phase, True, y, dy, out)
+        # Rigid impacts have no force over time.
+        evaluate(constants, inputs, now, 0.0, onset_speed, phase if compliant else FLIGHT, True, y, dy, out)
         rows[row, : S.N_VECTOR] = y
         rows[row, S.N_VECTOR :] = out
         row += 1
@@ -420,9 +431,9 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         on_houses = drive_work = hammer_work = unbalance_work = gap_work = bearing_loss = 0.0
         contact_loss = friction_loss = impulse = turn_x = turn_y = turn_z = 0.0
         house_before = _house_energy(constants, x0, x1, x2, x3, y0, y1, y2, y3)
-        cos_a = math.cos(theta) * cos_phi - math.sin(theta) * sin_phi
-        sin_a = math.sin(theta) * cos_phi + math.cos(theta) * sin_phi
-        angle = theta
+        # The unbalance's direction is turned step by step; its length is kept here.
+        q = 1.5 - 0.5 * (cos_a * cos_a + sin_a * sin_a)
+        cos_a, sin_a = cos_a * q, sin_a * q
         last = min(stride, steps - first) * 2**_GRID
         n = 0
         owed = -1  # level of the half flow that the last kick still owes
@@ -437,13 +448,15 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 free = r0 - distance
                 t0 = flows[owed, 10] if owed >= 0 else 0.0
                 speed = lA * math.sqrt(px * px + py * py)
+                ringing = 0.0
                 if inner:
                     ringing = math.sqrt(2.0 * _house_energy(constants, x0, x1, x2, x3, y0, y1, y2, y3))
                     speed += ringing * (math.sqrt(per_inner) + both * math.sqrt(per_outer))
                 level = _GRID
                 while level > 0 and limits[level] < speed:
                     level -= 1
-                highest = _BLOW if struck else _LONGEST
+                # Transducers that come loose are no part of the flow.
+                highest = _BLOW if struck or ringing > tightest else _LONGEST
                 while level < highest:
                     t = 2.0 * 2.0 * flows[level, 10]
                     # Gravity, magnets, unbalance and hammer together stay below 100 m/s^2 at the ring.
@@ -484,7 +497,11 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
             # Flow to the middle of the step.
             middle = (n + 0.5 * count) * part_ticks
             spin = w
-            aim = drive_speed(inputs, now, middle)
+            # The drive's speed in the middle of the flow up to there.
+            back = 0.25 * count if owed < 0 else 0.25 * (count + (1 << owed))
+            aim = drive_speed(inputs, now, middle - back * part_ticks)
+            if ideal:
+                w = aim
             merged = owed == level
             if owed >= 0 and not merged:
                 ux, px, uy, py, w, theta, x0, x1, x2, x3, y0, y1, y2, y3 = _flow(
@@ -508,8 +525,6 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 memory, at, inner, flows[at], ux, px, uy, py, w, theta, aim, x0, x1, x2, x3, y0, y1, y2, y3
             )
             ago += flows[at, 10]
-            drive_work += 0.5 * Izz * (w * w - spin * spin)
-            moved = Izz * (w - spin)
 
             # Geometry of the axis.
             uz, pz, w_share, per_uz, share_x = 1.0, 0.0, 0.0, 1.0, 0.0
@@ -529,7 +544,9 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 pz = -(ux * px + uy * py) * per_uz
                 w_share = share_x * (uy * pz - uz * py)
             if ideal:
-                w = aim + w_share
+                w = drive_speed(inputs, now, middle) + w_share
+            drive_work += 0.5 * Izz * (w * w - spin * spin)
+            moved = Izz * (w - spin)
             rotation = w - w_share  # theta'
 
             # Everything smooth: sum of arm times force, without the linear magnets of the flow.
@@ -647,11 +664,14 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     shift = h * jn * damping * w_nn * (1.0 / 24.0)
                     jn = max(0.0, jn)
                 else:
+                    # Newton's law at an onset, Moreau's in lasting contact: no speed in the mean of a step.
                     share = 1.0
-                    jn = max(0.0, (1.0 + contact.restitution) * rate / w_nn)
+                    goal = -0.5 * (rate - rate_before) - _RETURN * (depth - _SLOP) * per_h
+                    if phase == FLIGHT:
+                        goal = -contact.restitution * rate if rate > contact.speed_floor else 0.0
+                    jn = max(0.0, (rate - goal) / w_nn)
                 # Rolling holds along the arc, not at the corners of the polygon that the kicks make of it.
                 lateral = sliding - R * w
-                corner = h * lateral * per_distance
                 sliding += lateral * (1.0 / 12.0) * h * jn * w_nn * per_distance
                 target = -0.5 * (sliding - slid) if slid == slid else 0.0
                 limit = mu * jn
@@ -659,7 +679,9 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 jt = min(max(wanted, -limit), limit)
                 if jn > 0.0 and compliant:
                     jn = max(0.0, jn - 0.5 * damping * w_nt * jt * share)
-                elif jn == 0.0:
+                elif jn > 0.0:
+                    jn = max(0.0, jn - w_nt * jt / w_nn)
+                elif compliant:
                     clamps += 1.0
                 phase = ROLLING
                 if jt != wanted:
@@ -708,6 +730,11 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                             wanted_level += 1
                             settled = 0
                     else:
+                        settled = 0
+                elif wanted_level < _GRID:
+                    settled += 1
+                    if settled >= _PATIENCE and (n + count) & ((2 << wanted_level) - 1) == 0:
+                        wanted_level += 1
                         settled = 0
                 depth_before, rate_before, ago = depth, rate - w_nn * jn - w_nt * jt, 0.0
             elif phase != FLIGHT:
@@ -793,9 +820,14 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 if abs(rise) > loose_v:
                     slack = h * _loose(rise, house.pair_stiffness_vertical, house.preload)
                     fy += slack
+                    on_houses -= slack * (y3 - 0.5 * slack * per_outer)
                     y3 -= slack * per_outer
                 if abs(x2) > loose_h:
-                    x3 += h * _loose(x2, house.pair_stiffness_horizontal, house.preload) * per_outer
+                    slack = h * _loose(x2, house.pair_stiffness_horizontal, house.preload)
+                    on_houses += slack * (x3 + 0.5 * slack * per_outer)
+                    x3 += slack * per_outer
+                if abs(rise) > 0.8 * loose_v or abs(x2) > 0.8 * loose_h:
+                    wanted_level = min(wanted_level, _BLOW)
                 gx, gy = fx * per_inner, fy * per_inner
                 on_houses += fx * (x1 + 0.5 * gx) + fy * (y1 + 0.5 * gy)
                 x1 += gx
@@ -815,13 +847,15 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
 
         # The half flow that is owed up to the row.
         spin = w
-        aim = drive_speed(inputs, now, last * part_ticks)
+        aim = drive_speed(inputs, now, (last - 0.25 * (1 << owed)) * part_ticks)
+        if ideal:
+            w = aim
         ux, px, uy, py, w, theta, x0, x1, x2, x3, y0, y1, y2, y3 = _flow(
             memory, owed, inner, flows[owed], ux, px, uy, py, w, theta, aim, x0, x1, x2, x3, y0, y1, y2, y3
         )
         ago += flows[owed, 10]
         if ideal:
-            w = aim
+            w = drive_speed(inputs, now, last * part_ticks)
             if euler:
                 uz = math.sqrt(1.0 - ux * ux - uy * uy)
                 w += ux * (-uy * (ux * px + uy * py) / uz - uz * py) / (1.0 - ux * ux)
@@ -856,6 +890,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     memory[PHASE], memory[ONSET], memory[_SLID] = float(phase), onset_speed, slid
     memory[_KICKED], memory[_CONJUGATE], memory[_H_LAST] = float(kicked), conjugate, h_last
     memory[_BEGUN] = float(begun)
+    memory[_COS], memory[_SIN], memory[_ANGLE] = cos_a, sin_a, angle
     memory[_S], memory[_S + 1], memory[_S + 2], memory[_S + 3] = sx, sy, dsx, dsy
     memory[_S + 4], memory[_S + 5], memory[_S + 6], memory[_S + 7] = cx, cy, dcx, dcy
     memory[_WANTED], memory[_SETTLED], memory[_BOUNCE] = float(wanted_level), float(settled), bounce

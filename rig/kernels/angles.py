@@ -29,3 +29,19 @@ def sin_cos(angle):
         1.0 - s * (1.0 / 12.0) * (1.0 - s * (1.0 / 30.0) * (1.0 - s * (1.0 / 56.0) * (1.0 - s * (1.0 / 90.0))))
     )
     return sine, cosine
+
+
+@njit(cache=True)
+def arc_sine(value):
+    """Angle [rad] of a sine, by its series where that is exact to rounding."""
+    if abs(value) > SERIES_REACH:
+        return math.asin(value)
+    s = value * value
+    return value * (
+        1.0
+        + s
+        * (
+            1.0 / 6.0
+            + s * (3.0 / 40.0 + s * (15.0 / 336.0 + s * (105.0 / 3456.0 + s * (945.0 / 42240.0 + s * (10395.0 / 599040.0)))))
+        )
+    )

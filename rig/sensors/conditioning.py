@@ -10,6 +10,8 @@ from numba import njit
 from rig.channels import Channel, Group
 from rig.kernels.signals import COLUMN
 
+_STORE = 4096
+"""Samples of noise drawn at a time: how many does not show in the result."""
 _SECTIONS = 3
 """Second-order sections of the filter: two of the fourth-order Butterworth low-pass, one for AC coupling."""
 
@@ -29,7 +31,7 @@ def _condition(rows, first, every, columns, gain, bias, low, high, sections, mem
         high: Upper output limit [V], shape (c,).
         sections: Filter, shape (c, _SECTIONS, 6) as second-order sections.
         memory: Filter memory (direct form II transposed), in and out, shape (c, _SECTIONS, 2).
-        noise: Added at the converter [V], shape (samples, c).
+        noise: Added at the converter [V], shape (c, samples).
         lsb: Converter step [V], shape (c,).
         limit: Largest count, shape (c,).
         counts: Out, shape (samples, c).
@@ -56,7 +58,7 @@ def _condition(rows, first, every, columns, gain, bias, low, high, sections, mem
             m20 = d[1] * v - d[4] * u + m21
             m21 = d[2] * v - d[5] * u
             if n == due:
-                value = np.rint((u + noise[sample, c]) / lsb[c])
+                value = np.rint((u + noise[c, sample]) / lsb[c])
                 counts[sample, c] = np.int32(min(max(value, -limit[c] - 1.0), limit[c]))
                 sample += 1
                 due += every
@@ -105,6 +107,7 @@ class Conditioner:
         self._memory = np.zeros((len(channels), _SECTIONS, 2))
         self._noise_v = np.array([channel.noise_v if noise else 0.0 for channel in channels])
         self._lsb = np.array([channel.lsb_v for channel in channels])
+        self._store, self._drawn = np.empty((len(channels), 0)), 0
         self._limit = np.array([2.0 ** (channel.adc_bits - 1) - 1.0 for channel in channels])
         self._generators = [
             np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(channel.name.encode())])))
@@ -128,9 +131,7 @@ class Conditioner:
             volts = np.clip(self._bias + self._gain * rows[first :: self.every, self._columns], self._low, self._high)
             return np.clip(np.rint(volts / self._lsb), -self._limit - 1.0, self._limit).astype(np.int32)
         samples = max(0, -(-(len(rows) - first) // self.every))
-        noise = np.empty((samples, len(self._columns)))
-        for c, generator in enumerate(self._generators):
-            noise[:, c] = self._noise_v[c] * generator.standard_normal(samples)
+        noise = self._next_noise(samples)
         counts = np.empty((samples, len(self._columns)), dtype=np.int32)
         _condition(
             rows, first, self.every, self._columns, self._gain, self._bias, self._low, self._high, self._sections,
@@ -138,6 +139,19 @@ class Conditioner:
         )  # fmt: skip
         self.rows_seen += len(rows)
         return counts
+
+    def _next_noise(self, samples: int) -> np.ndarray:
+        """Noise of the next samples [V], shape (channels, samples), out of a store that is filled now and then."""
+        if self._drawn + samples > self._store.shape[1]:
+            left = self._store[:, self._drawn :]
+            fresh = np.zeros((len(left), max(_STORE, samples - left.shape[1])))
+            for generator, noise_v, draws in zip(self._generators, self._noise_v, fresh, strict=True):
+                if noise_v:
+                    generator.standard_normal(out=draws)
+                    draws *= noise_v
+            self._store, self._drawn = np.concatenate([left, fresh], axis=1), 0
+        self._drawn += samples
+        return self._store[:, self._drawn - samples : self._drawn]
 
     def _settle(self, row: np.ndarray) -> None:
         # The instruments have been on for long: filters start in the steady state of the first row.

@@ -1,0 +1,212 @@
+"""One engine on one small system: what a trial sets going and reads off, without scenes, sensors or commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from rig.engines import ENGINES, load_engine
+from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE
+from rig.kernels import signals as S
+from rig.kernels.constants import Constants, Inputs
+from rig.kernels.contact import FLIGHT
+from rig.kernels.signals import COLUMN, N_ROW, N_STATE, N_VECTOR
+from rig.levels import ModelLevels
+from rig.model import Model, build_model
+from rig.parameters import load_parameters
+
+TICK_S = 1e-6
+"""Length of a tick [s], unless a trial says otherwise."""
+
+
+@cache
+def base_model(levels: ModelLevels) -> Model:
+    """The default parameters on a level of the model; a fit of the magnets' map is made once."""
+    return build_model(load_parameters(), levels)
+
+
+def quiet_inputs(
+    *,
+    tick_s: float = TICK_S,
+    spin: float = 0.0,
+    magnets: bool = False,
+    ideal: bool = False,
+    blow: tuple[float, int, int] = (0.0, 0, 0),
+) -> Inputs:
+    """Nothing happens but, perhaps, one blow along x.
+
+    Args:
+        tick_s: Length of a tick [s].
+        spin: What the drive aims at [rad/s].
+        magnets: Whether they hold.
+        ideal: The drive prescribes the spin instead of a torque.
+        blow: Peak force [N], first tick and end of the pulse.
+    """
+    return Inputs(
+        tick_s=tick_s, hammer_force=blow[0], hammer_x=1.0, hammer_y=0.0, hammer_start=blow[1], hammer_end=blow[2],
+        speed=spin, speed_slope=0.0, speed_tick=0, ideal_drive=ideal, magnet_engaged=magnets,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an engine made of a system.
+
+    Attributes:
+        times: Instants of the rows [s], shape (n,).
+        rows: Observed rows, shape (n, N_ROW); the end has none.
+        end: State and integrals at the end, shape (N_VECTOR,).
+        memory: The engine's memory at the end, shape (MEMORY,).
+    """
+
+    times: np.ndarray
+    rows: np.ndarray
+    end: np.ndarray
+    memory: np.ndarray
+
+    @property
+    def states(self) -> np.ndarray:
+        """States at the rows and at the end, shape (n + 1, 14)."""
+        return np.vstack([self.rows[:, :N_STATE], self.end[None, :N_STATE]])
+
+    def column(self, name: str) -> np.ndarray:
+        """One column of the rows, shape (n,)."""
+        return self.rows[:, COLUMN[name]]
+
+    @property
+    def finite(self) -> bool:
+        """Whether every number of the end is finite."""
+        return bool(np.isfinite(self.end).all())
+
+    @property
+    def contacts(self) -> int:
+        """Contacts begun."""
+        return int(self.memory[CONTACTS])
+
+    @property
+    def floored(self) -> int:
+        """Contacts begun slower than the floor of v0."""
+        return int(self.memory[FLOORED])
+
+    @property
+    def clamps(self) -> int:
+        """Steps at which the law would have pulled."""
+        return int(self.memory[CLAMPS])
+
+    @property
+    def ceiling(self) -> int:
+        """Steps that stayed above the tolerance."""
+        return int(self.memory[CEILING])
+
+    @property
+    def peak_force(self) -> float:
+        """Largest normal force by the engine's own steps [N]."""
+        return float(self.memory[PEAK_FORCE])
+
+    @property
+    def impulse(self) -> float:
+        """Integral of the normal force [N s]."""
+        return float(self.end[S.CONTACT_IMPULSE])
+
+
+def move(
+    engine: str,
+    constants: Constants,
+    inputs: Inputs,
+    y0: np.ndarray,
+    *,
+    ticks: int,
+    step: int = 0,
+    every: int = 0,
+    tolerance: float = 0.0,
+) -> Motion:
+    """Let an engine loose on a system.
+
+    Args:
+        engine: Its name.
+        constants: The model.
+        inputs: What acts on it.
+        y0: State and integrals at the start, shape (N_VECTOR,).
+        ticks: How long, in ticks of `inputs`; cut to whole rows.
+        step: Ticks a step; 0 for the engine's own (in ticks of 1 us).
+        every: Ticks between rows, at least one step; 0 for one row only.
+        tolerance: Of an adaptive engine; 0 for its own.
+    """
+    method, module = ENGINES[engine], load_engine(engine)
+    step = step or method.step_us
+    stride = max(1, (every or ticks) // step)
+    steps = max(1, ticks // (stride * step)) * stride
+    rows = np.empty((steps // stride, N_ROW))
+    y, memory = y0.copy(), np.zeros(MEMORY)
+    module.start(constants, inputs, y, memory, float(step), tolerance or method.tolerance)
+    module.advance(constants, inputs, y, memory, 0, step, steps, stride, rows)
+    times = np.arange(len(rows)) * stride * step * inputs.tick_s
+    return Motion(times=times, rows=rows, end=y, memory=memory)
+
+
+def state(**values: float) -> np.ndarray:
+    """State and integrals, 0 but for the columns named, shape (N_VECTOR,)."""
+    y = np.zeros(N_VECTOR)
+    for name, value in values.items():
+        y[COLUMN[name]] = value
+    return y
+
+
+def pivoted_mass(constants: Constants) -> float:
+    """Effective mass of the shaft at the ring [kg]."""
+    return constants.shaft.transverse_inertia / constants.shaft.arm_ring**2
+
+
+def bare_shaft(
+    *,
+    damping_factor: float | None = None,
+    exponent: float = 1.5,
+    stiffness: float | None = None,
+    speed_floor: float | None = None,
+    gravity: bool = False,
+) -> Constants:
+    """Planar shaft in a rigid, centred, frictionless ring: along x it is a mass on one line.
+
+    Args:
+        damping_factor: c of the contact; None for the rig's own.
+        exponent: n.
+        stiffness: K [N/m^n]; None for the rig's own.
+        speed_floor: Floor of v0 [m/s]; None for the rig's own.
+        gravity: Whether there is any.
+    """
+    levels = ModelLevels(magnet="linear", shaft="planar", stator="rigid", friction="none")
+    constants = base_model(levels).constants
+    contact = constants.contact
+    contact = contact._replace(
+        offset_x=0.0,
+        offset_y=0.0,
+        exponent=exponent,
+        viscous_damping=0.0,
+        damping_factor=contact.damping_factor if damping_factor is None else damping_factor,
+        stiffness=contact.stiffness if stiffness is None else stiffness,
+        speed_floor=contact.speed_floor if speed_floor is None else speed_floor,
+    )
+    shaft = constants.shaft._replace(unbalance=0.0, gravity=constants.shaft.gravity if gravity else 0.0)
+    return constants._replace(contact=contact, shaft=shaft, magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0))
+
+
+def hammer_run(
+    friction: str, *, force_n: float = 100.0, mu: float | None = None, smoothing_speed: float | None = None
+) -> tuple[Constants, Inputs, np.ndarray]:
+    """The full rig running at 6.2 Hz, hit for 5 ms along x at 20 ms: the scene `hammer`."""
+    model = base_model(ModelLevels.model_validate({"friction": friction}))
+    contact = model.constants.contact
+    contact = contact._replace(
+        friction=contact.friction if mu is None else mu,
+        smoothing_speed=contact.smoothing_speed if smoothing_speed is None else smoothing_speed,
+    )
+    spin = 2.0 * np.pi * 6.2
+    inputs = quiet_inputs(spin=spin, magnets=True, blow=(force_n, 20_000, 25_000))
+    return model.constants._replace(contact=contact), inputs, model.state(spin=spin)
+
+
+def in_flight(motion: Motion) -> bool:
+    """Whether it ends apart from the ring."""
+    return int(motion.memory[0]) == FLIGHT
