@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import json
 import math
 import tomllib
@@ -204,6 +205,72 @@ class SensorChoice(_Part):
         return groups
 
 
+class PickedQuantity(_Part):
+    """One quantity that a pick was made for, with its errors as `rig ladder` measured them."""
+
+    quantity: str
+    unit: str = ""
+    tolerance: FiniteFloat
+    """Error allowed, as a part of the quantity's scale."""
+    value: FiniteFloat | str
+    """By the picked model and engine [unit]."""
+    reference: FiniteFloat | str
+    """By the full model and the engine of the reference [unit]."""
+    model_error: FiniteFloat
+    """Of the picked levels against the full model, both converged."""
+    numerical_error: FiniteFloat
+    """Of the picked engine against a converged one on the picked levels."""
+    total_error: FiniteFloat
+    reference_error: FiniteFloat
+    """Of the reference itself: its distance from an unlike engine."""
+
+
+class Pick(_Part):
+    """The cheapest model, engine and step that `rig ladder` found good enough, with what they were picked on."""
+
+    magnet: str
+    shaft: str
+    stator: str
+    contact: str
+    friction: str
+    drive: Literal["torque", "ideal"]
+    sensors: Literal["ideal", "full"]
+    engine: str
+    step_us: int
+    engine_tolerance: FiniteFloat = 0.0
+    quantities: tuple[PickedQuantity, ...]
+    wall_s: FiniteFloat
+    """Wall time of a simulated second of the pick, with the scene's sensors [s]."""
+    wall_given_s: FiniteFloat
+    """The same of the scene as it is given [s]."""
+    wall_full_s: FiniteFloat
+    """The same of the full model on the engine of the reference [s]."""
+    reference_engine: str = ""
+    unlike_engine: str = ""
+    """Whose distance from the reference is the reference's own error."""
+    date: str = ""
+    rig: str = ""
+    """Version of the rig."""
+    commit: str = ""
+    machine: str = ""
+    seed: int = 0
+    scene_digest: str
+    parameters_digest: str
+    code_digest: str
+
+    def apply(self, data: dict[str, Any]) -> dict[str, Any]:
+        """The fields of a scene with the pick's in their place."""
+        levels = {name: getattr(self, name) for name in ModelLevels.model_fields}
+        engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
+        return {
+            **data,
+            "model": levels,
+            "engine": engine,
+            "drive": {**_table_in(data, "drive"), "mode": self.drive},
+            "sensors": {**_table_in(data, "sensors"), "chain": self.sensors},
+        }
+
+
 class Scene(_Part):
     """One run: initial state, drive, timed commands, engine, sensors, seed, and the parameters it runs on."""
 
@@ -221,6 +288,10 @@ class Scene(_Part):
     model: ModelLevels = ModelLevels()
     engine: EngineChoice = EngineChoice()
     sensors: SensorChoice = SensorChoice()
+    fidelity: Literal["given", "auto"] = "given"
+    """Model and engine as given here, or as `rig ladder` has picked and stored them."""
+    pick: Pick | None = None
+    """What `rig ladder --write` has stored; only fidelity "auto" makes use of it."""
 
     @field_validator("commands", mode="before")
     @classmethod
@@ -280,6 +351,34 @@ class Scene(_Part):
                 free_s = timed.at_s + command.duration_ms * 1e-3
         return self
 
+    @model_validator(mode="after")
+    def _pick_in_force(self) -> Scene:
+        if self.fidelity == "auto":
+            if self.pick is None:
+                raise InputError("fidelity", '"given" until `rig ladder SCENE --write FILE` has stored a pick', "auto")
+            asked = self.pick.apply(self.model_dump())
+            own = self.model_dump()
+            if any(own[name] != asked[name] for name in ("model", "engine", "drive", "sensors")):
+                raise InputError("fidelity", '"given" where model, engine, drive or sensors are chosen by hand', "auto")
+        return self
+
+    @property
+    def fidelity_line(self) -> str | None:
+        """What a run says of a pick in force; None for a scene as given."""
+        if self.fidelity == "given" or self.pick is None:
+            return None
+        pick = self.pick
+        levels = ", ".join(getattr(pick, name) for name in ModelLevels.model_fields)
+        asked = ", ".join(
+            f"{entry.quantity} within {entry.tolerance:g} (measured {entry.total_error:.1e})"
+            for entry in pick.quantities
+        )
+        finest = f" at {pick.engine_tolerance:g}" if pick.engine_tolerance else ""
+        return (
+            f"fidelity auto: {levels}; drive {pick.drive}, sensors {pick.sensors}; {pick.engine} "
+            f"{pick.step_us} us{finest}; picked {pick.date} for {asked}"
+        )
+
     def load_parameters(self) -> ParameterSet:
         """The scene's parameters with its own changes applied."""
         parameters = load_parameters(self.parameters)
@@ -322,7 +421,9 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
     data = {"name": path.stem, **read_toml(path)}
     for key, value in (overrides or {}).items():
         _override(data, key, read_value(value) if isinstance(value, str) else value)
-    scene = parse_scene(data)
+    scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
+    if data.get("fidelity") == "auto":
+        scene = _with_pick(scene, data, [] if overrides is None else list(overrides))
     # Parameters are checked here, so that a scene that loads can run.
     top = scene.load_parameters().entries["drive.top_speed"].value
     speeds = {"drive.speed_hz": [scene.drive.speed_hz], "drive.profile": [speed for _, speed in scene.drive.profile]}
@@ -333,6 +434,47 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
         if not isinstance(top, str) and max(values, default=0.0) > top:
             raise InputError(field, f"at most drive.top_speed = {top:g} Hz", max(values))
     return scene
+
+
+def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scene:
+    """The scene with its stored pick in force, if that is of this very scene."""
+    by_hand = [key for key in overrides if key.split(".")[0] in ("model", "engine") or key in _PICKED]
+    if by_hand:
+        raise InputError("fidelity", f'"given" where {by_hand[0]} is chosen by hand', "auto")
+    if scene.pick is not None:
+        stored = (scene.pick.scene_digest, scene.pick.parameters_digest, scene.pick.code_digest)
+        names = ("the scene", "its parameters", "the rig's equations or engines")
+        changed = [name for name, a, b in zip(names, stored, pick_digests(scene), strict=True) if a != b]
+        if changed:
+            must = f'"given", or picked anew by `rig ladder --write`: {" and ".join(changed)} changed since the pick'
+            raise InputError("fidelity", must, "auto")
+        data = scene.pick.apply(data)
+    return parse_scene(data)
+
+
+_PICKED = ("drive.mode", "sensors.chain")
+_EQUATIONS = ("kernels", "engines", "contacts.py", "levels.py", "magnets.py", "model.py")
+
+
+def pick_digests(scene: Scene) -> tuple[str, str, str]:
+    """What a pick depends on: digests of the scene as given, of its parameters, and of equations and engines."""
+
+    def digest(*parts: bytes) -> str:
+        total = hashlib.sha256()
+        for part in parts:
+            total.update(len(part).to_bytes(8, "big") + part)
+        return total.hexdigest()[:16]
+
+    # Neither its name nor the seed of the sensors' noise changes what a scene does.
+    left_out = {"name", "title", "seed", "parameters", "set", "model", "engine", "fidelity", "pick"}
+    given = scene.model_dump_json(exclude=left_out)
+    values = {key: [entry.value, entry.unit] for key, entry in scene.load_parameters().entries.items()}
+    package = Path(__file__).parent
+    files = [file for name in _EQUATIONS for file in ((package / name).glob("*.py") if (package / name).is_dir() else
+             [package / name])]  # fmt: skip
+    # Line ends differ between systems.
+    code = [part for file in sorted(files) for part in (file.name.encode(), file.read_bytes().replace(b"\r\n", b"\n"))]
+    return digest(given.encode()), digest(json.dumps(values, sort_keys=True).encode()), digest(*code)
 
 
 def parse_scene(data: dict[str, Any]) -> Scene:

@@ -18,7 +18,7 @@ import numpy as np
 
 from rig.channels import ChannelTable, default_table
 from rig.engines import load_engine
-from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE
+from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, STEPS
 from rig.errors import InputError, SimulationError
 from rig.kernels import signals as S
 from rig.kernels.constants import Inputs
@@ -252,6 +252,7 @@ class Simulation:
             },
             "contacts": int(self._memory[CONTACTS]),
             "peak_normal_force_n": float(self._memory[PEAK_FORCE]),
+            "steps": int(self._memory[STEPS]),
             "warnings": warnings,
         }
 

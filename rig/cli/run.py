@@ -63,6 +63,8 @@ def run(
         service = Service(simulation, server, _clock(pace), block_ticks=block_ticks)
         notice = "preparing" if compiled_before() else COMPILE_NOTICE
         typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
+        if loaded.fidelity_line:
+            typer.echo(f"rig: {loaded.fidelity_line}", err=True)
         service.prepare()
         typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
         with _stopping_on_signals(service.stop), _showing(service):

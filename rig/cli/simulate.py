@@ -41,6 +41,8 @@ def simulate(
     from rig.simulation import Simulation
 
     simulation = Simulation(loaded)
+    if loaded.fidelity_line:
+        typer.echo(loaded.fidelity_line, err=True)
     if not compiled_before():
         typer.echo(COMPILE_NOTICE, err=True)
     simulation.warm_up()

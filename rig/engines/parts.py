@@ -62,7 +62,7 @@ _TOLERANCE, _SIZE, _BEFORE, _BEFORE_SPAN, _LAST = range(OWN, OWN + 5)
 
 SCALES = np.array([5e-3, 5e-3, 1.0, 20e-6, 20e-6, 20e-6, 20e-6, 1.0, 1.0, 40.0, 0.04, 0.04, 0.04, 0.04])
 """What counts as 1 in each state when errors are added up: 5 mrad, 1 rad of spin, 20 um, 1 and 40 rad/s, 40 mm/s."""
-_PER_SCALE = 1.0 / SCALES
+PER_SCALE = 1.0 / SCALES
 
 _LEAST = 1.0 / 64.0
 """Shortest part next to a crossing, in steps of the grid; ..."""
@@ -89,9 +89,7 @@ FUNCTIONS: dict[type, Functions] = {}
 """Of every type of method; its module enters it."""
 
 
-def method_step(
-    method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out
-):  # pragma: no cover - compiled through its overload
+def method_step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
     """One step of `ticks` (any part of a tick) from `y`, whose rates are in k[0], to `end`.
 
     Returns:
@@ -177,7 +175,6 @@ def _locate(event, before, after, method, constants, inputs, tick, fraction, tic
         out: What is observed there, out.
     """
     low, high, value_low, value_high = 0.0, 1.0, before, after
-    stages = len(method.b)
     cut, side = 1.0, 0
     for _ in range(60):
         cut = high - value_high * (high - low) / (value_high - value_low)
@@ -207,10 +204,10 @@ def _locate(event, before, after, method, constants, inputs, tick, fraction, tic
             int(memory[PHASE]),
             False,
             end,
-            k[stages],
+            k[method.rows - 1],
             out,
         )
-        memory[EVALUATIONS] += stages
+        memory[EVALUATIONS] += evaluations + 1.0
         value = _surplus(event, constants.contact, out)
         if value == 0.0:
             break
@@ -295,12 +292,11 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
 
     Entered with the rates at `y` in k[0] and what is observed there in `out`; leaves both for the end.
     """
-    stages = len(method.b)
     contact = constants.contact
-    last = k[stages]
+    last = k[method.rows - 1]
     tolerance = memory[_TOLERANCE]
     estimates = method.order > 0.0
-    fraction = 0.0
+    fraction, stale = 0.0, True
     depth, rate, sliding, margin = out[S.PENETRATION], out[S.PENETRATION_RATE], out[S.SLIDING_SPEED], 0.0
     margin = _surplus(_BREAK, contact, out)
     for _ in range(_MOST_PARTS):
@@ -309,19 +305,26 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
         size = left
         if estimates:
             size = min(size, memory[_SIZE])
-        if phase != FLIGHT:
+        if method.graded and phase != FLIGHT:
             # Time since onset or until lift-off, by the present rate.
             pace = abs(rate) * inputs.tick_s
             if depth < pace * ticks / _GROWTH:
                 size = min(size, max(_LEAST * ticks, _GROWTH * depth / pace))
         if size > 0.999 * left:  # no slivers
             size = left
-        _step(method, constants, inputs, tick, fraction, size, memory[ONSET], phase, y, k, z, end, out)
+        if stale:
+            memory[EVALUATIONS] += method_prepare(
+                method, constants, inputs, tick, fraction, left, memory[ONSET], phase, y, k, z, out
+            )
+            stale = False
+        evaluations = method_step(
+            method, constants, inputs, tick, fraction, size, memory[ONSET], phase, y, k, z, end, out
+        )
         rates(constants, inputs, tick, fraction + size, memory[ONSET], phase, False, end, last, out)
-        memory[EVALUATIONS] += stages
+        memory[EVALUATIONS] += evaluations + 1.0
         memory[STEPS] += 1.0
         if estimates:
-            error = _error(method, size * inputs.tick_s, k, scratch)
+            error = method_error(method, size * inputs.tick_s, k, scratch)
             if np.isnan(error):
                 y[:] = end
                 return
@@ -337,6 +340,7 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
             if size < memory[_SIZE] and factor >= 1.0:
                 proposal = max(memory[_SIZE], proposal)
             memory[_SIZE] = min(ticks, proposal)
+        stale = True
         event = _event(phase, contact, out)
         if event == _LIFT_OFF:
             # Friction may have changed on the way out.
@@ -411,7 +415,7 @@ def advance(method, constants, inputs, y, memory, tick, step_ticks, steps, strid
         stride: Steps a row.
         rows: Out, shape (ceil(steps / stride), N_ROW).
     """
-    k = np.zeros((len(method.b) + 1, S.N_VECTOR))
+    k = np.zeros((method.rows, S.N_VECTOR))
     scratch = np.empty((2, S.N_STATE))
     z = np.empty(S.N_VECTOR)
     end = np.empty(S.N_VECTOR)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rig.engines import runge_kutta
+from rig.engines import parts
 from rig.engines.runge_kutta import Tableau
 
 ORDER = 4
@@ -15,11 +15,12 @@ TABLEAU = Tableau(
     coarse=np.zeros(5),
     fine=np.zeros(5),
     order=0.0,
+    rows=5,
 )
 
-start = runge_kutta.start
+start = parts.start
 
 
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.runge_kutta.advance`."""
-    runge_kutta.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
+    """See `rig.engines` and `rig.engines.parts.advance`."""
+    parts.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rig.engines import runge_kutta
+from rig.engines import parts
 from rig.engines.runge_kutta import Tableau
 
 ORDER = 8
@@ -25,13 +25,14 @@ def _tableau() -> Tableau:
         coarse=np.ascontiguousarray(DOP853.E3),  # pyright: ignore[reportAttributeAccessIssue]
         fine=np.ascontiguousarray(DOP853.E5),  # pyright: ignore[reportAttributeAccessIssue]
         order=float(ORDER),
+        rows=s + 1,
     )
 
 
 TABLEAU = _tableau()
-start = runge_kutta.start
+start = parts.start
 
 
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.runge_kutta.advance`."""
-    runge_kutta.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
+    """See `rig.engines` and `rig.engines.parts.advance`."""
+    parts.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

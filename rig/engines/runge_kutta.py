@@ -7,11 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rig.engines.parts import FUNCTIONS, SCALES, Functions, nothing_to_prepare
+from rig.engines.parts import FUNCTIONS, PER_SCALE, Functions, nothing_to_prepare
 from rig.kernels import signals as S
 from rig.kernels.dynamics import evaluate
-
-_PER_SCALE = 1.0 / SCALES
 
 
 class Tableau(NamedTuple):
@@ -23,11 +21,13 @@ class Tableau(NamedTuple):
     coarse: np.ndarray  # (s + 1,) weights of a lower-order estimate, the last for the rates at the end
     fine: np.ndarray  # (s + 1,) weights of a higher-order estimate; all 0 where there is only the coarse one
     order: float  # of the estimate's leading error; 0: no estimate
+    rows: int  # s + 1
+    graded: bool = True
 
 
 @njit(cache=True)
 def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
-    """One Runge-Kutta step of `ticks` (any part of a tick) from `y`, whose rates are in k[0], to `end`."""
+    """One step; k holds the stages' rates, then those at the end."""
     a, b, c = method.a, method.b, method.c
     h = ticks * inputs.tick_s
     for stage in range(1, len(b)):
@@ -50,6 +50,7 @@ def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, 
                 z[i] += weight * k[stage, i]
     for i in range(S.N_VECTOR):
         end[i] = y[i] + z[i]
+    return len(b) - 1
 
 
 @njit(cache=True)
@@ -67,8 +68,8 @@ def _error(method, h, k, scratch):
     coarse = 0.0
     fine = 0.0
     for i in range(S.N_STATE):
-        coarse += (low[i] * _PER_SCALE[i]) ** 2
-        fine += (high[i] * _PER_SCALE[i]) ** 2
+        coarse += (low[i] * PER_SCALE[i]) ** 2
+        fine += (high[i] * PER_SCALE[i]) ** 2
     if fine == 0.0:
         return h * np.sqrt(coarse / S.N_STATE)
     return h * fine / np.sqrt((fine + 0.01 * coarse) * S.N_STATE)

@@ -73,9 +73,9 @@ _GRID = 5
 """Level of the grid's own step: level l lasts 2**(l - _GRID) steps of the grid."""
 _LEVELS = _GRID + 8
 """Flows are kept for half a step of every level; each: horizontal and vertical block of the houses, (4, 4)."""
-_LONGEST = _GRID + 6
-"""A flight covers at most 2**6 steps of the grid ..."""
-_FLIGHT_S = 2.6e-4
+_LONGEST = _GRID + 4
+"""A flight covers at most 2**4 steps of the grid ...
+_FLIGHT_S = 1.1e-3
 """... and lasts at most this long [s]."""
 _BLOW = _GRID - 3
 """Longest step in a blow of the hammer."""
@@ -87,8 +87,8 @@ _DRIFT = 0.01
 """Weight of the gap's slow motion, squared, against its acceleration."""
 _PATIENCE = 16
 """Calm kicks in a row before the step is doubled."""
-_SLOP = 1e-7
-"""Depth that a rigid ring keeps in lasting contact [m], so that rounding does not make a flight of it."""
+_SLOP = 200.0
+"""Depth that a rigid ring keeps in lasting contact, over the step squared [m/s^2]: a chord of the arc stays inside."""
 _RETURN = 0.1
 """Part of a depth beyond it that is taken back in a step."""
 
@@ -197,8 +197,9 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     else:
         memory[_UX], memory[_UY], memory[_PX], memory[_PY], memory[_SPIN] = y[1], -y[0], y[8], -y[7], y[9]
     memory[_THETA] = memory[_ANGLE] = y[2]
-    memory[_COS], memory[_SIN] = math.cos(y[2] + constants.shaft.unbalance_phase), math.sin(
-        y[2] + constants.shaft.unbalance_phase
+    memory[_COS], memory[_SIN] = (
+        math.cos(y[2] + constants.shaft.unbalance_phase),
+        math.sin(y[2] + constants.shaft.unbalance_phase),
     )
     memory[_X : _X + 4] = np.array([y[3], y[10], y[5], y[12]])
     memory[_Y : _Y + 4] = np.array([y[4], y[11], y[6], y[13]])
@@ -359,7 +360,9 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     loose_v = 2.0 * house.preload / house.pair_stiffness_vertical
     loose_h = 2.0 * house.preload / house.pair_stiffness_horizontal
     # Root of twice the houses' energy at which a transducer can come loose.
-    tightest = min(loose_v * math.sqrt(house.pair_stiffness_vertical), loose_h * math.sqrt(house.pair_stiffness_horizontal))
+    tightest = min(
+        loose_v * math.sqrt(house.pair_stiffness_vertical), loose_h * math.sqrt(house.pair_stiffness_horizontal)
+    )
     # Flows of the shaft and the drive, for every length that a half step can have.
     flows = np.empty((_LEVELS, 14))
     for level in range(_LEVELS):
@@ -666,7 +669,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 else:
                     # Newton's law at an onset, Moreau's in lasting contact: no speed in the mean of a step.
                     share = 1.0
-                    goal = -0.5 * (rate - rate_before) - _RETURN * (depth - _SLOP) * per_h
+                    goal = -0.5 * (rate - rate_before) - _RETURN * (depth - _SLOP * h * h) * per_h
                     if phase == FLIGHT:
                         goal = -contact.restitution * rate if rate > contact.speed_floor else 0.0
                     jn = max(0.0, (rate - goal) / w_nn)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rig.engines import runge_kutta
+from rig.engines import parts
 from rig.engines.runge_kutta import Tableau
 
 ORDER = 5
@@ -34,11 +34,12 @@ TABLEAU = Tableau(
     ),
     fine=np.zeros(7),
     order=5.0,
+    rows=7,
 )  # fmt: skip
 
-start = runge_kutta.start
+start = parts.start
 
 
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.runge_kutta.advance`."""
-    runge_kutta.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
+    """See `rig.engines` and `rig.engines.parts.advance`."""
+    parts.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

@@ -94,7 +94,7 @@ CASES = [
     scene("no such group", '[sensors]\ngroups = ["probs"]', "sensors.groups", "names out of probes, forces"),
     scene("no group", "[sensors]\ngroups = []", "sensors.groups", "names out of probes, forces"),
     scene("noise maybe", '[sensors]\nnoise = "maybe"', "sensors.noise", "a valid boolean"),
-    scene("no such engine", '[engine]\nname = "euler"', "engine.name", "one of rk8, rk4"),
+    scene("no such engine", '[engine]\nname = "euler"', "engine.name", "one of split, rk8"),
     scene("step of zero", "[engine]\nstep_us = 0", "engine.step_us", "greater than or equal to 1"),
     scene(
         "no such position",
@@ -230,7 +230,7 @@ CASES = [
         {"scene.txt": "seed = 1"},
     ),
     Case("no such set in an option", (*DROP, "--parameters", "nosuch"), "parameters", "one of corrected"),
-    Case("no such engine in an option", (*DROP, "--engine", "euler"), "engine.name", "one of rk8, rk4"),
+    Case("no such engine in an option", (*DROP, "--engine", "euler"), "engine.name", "one of split, rk8"),
     Case("duration of -1", (*DROP, "--duration-s", "-1"), "duration_s", "greater than 0"),
     Case("duration of nan", (*DROP, "--duration-s", "nan"), "duration_s", "a finite number"),
     Case("duration of x", (*DROP, "--duration-s", "x"), "--duration-s", "valid"),

@@ -1,0 +1,158 @@
+"""Points that have been measured, kept as they come, so that a chart that was stopped goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import subprocess
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from rig.errors import InputError
+
+KEY = ("mode", "panel", "phase", "case", "method", "rung")
+"""Columns that tell one point from another."""
+COLUMNS = (
+    *KEY, "title", "family", "known_failure", "friction", "smoothing_speed", "step_us", "tolerance", "simulated_s",
+    "runs", "wall_s", "wall_min_s", "wall_max_s", "compile_s", "speed", "speed_min", "speed_max", "error",
+    "reference", "reference_error", "energy_residual", "steps", "evaluations", "contacts", "contacts_reference",
+    "worst_frame_ms", "contact_fraction", "contact_fraction_low", "contact_fraction_high", "rms_force",
+    "rms_force_low", "rms_force_high", "impacts_per_s", "impacts_per_s_low", "impacts_per_s_high", "failure",
+    "message", "code", "commit", "date", "machine", "versions",
+)  # fmt: skip
+"""Columns of the table; speeds are times real time, forces newtons."""
+_TEXT = {*KEY, "title", "family", "known_failure", "friction", "reference", "failure", "message", "code", "commit",
+         "date", "machine", "versions"}  # fmt: skip
+_LIBRARIES = ("rotor-stator-rig", "numba", "numpy", "scipy", "heyoka", "scikit-sundae", "mujoco")
+
+Row = dict[str, Any]
+
+
+class Store:
+    """Points in a folder: a journal that grows with every point, and at the end Parquet and CSV.
+
+    A point counts as measured only for the code that it was measured with.
+    """
+
+    def __init__(self, folder: Path, stem: str = "chart", *, fresh: bool = False) -> None:
+        """Open a folder, which is made where it is missing.
+
+        Raises:
+            InputError: It cannot be written, or is a file.
+        """
+        if folder.exists() and not folder.is_dir():
+            raise InputError("output", "a folder", f"{folder}, which is a file")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError("output", "a folder that can be made", f"{folder} ({error.strerror})") from None
+        if not os.access(folder, os.W_OK):
+            raise InputError("output", "a folder that can be written", str(folder))
+        self.folder, self.stem = folder, stem
+        self.stamp = stamp()
+        self._rows: dict[tuple[Any, ...], Row] = {}
+        self.outdated = 0
+        if fresh:
+            self._journal.unlink(missing_ok=True)
+        self._load()
+
+    @property
+    def _journal(self) -> Path:
+        return self.folder / f"{self.stem}.journal.jsonl"
+
+    def _load(self) -> None:
+        if not self._journal.is_file():
+            return
+        for line in self._journal.read_text(encoding="utf-8").splitlines():
+            try:
+                row = json.loads(line)
+            except json.JSONDecodeError:
+                continue  # the last line of a run that was killed
+            if row.get("code") != self.stamp["code"]:
+                self.outdated += 1
+                continue
+            self._rows[tuple(row[name] for name in KEY)] = row
+
+    def has(self, key: tuple[Any, ...]) -> bool:
+        """Whether a point has been measured."""
+        return key in self._rows
+
+    def rows(self, mode: str) -> list[Row]:
+        """All points of a mode."""
+        return [row for row in self._rows.values() if row["mode"] == mode]
+
+    def add(self, row: Row) -> None:
+        """Keep a point; it is on the disk when this returns."""
+        whole: Row = {name: row.get(name, "" if name in _TEXT else None) for name in COLUMNS} | self.stamp
+        for name, value in whole.items():
+            # JSON has no words for what is not finite; an empty field says the same.
+            if isinstance(value, float) and not math.isfinite(value):
+                whole[name] = None
+        with self._journal.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(whole) + "\n")
+        self._rows[tuple(whole[name] for name in KEY)] = whole
+
+    def write(self, mode: str) -> list[Path]:
+        """Write the points of a mode as Parquet and CSV."""
+        import pyarrow as pa
+        import pyarrow.csv
+        import pyarrow.parquet
+
+        rows = self.rows(mode)
+        schema = pa.schema([(name, pa.string() if name in _TEXT else pa.float64()) for name in COLUMNS])
+        table = pa.table(
+            {
+                name: [row[name] if name in _TEXT or row[name] is None else float(row[name]) for row in rows]
+                for name in COLUMNS
+            },
+            schema=schema,
+        )
+        paths = [self.folder / f"{self.stem}.parquet", self.folder / f"{self.stem}.csv"]
+        pyarrow.parquet.write_table(table, paths[0])
+        pyarrow.csv.write_csv(table, paths[1])
+        return paths
+
+
+def stamp() -> dict[str, str]:
+    """What a point is measured with: code, commit, date, machine, versions of libraries."""
+    from rig.kernels import source_digest
+
+    versions = []
+    for library in _LIBRARIES:
+        try:
+            versions.append(f"{library} {version(library)}")
+        except PackageNotFoundError:
+            continue
+    return {
+        "code": source_digest(),
+        "commit": _commit(),
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "machine": f"{_processor()}, {platform.system()}",
+        "versions": f"Python {platform.python_version()}, " + ", ".join(versions),
+    }
+
+
+def _commit() -> str:
+    here = Path(__file__).resolve().parent
+    try:
+        done = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--exclude", "*"],
+            cwd=here, capture_output=True, text=True, timeout=10, check=False,
+        )  # fmt: skip
+    except OSError:
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -1,0 +1,111 @@
+"""A pick in a scene's file: only the table [pick] is replaced or added, all else stays as its author wrote it."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from rig.errors import InputError
+from rig.scenes import Pick, Scene, load_scene, pick_digests, scene_path
+
+_HEADER = re.compile(r"^\s*\[{1,2}\s*(?P<name>[^\]\[]+?)\s*\]{1,2}\s*(#.*)?$")
+_COMMENT = "# Written by `rig ladder`: what it measured. In force where the scene says fidelity = \"auto\"."
+
+
+def check_target(path: Path, scene_name: str, scene: Scene) -> None:
+    """Check, before a long search, that a pick can be written into a file.
+
+    Raises:
+        InputError: It is no .toml file, or holds another scene than the one that is searched.
+    """
+    if path.suffix != ".toml":
+        raise InputError("--write", "a .toml file", str(path))
+    source = path if path.is_file() else scene_path(scene_name)
+    if pick_digests(_as_given(source)) != pick_digests(scene):
+        must = "the file of this very scene (changes by --set have to be in it)"
+        raise InputError("--write", must, str(path))
+
+
+def write_pick(path: Path, scene_name: str, pick: Pick) -> None:
+    """Put a pick into a scene's file; a file that is not there yet becomes a copy of the scene's.
+
+    Raises:
+        InputError: The file cannot be edited safely.
+    """
+    source = path if path.is_file() else scene_path(scene_name)
+    # newline="": line ends stay as they are.
+    with source.open(encoding="utf-8", newline="") as file:
+        old = file.read()
+    new = with_pick(old, pick)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        file.write(new)
+
+
+def with_pick(text: str, pick: Pick) -> str:
+    """A scene's text with the pick in it.
+
+    Raises:
+        InputError: Something else than the table would change.
+    """
+    end = "\r\n" if "\r\n" in text else "\n"
+    lines = text.splitlines()
+    kept: list[str] = []
+    place: int | None = None
+    inside = False
+    trailing: list[str] = []
+    for line in lines:
+        header = _HEADER.match(line)
+        if header:
+            name = header["name"].split(".")[0].strip().strip("\"'")
+            if inside and name != "pick":
+                # Comments and blank lines before the next header are that table's.
+                kept += trailing
+            inside = name == "pick"
+            trailing = []
+            if inside and place is None:
+                place = len(kept)
+        if not inside:
+            kept.append(line)
+        elif not line.strip() or (line.lstrip().startswith("#") and line.strip() != _COMMENT):
+            trailing.append(line)
+        else:
+            trailing = []
+    if inside:
+        kept += [line for line in trailing if line.strip()]
+    table = pick_table(pick).splitlines()
+    if place is None:
+        place = len(kept)
+    before, after = kept[:place], kept[place:]
+    while before and not before[-1].strip():
+        before.pop()
+    while after and not after[0].strip():
+        after.pop(0)
+    joined = [*before, "", *table, *([""] if after else []), *after]
+    new = end.join(joined) + end
+    old_data, new_data = tomllib.loads(text), tomllib.loads(new)
+    old_data.pop("pick", None)
+    if new_data.pop("pick", None) is None or old_data != new_data:
+        raise InputError("--write", "a file whose [pick] stands in a table of its own", "text that hides it")
+    return new
+
+
+def pick_table(pick: Pick) -> str:
+    """The pick as TOML, with a table for each quantity."""
+    data = pick.model_dump(mode="json")
+    quantities = data.pop("quantities")
+    lines = ["[pick]", _COMMENT, *(f"{key} = {_value(value)}" for key, value in data.items())]
+    for entry in quantities:
+        lines += ["", "[[pick.quantities]]"]
+        lines += [f"{key} = {_value(value)}" for key, value in entry.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _value(value: str | float) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return repr(value)
+
+
+def _as_given(path: Path) -> Scene:
+    return load_scene(path, {"fidelity": "given"})

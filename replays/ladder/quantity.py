@@ -1,0 +1,233 @@
+"""Quantities that a model can be judged by: each one number (or a word) of a run, with its unit and its phase."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rig.errors import InputError
+from rig.kernels.signals import COLUMN
+from rig.simulation import DISSIPATED
+
+SETTLED = 0.25
+"""The settled phase is this last part of a run."""
+ROLLS = 0.02
+"""A contact rolls while it slides by less than this part of the surface's speed."""
+Value = float | str
+
+
+class Trace(NamedTuple):
+    """What is kept of a run: rows on a grid of 1 ms, and what the engine has accumulated."""
+
+    times_s: np.ndarray
+    """Shape (n,)."""
+    rows: np.ndarray
+    """Shape (n, N_ROW)."""
+    peak_force: float
+    """By the engine's own steps [N]."""
+    clearance: float
+    """r0 [m]."""
+    surface_radius: float
+    """R_S [m]."""
+    first_impact_s: float
+    """Located between steps [s]; nan where there is none or where nobody asked."""
+
+    def column(self, name: str) -> np.ndarray:
+        """One signal, shape (n,)."""
+        return self.rows[:, COLUMN[name]]
+
+    def settled(self, name: str) -> np.ndarray:
+        """One signal in the settled phase."""
+        return self.column(name)[-self.settled_rows :]
+
+    @property
+    def settled_rows(self) -> int:
+        """Rows of the settled phase."""
+        return max(2, round(SETTLED * len(self.times_s)))
+
+    @property
+    def settled_s(self) -> float:
+        """Time between the first and the last row of the settled phase [s]."""
+        return float(self.times_s[-1] - self.times_s[-self.settled_rows])
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One quantity.
+
+    Attributes:
+        name: Its name on the command line.
+        unit: Unit, "" for a word.
+        phase: Part of the run that it belongs to.
+        title: What it is and how it is read.
+        read: Reads it off a run; nan where the run has none.
+        scale: What an error is a part of; None: the reference's own value.
+        scale_title: The same in words.
+        needs_force: True where a rigid impact, which has no force over time, cannot give it.
+        resolution: Of the reading itself [unit].
+    """
+
+    name: str
+    unit: str
+    phase: str
+    title: str
+    read: Callable[[Trace], Value]
+    scale: Callable[[Trace], float] | None = None
+    scale_title: str = "its value"
+    needs_force: bool = False
+    resolution: float = 0.0
+
+    def error(self, value: Value, reference: Value, trace: Trace) -> float:
+        """Distance of a value from the reference's as a part of the scale; infinite where one of them has none."""
+        if isinstance(value, str) or isinstance(reference, str):
+            return 0.0 if value == reference else math.inf
+        if value == reference:
+            return 0.0
+        scale = abs(reference) if self.scale is None else self.scale(trace)
+        if not (math.isfinite(value) and math.isfinite(reference)) or scale == 0.0:
+            return math.inf
+        return abs(value - reference) / scale
+
+
+def _whirl_frequency(trace: Trace) -> float:
+    if _contact_fraction_settled(trace) < 0.5:
+        return math.nan
+    x, y = trace.settled("ring_x"), trace.settled("ring_y")
+    phase = np.unwrap(np.arctan2(y, x))
+    times = trace.times_s[-trace.settled_rows :]
+    return float(np.polyfit(times - times[0], phase, 1)[0] / (2.0 * math.pi))
+
+
+def _contact_fraction_settled(trace: Trace) -> float:
+    return float(np.mean(trace.settled("penetration") > 0.0))
+
+
+def _mean_force(trace: Trace) -> float:
+    impulse = trace.settled("contact_impulse")
+    return float(impulse[-1] - impulse[0]) / trace.settled_s
+
+
+def _ripple(trace: Trace) -> float:
+    return float(np.std(trace.settled("normal_force")))
+
+
+def _reaction(trace: Trace) -> float:
+    return float(math.sqrt(2.0) * np.std(trace.settled("P_E") - trace.settled("P_W")))
+
+
+def _spin(trace: Trace) -> float:
+    theta = trace.settled("theta")
+    return float(theta[-1] - theta[0]) / trace.settled_s / (2.0 * math.pi)
+
+
+def _dissipated(trace: Trace) -> float:
+    return float(sum(trace.column(name)[-1] for name in DISSIPATED))
+
+
+def _time_to_roll(trace: Trace) -> float:
+    slides = np.abs(trace.column("sliding_speed")) > ROLLS * trace.surface_radius * np.abs(trace.column("theta_rate"))
+    loose = slides | (trace.column("penetration") <= 0.0)
+    if loose[-1]:
+        return math.nan
+    return float(trace.times_s[np.flatnonzero(loose)[-1] + 1]) if loose.any() else 0.0
+
+
+def _rebound(trace: Trace) -> float:
+    rises = np.flatnonzero(np.diff(trace.column("contact_impulse")) > 0.0)
+    later = rises[1:][np.diff(rises) > 2]
+    if not len(later):
+        return math.nan
+    begin = int(later[0])
+    before = rises[rises < begin]
+    y = trace.column("ring_y")[int(before[-1]) + 1 : begin + 1]
+    top = int(np.argmax(y))
+    if not 0 < top < len(y) - 1:
+        return math.nan
+    slope, bend = 0.5 * (y[top + 1] - y[top - 1]), y[top + 1] - 2.0 * y[top] + y[top - 1]
+    return float(y[top] - 0.5 * slope * slope / bend + trace.clearance)
+
+
+def _outcome(trace: Trace) -> str:
+    share = _contact_fraction_settled(trace)
+    if share == 0.0:
+        impulse = trace.settled("contact_impulse")
+        return "no contact" if impulse[-1] == impulse[0] else "bouncing"
+    if share < 0.95:
+        return "bouncing"
+    turns = np.unwrap(np.arctan2(trace.settled("ring_y"), trace.settled("ring_x")))
+    if abs(turns[-1] - turns[0]) < 2.0 * math.pi:
+        return "resting"
+    return "forward whirl" if turns[-1] > turns[0] else "backward whirl"
+
+
+def _fraction(trace: Trace) -> float:
+    return float(np.mean(trace.column("penetration") > 0.0))
+
+
+def _whole(name: str) -> Callable[[Trace], float]:
+    return lambda trace: float(trace.column(name)[-1])
+
+
+_LAST = f"last {SETTLED:.0%} of the run"
+QUANTITIES = {
+    quantity.name: quantity
+    for quantity in (
+        Quantity(
+            "whirl_frequency", "Hz", _LAST, "slope of the phase of the shaft in the ring; negative is backward",
+            _whirl_frequency,
+        ),
+        Quantity("spin", "Hz", _LAST, "turns of the shaft over time", _spin),
+        Quantity("mean_normal_force", "N", _LAST, "the engine's own contact impulse over time", _mean_force),
+        Quantity(
+            "force_ripple", "N", _LAST, "RMS of the normal force about its mean, every 1 ms", _ripple,
+            scale=_mean_force, scale_title="the mean normal force", needs_force=True,
+        ),
+        Quantity(
+            "reaction_amplitude", "N", _LAST, "sqrt(2) RMS of P_E - P_W about its mean, every 1 ms", _reaction,
+            needs_force=True,
+        ),
+        Quantity(
+            "peak_normal_force", "N", "whole run", "largest by the engine's own steps",
+            lambda trace: trace.peak_force, needs_force=True,
+        ),
+        Quantity("contact_impulse", "N s", "whole run", "the engine's own integral of the normal force",
+                 _whole("contact_impulse")),
+        Quantity("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipated),
+        Quantity("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction,
+                 scale=lambda _: 1.0, scale_title="1"),
+        Quantity(
+            "time_to_roll", "s", "transient", f"until it rolls for good (slip below {ROLLS:.0%}), to 1 ms",
+            _time_to_roll, resolution=1e-3,
+        ),
+        Quantity(
+            "first_impact_time", "s", "first impact", "located between two steps", lambda trace: trace.first_impact_s
+        ),
+        Quantity(
+            "rebound_height", "m", "first impact", "top of the first rebound above the ring's lowest point", _rebound
+        ),
+        Quantity("outcome", "", _LAST, "no contact, bouncing, resting, forward whirl or backward whirl", _outcome),
+    )
+}  # fmt: skip
+
+
+def parse_quantities(names: list[str], tolerances: list[float]) -> dict[str, float]:
+    """Quantities and the error allowed to each; one tolerance serves all.
+
+    Raises:
+        InputError: No such quantity, one given twice, or a tolerance that is none.
+    """
+    for name in names:
+        if name not in QUANTITIES:
+            raise InputError("--quantity", f"one of {', '.join(QUANTITIES)}", name)
+    if not names or len(set(names)) < len(names):
+        raise InputError("--quantity", "given once for each quantity", names)
+    for tolerance in tolerances:
+        if not 0.0 < tolerance <= 1.0:
+            raise InputError("--tolerance", "above 0 and at most 1, as a part of the quantity", tolerance)
+    if len(tolerances) not in (1, len(names)):
+        raise InputError("--tolerance", "given once, or once for each --quantity", tolerances)
+    return dict(zip(names, tolerances * (len(names) // len(tolerances)), strict=True))

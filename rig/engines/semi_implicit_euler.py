@@ -1,0 +1,48 @@
+"""Semi-implicit (symplectic) Euler: new speeds by the forces at the start, new positions by the new speeds; order 1.
+
+One evaluation a step and a bounded energy error where forces come from the positions. Explicit in the speeds.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from numba import njit
+
+from rig.engines import parts
+from rig.engines.parts import FUNCTIONS, Functions, no_estimate, nothing_to_prepare
+from rig.kernels import signals as S
+
+ORDER = 1
+_N = S.N_STATE // 2
+
+
+class SemiImplicitEuler(NamedTuple):
+    """The method, as `rig.engines.parts` takes it."""
+
+    rows: int = 2
+    order: float = 0.0
+    graded: bool = False
+
+
+METHOD = SemiImplicitEuler()
+
+
+@njit(cache=True)
+def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
+    h = ticks * inputs.tick_s
+    for i in range(_N):
+        end[_N + i] = y[_N + i] + h * k[0, _N + i]
+        end[i] = y[i] + h * end[_N + i]
+    for i in range(S.N_STATE, S.N_VECTOR):
+        end[i] = y[i] + h * k[0, i]
+    return 0
+
+
+FUNCTIONS[SemiImplicitEuler] = Functions(step=_step, error=no_estimate, prepare=nothing_to_prepare)
+start = parts.start
+
+
+def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
+    """See `rig.engines` and `rig.engines.parts.advance`."""
+    parts.advance(METHOD, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

@@ -1,0 +1,54 @@
+"""Velocity Verlet: half a kick, a drift, half a kick; order 2.
+
+Forces that depend on the speeds (damping, gyroscopic and centrifugal terms, friction) are taken at the end with the
+speeds that the first force alone would lead to, as is usual. That is of order 2 for them too, as Heun's method is, but
+it is not symplectic: only where forces come from the positions is the energy error bounded. Two evaluations a step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from numba import njit
+
+from rig.engines import parts
+from rig.engines.parts import FUNCTIONS, Functions, no_estimate, nothing_to_prepare, rates
+from rig.kernels import signals as S
+
+ORDER = 2
+_N = S.N_STATE // 2
+
+
+class Verlet(NamedTuple):
+    """The method, as `rig.engines.parts` takes it."""
+
+    rows: int = 3
+    order: float = 0.0
+    graded: bool = False
+
+
+METHOD = Verlet()
+
+
+@njit(cache=True)
+def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
+    h = ticks * inputs.tick_s
+    half = 0.5 * h
+    for i in range(_N):
+        z[i] = y[i] + h * (y[_N + i] + half * k[0, _N + i])
+        z[_N + i] = y[_N + i] + h * k[0, _N + i]
+    rates(constants, inputs, tick, fraction + ticks, onset_speed, phase, False, z, k[1], out)
+    for i in range(_N):
+        end[i] = z[i]
+    for i in range(_N, S.N_VECTOR):
+        end[i] = y[i] + half * (k[0, i] + k[1, i])
+    return 1
+
+
+FUNCTIONS[Verlet] = Functions(step=_step, error=no_estimate, prepare=nothing_to_prepare)
+start = parts.start
+
+
+def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
+    """See `rig.engines` and `rig.engines.parts.advance`."""
+    parts.advance(METHOD, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
