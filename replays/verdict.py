@@ -10,6 +10,7 @@ import numpy as np
 from recorder.reader import Recording
 from replays.whirl import WhirlFigures, parameter_si, whirl_figures
 from rig.errors import InputError
+from rig.simulation import ENERGY_ALARM
 
 PAPER_WHIRL_HZ = 83.7
 """The paper's Fig. 14, at 6.2 Hz."""
@@ -168,9 +169,9 @@ def _status_rows(status: dict[str, Any]) -> list[Row]:
     residual_j, dissipated_j = status["energy"]["residual_j"], status["energy"]["dissipated_j"]
     lateness = f"{late['p50']:.3f} / {late['p99']:.3f} / {late['max']:.3f} ms"
     ledger = f"{residual_j:.1e} J of {dissipated_j:.2f} J"
-    closed = abs(residual_j) < 1e-6 * max(dissipated_j, 1e-6)
+    closed = abs(residual_j) < ENERGY_ALARM * max(dissipated_j, 1e-6)
     return [
         _asked("lateness p50 / p99 / max", lateness, f"p99 below a block of {block_ms:g} ms", late["p99"] < block_ms),
         _asked("real-time factor", f"{factor:.4f}", "1.000", abs(factor - 1.0) < 2e-3),
-        _asked("energy residual", ledger, "below 1e-6 of what was dissipated", closed),
+        _asked("energy residual", ledger, f"below {ENERGY_ALARM:g} of what was dissipated", closed),
     ]

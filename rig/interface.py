@@ -19,7 +19,7 @@ _DOCUMENTS = {
     ),
     wire.STATUS: (
         "published twice a second and on request: state, pace, lateness, overruns, real-time factor, queue, clients, "
-        "spin, energy residual, warnings"
+        "spin, engine, energy residual (its error estimate), warnings"
     ),
     wire.CATALOGUE: "on request: the channel table with calibration, truth tables with units",
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",

@@ -321,6 +321,7 @@ class Service:
                 "clients": self._client_rows(),
                 "spin_hz": health.get("spin_hz"),
                 "energy": health.get("energy", {}),
+                "engine": health.get("engine", {}),
                 "warnings": warnings,
                 "samples_published": self._samples_published,
                 "commands": self._accepted,

@@ -250,6 +250,7 @@ class Simulation:
                 "dissipated_j": dissipated,
                 "residual_share": residual / max(dissipated, 1e-6),
             },
+            "engine": {**self.scene.engine.model_dump(), "levels": self.scene.model.model_dump()},
             "contacts": int(self._memory[CONTACTS]),
             "peak_normal_force_n": float(self._memory[PEAK_FORCE]),
             "steps": int(self._memory[STEPS]),

@@ -18,7 +18,7 @@ from rig.engines import load_engine
 from rig.engines.memory import CONTACTS, EVALUATIONS, MEMORY, STEPS
 from rig.kernels.contact import normal_force
 from rig.kernels.dynamics import gap
-from rig.kernels.signals import COLUMN, N_ROW, N_STATE, N_VECTOR
+from rig.kernels.signals import N_ROW, N_STATE, N_VECTOR
 from rig.simulation import energy_balance
 
 OFF = 0.5
@@ -59,8 +59,6 @@ class Run:
     compile_s: float = 0.0
     energy_residual: float | None = None
     worst_frame_s: float | None = None
-    force: np.ndarray | None = None
-    """Normal force at the instants [N], shape (n,)."""
     onsets: np.ndarray = field(default_factory=lambda: np.empty(0))
     """Times at which contacts began, to a frame [s]."""
 
@@ -82,9 +80,9 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         engine.start(constants, inputs, y, memory, step, rung.tolerance)
         return y, memory
 
-    y, memory = begin()
     rows = np.full((n + 1, N_ROW), np.nan)
     clock = time.perf_counter()
+    y, memory = begin()
     engine.advance(constants, inputs, y, memory, problem.start_tick, rung.step_us, 1, 1, rows[:1])
     compile_s = time.perf_counter() - clock
     frames = np.empty(n)
@@ -122,9 +120,7 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         while len(walls) < budget.runs or (sum(walls) < _ENOUGH_S and len(walls) < _MOST):
             clock = time.perf_counter()
             again, kept = begin()
-            engine.advance(
-                constants, inputs, again, kept, problem.start_tick, rung.step_us, n * stride, stride, whole
-            )
+            engine.advance(constants, inputs, again, kept, problem.start_tick, rung.step_us, n * stride, stride, whole)
             walls.append(time.perf_counter() - clock)
             if walls[-1] > budget.single_s:
                 break
@@ -149,7 +145,6 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         compile_s=compile_s,
         energy_residual=residual,
         worst_frame_s=None if failure else float(best.max()),
-        force=rows[:, COLUMN["normal_force"]].copy(),
         onsets=np.repeat(times, np.diff(counts, prepend=0.0).clip(0).astype(int)),
     )
 
@@ -184,7 +179,6 @@ def run_peer(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         failure=failure,
         message=message,
         compile_s=compile_s,
-        force=None,
         onsets=np.array([time_s for time_s, _ in solution.onsets]),
     )
 
@@ -226,21 +220,22 @@ def statistics_point(
     columns: dict[str, Any] = {**_cost(done, problem), "failure": done.failure, "message": done.message}
     if done.failure:
         return columns
-    force = contact_forces(problem, done)
+    force = elastic_forces(problem, done.states)
     for name, (mean, low, high) in block_statistics(problem.times, force, done.onsets, settle_s=settle_s).items():
         columns |= {name: mean, f"{name}_low": low, f"{name}_high": high}
     return columns
 
 
-def contact_forces(problem: Problem, done: Run) -> np.ndarray:
-    """Normal force at the instants [N], shape (n,); from the states where the method tells none.
+def elastic_forces(problem: Problem, states: np.ndarray) -> np.ndarray:
+    """Elastic part of the normal force [N], shape (n,): the part that a state alone tells, the same for every method.
 
-    Of a state alone v0 is not known: the floor stands in for it, and the damping is taken as 1 where it would matter,
-    so that only the elastic part is compared.
+    Args:
+        problem: The problem.
+        states: Shape (n, 14).
     """
     contact = problem.constants.contact
-    forces = np.zeros(len(problem.times))
-    for i, state in enumerate(done.states):
+    forces = np.zeros(len(states))
+    for i, state in enumerate(states):
         depth = gap(problem.constants, state)[0]
         if depth > 0.0:
             forces[i] = normal_force(depth, 0.0, contact.speed_floor, contact)[1]

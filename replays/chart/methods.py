@@ -58,6 +58,8 @@ _QUICK: dict[str, tuple[tuple[int, float], ...]] = {
     "rk8": tuple((25, 10.0**-n) for n in (6, 8, 10, 12)),
     "tsit5": tuple((500, 10.0**-n) for n in (4, 6, 8, 10)),
     "rk4": tuple((step, 0.0) for step in (50, 20, 10, 5)),
+    "verlet": tuple((step, 0.0) for step in (50, 10, 5)),
+    "semi-implicit-euler": tuple((step, 0.0) for step in (50, 10, 5)),
 }
 """Step [us] and tolerance of each rung; an engine that is not named gets one about its own default."""
 _QUICK_PEERS = 3
@@ -92,7 +94,7 @@ def _engine(name: str) -> Competitor:
         else tuple((step, 0.0) for step in _STEPS)
     )
     ladder = _LADDERS.get(name, own)
-    return Competitor(name, name, OURS, rungs(ladder), rungs(_QUICK.get(name, ladder[::2])))
+    return Competitor(name, name, OURS, rungs(ladder), rungs(_QUICK.get(name, ladder[1::2])))
 
 
 def _peer(name: str) -> Competitor:

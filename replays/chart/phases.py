@@ -42,6 +42,8 @@ _ALL = (
     ),
 )  # fmt: skip
 PHASES = {phase.name: phase for phase in _ALL}
+RUB_SAMPLE_S = 5e-4
+"""Instants that its statistics are taken at [s]."""
 RUB_SPEED_HZ = 12.0
 """With these changes two runs that begin 5e-10 rad apart are fully apart after 0.4 s, and stay so."""
 
@@ -98,14 +100,14 @@ def select(only: str | None, panels: list[str] | None) -> tuple[list[str], str |
     return chosen, only
 
 
-def plan(
-    contenders: dict[str, Competitor], *, mode: Mode, panels: list[str], only: str | None = None
-) -> list[Task]:
+def plan(contenders: dict[str, Competitor], *, mode: Mode, panels: list[str], only: str | None = None) -> list[Task]:
     """All points of a chart but the profile's, those that tell most for their time first."""
     tasks: list[tuple[int, Task]] = []
     for panel in panels:
         for turn, phase in enumerate(_PANEL_PHASES[panel]):
             if only not in (None, phase):
+                continue
+            if mode == "quick" and panel == "smoothed" and phase != "transient" and only is None:
                 continue
             cases = MEMORY_CASES if panel == "memory" else ("", "smoothed") if panel == "exact" else ("",)
             for case in cases:
@@ -114,9 +116,7 @@ def plan(
     return [task for _, task in sorted(tasks, key=lambda pair: pair[0])]
 
 
-def _points(
-    contender: Competitor, panel: str, phase: str, case: str, turn: int, mode: Mode
-) -> list[tuple[int, Task]]:
+def _points(contender: Competitor, panel: str, phase: str, case: str, turn: int, mode: Mode) -> list[tuple[int, Task]]:
     friction = friction_of(panel, case)
     if not contender.takes(friction):
         return []
@@ -124,6 +124,7 @@ def _points(
         return []
     rungs = contender.rungs if mode == "full" else contender.quick
     if panel == RUB:
+        rungs = tuple(rung for rung in rungs if not rung.step_us or round(RUB_SAMPLE_S * 1e6) % rung.step_us == 0)
         rungs = rungs[1:-1:2] if contender.ours else rungs[len(rungs) // 2 : len(rungs) // 2 + 1]
         if contender.known_failure or contender.family == "scipy":
             return []
@@ -159,7 +160,7 @@ def problem_of(
     return Problem.from_scene(
         scene,
         end_s=end,
-        sample_s=FRAME_S if panel != RUB else 0.2 * FRAME_S,
+        sample_s=FRAME_S if panel != RUB else RUB_SAMPLE_S,
         friction=friction_of(panel, case),
         smoothing_speed=smoothing_speed,
         memory=case != "no memory",

@@ -9,10 +9,12 @@ import typer
 
 from rig.cli import (
     bench,
+    chart,
     demo,
     hammer,
     info,
     keys,
+    ladder,
     laws,
     magnets,
     params,
@@ -63,7 +65,7 @@ _PANELS: dict[str, dict[str, Any]] = {
         "stop": stop.stop,
     },
     "Recordings and pictures": {"record": record.record, "view": view.view, "info": info.info},
-    "Without a clock": {"simulate": simulate.simulate, "bench": bench.bench},
+    "Without a clock": {"simulate": simulate.simulate, "bench": bench.bench, "ladder": ladder.ladder, "chart": chart.chart},
 }
 
 

@@ -74,7 +74,7 @@ _GRID = 5
 _LEVELS = _GRID + 8
 """Flows are kept for half a step of every level; each: horizontal and vertical block of the houses, (4, 4)."""
 _LONGEST = _GRID + 4
-"""A flight covers at most 2**4 steps of the grid ...
+"""A flight covers at most 2**4 steps of the grid ..."""
 _FLIGHT_S = 1.1e-3
 """... and lasts at most this long [s]."""
 _BLOW = _GRID - 3

@@ -74,9 +74,10 @@ def unit_response(constants, inputs, sin_g, cos_g, sin_b, cos_b, nx, ny):
     force_x, force_y = shaft.arm_ring * ny, -shaft.arm_ring * nx
     per_Ixx = 1.0 / shaft.transverse_inertia
     ddG = -cos_g * force_y * per_Ixx / cos_b
-    ddb = (cos_b * force_x + sin_b * sin_g * force_y) * per_Ixx
+    cross = sin_b * sin_g if constants.levels.euler else 0.0
+    ddb = (cos_b * force_x + cross * force_y) * per_Ixx
     ax = shaft.arm_ring * cos_b * ddb
-    ay = shaft.arm_ring * (-cos_g * cos_b * ddG + sin_g * sin_b * ddb)
+    ay = shaft.arm_ring * (-cos_g * cos_b * ddG + cross * ddb)
     response = ay * nx - ax * ny
     if constants.levels.inner_house:
         response -= 1.0 / constants.house.inner_mass
@@ -119,10 +120,11 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, 
         spread = dG * dG + db * db
         turning = dG * db
         drag = dG * dG * sb * cb
+        cross = sb * sG
     else:
         sG, cG, sb, cb = y[0], 1.0, y[1], 1.0
         w = dth
-        spread = turning = drag = 0.0
+        spread = turning = drag = cross = 0.0
     # Direction of the axis and its rate.
     ux, uy, uz = sb, -sG * cb, cG * cb
     dux, duy = cb * db, -cG * cb * dG
@@ -185,7 +187,7 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, 
         # The friction that keeps the sliding speed from changing: its rate is linear in the force.
         torque_x, torque_y = Lx + lA * Fx, Ly + lA * Fy
         ddG = ((-cG * torque_y - Izz * w * db) * per_Ixx + 2.0 * turning * sb) / cb
-        ddb = (cb * torque_x + sb * sG * torque_y + Izz * w * dG * cb) * per_Ixx - drag
+        ddb = (cb * torque_x + cross * torque_y + Izz * w * dG * cb) * per_Ixx - drag
         dw = drive * per_Izz
         if inputs.ideal_drive:
             dw = inputs.speed_slope
@@ -215,7 +217,7 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, 
     Lx += lA * Fx
     Ly += lA * Fy
     ddG = ((-cG * Ly - Izz * w * db) * per_Ixx + 2.0 * turning * sb) / cb
-    ddb = (cb * Lx + sb * sG * Ly + Izz * w * dG * cb) * per_Ixx - drag
+    ddb = (cb * Lx + cross * Ly + Izz * w * dG * cb) * per_Ixx - drag
     # theta' differs from the spin by the share of Gamma' along the shaft.
     share = ddG * sb + turning * cb if levels.euler else 0.0
     if inputs.ideal_drive:

@@ -1,0 +1,131 @@
+"""The map of every engine over step and stiffness: what becomes of an undamped oscillator's energy in 60 periods.
+
+Two oscillators. The inner house on its beam: part of what `split` solves exactly. The shaft that lies in the ring on a
+linear contact: what `split` kicks. For engines of fixed step theory draws a line h w = const across the map.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from replays.stability.closed_forms import (
+    RUNGE_KUTTA_4_LIMIT,
+    SPLIT_CONTACT_LIMIT,
+    VERLET_LIMIT,
+)
+from replays.stability.motion import bare_shaft, base_model, move, pivoted_mass, quiet_inputs, state
+from rig.levels import ModelLevels
+
+PERIODS = 60
+LIMITS: dict[str, dict[str, float]] = {
+    "house": {"rk4": RUNGE_KUTTA_4_LIMIT, "verlet": VERLET_LIMIT, "semi-implicit-euler": VERLET_LIMIT},
+    "contact": {
+        "split": SPLIT_CONTACT_LIMIT,
+        "rk4": RUNGE_KUTTA_4_LIMIT,
+        "verlet": VERLET_LIMIT,
+        "semi-implicit-euler": VERLET_LIMIT,
+    },
+}
+"""Largest h w by oscillator and engine; engines not named have none, or none that is known here."""
+GROWN = 3.0
+"""Energy ratio above which a run counts as unstable."""
+
+
+class Map(NamedTuple):
+    """Map of one engine on one oscillator.
+
+    Attributes:
+        engine: Its name.
+        oscillator: "house" or "contact".
+        steps_us: Shape (n,) [us].
+        stiffness: Shape (m,) [N/m].
+        mass: [kg].
+        ratio: Energy at the end over that at the start, shape (m, n); inf where it is not finite.
+    """
+
+    engine: str
+    oscillator: str
+    steps_us: np.ndarray
+    stiffness: np.ndarray
+    mass: float
+    ratio: np.ndarray
+
+    @property
+    def hw(self) -> np.ndarray:
+        """h w at every point, shape (m, n)."""
+        return np.sqrt(self.stiffness[:, None] / self.mass) * self.steps_us[None, :] * 1e-6
+
+    @property
+    def limit(self) -> float:
+        """Largest h w by theory; nan where there is none."""
+        return LIMITS[self.oscillator].get(self.engine, math.nan)
+
+
+def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
+    """Energy ratio of the inner house on its undamped beam, the outer house fixed."""
+    constants = base_model(ModelLevels(magnet="linear", shaft="planar", stator="inner-house")).constants
+    house = constants.house._replace(inner_beam_damping=0.0, inner_beam_stiffness=stiffness)
+    constants = constants._replace(house=house, contact=constants.contact._replace(clearance=1.0))
+    y0 = state(x_ih=1e-6)
+    return _ratio(engine, constants, y0, step_s, stiffness, house.inner_mass, ("x_ih", "vx_ih"), 1.0, periods)
+
+
+def contact_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
+    """Energy ratio of a small oscillation of the shaft on an undamped linear contact, pressed on by gravity."""
+    constants = bare_shaft(damping_factor=0.0, exponent=1.0, stiffness=stiffness, gravity=True)
+    shaft = constants.shaft
+    depth = shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring / stiffness
+    # Gamma > 0 lowers the shaft.
+    y0 = state(Gamma=(constants.contact.clearance + 1.001 * depth) / shaft.arm_ring)
+    columns = ("Gamma", "Gamma_rate")
+    return _ratio(engine, constants, y0, step_s, stiffness, pivoted_mass(constants), columns, shaft.arm_ring, periods)
+
+
+OSCILLATORS = {"house": house_ratio, "contact": contact_ratio}
+
+
+def chart(engine: str, oscillator: str, *, points: int, periods: int = PERIODS) -> Map:
+    """The map of one engine on one oscillator.
+
+    Args:
+        engine: Its name.
+        oscillator: "house" or "contact".
+        points: Along each axis.
+        periods: How long each run is.
+    """
+    steps = np.geomspace(2.0, 1000.0, points)
+    stiffness = np.geomspace(1e5, 1e10, points)
+    mass = base_model(ModelLevels()).constants.house.inner_mass if oscillator == "house" else pivoted_mass(bare_shaft())
+    run = OSCILLATORS[oscillator]
+    ratio = np.full((points, points), np.nan)
+    for i, k in enumerate(stiffness):
+        for j, h in enumerate(steps):
+            # Below, nothing happens but long runs; above, all is settled.
+            if 2e-2 < h * 1e-6 * math.sqrt(k / mass) < 30.0:
+                ratio[i, j] = run(engine, h * 1e-6, float(k), periods=periods)
+    return Map(engine, oscillator, steps, stiffness, mass, ratio)
+
+
+def _ratio(
+    engine: str, constants: object, y0: np.ndarray, step_s: float, stiffness: float, mass: float,
+    columns: tuple[str, str], arm: float, periods: int,
+) -> float:  # fmt: skip
+    """Energy of the fluctuation in the last quarter over that in the first."""
+    angular = math.sqrt(stiffness / mass)
+    ticks = max(80, math.ceil(periods * 2.0 * math.pi / (angular * step_s)))
+    with np.errstate(all="ignore"):
+        motion = move(
+            engine, constants, quiet_inputs(tick_s=step_s), y0,  # type: ignore[arg-type]
+            ticks=ticks, step=1, every=max(1, ticks // 997),
+        )  # fmt: skip
+        place, speed = arm * motion.column(columns[0]), arm * motion.column(columns[1])
+        part = len(place) // 4
+
+        def energy(window: slice) -> float:
+            return stiffness * float(np.var(place[window])) + mass * float(np.var(speed[window]))
+
+        ratio = energy(slice(-part, None)) / energy(slice(None, part))
+    return ratio if math.isfinite(ratio) else math.inf

@@ -1,0 +1,80 @@
+"""`rig chart`: speed against accuracy of our engines and other people's solvers, measured and drawn here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def chart(
+    *,
+    quick: Annotated[bool, typer.Option("--quick", help="Few points, in about two minutes (the default).")] = False,
+    full: Annotated[bool, typer.Option("--full", help="All points, within an hour.")] = False,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder for pictures and data.")
+    ] = Path("chart"),
+    only: Annotated[
+        str | None, typer.Option("--only", metavar="PHASE", help="One phase: first-impacts, transient, whirl, ...")
+    ] = None,
+    panel: Annotated[
+        list[str] | None,
+        typer.Option("--panel", metavar="PANEL", help="exact, smoothed, memory, rub, profile; may be repeated."),
+    ] = None,
+    no_peers: Annotated[bool, typer.Option("--no-peers", help="Our engines only.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of going on where a run ended.")] = False,
+) -> None:
+    """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
+    import sys
+
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    from replays.chart.session import Progress, make_chart
+    from rig.errors import InputError
+    from rig.kernels import COMPILE_NOTICE, compiled_before
+
+    if quick and full:
+        raise InputError("--quick, --full", "one of the two", "both")
+    mode = "full" if full else "quick"
+    if not compiled_before():
+        print(COMPILE_NOTICE, file=sys.stderr, flush=True)
+    console = Console(stderr=True)
+    with Bar(
+        TextColumn("{task.percentage:3.0f} %"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("{task.description}"), console=console, transient=True, disable=not console.is_terminal,
+    ) as bar:  # fmt: skip
+        task = bar.add_task("references")
+
+        def step(text: str) -> None:
+            bar.update(task, description=text, advance=1)
+
+        outcome = make_chart(
+            output,
+            mode=mode,
+            only=only,
+            panels=panel,
+            peers=not no_peers,
+            fresh=fresh,
+            command="rig chart --full" if full else "rig chart",
+            progress=Progress(begin=lambda total: bar.update(task, total=total), step=step),
+        )
+    if outcome.missing:
+        console.print(
+            f"not installed: {', '.join(outcome.missing)} (pip install 'rotor-stator-rig\\[peers]'); charted without",
+            highlight=False,
+        )
+    if outcome.outdated:
+        console.print(f"{outcome.outdated} points of other code were measured anew", highlight=False)
+    left = f", {outcome.left} left for want of time: run again to add them" if outcome.left else ""
+    console.print(
+        f"{outcome.measured} points measured, {outcome.resumed} kept, {outcome.failures} failures drawn{left}",
+        highlight=False,
+    )
+    for path in outcome.files:
+        typer.echo(str(path))
+    if outcome.interrupted:
+        console.print("stopped; the same command goes on from here", highlight=False)
+        raise typer.Exit(130)

@@ -1,0 +1,181 @@
+"""`rig ladder`: the cheapest model, engine and step that give the quantities asked for within a tolerance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def ladder(
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")],
+    *,
+    quantity: Annotated[
+        list[str], typer.Option("--quantity", "-q", metavar="NAME", help="What counts; may be repeated.")
+    ],
+    tolerance: Annotated[
+        list[float],
+        typer.Option("--tolerance", "-t", metavar="PART", help="Error allowed, as a part: one for all, or each."),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="For ladder.png, .svg and .json.")
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="Everything measured, as a JSON document.")] = False,
+    write: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Store the pick in this scene file, as [pick].")
+    ] = None,
+    keep: Annotated[
+        list[str] | None, typer.Option(metavar="LEVEL", help="A level that stays as full as it is; may be repeated.")
+    ] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, help="Timed runs of each rung.")] = 3,
+    budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
+) -> None:
+    """Go down the ladder of models: what does each level cost, what does it err by, what is good enough here?"""
+    import json
+    import sys
+
+    from rich.console import Console
+
+    from replays.ladder.chart import draw
+    from replays.ladder.document import ladder_document, pick_of
+    from replays.ladder.pick import check_target, write_pick
+    from replays.ladder.quantity import parse_quantities
+    from replays.ladder.search import search
+    from rig.cli.run import scene_overrides
+    from rig.kernels import COMPILE_NOTICE, compiled_before
+    from rig.scenes import load_scene
+
+    tolerances = parse_quantities(quantity, tolerance)
+    # A pick is made anew from what the scene is without one.
+    loaded = load_scene(scene, {**scene_overrides(changes or []), "fidelity": "given"})
+    if write is not None:
+        check_target(write, scene, loaded)
+    if not compiled_before():
+        typer.echo(COMPILE_NOTICE, err=True)
+    console = Console(file=sys.stderr)
+    with console.status("") as status:
+        found = search(
+            loaded,
+            tolerances,
+            keep=tuple(keep or ()),
+            runs=runs,
+            budget_s=budget_s,
+            progress=lambda what: status.update(f"ladder: {what}"),
+        )
+    document = ladder_document(found)
+    paths: list[Path] = []
+    if output is not None:
+        paths = draw(found, output)
+        paths.append(output / "ladder.json")
+        paths[-1].write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    if write is not None:
+        write_pick(write, scene, pick_of(found))
+    if json_output:
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        return
+    _show(document)
+    for path in paths:
+        typer.echo(f"written  {path}")
+    if write is not None:
+        typer.echo(f'written  {write}: [pick], in force with fidelity = "auto" at the head of the file')
+
+
+def _show(document: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    console = Console(width=None if Console().is_terminal else 160, highlight=False)
+    console.print(_levels_table(document))
+    console.print()
+    console.print(_engines_table(document))
+    pick, names = document["pick"], [entry["name"] for entry in document["quantities"]]
+    levels = ", ".join(f"{level} {pick[level]}" for level in ("magnet", "shaft", "stator", "contact", "friction"))
+    console.print(f"\npick: {levels}, drive {pick['drive']}, sensors {pick['sensors']}; {document['picked']['engine']}")
+    for entry in pick["quantities"]:
+        console.print(
+            f"  {entry['quantity']} = {entry['value']} {entry['unit']} against {entry['reference']}: "
+            f"model {entry['model_error']:.1e}, numerical {entry['numerical_error']:.1e}, "
+            f"total {entry['total_error']:.1e} of {entry['tolerance']:g} allowed "
+            f"(the reference's own {entry['reference_error']:.1e})"
+        )
+    own = ", ".join(f"{entry['as_given_error']:.1e}" if entry["as_given_error"] is not None else "infinite"
+                    for entry in document["quantities"])  # fmt: skip
+    console.print(
+        f"  a simulated second takes {pick['wall_s'] * 1e3:.3g} ms with the picked sensors, {pick['wall_given_s'] * 1e3:.3g} ms "
+        f"as the scene is given (errors {own} in {', '.join(names)}), "
+        f"{pick['wall_full_s'] * 1e3:.3g} ms on the full model by {document['full']['engine']}"
+    )
+    if pick["sensors"] == "ideal":
+        console.print("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
+    console.print(
+        f"  reference: full model by {document['reference']['engine']}, its own error the distance to "
+        f"{document['reference']['unlike']}; seed {pick['seed']}, {pick['date']}, rig {pick['rig']} {pick['commit']}"
+    )
+    if not document["all_engines_tried"]:
+        console.print("  the budget ended before every engine was tried")
+
+
+def _table(title: str) -> Table:
+    from rich.table import Table
+
+    return Table(title=title, box=None, header_style="bold", title_justify="left")
+
+
+def _error(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1e}"
+
+
+def _levels_table(document: dict[str, Any]) -> Table:
+    names = [entry["name"] for entry in document["quantities"]]
+    table = _table(f"Levels of the model in scene {document['scene']}: model error, each against the full model")
+    table.add_column("level")
+    for name in names:
+        table.add_column(name, justify="right")
+    for header in ("ms a second", "ns a step", "on", "", ""):
+        table.add_column(header, justify="left" if header in ("on", "") else "right")
+    for step in document["steps"]:
+        if step["stage"] not in ("full", "single", "together"):
+            continue
+        errors = [_error(step["errors"]["model"].get(name)) if step["stage"] != "full" else "0" for name in names]
+        table.add_row(
+            ("together: " if step["stage"] == "together" else "") + step["label"],
+            *errors,
+            f"{step['cost']['wall_s'] * 1e3:.2f}",
+            f"{step['cost']['ns_a_step']:.0f}",
+            step["cost"]["engine"],
+            "passes" if step["passes"] else "fails",
+            step["note"],
+        )
+    return table
+
+
+def _engines_table(document: dict[str, Any]) -> Table:
+    names = [entry["name"] for entry in document["quantities"]]
+    table = _table("Engines and steps on the picked model: numerical error, total error")
+    table.add_column("engine")
+    for name in names:
+        table.add_column(name, justify="right")
+    for header in ("ms a second", "ns a step", "", ""):
+        table.add_column(header, justify="left" if not header else "right")
+    for step in document["steps"]:
+        if step["stage"] not in ("engine", "verified"):
+            continue
+        errors = [
+            f"{_error(step['errors']['numerical'][name])}, {_error(step['errors']['total'][name])}" for name in names
+        ]
+        wall, ns = step["wall_s"], step["ns_a_step"]
+        table.add_row(
+            step["label"] + (" as it will run" if step["stage"] == "verified" else ""),
+            *errors,
+            "-" if wall is None else f"{wall * 1e3:.2f}",
+            "-" if ns is None else f"{ns:.0f}",
+            "passes" if step["passes"] else "fails",
+            step["note"],
+        )
+    return table
