@@ -58,7 +58,7 @@ _WINDOWS = ("whirl", "transient", "first-impacts", "drop")
 _PANEL_PHASES = {
     "exact": _WINDOWS,
     "smoothed": ("transient", "whirl", "first-impacts"),
-    "memory": ("transient",),
+    "memory": ("first-impacts",),
     RUB: (RUB,),
     "profile": (),
 }

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from replays.chart.measure import Budget, point
-from replays.chart.methods import Competitor, Rung
+from replays.chart.methods import Competitor
 from replays.chart.phases import FRAME_S
 from replays.peers.problem import Problem
 from replays.peers.reference import Reference
@@ -20,7 +20,7 @@ from rig.scenes import Scene, parse_scene
 TARGET = 1e-3
 """Scaled error to be reached."""
 SCENES = {"quick": 12, "full": 100}
-DURATION_S = 0.2
+DURATION_S = 0.15
 SHARP = 0.1
 """A scene counts only where its reference is this much sharper than the target."""
 
@@ -41,7 +41,7 @@ def draw_scene(seed: int) -> Scene:
                 {
                     "at_s": 0.005,
                     "command": "hammer",
-                    "force_n": round(float(rng.uniform(60.0, 250.0)), 2),
+                    "force_n": round(float(rng.uniform(60.0, 180.0)), 2),
                     "duration_ms": round(float(rng.uniform(2.0, 8.0)), 2),
                     "direction": round(float(rng.uniform(-180.0, 180.0)), 1),
                 }
@@ -55,11 +55,6 @@ def draw_problem(seed: int) -> Problem:
     return Problem.from_scene(draw_scene(seed), sample_s=FRAME_S, friction="exact")
 
 
-def rungs_for(contender: Competitor) -> tuple[Rung, ...]:
-    """The part of a ladder in which the cheapest rung that reaches the target is looked for."""
-    return contender.rungs[:6]
-
-
 def cheapest(contender: Competitor, problem: Problem, reference: Reference, budget: Budget) -> dict[str, Any]:
     """Walk down a method's ladder until the target is reached.
 
@@ -67,7 +62,7 @@ def cheapest(contender: Competitor, problem: Problem, reference: Reference, budg
         Columns of that rung's point; where none reaches it, of the last one tried, with failure "target".
     """
     columns: dict[str, Any] = {}
-    for rung in rungs_for(contender):
+    for rung in contender.rungs:
         try:
             columns = point(contender, rung, problem, reference, budget._replace(runs=1, single_s=0.0))
         except NotImplementedError as error:

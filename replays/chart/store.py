@@ -67,11 +67,12 @@ class Store:
     def _load(self) -> None:
         if not self._journal.is_file():
             return
-        for line in self._journal.read_text(encoding="utf-8").splitlines():
-            try:
-                row = json.loads(line)
-            except json.JSONDecodeError:
-                continue  # the last line of a run that was killed
+        text = self._journal.read_text(encoding="utf-8")
+        if text and not text.endswith("\n"):  # the last line of a run that was killed
+            text = text[: text.rfind("\n") + 1]
+            self._journal.write_text(text, encoding="utf-8")
+        for line in text.splitlines():
+            row = json.loads(line)
             if row.get("code") != self.stamp["code"]:
                 self.outdated += 1
                 continue

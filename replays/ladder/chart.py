@@ -100,7 +100,14 @@ def _draw_levels(axes: Any, ladder: Ladder, rungs: list[Step], name: str, *, nam
         place = _placed(error, low, high)
         axes.plot([low, place], [row, row], color="0.75", lw=1.2, zorder=2)
         axes.plot(
-            place, row, marker="o" if good else "X", ms=8, color=_BLUE if good else _RED, mec="white", ls="none", zorder=3
+            place,
+            row,
+            marker="o" if good else "X",
+            ms=8,
+            color=_BLUE if good else _RED,
+            mec="white",
+            ls="none",
+            zorder=3,
         )
         text = "0" if error == 0.0 else f"{error:.1e}".replace("e-0", "e-").replace("e+00", "")
         text = text if math.isfinite(error) else "cannot give it"
@@ -162,13 +169,12 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, legend: bool) -> None:
         axes.plot(numerical, walls, color=color, marker=marker, mfc="white", ms=6, ls=":", lw=1.0, zorder=3)
         axes.plot(total, walls, color=color, marker=marker, ms=6, lw=1.4, zorder=3, label=engine)
     picked, errors = ladder.picked, ladder.picked_errors
-    assert picked is not None and errors is not None
-    chosen = next(
-        step for step in ladder.steps if step.stage == "engine" and step.measured.rung == picked.rung
-    )
+    assert picked is not None
+    assert errors is not None
+    chosen = next(step for step in ladder.steps if step.stage == "engine" and step.measured.rung == picked.rung)
     axes.plot(
-        _placed(errors.total[name], low, high), chosen.measured.wall_s * 1e3, marker="*", ms=20, color=_RED, mec="black",
-        ls="none", zorder=4, label=f"pick: {picked.rung.method}",
+        _placed(errors.total[name], low, high), chosen.measured.wall_s * 1e3, marker="*", ms=20, color=_RED,
+        mec="black", ls="none", zorder=4, label=f"pick: {picked.rung.method}",
     )  # fmt: skip
     axes.plot([], [], color="0.3", marker="o", mfc="white", ls=":", label="numerical error alone")
     axes.plot([], [], color="0.3", marker="o", label="total error")
@@ -188,7 +194,10 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, legend: bool) -> None:
 
 def _write_evidence(axes: Any, ladder: Ladder) -> None:
     picked, given, full, errors = ladder.picked, ladder.given, ladder.full, ladder.picked_errors
-    assert picked is not None and given is not None and full is not None and errors is not None
+    assert picked is not None
+    assert given is not None
+    assert full is not None
+    assert errors is not None
     axes.axis("off")
     model = picked.rung.model
     lines = [

@@ -23,7 +23,9 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
     """The whole search as a JSON document; what is infinite or has no value is null."""
     scene = ladder.scene
     picked, given, full = ladder.picked, ladder.given, ladder.full
-    assert picked is not None and given is not None and full is not None
+    assert picked is not None
+    assert given is not None
+    assert full is not None
     return {
         "scene": scene.name,
         "duration_s": scene.duration_s,
@@ -74,7 +76,10 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
 def pick_of(ladder: Ladder) -> Pick:
     """The pick as a scene stores it."""
     picked, errors, given, full = ladder.picked, ladder.picked_errors, ladder.given, ladder.full
-    assert picked is not None and errors is not None and given is not None and full is not None
+    assert picked is not None
+    assert errors is not None
+    assert given is not None
+    assert full is not None
     scene, rung = ladder.scene, picked.rung
     scene_digest, parameters_digest, code_digest = pick_digests(scene)
     found = versions()
@@ -179,4 +184,6 @@ def python_line() -> str:
     found = versions()
     packages = ", ".join(f"{name} {found[name]}" for name in _PACKAGES)
     commit = f", commit {found['commit']}" if found["commit"] else ""
-    return f"rig {found['rig']}{commit}, {found['date']}; {found['machine']}; Python {sys.version.split()[0]}, {packages}"
+    return (
+        f"rig {found['rig']}{commit}, {found['date']}; {found['machine']}; Python {sys.version.split()[0]}, {packages}"
+    )

@@ -10,7 +10,7 @@ from rig.errors import InputError
 from rig.scenes import Pick, Scene, load_scene, pick_digests, scene_path
 
 _HEADER = re.compile(r"^\s*\[{1,2}\s*(?P<name>[^\]\[]+?)\s*\]{1,2}\s*(#.*)?$")
-_COMMENT = "# Written by `rig ladder`: what it measured. In force where the scene says fidelity = \"auto\"."
+_COMMENT = '# Written by `rig ladder`: what it measured. In force where the scene says fidelity = "auto".'
 
 
 def check_target(path: Path, scene_name: str, scene: Scene) -> None:
@@ -83,8 +83,12 @@ def with_pick(text: str, pick: Pick) -> str:
         after.pop(0)
     joined = [*before, "", *table, *([""] if after else []), *after]
     new = end.join(joined) + end
-    old_data, new_data = tomllib.loads(text), tomllib.loads(new)
+    old_data = tomllib.loads(text)
     old_data.pop("pick", None)
+    try:
+        new_data = tomllib.loads(new)
+    except tomllib.TOMLDecodeError:
+        new_data = {}
     if new_data.pop("pick", None) is None or old_data != new_data:
         raise InputError("--write", "a file whose [pick] stands in a table of its own", "text that hides it")
     return new

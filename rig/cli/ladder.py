@@ -107,8 +107,8 @@ def _show(document: dict[str, Any]) -> None:
     own = ", ".join(f"{entry['as_given_error']:.1e}" if entry["as_given_error"] is not None else "infinite"
                     for entry in document["quantities"])  # fmt: skip
     console.print(
-        f"  a simulated second takes {pick['wall_s'] * 1e3:.3g} ms with the picked sensors, {pick['wall_given_s'] * 1e3:.3g} ms "
-        f"as the scene is given (errors {own} in {', '.join(names)}), "
+        f"  a simulated second takes {pick['wall_s'] * 1e3:.3g} ms with the picked sensors, "
+        f"{pick['wall_given_s'] * 1e3:.3g} ms as the scene is given (errors {own} in {', '.join(names)}), "
         f"{pick['wall_full_s'] * 1e3:.3g} ms on the full model by {document['full']['engine']}"
     )
     if pick["sensors"] == "ideal":

@@ -24,6 +24,7 @@ from rig.cli import (
     scenes,
     simulate,
     speed,
+    stability,
     status,
     step,
     stop,
@@ -65,7 +66,7 @@ _PANELS: dict[str, dict[str, Any]] = {
         "stop": stop.stop,
     },
     "Recordings and pictures": {"record": record.record, "view": view.view, "info": info.info},
-    "Without a clock": {"simulate": simulate.simulate, "bench": bench.bench, "ladder": ladder.ladder, "chart": chart.chart},
+    "Without a clock": {"simulate": simulate.simulate, "bench": bench.bench, "ladder": ladder.ladder, "chart": chart.chart, "stability": stability.stability},
 }
 
 

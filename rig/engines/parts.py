@@ -31,7 +31,6 @@ takes functions as arguments from one process to the next.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,9 +79,9 @@ _NONE, _ONSET, _LIFT_OFF, _TURN, _BREAK = range(5)
 class Functions(NamedTuple):
     """What a type of method does; compiled, with the parameters of the functions below."""
 
-    step: Callable[..., Any]
-    error: Callable[..., Any]
-    prepare: Callable[..., Any]
+    step: Any
+    error: Any
+    prepare: Any
 
 
 FUNCTIONS: dict[type, Functions] = {}
@@ -165,14 +164,8 @@ def _surplus(event, contact, out):
 def _locate(event, before, after, method, constants, inputs, tick, fraction, ticks, memory, y, k, z, end, out):
     """Part of `ticks` after which the event happens, by bracketing secants on steps of the method itself.
 
-    Args:
-        event: Which one.
-        before: Its surplus at the start, of the other sign than `after`.
-        after: Its surplus at the end.
-        method, constants, inputs, tick, fraction, ticks, memory, y, k: The step; its first rates in k[0].
-        z: Scratch.
-        end: The state at the event, out.
-        out: What is observed there, out.
+    `before` and `after` are the event's surplus at both ends of the step, of unlike sign; the step's first rates are in
+    k[0]. Leaves the state at the event in `end`, its rates in the last row of k, what is observed there in `out`.
     """
     low, high, value_low, value_high = 0.0, 1.0, before, after
     cut, side = 1.0, 0
@@ -346,7 +339,7 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
             # Friction may have changed on the way out.
             if phase == ROLLING and margin < 0.0 and _surplus(_BREAK, contact, out) > 0.0:
                 event = _BREAK
-            elif (phase == FORWARD or phase == BACKWARD) and sliding * out[S.SLIDING_SPEED] < 0.0:
+            elif phase in (FORWARD, BACKWARD) and sliding * out[S.SLIDING_SPEED] < 0.0:
                 event = _TURN
         if event == _NONE:
             y[:] = end

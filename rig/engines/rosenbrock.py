@@ -8,7 +8,7 @@ A stage solves one linear system in the Jacobian J, in the form without products
 J comes by differences, once a step. Positions have their speeds for rates, so the system of 14 folds into one of 7;
 the integrals of the ledger feed back into nothing and follow by substitution.
 
-A part costs 20 evaluations where rk8 takes 12, and rk8 needs no smoothing at all: this engine pays where the smoothed
+A part costs 21 evaluations where rk8 takes 12, and rk8 needs no smoothing at all: this engine pays where the smoothed
 law is wanted at a small smoothing speed, which makes every explicit method's step as short.
 """
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rig.engines import ENGINES
 from rig.kernels.signals import COLUMN
 from rig.scenes import load_scene
 from rig.simulation import Simulation
@@ -175,3 +176,26 @@ def test_a_command_of_the_scene_is_one_sent_at_that_tick() -> None:
     second = simulation.advance(80_000).rows
     frame = Simulation(scene).advance(100_000)
     assert np.concatenate([first, second]).tobytes() == frame.rows.tobytes()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_cuts_change_no_bit_with_any_engine(engine: str) -> None:
+    # Through the blow, impacts and the first rolling, in steps as long as an adaptive engine may get.
+    def motion(length: int) -> tuple[bytes, ...]:
+        method = ENGINES[engine]
+        simulation = Simulation(
+            load_scene(
+                "hammer",
+                {
+                    "engine.name": engine,
+                    "model.friction": "exact" if "exact" in method.frictions else "smoothed",
+                    "sensors.rate_hz": 1000,
+                    "sensors.truth_rate_hz": 1000,
+                },
+            )
+        )
+        rows = [simulation.advance(length).rows.copy() for _ in range(120_000 // length)]
+        assert simulation.health()["contacts"] > 0
+        return np.concatenate(rows).tobytes(), simulation._y.tobytes(), simulation._memory.tobytes()
+
+    assert motion(1_000) == motion(120_000)

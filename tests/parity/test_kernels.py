@@ -17,12 +17,17 @@ import pytest
 import rig
 from rig.engines import ENGINES, load_engine
 from rig.kernels import signals as S
+from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, TOUCHING
 from rig.kernels.dynamics import evaluate
 from rig.scenes import load_scene
 from rig.sensors import conditioning
 from rig.simulation import Simulation
 
 PACKAGE = Path(rig.__file__).parent
+FRICTION = {name: "exact" if "exact" in method.frictions else "smoothed" for name, method in ENGINES.items()}
+"""The friction law that every engine is tested with, ..."""
+PAIRS = [*FRICTION.items(), ("rosenbrock", "switch"), ("verlet", "smoothed"), ("split", "none")]
+"""... and some more."""
 
 JIT_RUN = """
 import sys
@@ -30,10 +35,11 @@ import numpy as np
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 
-def run(engine):
+def run(engine, friction):
     # A hair off the ring, hit hard toward it: flight, onset, contact and flight again within 2 ms.
     simulation = Simulation(load_scene("hammer", {
-        "engine.name": engine, "initial.position": "given", "initial.x_mm": 0.92,
+        "engine.name": engine, "engine.step_us": 25, "model.friction": friction,
+        "initial.position": "given", "initial.x_mm": 0.92,
         "commands": [{"at_s": 0.0, "command": "hammer", "force_n": 1000.0, "duration_ms": 1.0}],
     }))
     frame = simulation.advance(2_000)
@@ -60,24 +66,27 @@ def process(code: str, *, place: Path = PACKAGE.parent, **environment: str) -> s
 
 
 @pytest.fixture(scope="module")
-def python_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, np.ndarray]]:
+def python_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, np.ndarray]]:
     folder = tmp_path_factory.mktemp("python")
     code = JIT_RUN + (
         "import types\n"
         "from rig.kernels.dynamics import evaluate\n"
         "assert isinstance(evaluate, types.FunctionType), 'not plain Python'\n"
-        f"for engine in {ENGINES!r}: np.savez({str(folder)!r} + '/' + engine + '.npz', **run(engine))\n"
+        f"for engine, friction in {PAIRS!r}:\n"
+        f"    np.savez({str(folder)!r} + f'/{{engine}}-{{friction}}.npz', **run(engine, friction))\n"
     )
     process(code, NUMBA_DISABLE_JIT="1")
-    return {engine: dict(np.load(folder / f"{engine}.npz")) for engine in ENGINES}
+    return {pair: dict(np.load(folder / f"{'-'.join(pair)}.npz")) for pair in PAIRS}
 
 
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing to compare: this process is plain Python")
-@pytest.mark.parametrize("engine", ENGINES)
-def test_compiled_is_python_bit_for_bit(engine: str, python_runs: dict[str, dict[str, np.ndarray]]) -> None:
+@pytest.mark.parametrize(("engine", "friction"), PAIRS)
+def test_compiled_is_python_bit_for_bit(
+    engine: str, friction: str, python_runs: dict[tuple[str, str], dict[str, np.ndarray]]
+) -> None:
     space: dict[str, Any] = {}
     exec(JIT_RUN, space)
-    compiled, plain = space["run"](engine), python_runs[engine]
+    compiled, plain = space["run"](engine, friction), python_runs[engine, friction]
     touched = compiled["rows"][:, S.COLUMN["normal_force"]] > 0.0
     assert 0 < touched.sum() < len(touched), "flight and contact are both in it"
     assert compiled.keys() == plain.keys()
@@ -87,8 +96,9 @@ def test_compiled_is_python_bit_for_bit(engine: str, python_runs: dict[str, dict
         np.testing.assert_array_equal(array, plain[name], err_msg=name)
 
 
-def hit() -> Simulation:
-    simulation = Simulation(load_scene("hammer"))
+def hit(engine: str = "split") -> Simulation:
+    changes = {"engine.name": engine, "engine.step_us": 25, "model.friction": FRICTION[engine]}
+    simulation = Simulation(load_scene("hammer", changes))
     simulation.advance(40_000)
     return simulation
 
@@ -96,7 +106,7 @@ def hit() -> Simulation:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("steps", "stride"), [(400, 1), (400, 2), (401, 4), (1, 1)])
 def test_engine_writes_every_value_of_every_row(engine: str, steps: int, stride: int) -> None:
-    simulation, module = hit(), load_engine(engine)
+    simulation, module = hit(engine), load_engine(engine)
     made = []
     for poison in (np.nan, 1e300):
         y, memory = simulation._y.copy(), simulation._memory.copy()
@@ -109,8 +119,8 @@ def test_engine_writes_every_value_of_every_row(engine: str, steps: int, stride:
         assert one.tobytes() == other.tobytes(), "what lay in the output leaks into the result"
 
 
-@pytest.mark.parametrize("touching", [False, True])
-def test_evaluation_writes_every_rate_and_every_observed_value(touching: bool) -> None:
+@pytest.mark.parametrize("phase", [FLIGHT, TOUCHING, FORWARD, BACKWARD, ROLLING])
+def test_evaluation_writes_every_rate_and_every_observed_value(phase: int) -> None:
     simulation = hit()
     rate, out = np.full(S.N_VECTOR, np.nan), np.full(S.N_OBSERVED, np.nan)
     arguments = (
@@ -119,7 +129,7 @@ def test_evaluation_writes_every_rate_and_every_observed_value(touching: bool) -
         simulation.tick,
         0.0,
         0.1,
-        touching,
+        phase,
         True,
         simulation._y,
     )
@@ -191,9 +201,7 @@ print(json.dumps(digests))
 def test_a_changed_byte_of_any_kernel_file_changes_the_digest(copied: Path) -> None:
     digests = json.loads(process(DIGESTS, place=copied))
     assert digests.pop("again") == digests[""]
-    assert {"kernels/dynamics.py", "kernels/__init__.py", "engines/runge_kutta.py", "sensors/conditioning.py"} <= set(
-        digests
-    )
+    assert {"kernels/dynamics.py", "kernels/__init__.py", "engines/parts.py", "sensors/conditioning.py"} <= set(digests)
     assert len(set(digests.values())) == len(digests)
 
 
@@ -214,10 +222,10 @@ def test_cache_folder_is_named_by_the_digest_unless_the_user_names_one(tmp_path:
 
 GAP = """
 import numpy as np
-from rig.kernels.constants import Constants, Contact, House, Magnet, Shaft
+from rig.kernels.constants import Constants, Contact, House, Levels, Magnet, Shaft
 from rig.kernels.dynamics import gap
 parts = [part(*np.ones(len(part._fields))) for part in (Shaft, Magnet, Contact, House)]
-print(repr(gap(Constants(*parts, 1.0), np.full(14, 0.01))))
+print(repr(gap(Constants(Levels(True, True, True, True, 1), *parts, 1.0), np.full(14, 0.01))))
 """
 
 

@@ -10,7 +10,6 @@
 | energy ledger                   | zero residual                           | first law                                |
 | momentum ledger                 | zero residual                           | Newton and Euler                         |
 | pivot reaction                  | static lever rule                       | statics                                  |
-| order of each engine            | 4 and 8                                 | Runge-Kutta on the smooth problem        |
 | restitution of the exact factor | what was asked for                      | definition of e                          |
 | contact stiffness               | Hertz, 2.86e10 / 5.40e9 N/m^1.5         | elastostatics                            |
 | whirl                           | backward, rolling, -spin R_S/(r0+delta) | kinematics of rolling; paper's eq. 41    |
@@ -27,10 +26,9 @@ import pytest
 
 from rig import InputError, Run, load_parameters, load_scene, simulate
 from rig.contacts import restitution_factor
-from rig.engines import load_engine
-from rig.engines.runge_kutta import DIVIDED, SCALES
+from rig.engines.parts import SCALES
 from rig.kernels import signals as S
-from rig.kernels.contact import ring_force
+from rig.kernels.contact import FORWARD, SMOOTHED, TOUCHING, ring_force
 from rig.model import build_model
 from rig.offline import frames
 from rig.simulation import DISSIPATED, Simulation
@@ -78,7 +76,10 @@ def whirl() -> Run:
     ],
 )
 def test_first_impacts_against_independent_solver(scene: str, duration_s: float, changes: dict[str, object]) -> None:
-    quiet = {"sensors.noise": False, "sensors.rate_hz": 10_000}
+    # The reference has the smoothed law.
+    quiet = {
+        "sensors.noise": False, "sensors.rate_hz": 10_000, "model.friction": "smoothed", "engine.name": "rk8",
+    }  # fmt: skip
     run = simulate(load_scene(scene, {**quiet, **changes}), duration_s=duration_s)
     blow = next((event for event in run.events if event["event"] == "hammer"), None)
     solution = reference.solve(
@@ -95,30 +96,25 @@ def test_first_impacts_against_independent_solver(scene: str, duration_s: float,
     assert run.simulation.health()["contacts"] == len(solution.onsets)
 
 
-def test_contact_force_is_frame_invariant() -> None:
+@pytest.mark.parametrize("phase", [TOUCHING, FORWARD])
+def test_contact_force_is_frame_invariant(phase: int) -> None:
     rng = np.random.default_rng(3)
-    clearance = 0.926e-3
-    law = {
-        "clearance": clearance,
-        "onset_speed": 0.1,
-        "stiffness": 2.86e10,
-        "damping_factor": 0.17,
-        "friction": 0.25,
-        "smoothing_speed": 5e-3,
-    }
+    contact = build_model(load_parameters()).constants.contact
     for _ in range(200):
         angle = rng.uniform(-math.pi, math.pi)
         e = rng.normal(size=2)
-        e *= (clearance + rng.uniform(0, 3e-5)) / np.hypot(*e)
+        e *= (contact.clearance + rng.uniform(0, 3e-5)) / np.hypot(*e)
         v = rng.normal(size=2) * 0.1
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        surface = rng.normal() * 0.3
-        plain = np.array(ring_force(*e, *v, surface, *law.values()))
-        turned = np.array(ring_force(*(turn @ e), *(turn @ v), surface, *law.values()))
+        law = (rng.normal() * 0.3, 0.1, SMOOTHED, phase, contact)
+        plain = np.array(ring_force(*e, *v, *law))
+        turned = np.array(ring_force(*(turn @ e), *(turn @ v), *law))
         assert plain[2] > 0.0
+        assert plain[4] != 0.0
         np.testing.assert_allclose(turned[:2], turn @ plain[:2], rtol=1e-9)
         # A turn by rounding moves the penetration by 1e-19 m, one part in 1e11 of the smallest here.
-        np.testing.assert_allclose(turned[2:], plain[2:], rtol=1e-8)
+        np.testing.assert_allclose(turned[2:-2], plain[2:-2], rtol=1e-8)
+        np.testing.assert_allclose(turned[-2:], turn @ plain[-2:], rtol=1e-9)
 
 
 def test_drop_hits_when_and_as_fast_as_a_falling_pendulum() -> None:
@@ -168,7 +164,7 @@ def test_free_flight_follows_the_linear_solution() -> None:
 
 @pytest.mark.parametrize("scene", ["hammer", "drop", "stable-run", "run-up"])
 def test_ledgers_close(scene: str) -> None:
-    simulation = Simulation(load_scene(scene, {"duration_s": 2.0}))
+    simulation = Simulation(load_scene(scene, {"duration_s": 2.0, "engine.name": "rk8"}))
     first = simulation.first_row
     column = S.COLUMN
     for frame in frames(simulation):
@@ -186,8 +182,18 @@ def test_ledgers_close(scene: str) -> None:
         np.testing.assert_allclose(stored, rows[:, column[f"house_impulse_{axis}"]], atol=1e-9)
 
 
+@pytest.mark.parametrize("scene", ["hammer", "drop", "stable-run", "run-up"])
+def test_ledger_of_the_default_engine_closes_to_its_own_error(scene: str) -> None:
+    # Its quadrature is of order 2, as its motion is; at 25 us a hammer run leaves a few 1e-5 of what was dissipated.
+    simulation = Simulation(load_scene(scene, {"duration_s": 2.0}))
+    assert simulation.scene.engine.name == "split"
+    for _ in frames(simulation):
+        energies = simulation.health()["energy"]
+        assert abs(energies["residual_j"]) <= 3e-4 * max(energies["dissipated_j"], 1e-6)
+
+
 def test_as_printed_gap_makes_energy_and_the_ledger_says_so() -> None:
-    run = simulate(load_scene("hammer", {"parameters": "as-printed"}), duration_s=0.3)
+    run = simulate(load_scene("hammer", {"parameters": "as-printed", "engine.name": "rk8"}), duration_s=0.3)
     assert abs(run["gap_work"][-1]) > 1e-5
     energy = run.energy()
     assert abs(energy["residual"][-1]) < 1e-6 * energy["dissipated"][-1]
@@ -200,39 +206,6 @@ def test_pivot_carries_its_share_at_rest() -> None:
     # Lever rule about the magnets: R l0B = M g (l0B - l0C).
     assert run["pivot_y"][-1] == pytest.approx(weight * (1 - shaft.arm_centre / shaft.arm_magnet), rel=1e-9)
     assert run["magnet_y"][-1] == pytest.approx(weight * shaft.arm_centre / shaft.arm_magnet, rel=1e-9)
-
-
-@pytest.mark.parametrize(("engine", "steps"), [("rk4", [100, 50, 25, 20]), ("rk8", [500, 250, 200, 125])])
-def test_order_on_the_smooth_problem(engine: str, steps: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
-    # The order of the plain method: no step may be divided.
-    module = load_engine(engine)
-    monkeypatch.setattr(module, "TABLEAU", module.TABLEAU._replace(tolerance=math.inf))
-
-    # Undamped free flight at 220 Hz on stiff, hardening magnets, in a ring too wide to touch: smooth and nonlinear.
-    free_flight = {
-        "ring.clearance": 15.0,
-        "initial.position": "given",
-        "initial.x_mm": 0.8,
-        "initial.y_mm": 0.4,
-        "magnet.stiffness": 1000.0,
-        "shaft.damping_ratio_x": 0.0,
-        "shaft.damping_ratio_y": 0.0,
-        "drive.speed_hz": 8.0,
-        "sensors.rate_hz": 1000,
-        "sensors.truth_rate_hz": 1000,
-    }
-
-    def swing(name: str, step_us: int) -> np.ndarray:
-        scene = load_scene("stable-run", {**free_flight, "engine.name": name, "engine.step_us": step_us})
-        run = simulate(scene, duration_s=0.05)
-        assert run["normal_force"].max() == 0.0
-        assert run.simulation._memory[DIVIDED] == 0.0
-        return run.signals[:, [0, 1, 7, 8]] / np.array([1e-2, 1e-2, 10.0, 10.0])
-
-    exact = swing("rk8", 20)
-    errors = [float(np.linalg.norm(swing(engine, step) - exact)) for step in steps]
-    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert slope == pytest.approx(module.ORDER, abs=0.15)
 
 
 @pytest.mark.parametrize("restitution", [0.3, 0.5, 0.8, 0.9, 0.99])

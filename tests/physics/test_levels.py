@@ -72,13 +72,13 @@ def test_planar_differs_from_euler_by_the_square_of_the_tilt() -> None:
 @pytest.mark.parametrize("friction", ["none", "exact"])
 def test_planar_model_is_one_model_on_two_engines(friction: str) -> None:
     planar = {"model.shaft": "planar", "model.friction": friction}
-    split = Run("hammer", 0.05, **planar, **{"engine.step_us": 5})
-    rk8 = Run("hammer", 0.05, **planar, **{"engine.name": "rk8"})
+    split = Run("hammer", 0.031, **planar, **{"engine.step_us": 5})
+    rk8 = Run("hammer", 0.031, **planar, **{"engine.name": "rk8"})
     assert split["contact_impulse"][-1] > 0.1
     for name, scale in (("Gamma", 5e-3), ("beta", 5e-3), ("theta_rate", 40.0), ("x_ih", 20e-6)):
-        assert np.abs(split[name] - rk8[name]).max() < 2e-6 * scale / 1e-0, name
-    euler = Run("hammer", 0.05, **{"model.friction": friction}, **{"engine.name": "rk8"})
-    assert np.abs(euler["beta"] - rk8["beta"]).max() > 5e-3 * 2e-6
+        assert np.abs(split[name] - rk8[name]).max() < 5e-7 * scale, name
+    euler = Run("hammer", 0.031, **{"model.friction": friction, "engine.name": "rk8"})
+    assert np.abs(euler["beta"] - rk8["beta"]).max() > 5e-7 * 5e-3
 
 
 def tops(run: Run) -> list[float]:
@@ -126,7 +126,7 @@ def test_oblique_impact_has_coulombs_impulse(friction: float, *, sticks: bool) -
     """A spinning shaft dropped: w grows or falls by R_S jt / Izz, jt = min(mu jn, what brings v_t to 0)."""
     e = 0.5
     run = Run(
-        "drop", 0.035, **IMPACT,
+        "drop", 0.028, **IMPACT,
         **{"drive.speed_hz": 3.0, "contact.friction": friction, "contact.restitution": e, "drive.torque_gain": 1e-5,
            "model.shaft": "planar", "shaft.unbalance_eccentricity": 0.0},
     )  # fmt: skip
@@ -141,8 +141,9 @@ def test_oblique_impact_has_coulombs_impulse(friction: float, *, sticks: bool) -
     assert run["contact_impulse"][-1] == pytest.approx(normal, rel=2e-3)
     change = spin - run["theta_rate"][-1]
     assert change == pytest.approx(shaft.radius * tangential / shaft.polar_inertia, rel=3e-3)
-    sideways = np.gradient(run["ring_x"], 1e-3)[-2]
-    assert abs(sideways) == pytest.approx(tangential / mass, rel=0.02)
+    # Less what the gyroscopic moment had given it before.
+    along = np.diff(run["ring_x"]) / 1e-3
+    assert abs(along[26] - along[24]) == pytest.approx(tangential / mass, rel=0.02, abs=1e-3)
     assert abs(run.residual_share) < 1e-4
 
 

@@ -1,0 +1,216 @@
+"""Pictures of where engines hold and fail: step against stiffness, the v_s and v0 ladders, whirl or no whirl."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from replays.stability import atlas, boundary
+from replays.stability.trials import (
+    first_impact,
+    friction_of,
+    least_smoothing_speed,
+    pushed,
+    smoothing_distance,
+)
+from rig.engines import ENGINES
+
+# Okabe and Ito's colours, which colour-blind readers can tell apart, and a marker for each engine besides.
+_STYLES: dict[str, tuple[str, str]] = {
+    "split": ("#000000", "o"),
+    "rk8": ("#0072B2", "s"),
+    "tsit5": ("#56B4E9", "^"),
+    "rk4": ("#D55E00", "D"),
+    "verlet": ("#E69F00", "v"),
+    "semi-implicit-euler": ("#CC79A7", "P"),
+    "rosenbrock": ("#009E73", "X"),
+}
+_UNSTABLE = "#D55E00"
+_CLASS_COLOURS = ("#F2F2F2", "#F0E442", "#E69F00", "#0072B2")
+
+
+def draw_all(folder: Path, engines: list[str], *, quick: bool) -> list[Path]:
+    """Draw all pictures into a folder, each as PNG and SVG.
+
+    Args:
+        folder: Made if it is not there.
+        engines: Which engines.
+        quick: Coarse maps and short ladders.
+
+    Returns:
+        The files.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files: list[Path] = []
+    for name, draw in (("map", draw_map), ("ladders", draw_ladders), ("whirl", draw_whirl)):
+        files += _save(draw(engines, quick=quick), folder / f"stability-{name}")
+    return files
+
+
+def draw_map(engines: list[str], *, quick: bool) -> Any:
+    """Energy of an undamped oscillator after 60 periods over step and stiffness, a row an oscillator."""
+    from matplotlib.colors import LogNorm
+
+    figure, axes = _figure(2, len(engines), (2.75 * len(engines) + 1.6, 7.4))
+    points = 16 if quick else 40
+    image = None
+    titles = {"house": "inner house on its beam", "contact": "shaft on a linear contact"}
+    for row, oscillator in enumerate(titles):
+        for column, engine in enumerate(engines):
+            ax = axes[row][column]
+            chart = atlas.chart(engine, oscillator, points=points)
+            stable = np.where(chart.ratio <= atlas.GROWN, np.abs(chart.ratio - 1.0), np.nan)
+            unstable = np.where(chart.ratio > atlas.GROWN, 1.0, np.nan)
+            x, y = chart.steps_us, chart.stiffness
+            ax.set_facecolor("white")
+            image = ax.pcolormesh(
+                x, y, np.clip(stable, 1e-6, 1.0), norm=LogNorm(1e-6, 1.0), cmap="Blues", shading="nearest",
+                rasterized=True,
+            )  # fmt: skip
+            from matplotlib.colors import ListedColormap
+
+            ax.pcolormesh(x, y, unstable, cmap=ListedColormap([_UNSTABLE]), shading="nearest", rasterized=True)
+            if np.isfinite(chart.limit):
+                ax.plot(x, chart.mass * (chart.limit / (x * 1e-6)) ** 2, color="black", lw=2.2)
+                ax.text(
+                    0.05, 0.05, f"limit h w = {chart.limit:.4g}", transform=ax.transAxes, fontsize=9,
+                    bbox={"fc": "white", "ec": "0.6", "pad": 2.5},
+                )  # fmt: skip
+            else:
+                ax.text(
+                    0.05, 0.05, "no limit: " + _why(engine, oscillator), transform=ax.transAxes, fontsize=9,
+                    bbox={"fc": "white", "ec": "0.6", "pad": 2.5},
+                )  # fmt: skip
+            ax.axvline(ENGINES[engine].step_us, color="0.25", lw=1.0, ls=":")
+            ax.set(xscale="log", yscale="log", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+            if row == 0:
+                ax.set_title(engine, fontsize=12)
+            else:
+                ax.set_xlabel("step h [us]")
+            if column == 0:
+                ax.set_ylabel(f"{titles[oscillator]}\nstiffness [N/m]")
+            else:
+                ax.tick_params(labelleft=False)
+    bar = figure.colorbar(image, ax=axes.ravel().tolist(), shrink=0.8, pad=0.01)
+    bar.set_label("|E/E0 - 1| after 60 periods [1]; orange: grows without end")
+    figure.suptitle(
+        "Undamped oscillators over step and stiffness (dotted: the engine's own step; line: the limit by theory; "
+        "white: not run, too slow or far beyond)",
+        fontsize=12,
+    )
+    return figure
+
+
+def draw_ladders(engines: list[str], *, quick: bool) -> Any:
+    """Smoothing speed against the set-valued limit; approach speed; v0 gone stale in a lasting contact."""
+    figure, axes = _figure(1, 3, (17.0, 6.2))
+    smooth, graze, stale = axes[0]
+    speeds = [1e-2, 1e-3, 1e-4, 1e-5] if quick else [10.0**n for n in range(-2, -10, -1)]
+    for engine in engines:
+        colour, marker = _STYLES.get(engine, ("0.5", "."))
+        style = {"color": colour, "marker": marker, "lw": 1.6, "ms": 6.5, "label": engine}
+        if "smoothed" in ENGINES[engine].frictions:
+            # Error control at a v_s far below its need costs minutes and shows nothing new.
+            reach = [v for v in speeds if engine != "rk8" or v >= 1e-6]
+            smooth.loglog(reach, [smoothing_distance(engine, v) for v in reach], **style)
+        places = np.geomspace(1e-5, 1.0, 6 if quick else 16)
+        graze.loglog(places, [max(1e-12, first_impact(engine, float(v))["restitution"]) for v in places], **style)
+        floors = np.geomspace(1e-5, 1.0, 6 if quick else 16)
+        stale.loglog(floors, [max(1e-12, pushed(engine, floor=float(v))) for v in floors], **style)
+    slope = smoothing_distance("tsit5", 1e-3) / 1e-3
+    smooth.loglog(speeds, [slope * v for v in speeds], color="0.6", lw=5, alpha=0.5, zorder=0, label="linear in v_s")
+    if "rk4" in engines:
+        smooth.axvline(least_smoothing_speed("rk4"), color=_STYLES["rk4"][0], ls=":", lw=1.2)
+        smooth.annotate(
+            "below this v_s a 5 us step of rk4\nis too long: h mu F / (v_s m) > 2.785",
+            (least_smoothing_speed("rk4"), 2e-6), xytext=(-6, 0), textcoords="offset points", ha="right", fontsize=9,
+            color=_STYLES["rk4"][0],
+        )  # fmt: skip
+    smooth.set(
+        title="Smoothed friction against Coulomb's law\n(first impacts of the hammer scene)",
+        xlabel="smoothing speed v_s [m/s]", ylabel="distance to exact Coulomb, scaled RMS [1]", ylim=(1e-6, 0.2),
+    )  # fmt: skip
+    graze.axvline(1e-3, color="0.5", lw=1.0, ls=":")
+    graze.annotate("floor of v0", (1e-3, 2e-12), xytext=(4, 2), textcoords="offset points", color="0.35", fontsize=9)
+    graze.set(
+        title="One impact, grazing to hard,\nagainst its closed form", xlabel="approach speed v0 [m/s]",
+        ylabel="relative error of the restitution [1]", ylim=(1e-12, 1e-1),
+    )  # fmt: skip
+    stale.axhspan(2e-2, 1e3, color="#D55E00", alpha=0.08)
+    stale.set(
+        title="Lasting contact with a stale v0: pushed in\nfrom rest with up to 1.6 kN", xlabel="v0 held, its floor [m/s]",
+        ylabel="error of the depth over the deepest [1]", ylim=(1e-12, 1e3),
+    )  # fmt: skip
+    for ax in axes[0]:
+        ax.grid(visible=True, color="0.9", lw=0.6)
+        ax.set_axisbelow(True)
+    smooth.legend(loc="upper left", fontsize=9)
+    stale.legend(loc="upper right", fontsize=9)
+    figure.suptitle("Ladders of v_s and v0, every engine at its own step and tolerance", fontsize=13)
+    return figure
+
+
+def draw_whirl(engines: list[str], *, quick: bool) -> Any:
+    """Class of the run over friction and the blow's impulse, each engine with its disagreements marked."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    able = [engine for engine in engines if friction_of(engine) == "exact"]
+    points = 12 if quick else 28
+    right = boundary.chart("tsit5", points=points, tolerance=1e-9)
+    figure, axes = _figure(1, max(1, len(able)), (3.3 * max(1, len(able)) + 0.6, 4.9))
+    colours, norm = ListedColormap(_CLASS_COLOURS), BoundaryNorm([-0.5, 0.5, 1.5, 2.5, 3.5], 4)
+    clear = boundary.clear_of_boundary(right.classes)
+    impulses = right.forces * 5e-3 * 2.0 / np.pi  # half sine of 5 ms
+    for ax, engine in zip(axes[0], able, strict=False):
+        found = boundary.chart(engine, points=points)
+        ax.pcolormesh(found.frictions, impulses, found.classes, cmap=colours, norm=norm, shading="nearest")
+        ax.contour(right.frictions, impulses, right.classes == boundary.ROLLING, levels=[0.5], colors="black",
+                   linewidths=1.6)  # fmt: skip
+        wrong = found.classes != right.classes
+        rows, columns = np.nonzero(wrong)
+        ax.plot(found.frictions[columns], impulses[rows], "x", color="#D55E00", ms=8, mew=2.4)
+        grave = int(np.sum(wrong & clear))
+        ax.set_title(f"{engine}\n{int(wrong.sum())} of {wrong.size} differ, {grave} off the boundary", fontsize=10.5)
+        ax.set_xlabel("friction coefficient mu [1]")
+        if ax is axes[0][0]:
+            ax.set_ylabel("impulse of the blow [N s]")
+        else:
+            ax.tick_params(labelleft=False)
+    handles: list[Any] = [
+        Patch(fc=colour, ec="0.5", label=name) for colour, name in zip(_CLASS_COLOURS, boundary.NAMES, strict=True)
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=10, frameon=False)
+    figure.suptitle(
+        "What a 5 ms blow leads to at 6.2 Hz after 0.6 s; line: boundary by tsit5 at 1e-9; x: another class than there",
+        fontsize=12,
+    )
+    return figure
+
+
+def _why(engine: str, oscillator: str) -> str:
+    if engine == "split" and oscillator == "house":
+        return "exact flow"
+    return "error control" if ENGINES[engine].tolerance else "none known"
+
+
+def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _save(figure: Any, stem: Path) -> list[Path]:
+    import matplotlib
+
+    files = [stem.with_suffix(".png"), stem.with_suffix(".svg")]
+    # Without a date and with fixed names, the same numbers give the same file.
+    with matplotlib.rc_context({"svg.hashsalt": "stability"}):
+        figure.savefig(files[0], dpi=110)
+        figure.savefig(files[1], metadata={"Date": None})
+    return files

@@ -1,0 +1,127 @@
+"""`rig stability`: trials of every engine, each with its expected verdict; maps of where they hold and fail."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from replays.stability.cell import Cell
+
+
+def stability(
+    *,
+    only: Annotated[
+        str | None, typer.Option("--only", metavar="T3,T7", help="Only these trials; none of the pictures' maps changes.")
+    ] = None,
+    engines: Annotated[
+        str | None, typer.Option("--engines", metavar="NAMES", help="Only these engines, joined by commas.")
+    ] = None,
+    full: Annotated[
+        bool, typer.Option("--full/--quick", help="Long ladders and fine maps (some minutes), or the short ones.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Draw the maps as well, as PNG and SVG.")
+    ] = None,
+    json_output: Annotated[bool, typer.Option("--json", help="As a JSON document.")] = False,
+) -> None:
+    """Test where integration methods fail; exit status 1 if any does not do what theory expects."""
+    import json
+
+    from replays.stability.table import chosen_engines, chosen_trials, run_trials
+
+    trials, names = chosen_trials(only), chosen_engines(engines)
+    cells: list[Cell] = []
+    for cell in run_trials(trials, names, quick=not full):
+        cells.append(cell)
+        if not json_output:
+            typer.echo(f"\r{cell.trial} {cell.method:<20}", nl=False, err=True)
+    if not json_output:
+        typer.echo("\r" + " " * 40 + "\r", nl=False, err=True)
+    pictures: list[Path] = []
+    if output is not None:
+        from replays.stability.figure import draw_all
+
+        pictures = draw_all(output, names, quick=not full)
+    wrong = [cell for cell in cells if not cell.agrees]
+    if json_output:
+        document = {
+            "cells": [cell.document() for cell in cells],
+            "disagree": len(wrong),
+            "pictures": [str(path) for path in pictures],
+        }
+        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+    else:
+        _show(cells, names)
+        for path in pictures:
+            typer.echo(f"picture  {path}")
+    if wrong:
+        raise typer.Exit(1)
+
+
+def _show(cells: list[Cell], names: list[str]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from replays.stability.trials import TRIALS
+
+    console = Console(width=None if Console().is_terminal else 200)
+    ours = [cell for cell in cells if cell.method in names]
+    table = Table(title="trials by engine: measured, and whether that holds", box=None, header_style="bold",
+                  title_justify="left")  # fmt: skip
+    table.add_column("trial", no_wrap=True)
+    table.add_column("case")
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
+    rows = dict.fromkeys((cell.trial, cell.case) for cell in ours)
+    seen = ""
+    for trial, case in rows:
+        found = {cell.method: cell for cell in ours if (cell.trial, cell.case) == (trial, case)}
+        if trial != seen:
+            table.add_row(Text(trial, style="bold"), Text(TRIALS[trial].title, style="bold"))
+            seen = trial
+        table.add_row("", Text(f"  {case}"), *(_text(found.get(name)) for name in names))
+    console.print(table)
+    others = [cell for cell in cells if cell.method not in names]
+    if others:
+        peers = Table(title="\nother people's solvers, where they are known to fail or to hold", box=None,
+                      header_style="bold", title_justify="left")  # fmt: skip
+        for heading in ("trial", "case", "solver", "measured", "because"):
+            peers.add_column(heading)
+        for cell in others:
+            peers.add_row(cell.trial, Text(cell.case), cell.method, _text(cell), Text(cell.skipped or cell.because))
+        console.print(peers)
+    console.print(
+        "\nholds: within its limit. fails*: as theory says it must. Those marked ! do not do what was expected; a bare "
+        "number has no expectation.",
+        highlight=False,
+    )
+    for cell in cells:
+        if not cell.agrees:
+            console.print(
+                f"! {cell.trial} {cell.case}, {cell.method}: {cell.value:.3g} {cell.unit}, limit {cell.limit:.3g}, "
+                f"expected to {'hold' if cell.expected else 'fail'}: {cell.because}",
+                highlight=False,
+                markup=False,
+            )
+
+
+def _text(cell: Cell | None) -> object:
+    from rich.text import Text
+
+    if cell is None:
+        return Text("-", style="dim")
+    if cell.skipped:
+        return Text("skipped", style="dim")
+    value = f"{cell.value:.1e}" if math.isfinite(cell.value) else str(cell.value)
+    if cell.value == 0.0:
+        value = "0"
+    if cell.expected is None:
+        return Text(value + "        ")
+    if not cell.agrees:
+        return Text(f"{value} {'holds!' if cell.holds else 'FAILS!'} ", style="bold red")
+    return Text(f"{value} holds " if cell.holds else f"{value} fails*", style="" if cell.holds else "dim")

@@ -1,0 +1,213 @@
+"""What each engine promises: its order, its friction, and what it cannot do.
+
+| the engine's                           | must be                          | because                             |
+|----------------------------------------|----------------------------------|-------------------------------------|
+| error on a smooth problem against step | h^p with the order p it names    | definition of order                 |
+| error of split on every scene          | h^2                              | its order holds through contact too |
+| sliding speed while it rolls           | 0                                | Filippov: rolling is a phase        |
+| distance of smoothed to exact friction | proportional to v_s              | creep is v_s atanh(needed / mu)     |
+| linearly implicit run at v_s = 1 um/s  | near to exact Coulomb            | L-stable                            |
+| explicit run at v_s = 1 um/s, 25 us    | wrong, and its energy ledger too | stable below 2 m v_s / (mu F_n)     |
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rig import InputError, load_scene
+from rig.engines import ENGINES, load_engine
+from rig.engines.memory import CEILING, CONTACTS, EVALUATIONS, MEMORY, PHASE, STEPS
+from rig.engines.parts import SCALES
+from rig.kernels import signals as S
+from rig.kernels.contact import ROLLING
+from rig.simulation import Simulation
+
+QUIET = {
+    "sensors.chain": "ideal",
+    "sensors.groups": ["hammer"],
+    "sensors.rate_hz": 1000,
+    "sensors.truth_rate_hz": 1000,
+    "sensors.noise": False,
+}
+"""Rows 1 ms apart: steps of every engine end on them."""
+_MEASURED = [0, 1, 3, 4, 7, 8, 9]
+EXACT = [name for name, method in ENGINES.items() if "exact" in method.frictions]
+
+
+def ready(scene: str, engine: str, smoothing_speed: float | None = None, **changes: Any) -> Simulation:
+    """A simulation with rows 1 ms apart; dots of dotted keys as `__`; v_s [m/s] may be below what a scene may ask."""
+    dotted = {key.replace("__", "."): value for key, value in changes.items()}
+    simulation = Simulation(load_scene(scene, {**QUIET, "engine.name": engine, **dotted}))
+    if smoothing_speed is not None:
+        constants = simulation.model.constants
+        contact = constants.contact._replace(smoothing_speed=smoothing_speed)
+        simulation.model = dataclasses.replace(simulation.model, constants=constants._replace(contact=contact))
+    return simulation
+
+
+def motion(simulation: Simulation, duration_s: float) -> np.ndarray:
+    """Scaled states on a grid of 1 ms, shape (n, 7)."""
+    rows = simulation.advance(round(duration_s * 1e6)).rows
+    return rows[:, _MEASURED] / SCALES[_MEASURED]
+
+
+def distance(one: np.ndarray, other: np.ndarray) -> float:
+    """RMS over states and time."""
+    return float(np.sqrt(np.mean((one - other) ** 2)))
+
+
+def slope(steps: list[Any], errors: list[float]) -> float:
+    """Fitted exponent of the error against the step."""
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
+
+
+# split's own steps in flight are 16 times these.
+SMOOTH_STEPS = {
+    "split": [25, 20, 10, 5, 4],
+    "rk8": [500, 250, 200, 160],
+    "tsit5": [50, 40, 25, 20],  # at longer ones the error of order 6 is the larger
+    "rosenbrock": [250, 200, 160, 100],
+    "rk4": [100, 50, 40, 25],
+    "verlet": [100, 50, 40, 25],
+    "semi-implicit-euler": [50, 25, 20, 10],
+}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_order_on_the_smooth_problem(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The order of the plain method: no error estimate may shorten a step.
+    for name in ("rk8", engine):
+        module = load_engine(name)
+        for method in ("METHOD", "TABLEAU"):
+            if hasattr(module, method):
+                monkeypatch.setattr(module, method, getattr(module, method)._replace(order=0.0))
+
+    # Undamped free flight at 220 Hz on stiff, hardening magnets, in a ring too wide to touch: smooth and nonlinear.
+    simulation = ready(
+        "stable-run", "rk8", ring__clearance=15.0, initial__position="given", initial__x_mm=0.8, initial__y_mm=0.4,
+        magnet__stiffness=1000.0, shaft__damping_ratio_x=0.0, shaft__damping_ratio_y=0.0, drive__speed_hz=8.0,
+    )  # fmt: skip
+    constants, inputs = simulation.model.constants, simulation._inputs()
+
+    def swing(name: str, step: int) -> np.ndarray:
+        module, y, memory = load_engine(name), simulation._y.copy(), np.zeros(MEMORY)
+        rows = np.empty((7, S.N_ROW))
+        module.start(constants, inputs, y, memory, float(step), ENGINES[name].tolerance)
+        module.advance(constants, inputs, y, memory, 0, step, 56_000 // step, 8_000 // step, rows)
+        assert memory[CONTACTS] == 0.0
+        if name == "split":  # the first ones are shorter
+            assert memory[STEPS] == pytest.approx(56_000 // step / 16, abs=12)
+        else:
+            assert memory[STEPS] == 56_000 // step, "no step was divided"
+        return rows[:, [0, 1, 7, 8]] / np.array([1e-2, 1e-2, 10.0, 10.0])
+
+    exact = swing("rk8", 20)
+    steps = SMOOTH_STEPS[engine]
+    errors = [float(np.linalg.norm(swing(engine, step) - exact)) for step in steps]
+    assert slope(steps, errors) == pytest.approx(load_engine(engine).ORDER, abs=0.15)
+
+
+SCENES: dict[str, tuple[str, dict[str, Any], float, float]] = {
+    "first impacts": ("hammer", {}, 0.0, 0.05),
+    "start of the whirl": ("hammer", {}, 0.0, 0.2),
+    "drop": ("drop", {}, 0.0, 0.06),
+    "resonance with contact": ("run-up", {}, 8.0, 0.1),
+    "stable run": ("stable-run", {"initial__position": "given", "initial__x_mm": 0.3}, 0.0, 0.1),
+}
+"""Scene, changes, start and length [s]."""
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_split_is_of_order_two_on_every_scene(name: str) -> None:
+    scene, changes, start_s, duration_s = SCENES[name]
+    first = ready(scene, "split", **changes)
+    if start_s:
+        first.advance(round(start_s * 1e6))
+
+    def run(engine: str, **choice: Any) -> tuple[np.ndarray, Simulation]:
+        simulation = ready(scene, engine, **changes, **choice)
+        simulation.tick, simulation._y = first.tick, first._y.copy()
+        return motion(simulation, duration_s), simulation
+
+    exact, reference = run("rk8", engine__step_us=20, engine__tolerance=1e-10)
+    assert (reference._memory[CONTACTS] > 0) == (name != "stable run")
+    # Impacts and stick make single errors scatter by several times: many steps.
+    steps = [50, 40, 25, 20, 10, 8, 5, 4, 2, 1]
+    errors = [distance(run("split", engine__step_us=step)[0], exact) for step in steps]
+    assert errors[2] < 2e-3, "at the step of 25 us"
+    assert slope(steps, errors) >= 1.7
+
+
+@pytest.mark.parametrize("engine", ["rk8", "tsit5"])
+def test_rolling_holds_the_sliding_speed_at_zero(engine: str) -> None:
+    simulation = ready("hammer", engine)
+    simulation.advance(200_000)
+    assert simulation._memory[PHASE] == ROLLING
+    rows = simulation.advance(300_000).rows
+    assert (rows[:, S.COLUMN["normal_force"]] > 0.0).all()
+    assert np.abs(rows[:, S.COLUMN["friction_force"]]).max() > 1.0
+    assert np.abs(rows[:, S.COLUMN["sliding_speed"]]).max() < 1e-6
+
+
+def test_smoothed_friction_is_as_far_from_exact_as_its_smoothing_speed() -> None:
+    exact = motion(ready("hammer", "rk8"), 0.15)
+    speeds = [5e-3, 2.5e-3, 1e-3, 0.5e-3]
+    errors = [distance(motion(ready("hammer", "rk8", v, model__friction="smoothed"), 0.15), exact) for v in speeds]
+    assert slope(speeds, errors) == pytest.approx(1.0, abs=0.15)
+
+
+# Error over the first 0.05 s of a hammer blow: sixteen impacts, which make small errors a thousand times larger.
+CLASS = {
+    "split": ({"engine__step_us": 25}, 3e-4),
+    "tsit5": ({"engine__tolerance": 1e-7}, 1e-3),
+    "rk4": ({"engine__step_us": 5}, 3e-4),
+    "verlet": ({"engine__step_us": 1}, 1e-2),
+    "rk8": ({"engine__step_us": 20}, 1e-6),
+}
+
+
+@pytest.mark.parametrize("engine", EXACT)
+def test_engines_agree_on_exact_friction(engine: str) -> None:
+    exact = motion(ready("hammer", "rk8", engine__tolerance=1e-10), 0.05)
+    choice, limit = CLASS[engine]
+    assert distance(motion(ready("hammer", engine, **choice), 0.05), exact) < limit
+
+
+@pytest.mark.parametrize("engine", [name for name in ENGINES if name not in EXACT])
+def test_engines_without_exact_friction_say_so(engine: str) -> None:
+    with pytest.raises(InputError, match="friction"):
+        ready("hammer", engine, model__friction="exact")
+
+
+@pytest.mark.parametrize("smoothing_speed", [1e-4, 1e-6])
+def test_linearly_implicit_engine_holds_at_any_smoothing_speed(smoothing_speed: float) -> None:
+    exact = motion(ready("hammer", "rk8"), 0.15)
+    implicit = ready("hammer", "rosenbrock", smoothing_speed, model__friction="smoothed")
+    assert distance(motion(implicit, 0.15), exact) < 4e-3
+    assert implicit._memory[CEILING] == 0.0
+    assert abs(implicit.health()["energy"]["residual_share"]) < 3e-5
+
+    # An explicit step of 25 us is some hundred times too long: what it adds is energy, and the ledger says so.
+    explicit = ready("hammer", "rk4", smoothing_speed, model__friction="smoothed", engine__step_us=25)
+    assert distance(motion(explicit, 0.15), exact) > 1e-2
+    assert abs(explicit.health()["energy"]["residual_share"]) > 1e-2
+    # What error control makes of the same: several times the work.
+    if smoothing_speed == 1e-4:
+        adaptive = ready("hammer", "rk8", smoothing_speed, model__friction="smoothed")
+        motion(adaptive, 0.15)
+        assert adaptive._memory[EVALUATIONS] > 2.0 * implicit._memory[EVALUATIONS]
+
+
+@pytest.mark.parametrize("friction", ["none", "switch"])
+@pytest.mark.parametrize("engine", ["rosenbrock", "verlet", "semi-implicit-euler"])
+def test_other_friction_laws(engine: str, friction: str) -> None:
+    # The two low orders at 1 us and up to the second impact only.
+    exact = motion(ready("hammer", "rk8", model__friction=friction), 0.034)
+    choice = {} if engine == "rosenbrock" else {"engine__step_us": 1}
+    run = ready("hammer", engine, model__friction=friction, **choice)
+    assert distance(motion(run, 0.034), exact) < (1e-4 if engine == "rosenbrock" else 2e-2)
+    assert run._memory[CONTACTS] >= 1.0
