@@ -67,7 +67,9 @@ CASES = (
     Case("split 20 us, hammer", "hammer", _engine("split", 20), goal=75, error_goal=1.6e-4),
     Case("tsit5 1e-6, hammer", "hammer", _engine("tsit5", 500, **{"engine.tolerance": 1e-6})),
     Case("rk8 1e-8, hammer", "hammer", _engine("rk8", 25), error_goal=1e-6),
-    Case("split 50 us, free flight, a row every 10 ms", "stable-run", _engine("split", 50, **SPARSE), 20.0, goal=5000),
+    Case(
+        "split 100 us, free flight, a row every 10 ms", "stable-run", _engine("split", 100, **SPARSE), 20.0, goal=5000
+    ),
     Case("split 25 us, 60 s: bounces, then free", "hammer", _engine("split", 25, commands=_DIES_OUT), 60.0, goal=500),
     Case("split 100 us, 60 s: bounces, then whirl", "hammer", _engine("split", 100), 60.0, goal=500),
     Case("split 25 us, hammer, all sensors at 20 kHz", "hammer", {}, goal=60, blocks=True),

@@ -96,7 +96,7 @@ def _draw_levels(axes: Any, ladder: Ladder, rungs: list[Step], name: str, *, nam
                 f"reference {shown}", (low, row), xytext=(6, 0), textcoords="offset points", va="center", fontsize=9
             )
             continue
-        good = error <= ladder.tolerances[name]
+        good = error <= ladder.tolerances[name] - ladder.reference_errors[name]
         place = _placed(error, low, high)
         axes.plot([low, place], [row, row], color="0.75", lw=1.2, zorder=2)
         axes.plot(

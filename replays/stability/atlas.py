@@ -55,7 +55,7 @@ class Map(NamedTuple):
 
     @property
     def hw(self) -> np.ndarray:
-        """h w at every point, shape (m, n)."""
+        """H w at every point, shape (m, n)."""
         return np.sqrt(self.stiffness[:, None] / self.mass) * self.steps_us[None, :] * 1e-6
 
     @property
@@ -113,7 +113,10 @@ def _ratio(
     engine: str, constants: object, y0: np.ndarray, step_s: float, stiffness: float, mass: float,
     columns: tuple[str, str], arm: float, periods: int,
 ) -> float:  # fmt: skip
-    """Energy of the fluctuation in the last quarter over that in the first."""
+    """Energy of the fluctuation in the last quarter over that in the first part.
+
+    The first part is a quarter; for the contact a fortieth, before growth lifts the shaft off; `split` first settles.
+    """
     angular = math.sqrt(stiffness / mass)
     # Beyond every limit a few steps tell, and more would only follow numbers without meaning.
     longest = 40 if angular * step_s > 3.6 else 10**9
@@ -129,5 +132,6 @@ def _ratio(
         def energy(window: slice) -> float:
             return stiffness * float(np.var(place[window])) + mass * float(np.var(speed[window]))
 
-        ratio = energy(slice(-part, None)) / energy(slice(None, part))
+        early = part if engine == "split" or columns[0] == "x_ih" else max(4, len(place) // 40)
+        ratio = energy(slice(-part, None)) / energy(slice(None, early))
     return ratio if math.isfinite(ratio) else math.inf

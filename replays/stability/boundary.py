@@ -51,7 +51,10 @@ def chart(engine: str, *, points: int, duration_s: float = 0.6, tolerance: float
     frictions, forces = np.linspace(0.02, 0.40, points), np.linspace(20.0, 200.0, points)
     classes = np.array(
         [
-            [whirl_class(engine, float(mu), float(force), duration_s=duration_s, tolerance=tolerance) for mu in frictions]
+            [
+                whirl_class(engine, float(mu), float(force), duration_s=duration_s, tolerance=tolerance)
+                for mu in frictions
+            ]
             for force in forces
         ]
     )

@@ -54,7 +54,9 @@ def impact(*, mass: float, speed: float, stiffness: float, exponent: float, fact
     low = -speed if g * speed < 1.0 else -1.0 / g * (1.0 - 1e-12)
     root: Any = brentq(work, low, -1e-12 * speed, xtol=1e-18, rtol=1e-14) if factor else -speed
     rebound = -float(root)
-    peak: Any = minimize_scalar(lambda v: -force(v), bounds=(-rebound, speed), method="bounded", options={"xatol": 1e-12})
+    peak: Any = minimize_scalar(
+        lambda v: -force(v), bounds=(-rebound, speed), method="bounded", options={"xatol": 1e-12}
+    )
     # F goes as s^(n/(n+1)) at both ends, with s the distance in speed from there: s = u^(n+1) takes that out.
     power = exponent + 1.0
     middle = 0.5 * (speed - rebound)
@@ -149,7 +151,7 @@ def runge_kutta_4_gain(z: float) -> float:
 
 
 def linear_motion(rates: np.ndarray, constant: np.ndarray, z0: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """z' = A z + b by the exponential of the bordered matrix, shape (n, len(z0))."""
+    """Z' = A z + b by the exponential of the bordered matrix, shape (n, len(z0))."""
     from scipy.linalg import expm
 
     size = len(z0)

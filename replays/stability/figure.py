@@ -140,7 +140,7 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
     )  # fmt: skip
     stale.axhspan(2e-2, 1e3, color="#D55E00", alpha=0.08)
     stale.set(
-        title="Lasting contact with a stale v0: pushed in\nfrom rest with up to 1.6 kN", xlabel="v0 held, its floor [m/s]",
+        title="Lasting contact, stale v0: pushed in\nfrom rest with up to 1.6 kN", xlabel="v0 held, its floor [m/s]",
         ylabel="error of the depth over the deepest [1]", ylim=(1e-12, 1e3),
     )  # fmt: skip
     for ax in axes[0]:
@@ -184,7 +184,7 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=10, frameon=False)
     figure.suptitle(
-        "What a 5 ms blow leads to at 6.2 Hz after 0.6 s; line: boundary by tsit5 at 1e-9; x: another class than there",
+        "A 5 ms blow at 6.2 Hz, after 0.6 s; line: boundary by tsit5 at 1e-9; x: another class than there",
         fontsize=12,
     )
     return figure

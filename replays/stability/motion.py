@@ -189,7 +189,9 @@ def bare_shaft(
         speed_floor=contact.speed_floor if speed_floor is None else speed_floor,
     )
     shaft = constants.shaft._replace(unbalance=0.0, gravity=constants.shaft.gravity if gravity else 0.0)
-    return constants._replace(contact=contact, shaft=shaft, magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0))
+    return constants._replace(
+        contact=contact, shaft=shaft, magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0)
+    )
 
 
 def hammer_run(

@@ -56,7 +56,7 @@ def _hammer(name: str, tolerance: float) -> float:
     return abs(float(states[-1, 8] / right[-1, 8]) - 1.0)
 
 
-def _problem(name: str, constants, inputs, y0: np.ndarray, duration_s: float) -> Problem:  # noqa: ANN001
+def _problem(name: str, constants, inputs, y0: np.ndarray, duration_s: float) -> Problem:
     return Problem(
         name=name, constants=constants, inputs=inputs, start_tick=0, y0=y0[:N_STATE], phase=FLIGHT,
         onset_speed=constants.contact.speed_floor, times=np.linspace(0.0, duration_s, 201),
@@ -66,7 +66,14 @@ def _problem(name: str, constants, inputs, y0: np.ndarray, duration_s: float) ->
 _RUNS = {"T1": _ring_down, "T5": _hammer}
 _KNOWN: dict[str, tuple[tuple[str, str, float, float, bool, str], ...]] = {
     "T1": (
-        ("scipy-lsoda", "tolerance 1e-3", 1e-3, 0.01, False, "multistep methods grow or damp what is near the imaginary axis"),
+        (
+            "scipy-lsoda",
+            "tolerance 1e-3",
+            1e-3,
+            0.01,
+            False,
+            "multistep methods grow or damp what is near the imaginary axis",
+        ),
         ("cvode-bdf", "tolerance 1e-4", 1e-4, 0.01, False, "BDF of order 3 and up is unstable near the imaginary axis"),
         ("scipy-dop853", "tolerance 1e-8", 1e-8, 0.01, True, "a one-step method of order 8 at a fine tolerance"),
     ),

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -309,7 +310,11 @@ def free_flight(engine: str, *, duration_s: float = 0.2, step: int = 0, toleranc
 
 def _t6(engine: str, quick: bool) -> Iterator[Cell]:
     limit = 1e-6 if engine == "split" else _limit(engine, 1e-4)
-    because = "its flow is the matrix exponential; only the gyroscopic term is a kick" if engine == "split" else "a smooth linear problem"
+    because = (
+        "its flow is the matrix exponential; only the gyroscopic term is a kick"
+        if engine == "split"
+        else "a smooth linear problem"
+    )
     yield Cell("T6", "0.2 s", engine, free_flight(engine), "1", limit, True, because)
 
 
@@ -452,7 +457,7 @@ def _sharp(friction: str) -> Motion:
 
 def _t11(engine: str, quick: bool) -> Iterator[Cell]:
     errors = [error for _, error in ladder(engine)]
-    worst = max(fine / coarse for coarse, fine in zip(errors, errors[1:], strict=False))
+    worst = max(fine / coarse for coarse, fine in pairwise(errors))
     yield Cell("T11", "worst rung over the one before", engine, worst, "1", 1.5, True, "asking for more gives more")
     # An engine whose grid alone is fine enough has nowhere to go.
     gain = errors[-1] / max(errors[0], 1e-6)
@@ -585,7 +590,7 @@ def stale_limit_step(floor: float, force_n: float = 1000.0) -> float:
 
 
 def stale_stiffness(engine: str, floor: float, force_n: float = 1000.0) -> float:
-    """h lambda of the damping with a stale v0 at an engine's own step: c F/(v0 m) h at the peak of `pushed`."""
+    """Value of h lambda of the stale damping at an engine's own step: c F/(v0 m) h at the peak of `pushed`."""
     return RUNGE_KUTTA_4_REAL_LIMIT * ENGINES[engine].step_us * 1e-6 / stale_limit_step(floor, force_n)
 
 

@@ -66,7 +66,13 @@ _PANELS: dict[str, dict[str, Any]] = {
         "stop": stop.stop,
     },
     "Recordings and pictures": {"record": record.record, "view": view.view, "info": info.info},
-    "Without a clock": {"simulate": simulate.simulate, "bench": bench.bench, "ladder": ladder.ladder, "chart": chart.chart, "stability": stability.stability},
+    "Without a clock": {
+        "simulate": simulate.simulate,
+        "bench": bench.bench,
+        "ladder": ladder.ladder,
+        "chart": chart.chart,
+        "stability": stability.stability,
+    },
 }
 
 

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 def stability(
     *,
     only: Annotated[
-        str | None, typer.Option("--only", metavar="T3,T7", help="Only these trials; none of the pictures' maps changes.")
+        str | None,
+        typer.Option("--only", metavar="T3,T7", help="Only these trials; pictures stay whole."),
     ] = None,
     engines: Annotated[
         str | None, typer.Option("--engines", metavar="NAMES", help="Only these engines, joined by commas.")
@@ -30,6 +31,7 @@ def stability(
 ) -> None:
     """Test where integration methods fail; exit status 1 if any does not do what theory expects."""
     import json
+    import sys
 
     from replays.stability.table import chosen_engines, chosen_trials, run_trials
 
@@ -37,9 +39,9 @@ def stability(
     cells: list[Cell] = []
     for cell in run_trials(trials, names, quick=not full):
         cells.append(cell)
-        if not json_output:
+        if sys.stderr.isatty():
             typer.echo(f"\r{cell.trial} {cell.method:<20}", nl=False, err=True)
-    if not json_output:
+    if sys.stderr.isatty():
         typer.echo("\r" + " " * 40 + "\r", nl=False, err=True)
     pictures: list[Path] = []
     if output is not None:

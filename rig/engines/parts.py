@@ -70,6 +70,8 @@ _GROWTH = 0.5
 _SHORTEST = 1e-6
 """Shortest part that an error estimate can ask for, in steps of the grid."""
 _MOST_PARTS = 100_000
+_MOST_EVENTS = 200
+"""Events in one step of the grid after which they are no longer located."""
 _SAFETY = 0.9
 
 _NONE, _ONSET, _LIFT_OFF, _TURN, _BREAK = range(5)
@@ -292,6 +294,7 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
     fraction, stale = 0.0, True
     depth, rate, sliding, margin = out[S.PENETRATION], out[S.PENETRATION_RATE], out[S.SLIDING_SPEED], 0.0
     margin = _surplus(_BREAK, contact, out)
+    events = 0
     for _ in range(_MOST_PARTS):
         left = ticks - fraction
         phase = int(memory[PHASE])
@@ -303,6 +306,8 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
             pace = abs(rate) * inputs.tick_s
             if depth < pace * ticks / _GROWTH:
                 size = min(size, max(_LEAST * ticks, _GROWTH * depth / pace))
+        if events >= _MOST_EVENTS:
+            size = max(size, _LEAST * ticks)
         if size > 0.999 * left:  # no slivers
             size = left
         if stale:
@@ -353,7 +358,14 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
                 before = sliding
             elif event == _BREAK:
                 before = margin
-            if before * after < 0.0:
+            events += 1
+            if events == _MOST_EVENTS:
+                memory[CEILING] += 1.0
+            if events >= _MOST_EVENTS:
+                # They pile up (a chatter, or bounces without end): from here on the phase changes at ends of parts.
+                y[:] = end
+                rates(constants, inputs, tick, fraction + size, memory[ONSET], phase, False, y, last, out)
+            elif before * after < 0.0:
                 size *= _locate(
                     event, before, after, method, constants, inputs, tick, fraction, size, memory, y, k, z, end, out
                 )

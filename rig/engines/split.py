@@ -73,8 +73,8 @@ _GRID = 5
 """Level of the grid's own step: level l lasts 2**(l - _GRID) steps of the grid."""
 _LEVELS = _GRID + 8
 """Flows are kept for half a step of every level; each: horizontal and vertical block of the houses, (4, 4)."""
-_LONGEST = _GRID + 4
-"""A flight covers at most 2**4 steps of the grid ..."""
+_LONGEST = _GRID + 3
+"""A flight covers at most 2**3 steps of the grid ..."""
 _FLIGHT_S = 1.1e-3
 """... and lasts at most this long [s]."""
 _BLOW = _GRID - 3
@@ -85,6 +85,8 @@ _ROUGH = 4.0
 """How many times (squared) a level's speed is exceeded before the step is halved."""
 _DRIFT = 0.01
 """Weight of the gap's slow motion, squared, against its acceleration."""
+_DAMPED = 0.3
+"""Largest part of the gap's speed that the contact's damping may take in one step: the commutators are a series in it."""
 _PATIENCE = 16
 """Calm kicks in a row before the step is doubled."""
 _SLOP = 200.0
@@ -724,10 +726,15 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     bounce = rate_mean
                     stiff = slope * w_nn
                     size = _DRIFT * rate_mean * rate_mean * stiff + change * change
-                    if wanted_level > 0 and size > _ROUGH * limits[wanted_level] * limits[wanted_level] * stiff:
+                    limit = limits[wanted_level]
+                    if wanted_level > 0 and (size > _ROUGH * limit * limit * stiff or z > _DAMPED):
                         wanted_level -= 1
                         settled = 0
-                    elif wanted_level < _GRID and size < limits[wanted_level + 1] * limits[wanted_level + 1] * stiff:
+                    elif (
+                        wanted_level < _GRID
+                        and size < limits[wanted_level + 1] * limits[wanted_level + 1] * stiff
+                        and 2.0 * z < _DAMPED
+                    ):
                         settled += 1
                         if settled >= _PATIENCE and (n + count) & ((2 << wanted_level) - 1) == 0:
                             wanted_level += 1

@@ -130,7 +130,6 @@ def test_energy_ledger_closes(run: Run) -> None:
     )
 
 
-
 def test_another_duration_and_its_progress() -> None:
     parts: list[float] = []
     run = simulate(load_scene("drop"), duration_s=0.25, progress=parts.append)
