@@ -1,4 +1,4 @@
-"""Speed of the rig with its error beside it: simulated over wall time, in cases that share one process and take turns."""
+"""Speed of the rig with its error beside it: simulated over wall time, cases in turn in one process."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ class Simulation:
             warnings.append(f"{late} commands of the scene lie after its end and will not be given")
         if self._memory[CEILING]:
             warnings.append(
-                f"{self._memory[CEILING]:.0f} steps stayed above engine.tolerance at the least length, or ran out of parts"
+                f"{self._memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least length"
             )
         if self._memory[FLOORED]:
             warnings.append(f"{self._memory[FLOORED]:.0f} contacts began slower than contact.speed_floor")

@@ -99,8 +99,8 @@ def status_table(document: dict[str, Any]) -> Table:
     engine, share = document.get("engine") or {}, energy.get("residual_share")
     if engine and share is not None:
         # Reference-free: what the method makes or loses of the energy that it should account for.
-        told = f"{engine['name']}, {engine['step_us']} us; error estimate (energy residual) {share:.1e} of what was dissipated"
-        table.add_row("engine", told)
+        table.add_row("engine", f"{engine['name']}, {engine['step_us']} us")
+        table.add_row("error estimate", f"energy residual {share:.1e} of what was dissipated (alarm at 1e-3)")
     table.add_row("samples published", str(document["samples_published"]))
     table.add_row("commands taken", str(document["commands"]))
     table.add_row("links", ", ".join(f"{name} {value:g}" for name, value in document["congestion"].items()) or "-")

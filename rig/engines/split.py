@@ -86,7 +86,7 @@ _ROUGH = 4.0
 _DRIFT = 0.01
 """Weight of the gap's slow motion, squared, against its acceleration."""
 _DAMPED = 0.3
-"""Largest part of the gap's speed that the contact's damping may take in one step: the commutators are a series in it."""
+"""Largest part of the gap's speed that the contact's damping takes in a step: the commutators are a series in it."""
 _PATIENCE = 16
 """Calm kicks in a row before the step is doubled."""
 _SLOP = 200.0
