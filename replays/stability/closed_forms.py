@@ -52,7 +52,9 @@ def impact(*, mass: float, speed: float, stiffness: float, exponent: float, fact
         return stiffness * depth(v) ** exponent * (1.0 + g * v)
 
     low = -speed if g * speed < 1.0 else -1.0 / g * (1.0 - 1e-12)
-    root: Any = brentq(work, low, -1e-12 * speed, xtol=1e-18, rtol=1e-14) if factor else -speed
+    root: Any = -speed
+    if factor:
+        root = brentq(work, low, -1e-12 * speed, xtol=1e-18, rtol=np.float64(1e-14))
     rebound = -float(root)
     peak: Any = minimize_scalar(
         lambda v: -force(v), bounds=(-rebound, speed), method="bounded", options={"xatol": 1e-12}

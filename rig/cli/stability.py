@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from rich.text import Text
+
     from replays.stability.cell import Cell
 
 
@@ -112,7 +114,7 @@ def _show(cells: list[Cell], names: list[str]) -> None:
             )
 
 
-def _text(cell: Cell | None) -> object:
+def _text(cell: Cell | None) -> Text:
     from rich.text import Text
 
     if cell is None:
