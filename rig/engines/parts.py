@@ -69,7 +69,8 @@ _GROWTH = 0.5
 """... away from it parts may last this times the time since or until the crossing."""
 _SHORTEST = 1e-6
 """Shortest part that an error estimate can ask for, in steps of the grid."""
-_MOST_PARTS = 5_000
+_MOST_PARTS = 20_000
+"""Parts of one step of the grid; then it is given up and counted. Smoothed friction of 1 um/s asks tsit5 for 15 000."""
 _MOST_EVENTS = 200
 """Events in one step of the grid after which they are no longer located."""
 _SAFETY = 0.9

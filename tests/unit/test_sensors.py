@@ -11,7 +11,7 @@ import pytest
 from rig.channels import Group, default_table
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.scenes import load_scene
-from rig.sensors.conditioning import Conditioner
+from rig.sensors.conditioning import Conditioner, channel_filter
 from rig.sensors.keyphasor import Keyphasor
 from rig.simulation import Simulation
 
@@ -280,3 +280,20 @@ def test_pulse_rises_where_the_edge_is() -> None:
     late = rises / 20_000 - edges
     assert late.min() > 0.0
     assert late.max() < 2e-4
+
+
+@pytest.mark.parametrize("row_rate_hz", [40_000, 100_000])
+def test_filters_are_butterworths(row_rate_hz: int) -> None:
+    from scipy.signal import butter, sosfreqz
+
+    for channel in default_table().channels.values():
+        sections = channel_filter(channel, row_rate_hz)
+        frequency = np.geomspace(0.1, 0.49 * row_rate_hz, 200)
+        expected = np.ones(len(frequency), complex)
+        if channel.bandwidth_hz < 0.45 * row_rate_hz:
+            low = butter(4, channel.bandwidth_hz, fs=row_rate_hz, output="sos")
+            expected *= sosfreqz(low, frequency, fs=row_rate_hz)[1]
+        if channel.highpass_hz > 0.0:
+            high = butter(1, channel.highpass_hz, "highpass", fs=row_rate_hz, output="sos")
+            expected *= sosfreqz(high, frequency, fs=row_rate_hz)[1]
+        np.testing.assert_allclose(sosfreqz(sections, frequency, fs=row_rate_hz)[1], expected, rtol=1e-9, atol=1e-12)
