@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from rig.channels import ChannelTable, default_table
-from rig.engines import load_engine
+from rig.engines import ENGINES, load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, STEPS
 from rig.errors import InputError, SimulationError
 from rig.kernels import signals as S
@@ -109,6 +109,7 @@ class Simulation:
         self.tick_rate_hz = TICK_RATE_HZ
         self.model = build_model(scene.load_parameters(), scene.model)
         self._engine = load_engine(scene.engine.name)
+        self._method = ENGINES[scene.engine.name]
         self._step_ticks = scene.engine.step_us
         sensors = scene.sensors
         periods = [TICK_RATE_HZ // rate for rate in (sensors.rate_hz, sensors.truth_rate_hz)]
@@ -237,6 +238,11 @@ class Simulation:
         late = sum(tick >= self.end_tick for tick, _ in self._pending)
         if late:
             warnings.append(f"{late} commands of the scene lie after its end and will not be given")
+        if self._step_ticks > self._method.longest_us:
+            warnings.append(
+                f"engine.step_us is above {self._method.longest_us} us, where {self.scene.engine.name} can be wrong without "
+                "its energy residual showing it"
+            )
         if self._memory[CEILING]:
             warnings.append(
                 f"{self._memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least length"

@@ -17,6 +17,7 @@ from replays.stability.closed_forms import (
     VERLET_LIMIT,
 )
 from replays.stability.motion import bare_shaft, base_model, move, pivoted_mass, quiet_inputs, state
+from rig.kernels.constants import Constants
 from rig.levels import ModelLevels
 
 PERIODS = 60
@@ -30,6 +31,8 @@ LIMITS: dict[str, dict[str, float]] = {
     },
 }
 """Largest h w by oscillator and engine; engines not named have none, or none that is known here."""
+_DEPTH = 20e-6
+"""Depth at rest in the contact [m]."""
 GROWN = 3.0
 """Energy ratio above which a run counts as unstable."""
 
@@ -74,14 +77,25 @@ def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = 
 
 
 def contact_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
-    """Energy ratio of a small oscillation of the shaft on an undamped linear contact, pressed on by gravity."""
+    """Energy ratio of a small oscillation of the shaft on an undamped linear contact, pressed on by its weight.
+
+    For `split` the weight is the true one and the oscillation 1/1000 of the depth: its steps follow the gap's speed,
+    and only next to rest are they as long as asked. For the others the weight is such that the depth is 20 um, and the
+    oscillation 1/100 of that: with less, error control has nothing to control.
+    """
     constants = bare_shaft(damping_factor=0.0, exponent=1.0, stiffness=stiffness, gravity=True)
     shaft = constants.shaft
-    depth = shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring / stiffness
+    depth, part = shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring / stiffness, 1e-3
+    if engine != "split":
+        shaft = shaft._replace(gravity=shaft.gravity * _DEPTH / depth)
+        depth, part = _DEPTH, 1e-2
+    constants = constants._replace(shaft=shaft)
     # Gamma > 0 lowers the shaft.
-    y0 = state(Gamma=(constants.contact.clearance + 1.001 * depth) / shaft.arm_ring)
+    rest = (constants.contact.clearance + depth) / shaft.arm_ring
+    y0 = state(Gamma=rest + part * depth / shaft.arm_ring)
     columns = ("Gamma", "Gamma_rate")
-    return _ratio(engine, constants, y0, step_s, stiffness, pivoted_mass(constants), columns, shaft.arm_ring, periods)
+    return _ratio(engine, constants, y0, step_s, stiffness, pivoted_mass(constants), columns, shaft.arm_ring, periods,
+                  rest=rest)  # fmt: skip
 
 
 OSCILLATORS = {"house": house_ratio, "contact": contact_ratio}
@@ -110,27 +124,32 @@ def chart(engine: str, oscillator: str, *, points: int, periods: int = PERIODS) 
 
 
 def _ratio(
-    engine: str, constants: object, y0: np.ndarray, step_s: float, stiffness: float, mass: float,
-    columns: tuple[str, str], arm: float, periods: int,
+    engine: str, constants: Constants, y0: np.ndarray, step_s: float, stiffness: float, mass: float,
+    columns: tuple[str, str], arm: float, periods: int, rest: float = 0.0,
 ) -> float:  # fmt: skip
-    """Energy of the fluctuation in the last quarter over that in the first part.
+    """Energy in the last quarter over that in the first part; `rest` is the angle or place of rest.
 
-    The first part is a quarter; for the contact a fortieth, before growth lifts the shaft off; `split` first settles.
+    The first part is a quarter; for the contact a fortieth, before growth lifts the shaft off. In the contact
+    `split` first settles, and its rest is where its mean is.
     """
     angular = math.sqrt(stiffness / mass)
     # Beyond every limit a few steps tell, and more would only follow numbers without meaning.
     longest = 40 if angular * step_s > 3.6 else 10**9
     ticks = min(longest, max(40, math.ceil(periods * 2.0 * math.pi / (angular * step_s))))
     with np.errstate(all="ignore"):
-        motion = move(
-            engine, constants, quiet_inputs(tick_s=step_s), y0,  # type: ignore[arg-type]
-            ticks=ticks, step=1, every=max(1, ticks // 997),
-        )  # fmt: skip
-        place, speed = arm * motion.column(columns[0]), arm * motion.column(columns[1])
+        try:
+            motion = move(
+                engine, constants, quiet_inputs(tick_s=step_s), y0, ticks=ticks, step=1, every=max(1, ticks // 997)
+            )
+        except ZeroDivisionError:  # numbers so large that a force over their distance is none
+            return math.inf
+        place, speed = arm * (motion.column(columns[0]) - rest), arm * motion.column(columns[1])
         part = len(place) // 4
 
         def energy(window: slice) -> float:
-            return stiffness * float(np.var(place[window])) + mass * float(np.var(speed[window]))
+            if engine == "split" and columns[0] != "x_ih":
+                return stiffness * float(np.var(place[window])) + mass * float(np.var(speed[window]))
+            return stiffness * float(np.mean(place[window] ** 2)) + mass * float(np.mean(speed[window] ** 2))
 
         early = part if engine == "split" or columns[0] == "x_ih" else max(4, len(place) // 40)
         ratio = energy(slice(-part, None)) / energy(slice(None, early))

@@ -100,7 +100,8 @@ def _show(cells: list[Cell], names: list[str]) -> None:
             peers.add_row(cell.trial, Text(cell.case), cell.method, _text(cell), Text(cell.skipped or cell.because))
         console.print(peers)
     console.print(
-        "\nholds: within its limit. fails*: as theory says it must. Those marked ! do not do what was expected; a bare "
+        "\nholds: within its limit. fails*: as was expected, by theory or by measurement (--json says why). "
+        "Those marked ! do not do what was expected; a bare "
         "number has no expectation.",
         highlight=False,
     )

@@ -25,13 +25,20 @@ class Method(NamedTuple):
     frictions: tuple[str, ...]
     """Friction laws it can take (`rig.levels`)."""
     contacts: tuple[str, ...] = ("compliant",)
+    longest_us: int = 1000
+    """Longest step at which its error estimate can be trusted [us]; above it a run says so."""
 
 
 _BY_STATE = ("none", "smoothed", "switch")
 
 ENGINES = {
     "split": Method(
-        "exact linear flow and one contact kick a step, order 2", 25, 0.0, ("none", "exact"), ("impact", "compliant")
+        "exact linear flow and one contact kick a step, order 2",
+        25,
+        0.0,
+        ("none", "exact"),
+        ("impact", "compliant"),
+        100,
     ),
     "rk8": Method("Dormand-Prince 8(5,3), events located", 25, 1e-8, (*_BY_STATE, "exact")),
     "tsit5": Method("Tsitouras 5(4), adaptive, events located", 500, 1e-6, (*_BY_STATE, "exact")),
