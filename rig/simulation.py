@@ -238,14 +238,14 @@ class Simulation:
         late = sum(tick >= self.end_tick for tick, _ in self._pending)
         if late:
             warnings.append(f"{late} commands of the scene lie after its end and will not be given")
-        if self._step_ticks > self._method.longest_us:
+        longest = self._method.longest_us
+        if self._step_ticks > longest:
             warnings.append(
-                f"engine.step_us is above {self._method.longest_us} us, where {self.scene.engine.name} can be wrong without "
-                "its energy residual showing it"
+                f"engine.step_us is above {longest}: its energy residual may not show how wrong the engine is"
             )
         if self._memory[CEILING]:
             warnings.append(
-                f"{self._memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least length"
+                f"{self._memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least size"
             )
         if self._memory[FLOORED]:
             warnings.append(f"{self._memory[FLOORED]:.0f} contacts began slower than contact.speed_floor")

@@ -133,25 +133,25 @@ def _compiled_prepare(method, constants, inputs, tick, fraction, ticks, onset_sp
     return FUNCTIONS[method.instance_class].prepare.py_func
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def rates(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy, out):
     """`evaluate` as a function of its own, so that only the stages' loop holds another copy of it."""
     evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy, out)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def nothing_to_prepare(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, out):
     """`method_prepare` of a method that has nothing to prepare."""
     return 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def no_estimate(method, h, k, scratch):
     """`method_error` of a method that has no estimate."""
     return 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _surplus(event, contact, out):
     """What is below 0 before an event and above 0 after it."""
     if event == _ONSET:
@@ -163,7 +163,7 @@ def _surplus(event, contact, out):
     return out[S.SLIDING_SPEED]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _locate(event, before, after, method, constants, inputs, tick, fraction, ticks, memory, y, k, z, end, out):
     """Part of `ticks` after which the event happens, by bracketing secants on steps of the method itself.
 
@@ -222,7 +222,7 @@ def _locate(event, before, after, method, constants, inputs, tick, fraction, tic
     return cut
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sliding_phase(constants, speed):
     """Phase of a contact that slides at a speed."""
     if constants.levels.friction != EXACT:
@@ -230,7 +230,7 @@ def _sliding_phase(constants, speed):
     return FORWARD if speed > 0.0 else BACKWARD
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _change_phase(event, constants, inputs, tick, fraction, memory, y, dy, out):
     """Go over to the phase behind an event, at the state where it happens."""
     phase = int(memory[PHASE])
@@ -253,7 +253,7 @@ def _change_phase(event, constants, inputs, tick, fraction, memory, y, dy, out):
         memory[PHASE] = ROLLING if held else (BACKWARD if phase == FORWARD else FORWARD)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _event(phase, contact, out):
     """The event that has happened by the end of a part, the gravest first."""
     if phase == FLIGHT:
@@ -267,7 +267,7 @@ def _event(phase, contact, out):
     return _NONE
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _note_force(memory, force, ticks):
     """Follow the largest normal force, by the parabola through three instants where the middle one is the largest."""
     before, last, span = memory[_BEFORE], memory[_LAST], memory[_BEFORE_SPAN]
@@ -282,7 +282,7 @@ def _note_force(memory, force, ticks):
     memory[_BEFORE], memory[_LAST], memory[_BEFORE_SPAN] = last, force, ticks
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scratch, out):
     """One step of the grid in as many parts as events, crossings and error estimates ask for.
 
@@ -391,7 +391,7 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
     memory[CEILING] += 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
     memory[:] = 0.0
@@ -405,7 +405,7 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
         memory[PHASE] = _sliding_phase(constants, out[S.SLIDING_SPEED])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def advance(method, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """Take `steps` steps in place and write every `stride`-th instant's row (see `rig.engines`).
 

@@ -69,7 +69,7 @@ class Rosenbrock(NamedTuple):
 METHOD = Rosenbrock()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _prepare(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, out):
     """Jacobian of all rates by the state and by time, as forward differences."""
     for j in range(S.N_STATE):
@@ -90,7 +90,7 @@ def _prepare(method, constants, inputs, tick, fraction, ticks, onset_speed, phas
     return S.N_STATE + 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _factor(k, g):
     """Factors of 1/g - J_v - g J_x for speeds v and positions x, rows exchanged as the pivots ask."""
     for i in range(_N):
@@ -115,7 +115,7 @@ def _factor(k, g):
                     k[_LU + i, j] -= factor * k[_LU + p, j]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _solve(k, g, u):
     """Solve (1/g - J) u = right for the whole vector."""
     right = k[_RIGHT]
@@ -144,7 +144,7 @@ def _solve(k, g, u):
         u[i] *= g
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
     h = ticks * inputs.tick_s
     _factor(k, _GAMMA * h)
@@ -175,7 +175,7 @@ def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, 
     return _STAGES - 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _error(method, h, k, scratch):
     total = 0.0
     for i in range(S.N_STATE):

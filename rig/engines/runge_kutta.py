@@ -25,7 +25,7 @@ class Tableau(NamedTuple):
     graded: bool = True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
     """One step; k holds the stages' rates, then those at the end."""
     a, b, c = method.a, method.b, method.c
@@ -53,7 +53,7 @@ def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, 
     return len(b) - 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _error(method, h, k, scratch):
     """Scaled error estimate of a step (Hairer's form where there are two estimates)."""
     low, high = scratch[0], scratch[1]

@@ -28,7 +28,7 @@ class SemiImplicitEuler(NamedTuple):
 METHOD = SemiImplicitEuler()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
     h = ticks * inputs.tick_s
     for i in range(_N):

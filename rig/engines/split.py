@@ -95,7 +95,7 @@ _RETURN = 0.1
 """Part of a depth beyond it that is taken back in a step."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _exponential(a, t):
     """exp(a t) of a small matrix by scaled and squared Taylor series, to rounding."""
     n = len(a)
@@ -130,7 +130,7 @@ def _exponential(a, t):
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _house_rates(constants):
     """Matrices of the houses' linear motion: horizontal and vertical, each on (inner, rate, outer, rate)."""
     house, levels = constants.house, constants.levels
@@ -153,7 +153,7 @@ def _house_rates(constants):
     return across, upright
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _axis_flow(stiffness, damping, t):
     """Exp of [[0, 1], [-stiffness, -damping]] t, row by row."""
     decay = math.exp(-0.5 * damping * t)
@@ -170,7 +170,7 @@ def _axis_flow(stiffness, damping, t):
     return decay * (c + half * s), decay * s, -decay * stiffness * s, decay * (c - half * s)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _house_energy(constants, x0, x1, x2, x3, y0, y1, y2, y3):
     """Kinetic and potential energy of the houses with their linear springs [J]."""
     house = constants.house
@@ -185,7 +185,7 @@ def _house_energy(constants, x0, x1, x2, x3, y0, y1, y2, y3):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: the inner state, and the flows for this step."""
     memory[:] = 0.0
@@ -229,7 +229,7 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
         memory[at + 16 : at + 32] = _exponential(upright, t).ravel()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _coordinates(constants, ux, uy, px, py, w, theta, x0, x1, x2, x3, y0, y1, y2, y3, y):
     """The inner state as generalised coordinates, into y."""
     y[2] = theta
@@ -249,7 +249,7 @@ def _coordinates(constants, ux, uy, px, py, w, theta, x0, x1, x2, x3, y0, y1, y2
     y[4], y[11], y[6], y[13] = y0, y1, y2, y3
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _crossing(before, rate_before, now, rate_now, h):
     """Where a gap crosses 0 between two kicks, on its cubic Hermite interpolant: part of h, and the rate there."""
     s = before / (before - now)
@@ -277,7 +277,7 @@ def _crossing(before, rate_before, now, rate_now, h):
     return s, rate
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _end_error(power, q):
     """Hurwitz' zeta(-power, q): error of the sum of (q + j)^power, j = 0, 1, ... against its integral from 0."""
     far = q + 3.0
@@ -286,7 +286,7 @@ def _end_error(power, q):
     return total + power * (1.0 - power) * (2.0 - power) / 720.0 * far ** (power - 3.0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _loose(displacement, stiffness, preload):
     """What a pair of transducers pushes less than its linear spring, once one has lost its preload [N]."""
     change = 0.5 * stiffness * displacement
@@ -295,7 +295,7 @@ def _loose(displacement, stiffness, preload):
     return 2.0 * change - (max(0.0, preload + change) - max(0.0, preload - change))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _peak(before, last, force):
     """Largest force of the parabola through three equal steps, if the middle one is the largest; else the last."""
     if last > before and last >= force and before > 0.0 and force > 0.0:
@@ -304,7 +304,7 @@ def _peak(before, last, force):
     return force
 
 
-@njit(cache=True, forceinline=True)
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _flow(memory, level, inner, f, ux, px, uy, py, w, theta, aim, x0, x1, x2, x3, y0, y1, y2, y3):
     """The exact flow over half a step times 2**level."""
     ux, px = f[0] * ux + f[1] * px, f[2] * ux + f[3] * px
@@ -330,7 +330,7 @@ def _flow(memory, level, inner, f, ux, px, uy, py, w, theta, aim, x0, x1, x2, x3
     return ux, px, uy, py, w, theta, x0, x1, x2, x3, y0, y1, y2, y3
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """See `rig.engines`."""
     # params:

@@ -30,7 +30,7 @@ class Verlet(NamedTuple):
 METHOD = Verlet()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
     h = ticks * inputs.tick_s
     half = 0.5 * h

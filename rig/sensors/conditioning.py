@@ -17,7 +17,7 @@ _SECTIONS = 3
 """Second-order sections of the filter: two of the fourth-order Butterworth low-pass, one for AC coupling."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def _condition(rows, first, every, columns, gain, bias, low, high, sections, memory, noise, lsb, limit, counts):
     """Filter every row, convert every `every`-th from row `first` on.
 
