@@ -293,7 +293,7 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
     tolerance = memory[_TOLERANCE]
     estimates = method.order > 0.0
     fraction, stale = 0.0, True
-    depth, rate, sliding, margin = out[S.PENETRATION], out[S.PENETRATION_RATE], out[S.SLIDING_SPEED], 0.0
+    depth, rate, sliding = out[S.PENETRATION], out[S.PENETRATION_RATE], out[S.SLIDING_SPEED]
     margin = _surplus(_BREAK, contact, out)
     events = 0
     for _ in range(_MOST_PARTS):
@@ -365,7 +365,6 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
             if events >= _MOST_EVENTS:
                 # They pile up (a chatter, or bounces without end): from here on the phase changes at ends of parts.
                 y[:] = end
-                rates(constants, inputs, tick, fraction + size, memory[ONSET], phase, False, y, last, out)
             elif before * after < 0.0:
                 size *= _locate(
                     event, before, after, method, constants, inputs, tick, fraction, size, memory, y, k, z, end, out

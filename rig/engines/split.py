@@ -65,10 +65,13 @@ _BEFORE, _LAST = OWN + 18, OWN + 19
 """Normal force at the last kick but one, and at the last [N]."""
 _WANTED, _SETTLED, _BOUNCE = OWN + 20, OWN + 21, OWN + 22
 _REST, _SPRING_X, _SPRING_Y = OWN + 23, OWN + 24, OWN + 25
-_KICKED, _CONJUGATE, _H_LAST, _S = OWN + 26, OWN + 27, OWN + 28, OWN + 29
-_BEGUN, _ENGAGED = OWN + 37, OWN + 38
-_COS, _SIN, _ANGLE = OWN + 39, OWN + 40, OWN + 41
-_FLOWS = OWN + 42
+"""Level asked for in contact, calm kicks in a row, mean rate of the gap in the last kick; rest of the shaft on its
+magnets and the springs of its flow about it."""
+_KICKED, _CONJUGATE, _S, _ENGAGED = OWN + 26, OWN + 27, OWN + 28, OWN + 36
+"""Level of the last kick, -1 before the first; h^2/24 of the coordinates in use; accelerations by the last kick and
+their rates, of shaft and contact; whether the flow has the magnets."""
+_COS, _SIN, _ANGLE = OWN + 37, OWN + 38, OWN + 39
+_FLOWS = OWN + 40
 _GRID = 5
 """Level of the grid's own step: level l lasts 2**(l - _GRID) steps of the grid."""
 _LEVELS = _GRID + 8
@@ -209,7 +212,6 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     memory[_WANTED] = _GRID
     memory[_KICKED] = -1.0
     memory[_ENGAGED] = 1.0 if inputs.magnet_engaged else 0.0
-    memory[_H_LAST] = step_ticks * inputs.tick_s
     # The shaft's flow is linear about its rest on the magnets.
     shaft, magnet = constants.shaft, constants.magnet
     lB, weight = shaft.arm_magnet, shaft.arm_centre * shaft.mass * shaft.gravity
@@ -330,6 +332,20 @@ def _flow(memory, level, inner, f, ux, px, uy, py, w, theta, aim, x0, x1, x2, x3
     return ux, px, uy, py, w, theta, x0, x1, x2, x3, y0, y1, y2, y3
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _processed(s, arm, per_inner, ux, uy, px, py, x0, x1, y0, y1, sx, sy, dsx, dsy, cx, cy, dcx, dcy):
+    """Coordinates changed by -s [A,B]: with s = h^2/24 from those of a step h to the motion's own.
+
+    A is the flow, B the kick: accelerations of the shaft and their rates (s, ds), forces of the contact and theirs
+    (c, dc), which act on the shaft at the ring and the other way on the inner house.
+    """
+    ux, px = ux - s * (sx + arm * cx), px + s * (dsx + arm * dcx)
+    uy, py = uy - s * (sy + arm * cy), py + s * (dsy + arm * dcy)
+    x0, x1 = x0 + s * per_inner * cx, x1 - s * per_inner * dcx
+    y0, y1 = y0 + s * per_inner * cy, y1 - s * per_inner * dcy
+    return ux, uy, px, py, x0, x1, y0, y1
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """See `rig.engines`."""
@@ -394,20 +410,18 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     phase = int(memory[PHASE])
     wanted_level, settled, bounce = int(memory[_WANTED]), int(memory[_SETTLED]), memory[_BOUNCE]
     level = wanted_level
-    kicked, conjugate, h_last = int(memory[_KICKED]), memory[_CONJUGATE], memory[_H_LAST]
+    kicked, conjugate = int(memory[_KICKED]), memory[_CONJUGATE]
     sx, sy, dsx, dsy = memory[_S], memory[_S + 1], memory[_S + 2], memory[_S + 3]
     cx, cy, dcx, dcy = memory[_S + 4], memory[_S + 5], memory[_S + 6], memory[_S + 7]
     cos_a, sin_a, angle = memory[_COS], memory[_SIN], memory[_ANGLE]
     arm = lA * per_Ixx
-    begun = int(memory[_BEGUN])
     if engaged != (memory[_ENGAGED] == 1.0):
         # Another division into flow and kick has other conjugate coordinates.
-        ux, px = ux - conjugate * (sx + arm * cx), px + conjugate * (dsx + arm * dcx)
-        uy, py = uy - conjugate * (sy + arm * cy), py + conjugate * (dsy + arm * dcy)
-        x0, x1 = x0 + conjugate * per_inner * cx, x1 - conjugate * per_inner * dcx
-        y0, y1 = y0 + conjugate * per_inner * cy, y1 - conjugate * per_inner * dcy
+        ux, uy, px, py, x0, x1, y0, y1 = _processed(
+            conjugate, arm, per_inner, ux, uy, px, py, x0, x1, y0, y1, sx, sy, dsx, dsy, cx, cy, dcx, dcy
+        )
         sx = sy = dsx = dsy = cx = cy = dcx = dcy = conjugate = 0.0
-        kicked, begun = -1, 0
+        kicked = -1
         memory[_ENGAGED] = 1.0 if engaged else 0.0
     onset_speed, slid = memory[ONSET], memory[_SLID]
     factor_per_speed = factor / onset_speed
@@ -420,12 +434,10 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     first = 0
     while first < steps:
         now = tick + first * step_ticks
-        _coordinates(
-            constants, ux - conjugate * (sx + arm * cx), uy - conjugate * (sy + arm * cy),
-            px + conjugate * (dsx + arm * dcx), py + conjugate * (dsy + arm * dcy), w, theta,
-            x0 + conjugate * per_inner * cx, x1 - conjugate * per_inner * dcx, x2, x3,
-            y0 + conjugate * per_inner * cy, y1 - conjugate * per_inner * dcy, y2, y3, y,
-        )  # fmt: skip
+        uxt, uyt, pxt, pyt, x0t, x1t, y0t, y1t = _processed(
+            conjugate, arm, per_inner, ux, uy, px, py, x0, x1, y0, y1, sx, sy, dsx, dsy, cx, cy, dcx, dcy
+        )
+        _coordinates(constants, uxt, uyt, pxt, pyt, w, theta, x0t, x1t, x2, x3, y0t, y1t, y2, y3, y)
         # Rigid impacts have no force over time.
         evaluate(constants, inputs, now, 0.0, onset_speed, phase if compliant else FLIGHT, True, y, dy, out)
         rows[row, : S.N_VECTOR] = y
@@ -468,7 +480,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     if t > _FLIGHT_S or free < (t0 + t) * (speed + 100.0 * (t0 + t)):
                         break
                     level += 1
-            if begun == 0:
+            if kicked < 0:
                 level = 0  # what the conjugate coordinates need is known after a kick
             # Steps start at whole multiples of their length, and end at the row.
             while n & ((1 << level) - 1) != 0 or n + (1 << level) > last:
@@ -490,14 +502,27 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     ahead_x, ahead_y, _ = magnet_force(lB * (ux + tau * px), lB * (uy + tau * py), magnet)
                     mx = (lB * (ahead_x - force_x) / tau + spring_x * px) * per_Ixx
                     my = (lB * (ahead_y - force_y) / tau + spring_y * py) * per_Ixx
-                ux += change * (sx + arm * cx)
-                uy += change * (sy + arm * cy)
-                px -= change * (dsx + mx + arm * dcx)
-                py -= change * (dsy + my + arm * dcy)
-                x0 -= change * per_inner * cx
-                y0 -= change * per_inner * cy
-                x1 += change * per_inner * dcx
-                y1 += change * per_inner * dcy
+                ux, uy, px, py, x0, x1, y0, y1 = _processed(
+                    -change,
+                    arm,
+                    per_inner,
+                    ux,
+                    uy,
+                    px,
+                    py,
+                    x0,
+                    x1,
+                    y0,
+                    y1,
+                    sx,
+                    sy,
+                    dsx + mx,
+                    dsy + my,
+                    cx,
+                    cy,
+                    dcx,
+                    dcy,
+                )
 
             # Flow to the middle of the step.
             middle = (n + 0.5 * count) * part_ticks
@@ -646,6 +671,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 per_w_tt = per_w * (1.0 + q * (1.0 + q * (1.0 + q * (1.0 + q))))
                 held = 0.0
                 damping = 0.0
+                lateral = sliding - R * w
                 if compliant:
                     per_depth = 1.0 / depth
                     if exponent == 1.5:
@@ -661,7 +687,6 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     share = 1.0 / (1.0 + z * (0.5 + z * (1.0 / 12.0)))
                     jn = (h * elastic + damping * rate) * share
                     relative = exponent * per_depth
-                    lateral = sliding - R * w
                     swerve = lateral * lateral * per_distance
                     held = h * elastic + end_impulse - jn * jn * relative * h * w_nn * (1.0 / 12.0)
                     held += damping * damping * w_nn * h * swerve * (1.0 / 24.0)
@@ -670,13 +695,11 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     jn = max(0.0, jn)
                 else:
                     # Newton's law at an onset, Moreau's in lasting contact: no speed in the mean of a step.
-                    share = 1.0
                     goal = -0.5 * (rate - rate_before) - _RETURN * (depth - _SLOP * h * h) * per_h
                     if phase == FLIGHT:
                         goal = -contact.restitution * rate if rate > contact.speed_floor else 0.0
                     jn = max(0.0, (rate - goal) / w_nn)
                 # Rolling holds along the arc, not at the corners of the polygon that the kicks make of it.
-                lateral = sliding - R * w
                 sliding += lateral * (1.0 / 12.0) * h * jn * w_nn * per_distance
                 target = -0.5 * (sliding - slid) if slid == slid else 0.0
                 limit = mu * jn
@@ -720,32 +743,27 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     force = max(0.0, elastic + damping_rate * rate_mean)
                     peak = max(peak, _peak(force_before, force_last, force))
                     force_before, force_last = force_last, force
-                # The next step's level, from how fast the gap moves or is made to move.
+                # The next step's level, from how fast the gap moves or is made to move; rigid contact is always calm.
+                rough, calm = False, True
                 if compliant:
                     change = (rate_mean - bounce) * per_h
                     bounce = rate_mean
                     stiff = slope * w_nn
                     size = _DRIFT * rate_mean * rate_mean * stiff + change * change
                     limit = limits[wanted_level]
-                    if wanted_level > 0 and (size > _ROUGH * limit * limit * stiff or z > _DAMPED):
-                        wanted_level -= 1
-                        settled = 0
-                    elif (
-                        wanted_level < _GRID
-                        and size < limits[wanted_level + 1] * limits[wanted_level + 1] * stiff
-                        and 2.0 * z < _DAMPED
-                    ):
-                        settled += 1
-                        if settled >= _PATIENCE and (n + count) & ((2 << wanted_level) - 1) == 0:
-                            wanted_level += 1
-                            settled = 0
-                    else:
-                        settled = 0
-                elif wanted_level < _GRID:
+                    rough = size > _ROUGH * limit * limit * stiff or z > _DAMPED
+                    limit = limits[min(wanted_level + 1, _GRID)]
+                    calm = size < limit * limit * stiff and 2.0 * z < _DAMPED
+                if rough and wanted_level > 0:
+                    wanted_level -= 1
+                    settled = 0
+                elif calm and wanted_level < _GRID:
                     settled += 1
                     if settled >= _PATIENCE and (n + count) & ((2 << wanted_level) - 1) == 0:
                         wanted_level += 1
                         settled = 0
+                else:
+                    settled = 0
                 depth_before, rate_before, ago = depth, rate - w_nn * jn - w_nt * jt, 0.0
             elif phase != FLIGHT:
                 distance = math.sqrt(square)
@@ -815,7 +833,6 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
             sy = ay + turning_y - blow * inputs.hammer_y * per_Ixx
             # Of what is smooth, only the unbalance changes fast.
             dsx, dsy = -rotation * pull_y * per_Ixx, rotation * pull_x * per_Ixx
-            begun = 1
             cx = cy = dcx = dcy = 0.0
             if touched and compliant:
                 cx, cy = (jx + aside * ny) * per_h, (jy - aside * nx) * per_h
@@ -891,15 +908,12 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     memory[_UX], memory[_UY], memory[_PX], memory[_PY], memory[_SPIN], memory[_THETA] = ux, uy, px, py, w, theta
     memory[_X], memory[_X + 1], memory[_X + 2], memory[_X + 3] = x0, x1, x2, x3
     memory[_Y], memory[_Y + 1], memory[_Y + 2], memory[_Y + 3] = y0, y1, y2, y3
-    _coordinates(
-        constants, ux - conjugate * (sx + arm * cx), uy - conjugate * (sy + arm * cy),
-        px + conjugate * (dsx + arm * dcx), py + conjugate * (dsy + arm * dcy), w, theta,
-        x0 + conjugate * per_inner * cx, x1 - conjugate * per_inner * dcx, x2, x3,
-        y0 + conjugate * per_inner * cy, y1 - conjugate * per_inner * dcy, y2, y3, y,
-    )  # fmt: skip
+    uxt, uyt, pxt, pyt, x0t, x1t, y0t, y1t = _processed(
+        conjugate, arm, per_inner, ux, uy, px, py, x0, x1, y0, y1, sx, sy, dsx, dsy, cx, cy, dcx, dcy
+    )
+    _coordinates(constants, uxt, uyt, pxt, pyt, w, theta, x0t, x1t, x2, x3, y0t, y1t, y2, y3, y)
     memory[PHASE], memory[ONSET], memory[_SLID] = float(phase), onset_speed, slid
-    memory[_KICKED], memory[_CONJUGATE], memory[_H_LAST] = float(kicked), conjugate, h_last
-    memory[_BEGUN] = float(begun)
+    memory[_KICKED], memory[_CONJUGATE] = float(kicked), conjugate
     memory[_COS], memory[_SIN], memory[_ANGLE] = cos_a, sin_a, angle
     memory[_S], memory[_S + 1], memory[_S + 2], memory[_S + 3] = sx, sy, dsx, dsy
     memory[_S + 4], memory[_S + 5], memory[_S + 6], memory[_S + 7] = cx, cy, dcx, dcy
