@@ -32,14 +32,10 @@ def laws(
     import json
 
     from replays.laws import compare, draw
-    from rig.cli.run import scene_overrides
-    from rig.parameters import load_parameters
-    from rig.scenes import read_value
+    from rig.cli.params import changed_parameters
 
-    values: dict[str, Any] = {key: read_value(text) for key, text in scene_overrides(changes or []).items()}
-    if restitution is not None:
-        values["contact.restitution"] = restitution
-    parameters = load_parameters(name).override(values, source="--set")
+    also = {} if restitution is None else {"contact.restitution": restitution}
+    parameters = changed_parameters(name, changes, also)
     if plot is not None:
         draw(parameters, plot)
     document = compare(parameters)

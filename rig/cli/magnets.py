@@ -26,13 +26,10 @@ def magnets(
     import json
 
     from replays.magnets import compare, draw
-    from rig.cli.run import scene_overrides
+    from rig.cli.params import changed_parameters
     from rig.model import build_model
-    from rig.parameters import load_parameters
-    from rig.scenes import read_value
 
-    values = {key: read_value(text) for key, text in scene_overrides(changes or []).items()}
-    model = build_model(load_parameters(name).override(values, source="--set"))
+    model = build_model(changed_parameters(name, changes))
     if plot is not None:
         draw(model, plot)
     document = compare(model)

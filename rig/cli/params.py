@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from rig.parameters import ParameterSet
 
 
 def params(
@@ -21,13 +24,10 @@ def params(
     from rich.console import Console
     from rich.table import Table
 
-    from rig.cli.run import scene_overrides
     from rig.model import build_model, describe
-    from rig.parameters import load_parameters, set_names
-    from rig.scenes import read_value
+    from rig.parameters import set_names
 
-    values = {key: read_value(text) for key, text in scene_overrides(changes or []).items()}
-    document = describe(build_model(load_parameters(name).override(values, source="--set")))
+    document = describe(build_model(changed_parameters(name, changes)))
     if json_output:
         typer.echo(json.dumps(document, indent=2))
         return
@@ -70,3 +70,22 @@ def params(
         f"sets: {', '.join(set_names())}",
         highlight=False,
     )
+
+
+def changed_parameters(name: str, changes: list[str] | None, also: dict[str, Any] | None = None) -> ParameterSet:
+    """A parameter set with changes from the command line.
+
+    Args:
+        name: Name or path of the set.
+        changes: Values of `--set`, each KEY=VALUE.
+        also: Values by key from options of their own; they come last.
+
+    Raises:
+        InputError: No such set or key, or a value that the model does not take.
+    """
+    from rig.cli.run import scene_overrides
+    from rig.parameters import load_parameters
+    from rig.scenes import read_value
+
+    values = {key: read_value(text) for key, text in scene_overrides(changes or []).items()}
+    return load_parameters(name).override(values | (also or {}), source="--set")
