@@ -10,12 +10,14 @@ the kinematics have no sines, and with S the sum of arm times lateral force
     Ixx u'' = S - (S.u) u - Ixx |u'|^2 u + Izz w (u x u')
 
 Errors of second order of such a step are two commutators of flow A and kick B. [B,[A,B]] goes into the kick: with the
-contact's force f on the relative motion at the ring, that is 2 (f.grad) f + (v.grad f_v) f - f_v (v.grad f) on the
-speed and -f_v f on the position, h^3/24 of each. For an undamped contact it is Takahashi and Imada's
-F* = F (1 - h^2/12 F' w_n) (J. Phys. Soc. Jpn. 53 (1984) 3765). [A,[A,B]] is a change of coordinates by h^2/24 [A,B]
-(the processing of Blanes, Casas and Murua, SIAM J. Sci. Comput. 27 (2006) 1817): it vanishes out of contact, so an
-impact returns the right speeds; where the length of step changes, and for the rows, it is carried out. Where a contact
-begins and ends, its force goes as t^n between two kicks; what the sum misses there is Hurwitz' zeta(-n, q).
+contact's force f on the relative motion at the ring and the flow's acceleration a of it, that is
+2 (f.grad) f + (v.grad f_v) f - f_v (v.grad f + f_v a) on the speed and -f_v f on the position, h^3/24 of each. For an
+undamped contact it is Takahashi and Imada's F* = F (1 - h^2/12 F' w_n) (J. Phys. Soc. Jpn. 53 (1984) 3765); what comes
+next in h^2 F' w_n is chosen for a lasting contact to keep its true depth. [A,[A,B]] is a change of coordinates by
+h^2/24 [A,B] (the processing of Blanes, Casas and Murua, SIAM J. Sci. Comput. 27 (2006) 1817): it vanishes out of
+contact, so an impact returns the right speeds; at the end of a step, where the next one is of another length, and for
+the rows it is carried out. Where a contact begins and ends, its force goes as t^n between two kicks; what the sum
+misses there is Hurwitz' zeta(-n, q). Left out of both commutators: the houses' damping, and friction where it rolls.
 
 The normal impulse holds its damping in closed form. Coulomb's friction is a clamp on the tangential impulse: what
 would bring the sliding speed to its target, held within mu times the normal impulse. The target is minus half of what
@@ -54,6 +56,10 @@ from rig.kernels.dynamics import drive_speed, evaluate
 from rig.kernels.magnet import magnet_force
 
 ORDER = 2
+
+_FAST = {"contract", "reassoc", "arcp", "nsz"}
+"""What the compiler may do beyond the rules of IEEE 754: fuse, reorder, take reciprocals. One build makes the same bits
+every time all the same, in 5/6 of the time. Nothing that assumes that there is no nan."""
 
 _UX, _UY, _PX, _PY, _SPIN, _THETA = range(OWN, OWN + 6)
 _X = OWN + 6  # inner displacement and rate, outer displacement and rate, horizontal
@@ -98,7 +104,7 @@ _RETURN = 0.1
 """Part of a depth beyond it that is taken back in a step."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _exponential(a, t):
     """exp(a t) of a small matrix by scaled and squared Taylor series, to rounding."""
     n = len(a)
@@ -133,7 +139,7 @@ def _exponential(a, t):
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _house_rates(constants):
     """Matrices of the houses' linear motion: horizontal and vertical, each on (inner, rate, outer, rate)."""
     house, levels = constants.house, constants.levels
@@ -156,7 +162,7 @@ def _house_rates(constants):
     return across, upright
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _axis_flow(stiffness, damping, t):
     """Exp of [[0, 1], [-stiffness, -damping]] t, row by row."""
     decay = math.exp(-0.5 * damping * t)
@@ -173,7 +179,7 @@ def _axis_flow(stiffness, damping, t):
     return decay * (c + half * s), decay * s, -decay * stiffness * s, decay * (c - half * s)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _house_energy(constants, x0, x1, x2, x3, y0, y1, y2, y3):
     """Kinetic and potential energy of the houses with their linear springs [J]."""
     house = constants.house
@@ -188,7 +194,7 @@ def _house_energy(constants, x0, x1, x2, x3, y0, y1, y2, y3):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: the inner state, and the flows for this step."""
     memory[:] = 0.0
@@ -231,7 +237,7 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
         memory[at + 16 : at + 32] = _exponential(upright, t).ravel()
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _coordinates(constants, ux, uy, px, py, w, theta, x0, x1, x2, x3, y0, y1, y2, y3, y):
     """The inner state as generalised coordinates, into y."""
     y[2] = theta
@@ -251,7 +257,7 @@ def _coordinates(constants, ux, uy, px, py, w, theta, x0, x1, x2, x3, y0, y1, y2
     y[4], y[11], y[6], y[13] = y0, y1, y2, y3
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _crossing(before, rate_before, now, rate_now, h):
     """Where a gap crosses 0 between two kicks, on its cubic Hermite interpolant: part of h, and the rate there."""
     s = before / (before - now)
@@ -279,7 +285,7 @@ def _crossing(before, rate_before, now, rate_now, h):
     return s, rate
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _end_error(power, q):
     """Hurwitz' zeta(-power, q): error of the sum of (q + j)^power, j = 0, 1, ... against its integral from 0."""
     far = q + 3.0
@@ -288,7 +294,7 @@ def _end_error(power, q):
     return total + power * (1.0 - power) * (2.0 - power) / 720.0 * far ** (power - 3.0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _loose(displacement, stiffness, preload):
     """What a pair of transducers pushes less than its linear spring, once one has lost its preload [N]."""
     change = 0.5 * stiffness * displacement
@@ -297,7 +303,7 @@ def _loose(displacement, stiffness, preload):
     return 2.0 * change - (max(0.0, preload + change) - max(0.0, preload - change))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _peak(before, last, force):
     """Largest force of the parabola through three equal steps, if the middle one is the largest; else the last."""
     if last > before and last >= force and before > 0.0 and force > 0.0:
@@ -306,7 +312,7 @@ def _peak(before, last, force):
     return force
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=_FAST, forceinline=True)
 def _flow(memory, level, inner, f, ux, px, uy, py, w, theta, aim, x0, x1, x2, x3, y0, y1, y2, y3):
     """The exact flow over half a step times 2**level."""
     ux, px = f[0] * ux + f[1] * px, f[2] * ux + f[3] * px
@@ -332,7 +338,7 @@ def _flow(memory, level, inner, f, ux, px, uy, py, w, theta, aim, x0, x1, x2, x3
     return ux, px, uy, py, w, theta, x0, x1, x2, x3, y0, y1, y2, y3
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=_FAST, forceinline=True)
 def _processed(s, arm, per_inner, ux, uy, px, py, x0, x1, y0, y1, sx, sy, dsx, dsy, cx, cy, dcx, dcy):
     """Coordinates changed by -s [A,B]: with s = h^2/24 from those of a step h to the motion's own.
 
@@ -346,7 +352,7 @@ def _processed(s, arm, per_inner, ux, uy, px, py, x0, x1, y0, y1, sx, sy, dsx, d
     return ux, uy, px, py, x0, x1, y0, y1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=_FAST, nogil=True)
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """See `rig.engines`."""
     # params:
@@ -488,41 +494,6 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
             count = 1 << level
             h = 2.0 * flows[level, 10]
             per_h = flows[level, 13]
-            if level != kicked:
-                # Each length of step has its own conjugate coordinates.
-                s_new = h * h * (1.0 / 24.0)
-                change = s_new - conjugate
-                conjugate = s_new
-                kicked = level
-                mx = my = 0.0
-                if engaged:
-                    # Rate of what the magnets have beyond their linear part.
-                    tau = 1e-5
-                    force_x, force_y, _ = magnet_force(lB * ux, lB * uy, magnet)
-                    ahead_x, ahead_y, _ = magnet_force(lB * (ux + tau * px), lB * (uy + tau * py), magnet)
-                    mx = (lB * (ahead_x - force_x) / tau + spring_x * px) * per_Ixx
-                    my = (lB * (ahead_y - force_y) / tau + spring_y * py) * per_Ixx
-                ux, uy, px, py, x0, x1, y0, y1 = _processed(
-                    -change,
-                    arm,
-                    per_inner,
-                    ux,
-                    uy,
-                    px,
-                    py,
-                    x0,
-                    x1,
-                    y0,
-                    y1,
-                    sx,
-                    sy,
-                    dsx + mx,
-                    dsy + my,
-                    cx,
-                    cy,
-                    dcx,
-                    dcy,
-                )
 
             # Flow to the middle of the step.
             middle = (n + 0.5 * count) * part_ticks
@@ -538,6 +509,31 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     memory, owed, inner, flows[owed], ux, px, uy, py, w, theta, aim, x0, x1, x2, x3, y0, y1, y2, y3
                 )
                 ago = 0.0
+            if level != kicked:
+                # Each length of step has its own conjugate coordinates, at the ends of the steps.
+                s_new = h * h * (1.0 / 24.0)
+                change = s_new - conjugate
+                conjugate = s_new
+                since = flows[kicked, 10] if kicked >= 0 else 0.0
+                kicked = level
+                # Rates of the smooth accelerations: by the turning of the axis, by the flow's damping of them, ...
+                pulled_x, pulled_y = -spring_x * ux * per_Ixx, -spring_y * (uy - rest) * per_Ixx
+                if not engaged:
+                    pulled_y = weight_torque * per_Ixx
+                mx = dsx + damper_x * per_Ixx * sx - gyro * w * pulled_y
+                my = dsy + damper_y * per_Ixx * sy + gyro * w * pulled_x
+                if engaged:
+                    # ... and of what the magnets have beyond their linear part.
+                    tau = 1e-5
+                    force_x, force_y, _ = magnet_force(lB * ux, lB * uy, magnet)
+                    ahead_x, ahead_y, _ = magnet_force(lB * (ux + tau * px), lB * (uy + tau * py), magnet)
+                    mx += (lB * (ahead_x - force_x) / tau + spring_x * px) * per_Ixx
+                    my += (lB * (ahead_y - force_y) / tau + spring_y * py) * per_Ixx
+                ax, ay = sx + since * mx, sy + since * my
+                bx, by = cx + since * dcx, cy + since * dcy
+                ux, uy, px, py, x0, x1, y0, y1 = _processed(
+                    -change, arm, per_inner, ux, uy, px, py, x0, x1, y0, y1, ax, ay, mx, my, bx, by, dcx, dcy
+                )
             at = level + 1 if merged else level
             if phase == FLIGHT and level <= _GRID and not merged:
                 # Where an onset in the half step ahead is measured from.
@@ -687,8 +683,17 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     share = 1.0 / (1.0 + z * (0.5 + z * (1.0 / 12.0)))
                     jn = (h * elastic + damping * rate) * share
                     relative = exponent * per_depth
-                    swerve = lateral * lateral * per_distance
-                    held = h * elastic + end_impulse - jn * jn * relative * h * w_nn * (1.0 / 12.0)
+                    # What the flow alone would add to the rate of the gap.
+                    swerve = lateral * lateral * per_distance - lA * per_Ixx * (
+                        spring_x * ux * nx + spring_y * (uy - rest) * ny
+                    )
+                    if inner:
+                        swerve += per_inner * (
+                            (house.inner_beam_stiffness * (x0 - x2) + house.inner_beam_damping * (x1 - x3)) * nx
+                            + house.pair_stiffness_vertical * (y0 - y2) * ny
+                        )
+                    bend = jn * relative * h * w_nn * (1.0 / 12.0)
+                    held = h * elastic + end_impulse - jn * bend * (1.0 + 0.25 * z - (7.0 / 6.0) * bend)
                     held += damping * damping * w_nn * h * swerve * (1.0 / 24.0)
                     jn = (held + damping * rate) * share
                     shift = h * jn * damping * w_nn * (1.0 / 24.0)
@@ -724,6 +729,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                     aside = shift * lateral * per_distance
                     jx -= aside * ny
                     jy += aside * nx
+                    # It comes after friction's clamp: the next target makes up for it, and takes it for no flow's.
+                    slid -= (w_tt - spin_mobility) * aside
                     springs = 0.0
                     if inner:
                         springs = (
@@ -801,10 +808,19 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 along = dx * ux + dyy * uy
                 dx -= along * ux
                 dyy -= along * uy
-            mx, my = px + 0.5 * (h * (ax + turning_x) + dx), py + 0.5 * (h * (ay + turning_y) + dyy)
             w_mid = w
-            if not ideal:
+            if jt != 0.0 and not ideal:
+                # The spin that counts is the one in the middle of the kick, for the unbalance too.
                 w_mid = w - 0.5 * R * jt * per_Izz
+                more = lI * shaft.unbalance * ((w_mid - w_share) ** 2 - rotation * rotation)
+                more_x, more_y = more * cos_a, more * sin_a
+                pull_x, pull_y = pull_x + more_x, pull_y + more_y
+                Sx, Sy = Sx + more_x, Sy + more_y
+                ax, ay = ax + more_x * per_Ixx, ay + more_y * per_Ixx
+                if euler:
+                    along = (more_x * ux + more_y * uy) * per_Ixx
+                    ax, ay = ax - along * ux, ay - along * uy
+            mx, my = px + 0.5 * (h * (ax + turning_x) + dx), py + 0.5 * (h * (ay + turning_y) + dyy)
             if euler:
                 mz = -(ux * mx + uy * my) * per_uz
                 spread = mx * mx + my * my + mz * mz - (damper_x * mx * ux + damper_y * my * uy) * per_Ixx
@@ -829,8 +845,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 w += (torque - R * jt) * per_Izz
             net = moved + torque - R * jt
             # What the next change of step and the rows need: accelerations by this kick, and their rates.
-            sx = ax + turning_x - blow * inputs.hammer_x * per_Ixx
-            sy = ay + turning_y - blow * inputs.hammer_y * per_Ixx
+            sx = ax + turning_x + blow * inputs.hammer_x * per_Ixx
+            sy = ay + turning_y + blow * inputs.hammer_y * per_Ixx
             # Of what is smooth, only the unbalance changes fast.
             dsx, dsy = -rotation * pull_y * per_Ixx, rotation * pull_x * per_Ixx
             cx = cy = dcx = dcy = 0.0

@@ -81,7 +81,7 @@ def python_runs(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str
 
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing to compare: this process is plain Python")
 @pytest.mark.parametrize(("engine", "friction"), PAIRS)
-def test_compiled_is_python_bit_for_bit(
+def test_compiled_is_python(
     engine: str, friction: str, python_runs: dict[tuple[str, str], dict[str, np.ndarray]]
 ) -> None:
     space: dict[str, Any] = {}
@@ -92,8 +92,16 @@ def test_compiled_is_python_bit_for_bit(
     assert compiled.keys() == plain.keys()
     for name, array in compiled.items():
         assert array.dtype == plain[name].dtype
-        # Both use the C library's functions, and nothing is reordered without fastmath.
-        np.testing.assert_array_equal(array, plain[name], err_msg=name)
+        if engine != "split":
+            # Both use the C library's functions, and nothing is reordered without fastmath.
+            np.testing.assert_array_equal(array, plain[name], err_msg=name)
+        elif array.dtype.kind in "iu":
+            # Rounding can move a reading over the edge of a count.
+            assert np.max(np.abs(array.astype(np.int64) - plain[name])) <= 1, name
+        else:
+            # `split` allows reordering. Work done may be what two large energies differ by: a floor for its size.
+            size = np.maximum(np.max(np.abs(plain[name]), axis=0), 1e-3)
+            assert np.all(np.abs(array - plain[name]) <= 1e-9 * size), name
 
 
 def hit(engine: str = "split") -> Simulation:
