@@ -62,7 +62,7 @@ SPARSE = {"sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
 _DIES_OUT = [{"at_s": 0.02, "command": "hammer", "force_n": 100.0, "duration_ms": 2.0}]
 
 CASES = (
-    Case("split 40 us, hammer", "hammer", _engine("split", 40), goal=300, error_goal=2e-3),
+    Case("split 50 us, hammer", "hammer", _engine("split", 50), goal=300, error_goal=2e-3),
     Case("split 25 us, hammer", "hammer", _engine("split", 25), goal=150, error_goal=6e-4),
     Case("split 20 us, hammer", "hammer", _engine("split", 20), goal=75, error_goal=1.6e-4),
     Case("tsit5 1e-6, hammer", "hammer", _engine("tsit5", 500, **{"engine.tolerance": 1e-6})),

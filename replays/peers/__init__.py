@@ -14,12 +14,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from replays.peers.problem import ERROR_COLUMNS, ERROR_SCALE, STATE_SCALE, Problem, scaled_error
+from replays.peers.problem import ERROR_COLUMNS, ERROR_SCALE, Problem, scaled_error
 from replays.peers.solution import Journal, Setting, Solution
 from rig.errors import InputError
 
 __all__ = [
-    "ERROR_COLUMNS", "ERROR_SCALE", "PEERS", "STATE_SCALE", "Peer", "Problem", "Setting", "Solution", "scaled_error",
+    "ERROR_COLUMNS", "ERROR_SCALE", "PEERS", "Peer", "Problem", "Setting", "Solution", "scaled_error",
 ]  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from replays.peers.plain_python import PlainPython
-from replays.peers.problem import STATE_SCALE, Problem
+from replays.peers.problem import Problem
 from replays.peers.right_hand_side import (
     N_STATE,
     N_SWITCH,
@@ -35,6 +35,7 @@ from replays.peers.right_hand_side import (
     vector_callbacks,
 )
 from replays.peers.solution import MISSED_HAMMER, SWITCH_CEILING, Journal, Setting, Solution
+from rig.kernels.signals import STATE_SCALE
 
 ADAMS, BDF = 1, 2
 ONE_STEP, ROOT_RETURN = 2, 2

@@ -16,7 +16,7 @@ import numpy as np
 from rig.errors import InputError
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, TOUCHING
-from rig.kernels.signals import N_STATE
+from rig.kernels.signals import N_STATE, STATE_SCALE
 from rig.levels import FRICTION_LAWS
 from rig.model import Model, build_model
 from rig.scenes import HammerCommand, ReleaseCommand, Scene, SpeedCommand
@@ -25,10 +25,8 @@ TICK_S = 1e-6
 """Length of a tick [s]."""
 ERROR_COLUMNS = (0, 1, 3, 4, 7, 8, 9)
 """States that an error is made of: both tilts, the inner house, the rates of the tilts and the spin."""
-ERROR_SCALE = np.array([5e-3, 5e-3, 2e-5, 2e-5, 1.0, 1.0, 40.0])
+ERROR_SCALE = STATE_SCALE[list(ERROR_COLUMNS)]
 """Their scales [rad, rad, m, m, rad/s, rad/s, rad/s]."""
-STATE_SCALE = np.array([5e-3, 5e-3, 1.0, 2e-5, 2e-5, 2e-5, 2e-5, 1.0, 1.0, 40.0, 0.1, 0.1, 0.1, 0.1])
-"""Scale of every state, in its own SI unit, shape (14,): absolute tolerances are a tolerance times this."""
 
 
 @dataclass(frozen=True)

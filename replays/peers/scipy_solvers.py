@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replays.peers.plain_python import PlainPython
-from replays.peers.problem import STATE_SCALE, Problem
+from replays.peers.problem import Problem
 from replays.peers.right_hand_side import (
     N_SWITCH,
     compile_s,
@@ -28,6 +28,7 @@ from replays.peers.right_hand_side import (
     take_switch,
 )
 from replays.peers.solution import MISSED_HAMMER, Journal, Setting, Solution
+from rig.kernels.signals import STATE_SCALE
 
 LEAST_TOLERANCE = 2.3e-14
 """scipy takes no relative tolerance below 100 times the rounding unit."""

@@ -33,10 +33,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.peers.problem import STATE_SCALE, Problem
+from replays.peers.problem import Problem
 from replays.peers.solution import Journal, Setting, Solution
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, SWITCH, TOUCHING
 from rig.kernels.magnet import LINEAR, RIPPLED
+from rig.kernels.signals import STATE_SCALE
 
 SLACK = 5
 """A phase more than the kernels count: touching, while the normal law would have to pull and the force is held at 0."""

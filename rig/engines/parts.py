@@ -59,9 +59,7 @@ _TOLERANCE, _SIZE, _BEFORE, _BEFORE_SPAN, _LAST = range(OWN, OWN + 5)
 """Scaled error a step; length proposed for the next part [ticks]; normal force before the last [N], time between both
 [ticks], last normal force [N]."""
 
-SCALES = np.array([5e-3, 5e-3, 1.0, 20e-6, 20e-6, 20e-6, 20e-6, 1.0, 1.0, 40.0, 0.04, 0.04, 0.04, 0.04])
-"""What counts as 1 in each state when errors are added up: 5 mrad, 1 rad of spin, 20 um, 1 and 40 rad/s, 40 mm/s."""
-PER_SCALE = 1.0 / SCALES
+PER_SCALE = 1.0 / S.STATE_SCALE
 
 _LEAST = 1.0 / 64.0
 """Shortest part next to a crossing, in steps of the grid; ..."""

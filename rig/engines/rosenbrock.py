@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from rig.engines import parts
-from rig.engines.parts import FUNCTIONS, PER_SCALE, SCALES, Functions, rates
+from rig.engines.parts import FUNCTIONS, PER_SCALE, Functions, rates
 from rig.kernels import signals as S
 
 ORDER = 4
@@ -54,7 +54,7 @@ _RIGHT = _STATE + 1
 _LU = _RIGHT + 1
 _ROWS = _LU + _N + 1
 
-_INCREMENTS = 1e-8 * SCALES
+_INCREMENTS = 1e-8 * S.STATE_SCALE
 """Differences in each state: in a sliding speed some nm/s, well below any smoothing speed."""
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 
 class Signal(NamedTuple):
     """One column."""
@@ -35,6 +37,8 @@ STATE = (
     Signal("vy_oh", "m/s", "Outer house velocity, vertical"),
 )
 """Generalised coordinates and their rates, in the order of the state vector."""
+STATE_SCALE = np.array([5e-3, 5e-3, 1.0, 2e-5, 2e-5, 2e-5, 2e-5, 1.0, 1.0, 40.0, 0.1, 0.1, 0.1, 0.1])
+"""What counts as 1 in each state where errors are added up, in its SI unit: shape (N_STATE,)."""
 
 INTEGRALS = (
     Signal("drive_work", "J", "Work done by the drive torque"),

@@ -26,7 +26,6 @@ import pytest
 
 from rig import InputError, Run, load_parameters, load_scene, simulate
 from rig.contacts import restitution_factor
-from rig.engines.parts import SCALES
 from rig.kernels import signals as S
 from rig.kernels.contact import FORWARD, SMOOTHED, TOUCHING, ring_force
 from rig.model import build_model
@@ -91,7 +90,7 @@ def test_first_impacts_against_independent_solver(scene: str, duration_s: float,
         magnet=run.simulation.scene.initial.magnets,
     )
     assert len(solution.onsets) >= 2, "the comparison must reach through impacts"
-    error = np.abs(run.signals[:, : S.N_STATE] - solution.states) / SCALES
+    error = np.abs(run.signals[:, : S.N_STATE] - solution.states) / S.STATE_SCALE
     assert np.sqrt(np.mean(error**2, axis=1)).max() < 1e-4
     assert run.simulation.health()["contacts"] == len(solution.onsets)
 

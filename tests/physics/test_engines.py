@@ -21,7 +21,6 @@ import pytest
 from rig import InputError, load_scene
 from rig.engines import ENGINES, load_engine
 from rig.engines.memory import CEILING, CONTACTS, EVALUATIONS, MEMORY, PHASE, STEPS
-from rig.engines.parts import SCALES
 from rig.kernels import signals as S
 from rig.kernels.contact import ROLLING
 from rig.simulation import Simulation
@@ -52,7 +51,7 @@ def ready(scene: str, engine: str, smoothing_speed: float | None = None, **chang
 def motion(simulation: Simulation, duration_s: float) -> np.ndarray:
     """Scaled states on a grid of 1 ms, shape (n, 7)."""
     rows = simulation.advance(round(duration_s * 1e6)).rows
-    return rows[:, _MEASURED] / SCALES[_MEASURED]
+    return rows[:, _MEASURED] / S.STATE_SCALE[_MEASURED]
 
 
 def distance(one: np.ndarray, other: np.ndarray) -> float:

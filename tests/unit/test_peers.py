@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replays.peers import ERROR_SCALE, PEERS, STATE_SCALE, Peer, Problem, Setting, scaled_error
+from replays.peers import ERROR_SCALE, PEERS, Peer, Problem, Setting, scaled_error
 from replays.peers.plain_python import PlainPython
 from replays.peers.reference import find_reference
 from replays.peers.right_hand_side import derivative, pack, switching
 from replays.peers.solution import MISSED_HAMMER
 from rig.errors import InputError
 from rig.kernels.contact import FLIGHT, FORWARD, ROLLING, TOUCHING
+from rig.kernels.signals import STATE_SCALE
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 
