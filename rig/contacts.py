@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rig.errors import InputError
+from rig.roots import find_root
 
 WORKING_FORCES = (5.0, 3000.0)
 """Forces that the rig's scenes reach [N]; a law that is no power of delta is fitted over them."""
@@ -122,16 +123,13 @@ class StiffnessLaw:
         if self.power is not None:
             stiffness, exponent = self.power(pair)
             return stiffness * penetration**exponent
-        from scipy.optimize import brentq
-
         high = 1e-3
         while (depth := self.depth(high, pair)) < penetration:
             # The logarithms turn back at forces that no line contact bears.
             if self.depth(2.0 * high, pair) <= depth:
                 return math.nan
             high *= 2.0
-        root: Any = brentq(lambda force: self.depth(force, pair) - penetration, 1e-9 * high, high, xtol=1e-12)
-        return float(root)
+        return find_root(lambda force: self.depth(force, pair) - penetration, 1e-9 * high, high, within=1e-12)
 
 
 def restitution_factor(restitution: float) -> float:
@@ -148,14 +146,12 @@ def restitution_factor(restitution: float) -> float:
     loss = 1.0 - restitution
     if loss < _SMALL:
         return 1.5 * loss * (1.0 + loss)
-    from scipy.optimize import brentq
 
     def residual(c: float) -> float:
         return c * (1.0 + restitution) - math.log1p(c) + math.log1p(-c * restitution)
 
     # c = 0 solves it as well; the wanted root lies between that and the pole at 1/e.
-    root: Any = brentq(residual, loss, (1.0 - 1e-12) / restitution, xtol=1e-15)
-    return float(root)
+    return find_root(residual, loss, (1.0 - 1e-12) / restitution, within=1e-15)
 
 
 def returned_restitution(factor: float) -> float:
@@ -169,7 +165,6 @@ def returned_restitution(factor: float) -> float:
     """
     if factor < _SMALL:
         return 1.0 - 2.0 / 3.0 * factor * (1.0 - 2.0 / 3.0 * factor)
-    from scipy.optimize import brentq
 
     def residual(e: float) -> float:
         return factor * (1.0 + e) - math.log1p(factor) + math.log1p(-factor * e)
@@ -177,8 +172,7 @@ def returned_restitution(factor: float) -> float:
     high = min(1.0, 1.0 / factor) * (1.0 - 1e-15)
     if residual(high) > 0.0:  # so damped that e is 1/c to the last digit
         return high
-    root: Any = brentq(residual, 0.0, high, xtol=1e-15)
-    return float(root)
+    return find_root(residual, 0.0, high, within=1e-15)
 
 
 def linear_damping_ratio(restitution: float) -> float:
@@ -193,15 +187,13 @@ def linear_damping_ratio(restitution: float) -> float:
     """
     if restitution == 1.0:
         return 0.0
-    from scipy.optimize import brentq
-
     loss = -math.log(restitution)
     if loss < 2.0:
-        root: Any = brentq(lambda a: 2.0 * a / math.tan(a) - loss, 1e-9, 0.5 * math.pi, xtol=1e-15)
+        root = find_root(lambda a: 2.0 * a / math.tan(a) - loss, 1e-9, 0.5 * math.pi, within=1e-15)
         return math.cos(root)
     if loss == 2.0:
         return 1.0
-    root = brentq(lambda a: 2.0 * a / math.tanh(a) - loss, 1e-9, loss, xtol=1e-15)
+    root = find_root(lambda a: 2.0 * a / math.tanh(a) - loss, 1e-9, loss, within=1e-15)
     return math.cosh(root)
 
 
@@ -296,14 +288,11 @@ def _pereira(pair: ContactPair) -> tuple[float, float]:
 
 
 def _liu(force: float, pair: ContactPair) -> float:
-    from scipy.optimize import brentq
-
     def residual(depth: float) -> float:
         share = depth / (2.0 * (pair.clearance + depth))
         return 0.5 * math.pi * pair.modulus * pair.width * depth * math.sqrt(share) - force
 
-    root: Any = brentq(residual, 0.0, 10.0 * pair.ring_radius, xtol=1e-16)
-    return float(root)
+    return find_root(residual, 0.0, 10.0 * pair.ring_radius, within=1e-16)
 
 
 _PARALLEL = "half-space, parallel axes, contact much narrower than R_S"

@@ -153,6 +153,12 @@ def radial_field(rho: np.ndarray, z: np.ndarray | float, radius: float, length: 
     return field
 
 
+@cache
+def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places and weights of Gauss's quadrature over -1 to 1."""
+    return np.polynomial.legendre.leggauss(nodes)
+
+
 def pair_force(distance: float, geometry: MagnetGeometry, *, nodes: int = 24) -> float:
     """Force by which one bearing magnet pushes the shaft magnet away, exact cylinders.
 
@@ -167,7 +173,7 @@ def pair_force(distance: float, geometry: MagnetGeometry, *, nodes: int = 24) ->
     Returns:
         Force [N].
     """
-    root, weight = np.polynomial.legendre.leggauss(nodes)
+    root, weight = _gauss(nodes)
     r = geometry.shaft_magnet_radius * (root[:, None] + 1.0) / 2.0
     area = np.pi * geometry.shaft_magnet_radius * weight[:, None] * r / (8 * nodes)
     phi = np.pi * (np.arange(8 * nodes) + 0.5) / (8 * nodes)

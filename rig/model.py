@@ -24,6 +24,7 @@ from rig.magnets import (
     model_errors,
 )
 from rig.parameters import ParameterSet
+from rig.roots import find_root
 
 
 def contact_pair(parameters: ParameterSet) -> ContactPair:
@@ -272,7 +273,6 @@ _MAPS = {"linear": linear_map, "map": fit_map, "cylinders": fit_cylinder_map}
 
 def _sag(shaft: Shaft, magnet: Magnet) -> float:
     """Height of the shaft at the ring at rest on the magnets [m], negative: torque balance about the pivot."""
-    from scipy.optimize import brentq
 
     def torque(gamma: float) -> float:
         # Both forces are vertical, one of the magnets being straight below, and share the lever cos(Gamma), which
@@ -281,10 +281,9 @@ def _sag(shaft: Shaft, magnet: Magnet) -> float:
         lift = float(map_force(np.zeros(1), depth, magnet)[0, 1])
         return shaft.arm_magnet * lift - shaft.arm_centre * shaft.mass * shaft.gravity
 
-    if torque(0.02 / shaft.arm_magnet) < 0.0:
+    deepest = 0.02 / shaft.arm_magnet
+    if torque(deepest) < 0.0:
         raise InputError(
             "magnet.stiffness", "enough to carry the shaft within 20 mm of the magnets' centre", magnet.stiffness
         )
-    root: Any = brentq(torque, 0.0, 0.02 / shaft.arm_magnet, xtol=1e-16)
-    gamma = float(root)
-    return -shaft.arm_ring * math.sin(gamma)
+    return -shaft.arm_ring * math.sin(find_root(torque, 0.0, deepest, within=1e-16))

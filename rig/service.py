@@ -8,7 +8,6 @@ the gap also shows in the row numbers. An unpaced run waits for the publisher in
 
 from __future__ import annotations
 
-import gc
 import math
 import re
 import threading
@@ -21,7 +20,7 @@ from typing import Any, Protocol
 
 from rig import wire
 from rig.errors import InputError
-from rig.pacing import Clock, Lockstep, RealTime, StepTimeoutError
+from rig.pacing import Clock, Lockstep, RealTime, StepTimeoutError, short_collections
 from rig.transport import Server
 
 SIMULATION_COMMANDS = ("hammer", "speed", "release")
@@ -416,14 +415,13 @@ class Service:
         self._queue.put(_Entry([self._event("start", **start)]))
         publisher = threading.Thread(target=self._publish_all, name="publisher", daemon=True)
         publisher.start()
-        # What the start left behind is never garbage, and walking it took 5 to 8 ms of a full collection.
-        gc.collect()
-        gc.freeze()
         started = time.monotonic()
         reason = "failed: the service itself failed"
         try:
-            self._clock.start(simulation.tick, self._rate)
-            reason = self._advance_all()
+            with short_collections():
+                started = time.monotonic()
+                self._clock.start(simulation.tick, self._rate)
+                reason = self._advance_all()
         except KeyboardInterrupt:
             reason = "stopped"
             raise
@@ -435,7 +433,6 @@ class Service:
             raise
         finally:
             wall_s = time.monotonic() - started
-            gc.unfreeze()
             self._finish(reason)
             publisher.join(timeout=60.0)
             # Where the publisher failed, nobody else answers the steps that it left.

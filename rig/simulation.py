@@ -11,7 +11,7 @@ import math
 from bisect import insort
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ class Snapshot:
 
 
 _CHANGING = (
-    "tick", "first_row", "_segments", "_engaged", "_blow", "_pending", "_y", "_memory", "_last", "_conditioners",
+    "tick", "first_row", "_segments", "_engaged", "_blow", "_pending", "_y", "_memory", "_last", "_conditioner",
     "_keyphasor",
 )  # fmt: skip
 
@@ -123,16 +123,20 @@ class Simulation:
         self.block_ticks = math.lcm(*periods)
         self.end_tick = math.ceil(round(scene.duration_s * TICK_RATE_HZ) / self.block_ticks) * self.block_ticks
         self.table: ChannelTable = default_table().only(sensors.groups, sensors.rate_hz)
-        row_rate = TICK_RATE_HZ // self.row_ticks
-        self._conditioners = {
-            name: Conditioner(
-                group, row_rate_hz=row_rate, seed=scene.seed, noise=sensors.noise, ideal=sensors.chain == "ideal"
-            )
-            for name, group in self.table.groups.items()
-        }
+        self._conditioner = Conditioner(
+            tuple(self.table.groups.values()),
+            row_rate_hz=TICK_RATE_HZ // self.row_ticks,
+            seed=scene.seed,
+            noise=sensors.noise,
+            ideal=sensors.chain == "ideal",
+        )
         self._keyphasor = Keyphasor() if "drive" in sensors.groups else None
         self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
-        self._truth_columns = {name: [COLUMN[column] for column in columns] for name, columns in S.TRUTH.items()}
+        self._truth_columns = np.array([COLUMN[column] for columns in S.TRUTH.values() for column in columns])
+        ends = accumulate(len(columns) for columns in S.TRUTH.values())
+        self._truth_parts = {
+            name: slice(end - len(columns), end) for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
+        }
 
         self.tick = 0
         self._segments = self._profile()
@@ -412,11 +416,11 @@ class Simulation:
         self.tick += ticks
 
     def _sample(self, rows: np.ndarray, start: int) -> dict[str, Block]:
-        blocks = {}
-        for name, conditioner in self._conditioners.items():
-            rate = conditioner.group.rate_hz
-            blocks[name] = self._block(start, start * rate // TICK_RATE_HZ, rate, conditioner.counts(rows))
-        return blocks
+        rate = self.scene.sensors.rate_hz
+        index = start * rate // TICK_RATE_HZ
+        return {
+            name: self._block(start, index, rate, counts) for name, counts in self._conditioner.counts(rows).items()
+        }
 
     def _edges(self, rows: np.ndarray, start: int) -> Block | None:
         if self._keyphasor is None:
@@ -427,11 +431,9 @@ class Simulation:
 
     def _truth(self, rows: np.ndarray, start: int) -> dict[str, Block]:
         rate = self.scene.sensors.truth_rate_hz
-        kept = rows[:: self._truth_every]
+        kept = rows[:: self._truth_every, self._truth_columns]
         index = start * rate // TICK_RATE_HZ
-        return {
-            name: self._block(start, index, rate, kept[:, columns]) for name, columns in self._truth_columns.items()
-        }
+        return {name: self._block(start, index, rate, kept[:, part]) for name, part in self._truth_parts.items()}
 
     def _block(self, tick: int, index: int, rate_hz: int, values: np.ndarray) -> Block:
         return Block(tick=tick, index=index, rate_hz=float(rate_hz), tick_rate_hz=float(TICK_RATE_HZ), values=values)

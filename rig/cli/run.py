@@ -50,22 +50,26 @@ def run(
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
     overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
 
-    from rig.kernels import COMPILE_NOTICE, compiled_before
-    from rig.scenes import load_scene
-    from rig.service import Service
-    from rig.simulation import Simulation
-    from rig.transport.zenoh import ZenohServer
+    from rig.pacing import rare_collections
 
-    loaded = load_scene(scene, overrides)
+    with rare_collections():
+        from rig.kernels import COMPILE_NOTICE, compiled_before
+        from rig.scenes import load_scene
+        from rig.service import Service
+        from rig.simulation import Simulation
+        from rig.transport.zenoh import ZenohServer
+
+        loaded = load_scene(scene, overrides)
     with ZenohServer(listen, expose=expose, wait=pace is not Pace.REAL_TIME) as server:
-        simulation = Simulation(loaded)
-        block_ticks = _block_ticks(block_ms, simulation)
-        service = Service(simulation, server, _clock(pace), block_ticks=block_ticks)
-        notice = "preparing" if compiled_before() else COMPILE_NOTICE
-        typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
-        if loaded.fidelity_line:
-            typer.echo(f"rig: {loaded.fidelity_line}", err=True)
-        service.prepare()
+        with rare_collections():
+            simulation = Simulation(loaded)
+            block_ticks = _block_ticks(block_ms, simulation)
+            service = Service(simulation, server, _clock(pace), block_ticks=block_ticks)
+            notice = "preparing" if compiled_before() else COMPILE_NOTICE
+            typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
+            if loaded.fidelity_line:
+                typer.echo(f"rig: {loaded.fidelity_line}", err=True)
+            service.prepare()
         typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
         with _stopping_on_signals(service.stop), _showing(service):
             summary = service.run()

@@ -25,27 +25,32 @@ def simulate(
     import sys
     import time
 
-    from rich.console import Console
-    from rich.progress import Progress
+    from rig.pacing import rare_collections
 
-    from replays.export import check_output, writer_for
-    from rig.cli.run import scene_overrides
-    from rig.scenes import load_scene
+    with rare_collections():
+        from rich.console import Console
+        from rich.progress import Progress
 
-    check_output(output, force=force)
-    overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
-    loaded = load_scene(scene, overrides)
+        from replays.export import check_output, writer_for
+        from rig.cli.run import scene_overrides
+        from rig.scenes import load_scene
 
-    from rig.kernels import COMPILE_NOTICE, compiled_before
-    from rig.offline import frames
-    from rig.simulation import Simulation
+        check_output(output, force=force)
+        overrides = scene_overrides(
+            changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed
+        )
+        loaded = load_scene(scene, overrides)
 
-    simulation = Simulation(loaded)
-    if loaded.fidelity_line:
-        typer.echo(loaded.fidelity_line, err=True)
-    if not compiled_before():
-        typer.echo(COMPILE_NOTICE, err=True)
-    simulation.warm_up()
+        from rig.kernels import COMPILE_NOTICE, compiled_before
+        from rig.offline import frames
+        from rig.simulation import Simulation
+
+        simulation = Simulation(loaded)
+        if loaded.fidelity_line:
+            typer.echo(loaded.fidelity_line, err=True)
+        if not compiled_before():
+            typer.echo(COMPILE_NOTICE, err=True)
+        simulation.warm_up()
     with (
         Progress(console=Console(file=sys.stderr), transient=True, disable=not sys.stderr.isatty()) as progress,
         writer_for(output, simulation, force=force) as writer,

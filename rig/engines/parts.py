@@ -51,6 +51,7 @@ from rig.engines.memory import (
     REJECTED,
     STEPS,
 )
+from rig.engines.peak import peak
 from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
 from rig.kernels.dynamics import evaluate, gap
@@ -267,17 +268,11 @@ def _event(phase, contact, out):
 
 @njit(cache=True, error_model="numpy")
 def _note_force(memory, force, ticks):
-    """Follow the largest normal force, by the parabola through three instants where the middle one is the largest."""
-    before, last, span = memory[_BEFORE], memory[_LAST], memory[_BEFORE_SPAN]
-    memory[PEAK_FORCE] = max(memory[PEAK_FORCE], force)
-    if last > before and last >= force and before > 0.0 and force > 0.0 and ticks > 0.0 and span > 0.0:
-        # F(t) = last + p t + q t^2 around the middle instant.
-        back, ahead = (before - last) / span, (force - last) / ticks
-        q = (back + ahead) / (span + ticks)
-        p = ahead - q * ticks
-        if q < 0.0:
-            memory[PEAK_FORCE] = max(memory[PEAK_FORCE], last - 0.25 * p * p / q)
-    memory[_BEFORE], memory[_LAST], memory[_BEFORE_SPAN] = last, force, ticks
+    """Follow the largest normal force."""
+    memory[PEAK_FORCE] = max(
+        memory[PEAK_FORCE], peak(memory[_BEFORE], memory[_BEFORE_SPAN], memory[_LAST], ticks, force)
+    )
+    memory[_BEFORE], memory[_LAST], memory[_BEFORE_SPAN] = memory[_LAST], force, ticks
 
 
 @njit(cache=True, error_model="numpy")

@@ -49,6 +49,7 @@ from rig.engines.memory import (
     PHASE,
     STEPS,
 )
+from rig.engines.peak import peak
 from rig.kernels import signals as S
 from rig.kernels.angles import arc_sine, sin_cos
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, NO_FRICTION, ROLLING, elastic_force
@@ -67,8 +68,8 @@ _Y = OWN + 10  # the same, vertical
 _SLID, _DEPTH, _RATE, _AGO = range(OWN + 14, OWN + 18)
 """Sliding speed after the last kick, nan before the first of a contact; penetration, its rate and the time since the
 last kick in flight."""
-_BEFORE, _LAST = OWN + 18, OWN + 19
-"""Normal force at the last kick but one, and at the last [N]."""
+_BEFORE, _LAST, _BEFORE_SPAN, _LAST_STEP = OWN + 18, OWN + 19, OWN + 40, OWN + 41
+"""Normal force at the last kick but one, and at the last [N]; time between both; length of the last's step [s]."""
 _WANTED, _SETTLED, _BOUNCE = OWN + 20, OWN + 21, OWN + 22
 _REST, _SPRING_X, _SPRING_Y = OWN + 23, OWN + 24, OWN + 25
 """Level asked for in contact, calm kicks in a row, mean rate of the gap in the last kick; rest of the shaft on its
@@ -77,7 +78,7 @@ _KICKED, _CONJUGATE, _S, _ENGAGED = OWN + 26, OWN + 27, OWN + 28, OWN + 36
 """Level of the last kick, -1 before the first; h^2/24 of the coordinates in use; accelerations by the last kick and
 their rates, of shaft and contact; whether the flow has the magnets."""
 _COS, _SIN, _ANGLE = OWN + 37, OWN + 38, OWN + 39
-_FLOWS = OWN + 40
+_FLOWS = OWN + 42
 _GRID = 5
 """Level of the grid's own step: level l lasts 2**(l - _GRID) steps of the grid."""
 _LEVELS = _GRID + 8
@@ -303,15 +304,6 @@ def _loose(displacement, stiffness, preload):
     return 2.0 * change - (max(0.0, preload + change) - max(0.0, preload - change))
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
-def _peak(before, last, force):
-    """Largest force of the parabola through three equal steps, if the middle one is the largest; else the last."""
-    if last > before and last >= force and before > 0.0 and force > 0.0:
-        slope, bend = 0.5 * (force - before), 0.5 * (force + before) - last
-        return last - 0.25 * slope * slope / bend if bend < 0.0 else last
-    return force
-
-
 @njit(cache=True, error_model="numpy", fastmath=_FAST, forceinline=True)
 def _flow(memory, level, inner, f, ux, px, uy, py, w, theta, aim, x0, x1, x2, x3, y0, y1, y2, y3):
     """The exact flow over half a step times 2**level."""
@@ -432,7 +424,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     onset_speed, slid = memory[ONSET], memory[_SLID]
     factor_per_speed = factor / onset_speed
     depth_before, rate_before, ago = memory[_DEPTH], memory[_RATE], memory[_AGO]
-    force_before, force_last, peak = memory[_BEFORE], memory[_LAST], memory[PEAK_FORCE]
+    force_before, force_last, largest = memory[_BEFORE], memory[_LAST], memory[PEAK_FORCE]
+    force_span, force_step = memory[_BEFORE_SPAN], memory[_LAST_STEP]
     contacts, floored, clamps, contact_steps, kicks = 0.0, 0.0, 0.0, 0.0, 0.0
     dy = np.empty(S.N_VECTOR)
     out = np.empty(S.N_OBSERVED)
@@ -651,7 +644,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                         end_impulse *= _end_error(exponent, since)
                         end_impulse -= h * viscous * rate * (0.5 - since)
                     slid = np.nan
-                    force_before = force_last = 0.0
+                    force_before = force_last = force_span = 0.0
                     wanted_level = min(level, _GRID)
                     settled = 0
                     bounce = rate
@@ -748,8 +741,9 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 impulse += jn
                 if compliant:
                     force = max(0.0, elastic + damping_rate * rate_mean)
-                    peak = max(peak, _peak(force_before, force_last, force))
-                    force_before, force_last = force_last, force
+                    span = 0.5 * (force_step + h)
+                    largest = max(largest, peak(force_before, force_span, force_last, span, force))
+                    force_before, force_last, force_span, force_step = force_last, force, span, h
                 # The next step's level, from how fast the gap moves or is made to move; rigid contact is always calm.
                 rough, calm = False, True
                 if compliant:
@@ -935,7 +929,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     memory[_S + 4], memory[_S + 5], memory[_S + 6], memory[_S + 7] = cx, cy, dcx, dcy
     memory[_WANTED], memory[_SETTLED], memory[_BOUNCE] = float(wanted_level), float(settled), bounce
     memory[_DEPTH], memory[_RATE], memory[_AGO] = depth_before, rate_before, ago
-    memory[_BEFORE], memory[_LAST], memory[PEAK_FORCE] = force_before, force_last, peak
+    memory[_BEFORE], memory[_LAST], memory[PEAK_FORCE] = force_before, force_last, largest
+    memory[_BEFORE_SPAN], memory[_LAST_STEP] = force_span, force_step
     memory[CONTACTS] += contacts
     memory[FLOORED] += floored
     memory[CLAMPS] += clamps

@@ -1,24 +1,90 @@
-"""Signal conditioning of one sensor group: sensitivity, range, anti-alias filter and AC coupling, noise, converter."""
+"""Signal conditioning of all sensors: sensitivity, range, anti-alias filter and AC coupling, noise, converter."""
 
 from __future__ import annotations
 
 import math
-import zlib
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
 
 from rig.channels import Channel, Group
 from rig.kernels.signals import COLUMN
+from rig.sensors.noise import draw, noise_streams
 
-_STORE = 4096
-"""Samples of noise drawn at a time: how many does not show in the result."""
 _SECTIONS = 3
 """Second-order sections of the filter: two of the fourth-order Butterworth low-pass, one for AC coupling."""
+_LANES = 16
+"""Channels that one pass takes, side by side."""
+_CHUNK = 64
+"""Rows that are filtered at a time."""
+
+_GAIN, _BIAS, _LOW, _HIGH, _NOISE, _LSB, _LIMIT = range(7)
+"""Rows of the table of channels: volts per SI unit; volts at zero; output limits [V]; noise [V]; converter step [V];
+largest count."""
+_SECTION = 7
+"""From here on three sections: b0, b1, b2, a1, a2 and both memories (direct form II transposed)."""
+_SECTION_AT = tuple(_SECTION + 7 * section for section in range(_SECTIONS))
+_TABLE = _SECTION + 7 * _SECTIONS
+_A, _B, _D = (_LANES * at for at in _SECTION_AT)
+
+
+@njit(cache=True, error_model="numpy")
+def _filter(table, volts):
+    """From signals to volts behind the filters, in place, for `_LANES` channels.
+
+    Every number of a channel stands at a fixed distance from the next one: only so can the compiler see that the
+    channels may go side by side.
+
+    Args:
+        table: Of these channels, with their memory, in and out, shape (_TABLE * _LANES,).
+        volts: In and out, row after row, shape (rows * _LANES,).
+    """
+    for n in range(len(volts) // _LANES):
+        row = volts[n * _LANES : (n + 1) * _LANES]
+        for c in range(_LANES):
+            v = table[c + _BIAS * _LANES] + table[c + _GAIN * _LANES] * row[c]
+            v = min(max(v, table[c + _LOW * _LANES]), table[c + _HIGH * _LANES])
+            u = table[c + _A] * v + table[c + (_A + 5 * _LANES)]
+            table[c + (_A + 5 * _LANES)] = (
+                table[c + (_A + _LANES)] * v - table[c + (_A + 3 * _LANES)] * u + table[c + (_A + 6 * _LANES)]
+            )
+            table[c + (_A + 6 * _LANES)] = table[c + (_A + 2 * _LANES)] * v - table[c + (_A + 4 * _LANES)] * u
+            v = table[c + _B] * u + table[c + (_B + 5 * _LANES)]
+            table[c + (_B + 5 * _LANES)] = (
+                table[c + (_B + _LANES)] * u - table[c + (_B + 3 * _LANES)] * v + table[c + (_B + 6 * _LANES)]
+            )
+            table[c + (_B + 6 * _LANES)] = table[c + (_B + 2 * _LANES)] * u - table[c + (_B + 4 * _LANES)] * v
+            u = table[c + _D] * v + table[c + (_D + 5 * _LANES)]
+            table[c + (_D + 5 * _LANES)] = (
+                table[c + (_D + _LANES)] * v - table[c + (_D + 3 * _LANES)] * u + table[c + (_D + 6 * _LANES)]
+            )
+            table[c + (_D + 6 * _LANES)] = table[c + (_D + 2 * _LANES)] * v - table[c + (_D + 4 * _LANES)] * u
+            row[c] = u
+
+
+@njit(cache=True, error_model="numpy")
+def _convert(table, volts, every, noise):
+    """From volts to counts, still as floats, in place.
+
+    Args:
+        table: As above.
+        volts: In and out, from the row of the first sample on, shape (rows * _LANES,).
+        every: Rows a sample.
+        noise: Of each sample, shape (samples, _LANES).
+    """
+    for n in range(len(noise)):
+        row = volts[n * every * _LANES : (n * every + 1) * _LANES]
+        loud = noise[n]
+        # A length that the compiler knew would be unrolled, one channel after the other.
+        for c in range(len(row)):
+            count = np.rint((row[c] + loud[c] * table[c + _NOISE * _LANES]) / table[c + _LSB * _LANES])
+            limit = table[c + _LIMIT * _LANES]
+            row[c] = min(max(count, -limit - 1.0), limit)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _condition(rows, first, every, columns, gain, bias, low, high, sections, memory, noise, lsb, limit, counts):
+def _condition(rows, first, every, columns, places, tables, streams, counts):
     """Filter every row, convert every `every`-th from row `first` on.
 
     Args:
@@ -26,46 +92,39 @@ def _condition(rows, first, every, columns, gain, bias, low, high, sections, mem
         first: Row of the first sample.
         every: Rows a sample.
         columns: Column of each channel, shape (c,).
-        gain: Volts per SI unit, shape (c,).
-        bias: Volts at zero, shape (c,).
-        low: Lower output limit [V], shape (c,).
-        high: Upper output limit [V], shape (c,).
-        sections: Filter, shape (c, _SECTIONS, 6) as second-order sections.
-        memory: Filter memory (direct form II transposed), in and out, shape (c, _SECTIONS, 2).
-        noise: Added at the converter [V], shape (c, samples).
-        lsb: Converter step [V], shape (c,).
-        limit: Largest count, shape (c,).
-        counts: Out, shape (samples, c).
+        places: Where its counts go: channels in the groups before its own, channels in its group, place in it,
+            shape (c, 3).
+        tables: Of the channels by sixteen, with the filters' memory, in and out, shape (sets, _TABLE, _LANES).
+        streams: Of their noise, in and out, shape (c, 4); (0, 4): no noise.
+        counts: Out, one group behind the other, each (samples, channels).
     """
-    for c in range(len(columns)):
-        column = columns[c]
-        m00, m01 = memory[c, 0, 0], memory[c, 0, 1]
-        m10, m11 = memory[c, 1, 0], memory[c, 1, 1]
-        m20, m21 = memory[c, 2, 0], memory[c, 2, 1]
-        a = sections[c, 0]
-        b = sections[c, 1]
-        d = sections[c, 2]
+    samples = len(counts) // len(columns)
+    volts = np.zeros(_CHUNK * _LANES)
+    noise = np.zeros((_CHUNK, _LANES))
+    for part in range(len(tables)):
+        table = tables[part].reshape(_TABLE * _LANES)
+        at = part * _LANES
+        lanes = min(_LANES, len(columns) - at)
         sample = 0
         due = first
-        for n in range(len(rows)):
-            v = min(max(bias[c] + gain[c] * rows[n, column], low[c]), high[c])
-            u = a[0] * v + m00
-            m00 = a[1] * v - a[4] * u + m01
-            m01 = a[2] * v - a[5] * u
-            v = b[0] * u + m10
-            m10 = b[1] * u - b[4] * v + m11
-            m11 = b[2] * u - b[5] * v
-            u = d[0] * v + m20
-            m20 = d[1] * v - d[4] * u + m21
-            m21 = d[2] * v - d[5] * u
-            if n == due:
-                value = np.rint((u + noise[c, sample]) / lsb[c])
-                counts[sample, c] = np.int32(min(max(value, -limit[c] - 1.0), limit[c]))
-                sample += 1
-                due += every
-        memory[c, 0, 0], memory[c, 0, 1] = m00, m01
-        memory[c, 1, 0], memory[c, 1, 1] = m10, m11
-        memory[c, 2, 0], memory[c, 2, 1] = m20, m21
+        for begin in range(0, len(rows), _CHUNK):
+            length = min(_CHUNK, len(rows) - begin)
+            for c in range(lanes):
+                column = columns[at + c]
+                for n in range(length):
+                    volts[n * _LANES + c] = rows[begin + n, column]
+            _filter(table, volts[: length * _LANES])
+            here = max(0, -(-(begin + length - due) // every))
+            if len(streams) > 0:
+                draw(streams[at : at + lanes], noise[:here])
+            _convert(table, volts[(due - begin) * _LANES :], every, noise[:here])
+            for c in range(lanes):
+                before, width, place = places[at + c]
+                to = before * samples + sample * width + place
+                for n in range(here):
+                    counts[to + n * width] = np.int32(volts[(due - begin + n * every) * _LANES + c])
+            sample += here
+            due += here * every
 
 
 def channel_filter(channel: Channel, row_rate_hz: float) -> np.ndarray:
@@ -90,81 +149,99 @@ def channel_filter(channel: Channel, row_rate_hz: float) -> np.ndarray:
 
 
 class Conditioner:
-    """Turns rows into counts for one group, block by block; cutting a run into blocks in another way changes no bit.
+    """Turns rows into counts, block by block; cutting a run into blocks in another way changes no bit.
 
     An ideal one has range and converter only: no filter, no coupling, no noise.
 
-    Each channel draws its noise from a generator of its own, keyed by seed and name: leaving a channel out does not
+    Each channel draws its noise from a stream of its own, keyed by seed and name: leaving a channel out does not
     change the others.
+
+    Args:
+        groups: Groups of one rate.
+        row_rate_hz: Rows a second, a whole multiple of that rate.
+        seed: Of the noise.
+        noise: Whether there is any.
+        ideal: Leave everything out but range and converter.
     """
 
-    def __init__(self, group: Group, *, row_rate_hz: int, seed: int, noise: bool, ideal: bool = False) -> None:
-        self.group = group
+    def __init__(
+        self, groups: Sequence[Group], *, row_rate_hz: int, seed: int, noise: bool, ideal: bool = False
+    ) -> None:
+        self.groups = tuple(groups)
         self.ideal = ideal
-        self.every = row_rate_hz // group.rate_hz
+        self.every = row_rate_hz // self.groups[0].rate_hz
         self.rows_seen = 0
-        channels = group.channels
+        channels = [channel for group in self.groups for channel in group.channels]
         self._columns = np.array([COLUMN[channel.signal] for channel in channels])
-        self._gain = np.array([channel.sensitivity_v / channel.si for channel in channels])
-        self._bias = np.array([channel.bias_v for channel in channels])
-        self._low = np.array([channel.range_v[0] for channel in channels])
-        self._high = np.array([channel.range_v[1] for channel in channels])
-        self._sections = np.stack([channel_filter(channel, row_rate_hz) for channel in channels])
-        self._memory = np.zeros((len(channels), _SECTIONS, 2))
-        self._noise_v = np.array([channel.noise_v if noise else 0.0 for channel in channels])
-        self._lsb = np.array([channel.lsb_v for channel in channels])
-        self._store, self._drawn = np.empty((len(channels), 0)), 0
-        self._limit = np.array([2.0 ** (channel.adc_bits - 1) - 1.0 for channel in channels])
-        self._generators = [
-            np.random.Generator(np.random.Philox(np.random.SeedSequence([seed, zlib.crc32(channel.name.encode())])))
-            for channel in channels
-        ]
+        self._spans: list[tuple[str, int, int]] = []
+        for group in self.groups:
+            self._spans.append((group.name, sum(width for _, _, width in self._spans), len(group.channels)))
+        self._places = np.array([(before, width, c) for _, before, width in self._spans for c in range(width)])
+        # Lanes without a channel make zeros.
+        self._tables = np.zeros((-(-len(channels) // _LANES), _TABLE, _LANES))
+        self._tables[:, _LSB] = 1.0
+        for c, channel in enumerate(channels):
+            table = self._tables[c // _LANES, :, c % _LANES]
+            table[:_SECTION] = (
+                channel.sensitivity_v / channel.si,
+                channel.bias_v,
+                *channel.range_v,
+                channel.noise_v,
+                channel.lsb_v,
+                2.0 ** (channel.adc_bits - 1) - 1.0,
+            )
+            for at, (b0, b1, b2, _, a1, a2) in zip(_SECTION_AT, channel_filter(channel, row_rate_hz), strict=True):
+                table[at : at + 5] = b0, b1, b2, a1, a2
+        self._streams = noise_streams([channel.name for channel in channels] if noise and not ideal else [], seed)
 
-    def counts(self, rows: np.ndarray) -> np.ndarray:
+    def counts(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Samples that fall into the next rows.
 
         Args:
             rows: Observed rows that follow those of the last call, shape (n, N_ROW).
 
         Returns:
-            ADC counts, int32, shape (samples, channels).
+            ADC counts by group, int32, shape (samples, channels).
         """
-        if self.rows_seen == 0:
+        if self.rows_seen == 0 and not self.ideal:
             self._settle(rows[0])
         first = -self.rows_seen % self.every
-        if self.ideal:
-            self.rows_seen += len(rows)
-            volts = np.clip(self._bias + self._gain * rows[first :: self.every, self._columns], self._low, self._high)
-            return np.clip(np.rint(volts / self._lsb), -self._limit - 1.0, self._limit).astype(np.int32)
-        samples = max(0, -(-(len(rows) - first) // self.every))
-        noise = self._next_noise(samples)
-        counts = np.empty((samples, len(self._columns)), dtype=np.int32)
-        _condition(
-            rows, first, self.every, self._columns, self._gain, self._bias, self._low, self._high, self._sections,
-            self._memory, noise, self._lsb, self._limit, counts,
-        )  # fmt: skip
         self.rows_seen += len(rows)
-        return counts
+        samples = max(0, -(-(len(rows) - first) // self.every))
+        counts = np.empty(samples * len(self._columns), dtype=np.int32)
+        if self.ideal:
+            self._ideal_counts(rows[first :: self.every], counts)
+        else:
+            # Sums of unsigned integers wrap, of which numpy would warn where nothing is compiled.
+            with np.errstate(over="ignore"):
+                _condition(rows, first, self.every, self._columns, self._places, self._tables, self._streams, counts)
+        return {
+            name: counts[samples * before : samples * (before + width)].reshape(samples, width)
+            for name, before, width in self._spans
+        }
 
-    def _next_noise(self, samples: int) -> np.ndarray:
-        """Noise of the next samples [V], shape (channels, samples), out of a store that is filled now and then."""
-        if self._drawn + samples > self._store.shape[1]:
-            left = self._store[:, self._drawn :]
-            fresh = np.zeros((len(left), max(_STORE, samples - left.shape[1])))
-            for generator, noise_v, draws in zip(self._generators, self._noise_v, fresh, strict=True):
-                if noise_v:
-                    generator.standard_normal(out=draws)
-                    draws *= noise_v
-            self._store, self._drawn = np.concatenate([left, fresh], axis=1), 0
-        self._drawn += samples
-        return self._store[:, self._drawn - samples : self._drawn]
+    def _number(self, row: int) -> np.ndarray:
+        """One row of the table for all channels, shape (c,)."""
+        return self._tables[:, row].ravel()[: len(self._columns)]
+
+    def _limited(self, rows: np.ndarray) -> np.ndarray:
+        """Volts of the conditioners for rows [V], shape (n, c)."""
+        volts = self._number(_BIAS) + self._number(_GAIN) * rows[:, self._columns]
+        return np.clip(volts, self._number(_LOW), self._number(_HIGH))
+
+    def _ideal_counts(self, rows: np.ndarray, counts: np.ndarray) -> None:
+        limit = self._number(_LIMIT)
+        values = np.clip(np.rint(self._limited(rows) / self._number(_LSB)), -limit - 1.0, limit)
+        for _, before, width in self._spans:
+            end = before + width
+            counts[len(rows) * before : len(rows) * end] = values[:, before:end].ravel()
 
     def _settle(self, row: np.ndarray) -> None:
         # The instruments have been on for long: filters start in the steady state of the first row.
-        volts = np.clip(self._bias + self._gain * row[self._columns], self._low, self._high)
-        for c, value in enumerate(volts):
-            for s in range(_SECTIONS):
-                b0, b1, b2, _, a1, a2 = self._sections[c, s]
+        for c, value in enumerate(self._limited(row[None, :])[0]):
+            table = self._tables[c // _LANES, :, c % _LANES]
+            for at in _SECTION_AT:
+                b0, b1, b2, a1, a2 = table[at : at + 5]
                 out = value * (b0 + b1 + b2) / (1.0 + a1 + a2)
-                self._memory[c, s] = out - b0 * value, b2 * value - a2 * out
+                table[at + 5 : at + 7] = out - b0 * value, b2 * value - a2 * out
                 value = out

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 
 from rig.kernels.signals import COLUMN
 
 TURN = 2.0 * math.pi
 FRACTIONS = 2**20
 """Parts of a tick (1 ps) that an edge is told in: added to whole ticks they are exact, whatever the block."""
+_ANGLE, _RATE = COLUMN["theta"], COLUMN["theta_rate"]
 
 
 class Keyphasor:
@@ -18,8 +20,8 @@ class Keyphasor:
 
     def __init__(self) -> None:
         self.edges_seen = 0
-        self._angle: float | None = None
-        self._rate = 0.0
+        self._last = np.full(2, np.nan)
+        """Angle and rate at the last row of the call before."""
 
     def edges(self, rows: np.ndarray, row_ticks: int) -> np.ndarray:
         """Edges (mark arriving, forward spin) up to the last of these rows.
@@ -32,35 +34,42 @@ class Keyphasor:
             Instants in ticks from the first of these rows, with their fraction; negative ones lie between the last
             row of the call before and the first of this one. Shape (edges,).
         """
-        angle = rows[:, COLUMN["theta"]]
-        rate = rows[:, COLUMN["theta_rate"]]
-        first = 0
-        if self._angle is not None:
-            angle = np.concatenate([[self._angle], angle])
-            rate = np.concatenate([[self._rate], rate])
-            first = -1
-        found = []
-        turns = np.floor(angle / TURN)
-        for n in np.nonzero(turns[1:] > turns[:-1])[0]:
+        found = np.empty(len(rows))
+        count = _edges(rows, row_ticks, self._last, found)
+        self.edges_seen += count
+        return found[:count]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _edges(rows, row_ticks, last, found):
+    """How many edges there are, at most one a row; `last` in and out, shape (2,), `found` out, shape (n,)."""
+    count = 0
+    angle, rate = last[0], last[1]
+    turns = math.floor(angle / TURN) if angle == angle else np.inf
+    for n in range(len(rows)):
+        angle_before, rate_before, turns_before = angle, rate, turns
+        angle, rate = rows[n, _ANGLE], rows[n, _RATE]
+        turns = math.floor(angle / TURN)
+        if turns > turns_before:
             step = row_ticks * 1e-6
-            part = _crossing(turns[n + 1] * TURN, angle[n : n + 2], rate[n : n + 2] * step)
-            found.append((first + n) * row_ticks + round(part * row_ticks * FRACTIONS) / FRACTIONS)
-        self._angle, self._rate = float(angle[-1]), float(rate[-1])
-        self.edges_seen += len(found)
-        return np.array(found, dtype=np.float64)
+            mark = turns * TURN
+            part = _crossing(angle_before - mark, angle - mark, rate_before * step, rate * step)
+            found[count] = (n - 1) * row_ticks + np.rint(part * row_ticks * FRACTIONS) / FRACTIONS
+            count += 1
+    last[0], last[1] = angle, rate
+    return count
 
 
-def _crossing(target: float, angle: np.ndarray, slope: np.ndarray) -> float:
-    """Part of an interval at which the interpolant reaches the target, by Newton's method.
+@njit(cache=True, error_model="numpy")
+def _crossing(y0, y1, m0, m1):
+    """Part of an interval at which the interpolant of values y and slopes m is 0, by Newton's method.
 
     Four rounds are enough: the angle is nearly straight over one row.
     """
-    (y0, y1), (m0, m1) = angle - target, slope
     s = -y0 / (y1 - y0)
     for _ in range(4):
-        value = (
-            y0 * (1 + 2 * s) * (1 - s) ** 2 + m0 * s * (1 - s) ** 2 + y1 * s * s * (3 - 2 * s) + m1 * s * s * (s - 1)
-        )
-        rate = 6 * s * (s - 1) * (y0 - y1) + m0 * (1 - s) * (1 - 3 * s) + m1 * s * (3 * s - 2)
-        s -= value / rate
+        r = 1.0 - s
+        value = y0 * (1.0 + 2.0 * s) * r * r + m0 * s * r * r + y1 * s * s * (3.0 - 2.0 * s) + m1 * s * s * (s - 1.0)
+        slope = 6.0 * s * (s - 1.0) * (y0 - y1) + m0 * r * (1.0 - 3.0 * s) + m1 * s * (3.0 * s - 2.0)
+        s -= value / slope
     return min(max(s, 0.0), 1.0)
