@@ -37,7 +37,9 @@ ROW_TICKS = 25
 The sensors' filters run at this rate. Ideal sensors have none: their rows are as far apart as samples and truth.
 """
 ENERGY_ALARM = 1e-3
-"""Energy residual over dissipated energy above which a run is in doubt."""
+"""Energy residual over dissipated energy above which a run is in doubt, ..."""
+BRANCH_ALARM = 1e-2
+"""... and above which it may have missed a contact or made one up: in the charts, such runs are off by 1e-2 to 0.5."""
 
 STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy")
 SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
@@ -236,7 +238,10 @@ class Simulation:
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
         warnings = []
         if abs(residual) > ENERGY_ALARM * max(dissipated, 1e-6):
-            warnings.append(f"energy residual {residual:.2e} J is above {ENERGY_ALARM:g} of what was dissipated")
+            text = f"energy residual {residual:.2e} J is above {ENERGY_ALARM:g} of what was dissipated"
+            if abs(residual) > BRANCH_ALARM * max(dissipated, 1e-6) and self._memory[CONTACTS] > 1:
+                text += "; after contacts, a wrong branch is suspected"
+            warnings.append(text)
         if self._memory[CLAMPS]:
             warnings.append(f"the contact law would have pulled at {self._memory[CLAMPS]:.0f} steps and was held at 0")
         late = sum(tick >= self.end_tick for tick, _ in self._pending)

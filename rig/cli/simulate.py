@@ -19,6 +19,7 @@ def simulate(
     engine: Annotated[str | None, typer.Option(help="Integration method.")] = None,
     duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")] = None,
+    check: Annotated[bool, typer.Option("--check", help="Run it again by finer steps and tell the error.")] = False,
     force: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
 ) -> None:
     """Simulate a scene as fast as it goes and write every state, force and sensor to a file, named and with units."""
@@ -69,5 +70,14 @@ def simulate(
         f"{output.stat().st_size / 1e6:.1f} MB; {health['contacts']} contacts, "
         f"energy residual {energy['residual_j']:.1e} J of {energy['dissipated_j']:.3g} J dissipated"
     )
-    for warning in health["warnings"]:
+    warnings = health["warnings"]
+    if check:
+        from replays.check import check as check_scene
+
+        checked = check_scene(loaded)
+        if checked.wrong_branch:
+            warnings = [*warnings, checked.line()]
+        else:
+            typer.echo(f"checked: {checked.line()}")
+    for warning in warnings:
         typer.echo(f"warning: {warning}", err=True)

@@ -1,0 +1,53 @@
+"""The check by finer steps: its error is the true one's size, and a wrong branch is suspected where there is one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from replays.check import Check, check
+from replays.peers.problem import scaled_error
+from rig.kernels.signals import N_STATE
+from rig.offline import simulate
+from rig.scenes import load_scene
+
+
+def states(changes: dict[str, Any]) -> Any:
+    run = simulate(load_scene("hammer", changes | {"sensors.rate_hz": 1000, "sensors.chain": "ideal"}))
+    return run.signals[:, :N_STATE]
+
+
+def test_error_is_as_large_as_against_another_method() -> None:
+    changes = {"duration_s": 0.3, "engine.step_us": 50, "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000}
+    found = check(load_scene("hammer", changes))
+    true = scaled_error(states(changes), states(changes | {"engine.name": "rk8", "engine.step_us": 25}))
+    assert 0.3 * true < found.error < 3.0 * true
+    assert found.contacts[0] == found.contacts[1] > 10
+    assert found.parted_s is None
+    assert not found.wrong_branch
+    assert "split at 25 us" in found.line()
+
+
+def test_wrong_branch_is_suspected() -> None:
+    changes = {
+        "duration_s": 0.3, "engine.name": "verlet", "engine.step_us": 50, "sensors.rate_hz": 1000,
+        "sensors.truth_rate_hz": 1000,
+    }  # fmt: skip
+    found = check(load_scene("hammer", changes))
+    true = scaled_error(states(changes), states(changes | {"engine.name": "rk8", "engine.step_us": 25}))
+    assert true > 0.1
+    assert found.wrong_branch
+    assert found.parted_s is not None
+    assert "a wrong branch is suspected after" in found.line()
+
+
+@pytest.mark.parametrize(("contacts", "wrong"), [((10, 10), False), ((10, 14), True), ((0, 0), False), ((0, 3), True)])
+def test_contacts_missed_are_a_wrong_branch(contacts: tuple[int, int], wrong: bool) -> None:
+    assert Check(finer="x", error=1e-3, parted_s=None, contacts=contacts).wrong_branch == wrong
+
+
+def test_adaptive_engine_is_checked_by_its_tolerance() -> None:
+    found = check(load_scene("hammer", {"duration_s": 0.1, "engine.name": "rk8", "engine.tolerance": 1e-6}))
+    assert "1e-08" in found.line()
+    assert 0.0 < found.error < 1e-3
