@@ -60,7 +60,7 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
     check_output(path, force=force)
     if path.suffix == ".mcap":
         return _McapRun(path, simulation, force=force)
-    return _ParquetRun(path, simulation) if path.suffix == ".parquet" else _CsvRun(path, simulation)
+    return _TableRun(path, simulation, _open_parquet if path.suffix == ".parquet" else _open_csv)
 
 
 def table_columns(simulation: Simulation) -> list[str]:
@@ -107,14 +107,16 @@ class _Background:
 class _TableRun:
     """A table that grows frame by frame in a file of its own until it is whole."""
 
-    def __init__(self, path: Path, simulation: Simulation) -> None:
+    def __init__(self, path: Path, simulation: Simulation, open_table: Callable[[Path, Any], Any]) -> None:
         self.path = path
         self.part = path.with_name(path.name + ".part")
         self.simulation = simulation
+        self._open_table = open_table
         self._background = _Background()
 
     def __enter__(self) -> Self:
-        self._begin()
+        self._schema = _schema(self.simulation)
+        self._writer = self._open_table(self.part, self._schema)
         return self
 
     def __exit__(
@@ -123,7 +125,7 @@ class _TableRun:
         whole = False
         try:
             self._background.finish()
-            self._end()
+            self._writer.close()
             whole = kind is None
         finally:
             if whole:
@@ -135,43 +137,21 @@ class _TableRun:
         """Take the next frame."""
         self._background.call(self._append, table_rows(self.simulation, frame))
 
-    def _begin(self) -> None:
-        raise NotImplementedError
-
-    def _append(self, rows: np.ndarray) -> None:
-        raise NotImplementedError
-
-    def _end(self) -> None:
-        raise NotImplementedError
-
-
-class _CsvRun(_TableRun):
-    def _begin(self) -> None:
-        from pyarrow import csv
-
-        self._schema = _schema(self.simulation)
-        self._writer = csv.CSVWriter(self.part, self._schema)
-
     def _append(self, rows: np.ndarray) -> None:
         self._writer.write_table(_table(rows, self._schema))
 
-    def _end(self) -> None:
-        self._writer.close()
+
+def _open_csv(path: Path, schema: Any) -> Any:
+    from pyarrow import csv
+
+    return csv.CSVWriter(path, schema)
 
 
-class _ParquetRun(_TableRun):
-    def _begin(self) -> None:
-        from pyarrow import parquet
+def _open_parquet(path: Path, schema: Any) -> Any:
+    from pyarrow import parquet
 
-        self._schema = _schema(self.simulation)
-        # Dictionaries would be tried in vain on every column of a continuous quantity.
-        self._writer = parquet.ParquetWriter(self.part, self._schema, compression="lz4", use_dictionary=False)
-
-    def _append(self, rows: np.ndarray) -> None:
-        self._writer.write_table(_table(rows, self._schema))
-
-    def _end(self) -> None:
-        self._writer.close()
+    # Dictionaries would be tried in vain on every column of a continuous quantity.
+    return parquet.ParquetWriter(path, schema, compression="lz4", use_dictionary=False)
 
 
 def _schema(simulation: Simulation) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from replays.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, check_suffix, draw_grid, new_figure, save
 from rig.contacts import (
     DAMPING,
     KELVIN_VOIGT,
@@ -34,30 +35,27 @@ SPEEDS = (1e-4, 1.0)
 DEPTHS_UM = (5, 10)
 """Penetrations at which the stiffness laws are compared [um]."""
 
-_BLACK, _ORANGE, _SKY, _GREEN, _BLUE, _RED, _PINK = (
-    "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7",
-)  # fmt: skip
-# Okabe and Ito's colours, which colour-blind readers can tell apart, and a dash for each law besides.
+# A dash for each law beside its colour.
 _STYLES: dict[str, tuple[str, Any]] = {
-    "exact": (_BLACK, "-"),
-    KELVIN_VOIGT: (_SKY, (0, (5, 4))),
+    "exact": (BLACK, "-"),
+    KELVIN_VOIGT: (SKY, (0, (5, 4))),
     "none": ("0.55", "-"),
-    "lee-wang": (_GREEN, "-"),
-    "lankarani-nikravesh": (_RED, "-"),
-    "hunt-crossley": (_BLUE, (0, (1, 1.2))),
-    "herbert-mcwhannell": (_PINK, (0, (6, 2))),
-    "zhiying-qishao": (_BLUE, "-"),
-    "gonthier": (_ORANGE, "-"),
-    "hu-guo": (_PINK, "-"),
-    "flores": (_GREEN, (0, (4, 1.5, 1, 1.5))),
-    "internal-sphere": (_BLACK, "-"),
+    "lee-wang": (GREEN, "-"),
+    "lankarani-nikravesh": (RED, "-"),
+    "hunt-crossley": (BLUE, (0, (1, 1.2))),
+    "herbert-mcwhannell": (PINK, (0, (6, 2))),
+    "zhiying-qishao": (BLUE, "-"),
+    "gonthier": (ORANGE, "-"),
+    "hu-guo": (PINK, "-"),
+    "flores": (GREEN, (0, (4, 1.5, 1, 1.5))),
+    "internal-sphere": (BLACK, "-"),
     "external-sphere": ("0.55", (0, (6, 2))),
-    "johnson-cylinder": (_BLUE, "-"),
-    "esdu-cylinder": (_ORANGE, "-"),
-    "dubowsky-freudenstein-cylinder": (_PINK, (0, (6, 2))),
-    "palmgren-cylinder": (_GREEN, (0, (4, 1.5, 1, 1.5))),
-    "pereira-cylinder": (_RED, "-"),
-    "liu-cylinder": (_SKY, "-"),
+    "johnson-cylinder": (BLUE, "-"),
+    "esdu-cylinder": (ORANGE, "-"),
+    "dubowsky-freudenstein-cylinder": (PINK, (0, (6, 2))),
+    "palmgren-cylinder": (GREEN, (0, (4, 1.5, 1, 1.5))),
+    "pereira-cylinder": (RED, "-"),
+    "liu-cylinder": (SKY, "-"),
 }
 
 
@@ -148,29 +146,18 @@ def draw(parameters: ParameterSet, path: Path) -> None:
     Raises:
         InputError: The file is neither .png nor .svg, or the parameters' own laws do not hold.
     """
-    if path.suffix not in (".png", ".svg"):
-        raise InputError("--plot", "a .png or .svg file", str(path))
+    check_suffix(path, field="--plot")
     normal_law(parameters)
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(14.0, 11.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    (wanted, difference), (speed, stiffness) = figure.subplots(2, 2)
-    figure.suptitle(
+    figure = new_figure(
+        (14.0, 11.5),
         f"Normal contact laws in free impacts without friction (parameters: {parameters.name}; not validated on a rig)",
-        fontsize=14,
     )
+    (wanted, difference), (speed, stiffness) = figure.subplots(2, 2)
     _draw_restitution(wanted, difference, parameters)
     _draw_speed(speed, parameters)
     _draw_stiffness(stiffness, parameters)
-    for axes in (wanted, difference, speed, stiffness):
-        axes.grid(visible=True, color="0.9", lw=0.6)
-        axes.set_axisbelow(True)
-    # Without a date and with fixed names, the same numbers give the same file.
-    with matplotlib.rc_context({"svg.hashsalt": "laws"}):
-        figure.savefig(path, dpi=120, metadata={"Date": None} if path.suffix == ".svg" else None)
+    draw_grid(wanted, difference, speed, stiffness)
+    save(figure, path, dpi=120)
 
 
 def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) -> None:
@@ -205,7 +192,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
     curves = over_speed(parameters, speeds)
     for (name, values), style in zip(
         curves.items(),
-        ({"color": _BLACK, "lw": 3.4}, {"color": _SKY, "ls": (0, (5, 4))}, {"color": _RED}),
+        ({"color": BLACK, "lw": 3.4}, {"color": SKY, "ls": (0, (5, 4))}, {"color": RED}),
         strict=True,
     ):
         axes.semilogx(speeds, values, **{"lw": 1.8, "label": name, **style})

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rig.errors import InputError
+from replays.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, check_suffix, draw_grid, new_figure, save
 from rig.magnets import (
     MagnetGeometry,
     MagnetMap,
@@ -27,9 +27,6 @@ from rig.model import Model
 
 FRACTIONS = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Displacements compared, of the reach."""
-
-_BLACK, _BLUE, _RED, _GREEN, _ORANGE, _SKY = "#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#56B4E9"
-# Okabe and Ito's colours, which colour-blind readers can tell apart.
 
 Force = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -112,39 +109,28 @@ def draw(model: Model, path: Path) -> None:
     Raises:
         InputError: The file is neither .png nor .svg.
     """
-    if path.suffix not in (".png", ".svg"):
-        raise InputError("--plot", "a .png or .svg file", str(path))
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+    check_suffix(path, field="--plot")
     geometry = model.magnets
-    figure = Figure(figsize=(14.0, 11.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    (magnets, scaled), (errors, ripple) = figure.subplots(2, 2)
-    figure.suptitle(
+    figure = new_figure(
+        (14.0, 11.0),
         f"Magnet models (parameters: {model.parameters.name}; {geometry.number} magnets of "
         f"{geometry.length * 1e3:g} mm are assumed; not validated on a rig)",
-        fontsize=14,
     )
+    (magnets, scaled), (errors, ripple) = figure.subplots(2, 2)
     _draw_same_magnets(magnets, model)
     _draw_same_stiffness(scaled, model)
     _draw_errors(errors, model)
     _draw_ripple(ripple, model)
-    for axes in (magnets, scaled, errors, ripple):
-        axes.grid(visible=True, color="0.9", lw=0.6)
-        axes.set_axisbelow(True)
-    # Without a date and with fixed names, the same numbers give the same file.
-    with matplotlib.rc_context({"svg.hashsalt": "magnets"}):
-        figure.savefig(path, dpi=120, metadata={"Date": None} if path.suffix == ".svg" else None)
+    draw_grid(magnets, scaled, errors, ripple)
+    save(figure, path, dpi=120)
 
 
 _STYLES: dict[str, dict[str, Any]] = {
     "linear": {"color": "0.55", "lw": 1.6, "ls": (0, (1, 1.2))},
-    "far-field map": {"color": _ORANGE, "lw": 2.0, "ls": (0, (5, 3)), "zorder": 4},
-    "far-field sum": {"color": _RED, "lw": 2.6},
-    "cylinder map": {"color": _SKY, "lw": 2.0, "ls": (0, (5, 3)), "zorder": 4},
-    "exact cylinders": {"color": _BLACK, "lw": 2.6},
+    "far-field map": {"color": ORANGE, "lw": 2.0, "ls": (0, (5, 3)), "zorder": 4},
+    "far-field sum": {"color": RED, "lw": 2.6},
+    "cylinder map": {"color": SKY, "lw": 2.0, "ls": (0, (5, 3)), "zorder": 4},
+    "exact cylinders": {"color": BLACK, "lw": 2.6},
 }
 
 
@@ -195,12 +181,12 @@ def _draw_errors(axes: Any, model: Model) -> None:
     forces = {name: each.force(x, y).reshape(len(angles), len(radii), 2) for name, each in models.items()}
     _shade_travel(axes, model)
     for name, better, same_stiffness, color, dash in (
-        ("far-field sum", "exact cylinders", False, _RED, "-"),
-        ("far-field sum", "exact cylinders", True, _RED, (0, (5, 3))),
+        ("far-field sum", "exact cylinders", False, RED, "-"),
+        ("far-field sum", "exact cylinders", True, RED, (0, (5, 3))),
         ("linear", "far-field map", True, "0.55", "-"),
         ("linear", "exact cylinders", True, "0.55", (0, (5, 3))),
-        ("far-field map", "far-field sum", False, _ORANGE, "-"),
-        ("cylinder map", "exact cylinders", False, _SKY, "-"),
+        ("far-field map", "far-field sum", False, ORANGE, "-"),
+        ("cylinder map", "exact cylinders", False, SKY, "-"),
     ):
         scale = models[better].stiffness / models[name].stiffness if same_stiffness else 1.0
         difference = np.linalg.norm(forces[name] * scale - forces[better], axis=-1).max(axis=0)
@@ -219,20 +205,20 @@ def _draw_ripple(axes: Any, model: Model) -> None:
     geometry = model.magnets
     angle = np.linspace(0.0, 4.0 * np.pi / geometry.number, 121)
     peak = 0.0
-    for fraction, color in ((1.0, _BLACK), (0.8, _BLUE), (0.5, _GREEN)):
+    for fraction, color in ((1.0, BLACK), (0.8, BLUE), (0.5, GREEN)):
         r = fraction * geometry.reach
         x, y = r * np.sin(angle), -r * np.cos(angle)
         for each in family(geometry)[2:]:
             force = np.linalg.norm(each.force(x, y), axis=-1)
             peak = max(peak, float(np.abs(force / force.mean() - 1.0).max()))
             style = {"far-field sum": {"ls": (0, (1, 1.2)), "lw": 1.6}, "exact cylinders": {"ls": "-", "lw": 2.6}}
-            dashed = {"ls": (0, (5, 3)), "lw": 2.0, "color": _SKY, "zorder": 4}
+            dashed = {"ls": (0, (5, 3)), "lw": 2.0, "color": SKY, "zorder": 4}
             axes.plot(
                 np.degrees(angle), force / force.mean() - 1.0,
                 **{"color": color, **style.get(each.name, dashed)},
             )  # fmt: skip
         axes.plot([], [], color=color, lw=2.6, label=f"{r * 1e3:.3g} mm: exact cylinders")
-    axes.plot([], [], color=_SKY, lw=2.0, ls=(0, (5, 3)), label="cylinder map")
+    axes.plot([], [], color=SKY, lw=2.0, ls=(0, (5, 3)), label="cylinder map")
     axes.plot([], [], color="0.3", lw=1.6, ls=(0, (1, 1.2)), label="far-field sum, same radii")
     axes.set(
         title="Ripple of the force over the direction", xlabel="direction from a magnet [deg]",

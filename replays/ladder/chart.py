@@ -6,35 +6,27 @@ import math
 from pathlib import Path
 from typing import Any
 
+from replays.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, new_figure, save
 from replays.ladder.document import python_line
 from replays.ladder.quantity import QUANTITIES
 from replays.ladder.search import Ladder, Step
 
-_BLACK, _ORANGE, _SKY, _GREEN, _BLUE, _RED, _PINK = (
-    "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7",
-)  # fmt: skip
-# Okabe and Ito's colours, which colour-blind readers can tell apart; shapes tell them apart once more.
-_ENGINES = ((_BLUE, "o"), (_ORANGE, "s"), (_GREEN, "D"), (_PINK, "^"), (_SKY, "v"), (_BLACK, "P"), (_RED, "X"))
+# Shapes tell the colours apart once more.
+_ENGINES = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PINK, "^"), (SKY, "v"), (BLACK, "P"), (RED, "X"))
 _MOST = 3
 """Quantities drawn; the document has them all."""
 
 
 def draw(ladder: Ladder, folder: Path) -> list[Path]:
     """Draw a search into ladder.png and ladder.svg of a folder that is made where needed."""
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     names = list(ladder.tolerances)[:_MOST]
     columns = len(names) + 1
-    figure = Figure(figsize=(4.6 * columns + 2.2, 11.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, columns, squeeze=False, gridspec_kw={"width_ratios": [*[1.0] * len(names), 0.95]})
-    figure.suptitle(
+    figure = new_figure(
+        (4.6 * columns + 2.2, 11.0),
         f"No more model than scene {ladder.scene.name} needs ({ladder.scene.duration_s:g} s; "
         f"parameters: {ladder.scene.parameters}, not validated on a rig)",
-        fontsize=14,
     )
+    axes = figure.subplots(2, columns, squeeze=False, gridspec_kw={"width_ratios": [*[1.0] * len(names), 0.95]})
     rungs = [step for step in ladder.steps if step.stage in ("full", "single", "together")]
     for column, name in enumerate(names):
         _draw_levels(axes[0, column], ladder, rungs, name, named=column == 0)
@@ -42,11 +34,7 @@ def draw(ladder: Ladder, folder: Path) -> list[Path]:
     _draw_work(axes[0, -1], rungs)
     _write_evidence(axes[1, -1], ladder)
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / "ladder.png", folder / "ladder.svg"]
-    with matplotlib.rc_context({"svg.hashsalt": "ladder"}):
-        for path in paths:
-            figure.savefig(path, dpi=110, metadata={"Date": None} if path.suffix == ".svg" else None)
-    return paths
+    return save(figure, folder / "ladder.png", folder / "ladder.svg")
 
 
 def _range(ladder: Ladder, name: str) -> tuple[float, float]:
@@ -73,7 +61,7 @@ def _dress(axes: Any, ladder: Ladder, name: str) -> tuple[float, float]:
     axes.axvline(high / 8.0, color="0.7", lw=0.8)
     own = ladder.reference_errors[name]
     if own > low:
-        axes.axvline(own, color=_SKY, lw=2.0, zorder=1)
+        axes.axvline(own, color=SKY, lw=2.0, zorder=1)
     axes.set_xlabel(f"error of {name.replace('_', ' ')},\nas part of {quantity.scale_title} [1]")
     axes.grid(visible=True, which="major", color="0.88", lw=0.6)
     axes.set_axisbelow(True)
@@ -104,7 +92,7 @@ def _draw_levels(axes: Any, ladder: Ladder, rungs: list[Step], name: str, *, nam
             row,
             marker="o" if good else "X",
             ms=8,
-            color=_BLUE if good else _RED,
+            color=BLUE if good else RED,
             mec="white",
             ls="none",
             zorder=3,
@@ -135,7 +123,7 @@ def _draw_work(axes: Any, rungs: list[Step]) -> None:
         if cost is None:
             continue
         wall = cost.wall_s * 1e3
-        axes.barh(row, wall, height=0.55, color=_SKY if step.stage != "together" else _BLUE, zorder=2)
+        axes.barh(row, wall, height=0.55, color=SKY if step.stage != "together" else BLUE, zorder=2)
         axes.plot([cost.spread_s[0] * 1e3, cost.spread_s[1] * 1e3], [row, row], color="0.2", lw=1.4, zorder=3)
         axes.annotate(
             f"{wall:.3g}  ({cost.rung.method})", (max(wall, cost.spread_s[1] * 1e3), row), xytext=(5, 0),
@@ -173,14 +161,14 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, legend: bool) -> None:
     assert errors is not None
     chosen = next(step for step in ladder.steps if step.stage == "engine" and step.measured.rung == picked.rung)
     axes.plot(
-        _placed(errors.total[name], low, high), chosen.measured.wall_s * 1e3, marker="*", ms=20, color=_RED,
+        _placed(errors.total[name], low, high), chosen.measured.wall_s * 1e3, marker="*", ms=20, color=RED,
         mec="black", ls="none", zorder=4, label=f"pick: {picked.rung.method}",
     )  # fmt: skip
     axes.plot([], [], color="0.3", marker="o", mfc="white", ls=":", label="numerical error alone")
     axes.plot([], [], color="0.3", marker="o", label="total error")
     axes.plot([], [], color="0.45", marker="x", ls="none", label="one level lowered: model error")
     axes.plot([], [], color="0.3", ls="--", label="tolerance")
-    axes.plot([], [], color=_SKY, lw=2.0, label="the reference's own error")
+    axes.plot([], [], color=SKY, lw=2.0, label="the reference's own error")
     axes.set_yscale("log")
     axes.set_ylabel("wall time of a simulated second, no sensors [ms]" if legend else "")
     axes.annotate(

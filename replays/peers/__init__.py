@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from replays.peers.problem import ERROR_COLUMNS, ERROR_SCALE, Problem, scaled_error
-from replays.peers.solution import Journal, Setting, Solution
+from replays.peers.solution import Journal, Manner, Setting, Solution
 from rig.errors import InputError
 
 __all__ = [
@@ -104,6 +104,7 @@ class Peer:
             return begun.close()
 
 
+_PLAIN, _UNSTOPPED, _EVENTLESS = Manner(plain=True), Manner(stops=False), Manner(events=False)
 _NO_STOPS = "no stop at the hammer's corners: may step over the pulse"
 _NO_EVENTS = "no events: the impact speed is latched at a step's end"
 
@@ -127,22 +128,22 @@ _ALL = (
     Peer(
         "scipy-bdf-python", "scipy BDF + events, plain Python", "scipy", "1 to 5", "as installed",
         (ODE15S, *_ladder(1e-4, 1e-6)), "scipy_solvers", exact_friction=False,
-        options={"method": "BDF", "plain": True},
+        options={"method": "BDF", "manner": _PLAIN},
     ),
     Peer(
         "scipy-bdf-no-stops", "scipy BDF + events, no stops", "scipy", "1 to 5", "compiled",
         (ODE15S, *_ladder(1e-3, 1e-4, 1e-6)), "scipy_solvers", known_failure=_NO_STOPS,
-        options={"method": "BDF", "stops": False},
+        options={"method": "BDF", "manner": _UNSTOPPED},
     ),
     Peer(
         "scipy-bdf-no-events", "scipy BDF, no events", "scipy", "1 to 5", "compiled",
         (ODE15S, *_ladder(1e-3, 1e-4, 1e-6, 1e-8)), "scipy_solvers", known_failure=_NO_EVENTS, exact_friction=False,
-        options={"method": "BDF", "events": False},
+        options={"method": "BDF", "manner": _EVENTLESS},
     ),
     Peer(
         "scipy-dop853-no-events", "scipy DOP853, no events", "scipy", "8", "compiled",
         _ladder(1e-3, 1e-4, 1e-6, 1e-8), "scipy_solvers", known_failure=_NO_EVENTS, exact_friction=False,
-        options={"method": "DOP853", "events": False},
+        options={"method": "DOP853", "manner": _EVENTLESS},
     ),
     Peer(
         "cvode-bdf", "CVODE BDF", "SUNDIALS", "1 to 5", "compiled", _CVODE, "cvode", module="sksundae",
@@ -155,22 +156,22 @@ _ALL = (
     Peer(
         "cvode-bdf-python", "CVODE BDF, plain Python", "SUNDIALS", "1 to 5", "as installed",
         _ladder(1e-4, 1e-6, 1e-8), "cvode", exact_friction=False, module="sksundae",
-        options={"method": 2, "plain": True},
+        options={"method": 2, "manner": _PLAIN},
     ),
     Peer(
         "cvode-adams-python", "CVODE Adams, plain Python", "SUNDIALS", "1 to 12", "as installed",
         _ladder(1e-4, 1e-6, 1e-8), "cvode", exact_friction=False, module="sksundae",
-        options={"method": 1, "plain": True},
+        options={"method": 1, "manner": _PLAIN},
     ),
     Peer(
         "cvode-bdf-no-stops", "CVODE BDF, no stops", "SUNDIALS", "1 to 5", "compiled",
         _ladder(1e-3, 1e-4, 1e-6), "cvode", known_failure=_NO_STOPS, module="sksundae",
-        options={"method": 2, "stops": False},
+        options={"method": 2, "manner": _UNSTOPPED},
     ),
     Peer(
         "cvode-bdf-no-events", "CVODE BDF, no events", "SUNDIALS", "1 to 5", "compiled",
         _ladder(1e-3, 1e-4, 1e-6, 1e-8), "cvode", known_failure=_NO_EVENTS, exact_friction=False, module="sksundae",
-        options={"method": 2, "events": False},
+        options={"method": 2, "manner": _EVENTLESS},
     ),
     Peer(
         "heyoka", "heyoka, Taylor series", "heyoka", "5 to 20, by the tolerance", "compiled",

@@ -34,7 +34,7 @@ from replays.peers.right_hand_side import (
     take_switch,
     vector_callbacks,
 )
-from replays.peers.solution import MISSED_HAMMER, SWITCH_CEILING, Journal, Setting, Solution
+from replays.peers.solution import MISSED_HAMMER, PROPER, SWITCH_CEILING, Journal, Manner, Setting, Solution
 from rig.kernels.signals import STATE_SCALE
 
 ADAMS, BDF = 1, 2
@@ -176,16 +176,7 @@ def _loop() -> tuple[Any, float]:
     return run, time.perf_counter() - begin
 
 
-def solve(
-    problem: Problem,
-    *,
-    setting: Setting,
-    budget_s: float,
-    method: int,
-    plain: bool = False,
-    stops: bool = True,
-    events: bool = True,
-) -> Solution:
+def solve(problem: Problem, *, setting: Setting, budget_s: float, method: int, manner: Manner = PROPER) -> Solution:
     """Solve a problem by CVODE.
 
     Args:
@@ -193,19 +184,17 @@ def solve(
         setting: Tolerances.
         budget_s: Wall time allowed [s].
         method: ADAMS or BDF.
-        plain: scikit-sundae's own interface with plain Python callbacks.
-        stops: False leaves out the stops at the hammer's corners.
-        events: False leaves out root finding.
+        manner: How it is driven.
     """
-    if plain:
+    if manner.plain:
         return _solve_plain(problem, setting=setting, budget_s=budget_s, method=method)
-    if not events and problem.exact_friction:
+    if not manner.events and problem.exact_friction:
         raise NotImplementedError("exact friction needs events")
     run, compiling_s = _loop()
     library = _library()
     parameters = pack(problem)
     pulse = problem.pulse
-    corners = np.array([*(problem.corners if stops else ()), problem.duration_s])
+    corners = np.array([*(problem.corners if manner.stops else ()), problem.duration_s])
     onsets = np.empty((SWITCH_CEILING, 2))
     now = np.zeros(8)
     now[_SAMPLE] = 1.0
@@ -213,20 +202,20 @@ def solve(
     journal = Journal(problem.times, budget_s, compiling_s)
     journal.states[0] = problem.y0
     with ExitStack() as stack:
-        session = _Session(library, problem, parameters, setting, method=method, events=events, stack=stack)
+        session = _Session(library, problem, parameters, setting, method=method, events=manner.events, stack=stack)
         library.CVodeSetStopTime(session.memory, corners[0])
         done = False
         while not done:
             done = run(
                 session.memory, session.place, session.y, session.spare_place, session.spare, parameters, problem.times,
-                corners, np.array(pulse or (0.0, 0.0)), journal.states, onsets, now, events,
+                corners, np.array(pulse or (0.0, 0.0)), journal.states, onsets, now, manner.events,
             )  # fmt: skip
             journal.steps, journal.switches = int(now[_STEPS]), int(now[_SWITCHES])
             done = done or journal.overrun()
     flag = int(now[_FLAG])
     if journal.failure is None and flag < 0:
         journal.failure = f"CVODE gave up at {now[_T]:.6g} s: {_MESSAGES.get(flag, f'flag {flag}')}"
-    if journal.failure is None and not stops and pulse is not None and now[_PULSE_SEEN] == 0.0:
+    if journal.failure is None and not manner.stops and pulse is not None and now[_PULSE_SEEN] == 0.0:
         journal.failure = MISSED_HAMMER
     journal.onsets = [(float(t), float(speed)) for t, speed in onsets[: int(now[_ONSETS])]]
     journal.evaluations = int(parameters[0]["evaluations"])

@@ -27,7 +27,7 @@ from replays.peers.right_hand_side import (
     switching,
     take_switch,
 )
-from replays.peers.solution import MISSED_HAMMER, Journal, Setting, Solution
+from replays.peers.solution import MISSED_HAMMER, PROPER, Journal, Manner, Setting, Solution
 from rig.kernels.signals import STATE_SCALE
 
 LEAST_TOLERANCE = 2.3e-14
@@ -44,16 +44,7 @@ class _Law(NamedTuple):
     plain: PlainPython | None
 
 
-def solve(
-    problem: Problem,
-    *,
-    setting: Setting,
-    budget_s: float,
-    method: str,
-    plain: bool = False,
-    stops: bool = True,
-    events: bool = True,
-) -> Solution:
+def solve(problem: Problem, *, setting: Setting, budget_s: float, method: str, manner: Manner = PROPER) -> Solution:
     """Solve a problem by one of scipy's methods.
 
     Args:
@@ -61,22 +52,20 @@ def solve(
         setting: Tolerances.
         budget_s: Wall time allowed [s].
         method: BDF, Radau, LSODA or DOP853.
-        plain: The right-hand side in plain Python instead of the compiled one.
-        stops: False leaves out the stops at the hammer's corners.
-        events: False leaves out event location.
+        manner: How it is driven.
     """
     import scipy.integrate
     import scipy.optimize  # here, to be off the clock
 
-    if not events and problem.exact_friction:
+    if not manner.events and problem.exact_friction:
         raise NotImplementedError("exact friction needs events")
     integrator: Any = getattr(scipy.integrate, method)
-    compiling_s = 0.0 if plain else compile_s()
+    compiling_s = 0.0 if manner.plain else compile_s()
     parameters = pack(problem)
-    law = _law(problem, parameters, plain=plain, events=events)
+    law = _law(problem, parameters, manner)
     rtol = max(setting.tolerance, LEAST_TOLERANCE)
     atol = setting.tolerance * STATE_SCALE if setting.absolute is None else setting.absolute
-    corners = [*problem.corners, problem.duration_s] if stops else [problem.duration_s]
+    corners = [*problem.corners, problem.duration_s] if manner.stops else [problem.duration_s]
     pulse = problem.pulse
     pulse_seen = pulse is None
 
@@ -100,7 +89,7 @@ def solve(
                 break
             # A function that starts at 0 to rounding may be back below it within the first step.
             fallen = [i for i in range(N_SWITCH) if after[i] <= 0.0 and (before[i] > 0.0 or young)]
-            met = _first_zero(law, run, fallen) if events and fallen else None
+            met = _first_zero(law, run, fallen) if manner.events and fallen else None
             t = run.t if met is None else met[0]
             pulse_seen = pulse_seen or (pulse is not None and pulse[0] < t < pulse[1])
             _sample(journal, run, t)
@@ -108,24 +97,24 @@ def solve(
                 y = run.dense_output()(t)
                 _switch(journal, law, parameters, t, y, met[1])
                 break
-            if not events and follow_sign(t, run.y, parameters):
+            if not manner.events and follow_sign(t, run.y, parameters):
                 journal.onsets.append((t, float(parameters[0]["onset_speed"])))
             y, before, young = run.y, after, False
         if t >= corners[0]:
             corners.pop(0)
     journal.evaluations = law.plain.evaluations if law.plain else int(parameters[0]["evaluations"])
     # With stops, a step from corner to corner has its stages inside.
-    if journal.failure is None and not stops and not pulse_seen:
+    if journal.failure is None and not manner.stops and not pulse_seen:
         journal.failure = MISSED_HAMMER
     journal.phase, journal.onset_speed = int(parameters[0]["phase"]), float(parameters[0]["onset_speed"])
     return journal.close()
 
 
-def _law(problem: Problem, parameters: np.ndarray, *, plain: bool, events: bool) -> _Law:
-    if plain:
+def _law(problem: Problem, parameters: np.ndarray, manner: Manner) -> _Law:
+    if manner.plain:
         callbacks = PlainPython(problem)
         return _Law(callbacks.rates, callbacks.switching, callbacks)
-    rates = derivative if events else derivative_by_sign
+    rates = derivative if manner.events else derivative_by_sign
     return _Law(lambda t, y: rates(t, y, parameters), lambda t, y: switching(t, y, parameters), None)
 
 

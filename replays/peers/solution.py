@@ -27,6 +27,20 @@ class Setting(NamedTuple):
     """One absolute tolerance for all states; None for tolerance times `STATE_SCALE`."""
 
 
+class Manner(NamedTuple):
+    """How a library's solver is driven: the default is the proper way, the others are those known to fail or to lag."""
+
+    plain: bool = False
+    """The right-hand side in plain Python through the library's own interface, instead of the compiled one."""
+    stops: bool = True
+    """Whether it stops at the hammer's corners."""
+    events: bool = True
+    """Whether changes of phase are located; where not, the right-hand side itself asks for the gap's sign."""
+
+
+PROPER = Manner()
+
+
 @dataclass(frozen=True)
 class Solution:
     """One solve of one problem. A failure is a result like any other.

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from replays.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, draw_grid, new_figure, save
 from replays.stability import atlas, boundary
 from replays.stability.trials import (
     first_impact,
@@ -17,18 +18,17 @@ from replays.stability.trials import (
 )
 from rig.engines import ENGINES
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart, and a marker for each engine besides.
+# A marker for each engine beside its colour.
 _STYLES: dict[str, tuple[str, str]] = {
-    "split": ("#000000", "o"),
-    "rk8": ("#0072B2", "s"),
-    "tsit5": ("#56B4E9", "^"),
-    "rk4": ("#D55E00", "D"),
-    "verlet": ("#E69F00", "v"),
-    "semi-implicit-euler": ("#CC79A7", "P"),
-    "rosenbrock": ("#009E73", "X"),
+    "split": (BLACK, "o"),
+    "rk8": (BLUE, "s"),
+    "tsit5": (SKY, "^"),
+    "rk4": (RED, "D"),
+    "verlet": (ORANGE, "v"),
+    "semi-implicit-euler": (PINK, "P"),
+    "rosenbrock": (GREEN, "X"),
 }
-_UNSTABLE = "#D55E00"
-_CLASS_COLOURS = ("#F2F2F2", "#F0E442", "#E69F00", "#0072B2")
+_CLASS_COLOURS = ("#F2F2F2", "#F0E442", ORANGE, BLUE)
 
 
 def draw_all(folder: Path, engines: list[str], *, quick: bool) -> list[Path]:
@@ -45,7 +45,8 @@ def draw_all(folder: Path, engines: list[str], *, quick: bool) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     files: list[Path] = []
     for name, draw in (("map", draw_map), ("ladders", draw_ladders), ("whirl", draw_whirl)):
-        files += _save(draw(engines, quick=quick), folder / f"stability-{name}")
+        figure = draw(engines, quick=quick)
+        files += save(figure, *(folder / f"stability-{name}{suffix}" for suffix in (".png", ".svg")))
     return files
 
 
@@ -53,9 +54,15 @@ def draw_map(engines: list[str], *, quick: bool) -> Any:
     """Energy of an undamped oscillator after 60 periods over step and stiffness, a row an oscillator."""
     from matplotlib.colors import LogNorm
 
-    figure, axes = _figure(2, len(engines), (2.75 * len(engines) + 1.6, 7.4))
+    figure = new_figure(
+        (2.75 * len(engines) + 1.6, 7.4),
+        "Undamped oscillators over step and stiffness (dotted: the engine's own step; line: the limit by theory; "
+        "grey: not run, too slow or far beyond)",
+        title_size=12,
+    )
+    axes = figure.subplots(2, len(engines), squeeze=False)
     points = 16 if quick else 40
-    image = None
+    image: Any = None
     titles = {"house": "inner house on its beam", "contact": "shaft on a linear contact"}
     for row, oscillator in enumerate(titles):
         for column, engine in enumerate(engines):
@@ -71,7 +78,7 @@ def draw_map(engines: list[str], *, quick: bool) -> Any:
             )  # fmt: skip
             from matplotlib.colors import ListedColormap
 
-            ax.pcolormesh(x, y, unstable, cmap=ListedColormap([_UNSTABLE]), shading="nearest", rasterized=True)
+            ax.pcolormesh(x, y, unstable, cmap=ListedColormap([RED]), shading="nearest", rasterized=True)
             if np.isfinite(chart.limit):
                 ax.plot(x, chart.mass * (chart.limit / (x * 1e-6)) ** 2, color="black", lw=2.2)
                 ax.text(
@@ -95,18 +102,13 @@ def draw_map(engines: list[str], *, quick: bool) -> Any:
                 ax.tick_params(labelleft=False)
     bar = figure.colorbar(image, ax=axes.ravel().tolist(), shrink=0.8, pad=0.01)
     bar.set_label("|E/E0 - 1| after 60 periods [1]; orange: grows without end")
-    figure.suptitle(
-        "Undamped oscillators over step and stiffness (dotted: the engine's own step; line: the limit by theory; "
-        "grey: not run, too slow or far beyond)",
-        fontsize=12,
-    )
     return figure
 
 
 def draw_ladders(engines: list[str], *, quick: bool) -> Any:
     """Smoothing speed against the set-valued limit; approach speed; v0 gone stale in a lasting contact."""
-    figure, axes = _figure(1, 3, (16.0, 6.4))
-    smooth, graze, stale = axes[0]
+    figure = new_figure((16.0, 6.4), "Ladders of v_s and v0, every engine at its own step and tolerance", title_size=13)
+    smooth, graze, stale = figure.subplots(1, 3)
     speeds = np.geomspace(1e-2, 1e-5, 7).tolist() if quick else np.geomspace(1e-2, 1e-9, 15).tolist()
     for engine in engines:
         colour, marker = _STYLES.get(engine, ("0.5", "."))
@@ -139,21 +141,18 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
         title="One impact, grazing to hard,\nagainst its quadrature", xlabel="approach speed v0 [m/s]",
         ylabel="relative error of the restitution [1]", ylim=(1e-12, 1e-1),
     )  # fmt: skip
-    stale.axhspan(2e-2, 1e3, color="#D55E00", alpha=0.08)
+    stale.axhspan(2e-2, 1e3, color=RED, alpha=0.08)
     stale.annotate("beyond the limit of trial T14", (1.0, 2.6e-2), ha="right", color="#A04000", fontsize=9)
     stale.set(
         title="Lasting contact, stale v0: pushed in\nfrom rest with up to 1.6 kN", xlabel="v0 held, its floor [m/s]",
         ylabel="error of the depth over the deepest [1]", ylim=(1e-12, 1e3),
     )  # fmt: skip
-    for ax in axes[0]:
-        ax.grid(visible=True, color="0.9", lw=0.6)
-        ax.set_axisbelow(True)
+    draw_grid(smooth, graze, stale)
     shown = dict(zip(*reversed(stale.get_legend_handles_labels()), strict=True))
     shown |= dict(zip(*reversed(smooth.get_legend_handles_labels()), strict=True))
     figure.legend(
         shown.values(), shown.keys(), loc="outside lower center", ncols=len(shown), fontsize=10, frameon=False
     )
-    figure.suptitle("Ladders of v_s and v0, every engine at its own step and tolerance", fontsize=13)
     return figure
 
 
@@ -165,7 +164,12 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
     able = [engine for engine in engines if friction_of(engine) == "exact"]
     points = 12 if quick else 28
     right = boundary.chart("tsit5", points=points, tolerance=1e-9)
-    figure, axes = _figure(1, max(1, len(able)), (3.3 * max(1, len(able)) + 0.6, 4.9))
+    figure = new_figure(
+        (3.3 * max(1, len(able)) + 0.6, 4.9),
+        "A 5 ms blow at 6.2 Hz, after 0.6 s; line: boundary by tsit5 at 1e-9; x: another class than there",
+        title_size=12,
+    )
+    panels = figure.subplots(1, max(1, len(able)), squeeze=False)[0]
     colours, norm = ListedColormap(_CLASS_COLOURS), BoundaryNorm([-0.5, 0.5, 1.5, 2.5, 3.5], 4)
     clear = boundary.clear_of_boundary(right.classes)
     impulses = right.forces * 5e-3 * 2.0 / np.pi  # half sine of 5 ms
@@ -176,7 +180,7 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
         return np.linspace(axis[0] - 0.95 * half, axis[-1] + 0.95 * half, 20 * len(axis))
 
     shown = set(right.classes.ravel().tolist())
-    for ax, engine in zip(axes[0], able, strict=False):
+    for ax, engine in zip(panels, able, strict=False):
         found = boundary.chart(engine, points=points)
         ax.pcolormesh(found.frictions, impulses, found.classes, cmap=colours, norm=norm, shading="nearest")
         ax.contour(fine(right.frictions), fine(impulses), np.kron(right.classes == boundary.ROLLING, np.ones((20, 20))),
@@ -184,11 +188,11 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
         shown |= set(found.classes.ravel().tolist())
         wrong = found.classes != right.classes
         rows, columns = np.nonzero(wrong)
-        ax.plot(found.frictions[columns], impulses[rows], "x", color="#D55E00", ms=8, mew=2.4)
+        ax.plot(found.frictions[columns], impulses[rows], "x", color=RED, ms=8, mew=2.4)
         grave = int(np.sum(wrong & clear))
         ax.set_title(f"{engine}\n{int(wrong.sum())} of {wrong.size} differ, {grave} off the boundary", fontsize=10.5)
         ax.set_xlabel("friction coefficient mu [1]")
-        if ax is axes[0][0]:
+        if ax is panels[0]:
             ax.set_ylabel("impulse of the blow [N s]")
         else:
             ax.tick_params(labelleft=False)
@@ -196,10 +200,6 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
         Patch(fc=_CLASS_COLOURS[number], ec="0.5", label=boundary.NAMES[number]) for number in sorted(shown)
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=10, frameon=False)
-    figure.suptitle(
-        "A 5 ms blow at 6.2 Hz, after 0.6 s; line: boundary by tsit5 at 1e-9; x: another class than there",
-        fontsize=12,
-    )
     return figure
 
 
@@ -207,23 +207,3 @@ def _why(engine: str, oscillator: str) -> str:
     if engine == "split" and oscillator == "house":
         return "exact flow"
     return "error control" if ENGINES[engine].tolerance else "none known"
-
-
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False)
-
-
-def _save(figure: Any, stem: Path) -> list[Path]:
-    import matplotlib
-
-    files = [stem.with_suffix(".png"), stem.with_suffix(".svg")]
-    # Without a date and with fixed names, the same numbers give the same file.
-    with matplotlib.rc_context({"svg.hashsalt": "stability"}):
-        figure.savefig(files[0], dpi=110)
-        figure.savefig(files[1], metadata={"Date": None})
-    return files

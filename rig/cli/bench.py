@@ -6,10 +6,13 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.options import Json
+from rig.cli.tables import new_table
+
 
 def bench(
     *,
-    json_output: Annotated[bool, typer.Option("--json", help="As a JSON document.")] = False,
+    json_output: Json = False,
     runs: Annotated[int, typer.Option(min=1, max=100, help="Runs of each case.")] = 5,
     peers: Annotated[
         bool, typer.Option(help="Time CVODE and heyoka in the same rounds, where they are installed.")
@@ -21,7 +24,6 @@ def bench(
     import sys
 
     from rich.console import Console
-    from rich.table import Table
 
     from replays.bench import measure
 
@@ -32,7 +34,7 @@ def bench(
     if json_output:
         typer.echo(json.dumps(report, indent=2))
         return
-    table = Table(title=f"times real time, {runs} runs", box=None, header_style="bold", title_justify="left")
+    table = new_table(f"times real time, {runs} runs")
     table.add_column("case")
     for heading in ("median", "min", "max", "of the first", "error", "energy residual", "goal"):
         table.add_column(heading, justify="right")

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any
+from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
+
+from rig.cli.tables import table_console
 
 if TYPE_CHECKING:
     import subprocess
@@ -54,7 +56,7 @@ def demo(
 
     say("reading the recording")
     from recorder.reader import Recording
-    from replays.figure import draw
+    from replays.picture import draw
     from replays.verdict import judge
 
     recording = Recording.open(file)
@@ -167,7 +169,6 @@ def _free_port() -> int:
 
 
 def _show(verdict: Verdict) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     table = Table(title="Verdict, from the recorded samples", title_justify="left", header_style="bold")
@@ -176,5 +177,4 @@ def _show(verdict: Verdict) -> None:
     marks = {True: "[green]good[/]", False: "[bold red]NOT GOOD[/]", None: ""}
     for row in verdict.rows:
         table.add_row(row.quantity, row.measured, row.expected, marks[row.good])
-    options: dict[str, Any] = {} if Console().is_terminal else {"width": 150}
-    Console(**options).print(table)
+    table_console(width=150).print(table)

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.tables import table_console
+
 
 def keys(
     *,
@@ -17,8 +19,6 @@ def keys(
     if markdown:
         typer.echo(page(), nl=False)
         return
-    from rich.console import Console
     from rich.markdown import Markdown
 
-    console = Console()
-    (console if console.is_terminal else Console(width=160)).print(Markdown(page()))
+    table_console(width=160).print(Markdown(page()))

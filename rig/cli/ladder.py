@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.options import Changes, SceneName
+from rig.cli.tables import new_table, table_console
+
 if TYPE_CHECKING:
     from rich.table import Table
 
 
 def ladder(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")],
+    scene: SceneName,
     *,
     quantity: Annotated[
         list[str], typer.Option("--quantity", "-q", metavar="NAME", help="What counts; may be repeated.")
@@ -31,9 +34,7 @@ def ladder(
     keep: Annotated[
         list[str] | None, typer.Option(metavar="LEVEL", help="A level that stays as full as it is; may be repeated.")
     ] = None,
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
-    ] = None,
+    changes: Changes = None,
     runs: Annotated[int, typer.Option(min=1, help="Timed runs of each rung.")] = 3,
     budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
 ) -> None:
@@ -88,9 +89,7 @@ def ladder(
 
 
 def _show(document: dict[str, Any]) -> None:
-    from rich.console import Console
-
-    console = Console(width=None if Console().is_terminal else 160, highlight=False)
+    console = table_console(width=160, highlight=False)
     console.print(_levels_table(document))
     console.print()
     console.print(_engines_table(document))
@@ -121,19 +120,13 @@ def _show(document: dict[str, Any]) -> None:
         console.print("  the budget ended before every engine was tried")
 
 
-def _table(title: str) -> Table:
-    from rich.table import Table
-
-    return Table(title=title, box=None, header_style="bold", title_justify="left")
-
-
 def _error(value: float | None) -> str:
     return "-" if value is None else f"{value:.1e}"
 
 
 def _levels_table(document: dict[str, Any]) -> Table:
     names = [entry["name"] for entry in document["quantities"]]
-    table = _table(f"Levels of the model in scene {document['scene']}: model error, each against the full model")
+    table = new_table(f"Levels of the model in scene {document['scene']}: model error, each against the full model")
     table.add_column("level")
     for name in names:
         table.add_column(name, justify="right")
@@ -157,7 +150,7 @@ def _levels_table(document: dict[str, Any]) -> Table:
 
 def _engines_table(document: dict[str, Any]) -> Table:
     names = [entry["name"] for entry in document["quantities"]]
-    table = _table("Engines and steps on the picked model: numerical error, total error")
+    table = new_table("Engines and steps on the picked model: numerical error, total error")
     table.add_column("engine")
     for name in names:
         table.add_column(name, justify="right")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from rig.cli.comparison import answer
+from rig.cli.options import Changes, Json, Plot, SetName
+from rig.cli.tables import new_table, table_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -15,43 +18,26 @@ _ROOM = 140
 
 
 def laws(
-    name: Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, by name or path.")] = "corrected",
+    name: SetName = "corrected",
     *,
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
-    ] = None,
+    changes: Changes = None,
     restitution: Annotated[
         float | None, typer.Option("--restitution", metavar="E", help="Restitution asked for, instead of the set's.")
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")
-    ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="As a JSON document.")] = False,
+    plot: Plot = None,
+    json_output: Json = False,
 ) -> None:
     """Compare all normal contact laws: restitution asked for and returned, force, time of contact, stiffness."""
-    import json
-
     from replays.laws import compare, draw
     from rig.cli.params import changed_parameters
 
     also = {} if restitution is None else {"contact.restitution": restitution}
     parameters = changed_parameters(name, changes, also)
-    if plot is not None:
-        draw(parameters, plot)
-    document = compare(parameters)
-    if json_output:
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
-        return
-    _show(document)
-    if plot is not None:
-        typer.echo(f"\npicture  {plot}")
+    answer(parameters, compare=compare, draw=draw, show=_show, plot=plot, as_json=json_output)
 
 
 def _show(document: dict[str, Any]) -> None:
-    from rich.console import Console
-
-    # Into a pipe the tables keep their whole width; on a terminal they fit it.
-    console = Console(width=None if Console().is_terminal else 200)
+    console = table_console()
     # Beside the numbers, formulas and sources need room.
     notes = console.width >= _ROOM
     impact, used = document["impact"], document["in_use"]
@@ -83,16 +69,10 @@ def _show(document: dict[str, Any]) -> None:
     )
 
 
-def _table(title: str) -> Table:
-    from rich.table import Table
-
-    return Table(title=title, box=None, header_style="bold", title_justify="left")
-
-
 def _damping_table(document: dict[str, Any], *, notes: bool) -> Table:
     from rich.text import Text  # brackets are units here, not markup
 
-    table = _table(f"damping laws at e = {document['restitution']:g} ({document['set']})")
+    table = new_table(f"damping laws at e = {document['restitution']:g} ({document['set']})")
     for heading in ("", "law"):
         table.add_column(heading, no_wrap=True)
     for heading in ("c", "D [N s/m]", "returned", "off by", "peak [N]", "contact [ms]"):
@@ -118,7 +98,7 @@ def _damping_table(document: dict[str, Any], *, notes: bool) -> Table:
 def _stiffness_table(document: dict[str, Any], *, notes: bool) -> Table:
     from rich.text import Text
 
-    table = _table("stiffness laws")
+    table = new_table("stiffness laws")
     for heading in ("", "law"):
         table.add_column(heading, no_wrap=True)
     for heading in ("K [N/m^n]", "n", "fit", "from - to [um]", "5 um [N]", "10 um [N]"):

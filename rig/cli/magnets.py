@@ -2,50 +2,34 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
+from rig.cli.comparison import answer
+from rig.cli.options import Changes, Json, Plot, SetName
+from rig.cli.tables import new_table, table_console
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 
 def magnets(
-    name: Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, by name or path.")] = "corrected",
+    name: SetName = "corrected",
     *,
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")
-    ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="As a JSON document.")] = False,
+    changes: Changes = None,
+    plot: Plot = None,
+    json_output: Json = False,
 ) -> None:
     """Compare the magnet models: spring, far-field sum, exact cylinders, and the maps that stand for them in a run."""
-    import json
-
     from replays.magnets import compare, draw
     from rig.cli.params import changed_parameters
     from rig.model import build_model
 
     model = build_model(changed_parameters(name, changes))
-    if plot is not None:
-        draw(model, plot)
-    document = compare(model)
-    if json_output:
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
-        return
-    _show(document)
-    if plot is not None:
-        typer.echo(f"\npicture  {plot}")
+    answer(model, compare=compare, draw=draw, show=_show, plot=plot, as_json=json_output)
 
 
 def _show(document: dict[str, Any]) -> None:
-    from rich.console import Console
-
-    # Into a pipe the tables keep their whole width; on a terminal they fit it.
-    console = Console(width=None if Console().is_terminal else 200)
+    console = table_console()
     geometry, overstated = document["geometry"], document["overstated"]
     console.print(
         _force_table(document, "force_toward_a_magnet_n", f"force toward the centre, same magnets ({document['set']})")
@@ -69,10 +53,9 @@ def _show(document: dict[str, Any]) -> None:
 
 
 def _force_table(document: dict[str, Any], column: str, title: str) -> Table:
-    from rich.table import Table
     from rich.text import Text  # brackets are units here, not markup
 
-    table = Table(title=title, box=None, header_style="bold", title_justify="left")
+    table = new_table(title)
     table.add_column("model", no_wrap=True)
     table.add_column("runs as", no_wrap=True)
     table.add_column(Text("K [kN/m]"), justify="right", no_wrap=True)
@@ -87,9 +70,7 @@ def _force_table(document: dict[str, Any], column: str, title: str) -> Table:
 
 
 def _error_table(document: dict[str, Any]) -> Table:
-    from rich.table import Table
-
-    table = Table(title="errors", box=None, header_style="bold", title_justify="left")
+    table = new_table("errors")
     for heading in ("model", "against", "with the same"):
         table.add_column(heading, no_wrap=True)
     travel = min(document["travel_mm"], document["reach_mm"])

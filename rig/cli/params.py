@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
+
+from rig.cli.options import Changes, Json, SetName
+from rig.cli.tables import new_table, table_console
 
 if TYPE_CHECKING:
     from rig.parameters import ParameterSet
 
 
 def params(
-    name: Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, by name or path.")] = "corrected",
+    name: SetName = "corrected",
     *,
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
-    ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="As a JSON document.")] = False,
+    changes: Changes = None,
+    json_output: Json = False,
 ) -> None:
     """Show a parameter set: value, unit, source and kind of each; what is assumed is marked."""
     import json
-
-    from rich.console import Console
-    from rich.table import Table
 
     from rig.model import build_model, describe
     from rig.parameters import set_names
@@ -31,7 +29,7 @@ def params(
     if json_output:
         typer.echo(json.dumps(document, indent=2))
         return
-    table = Table(title=f"{document['set']}: {document['title']}", box=None, header_style="bold", title_justify="left")
+    table = new_table(f"{document['set']}: {document['title']}")
     table.add_column("parameter", no_wrap=True)
     table.add_column("symbol")
     table.add_column("value", justify="right")
@@ -46,7 +44,7 @@ def params(
         table.add_row(
             key, entry["symbol"], shown, entry["unit"], kind, entry["source"], style="yellow" if assumed else None
         )
-    console = Console(width=None if Console().is_terminal else 200)
+    console = table_console()
     console.print(table)
     derived = document["derived"]
     errors = {(error["model"], error["against"]): error for error in derived["magnet_errors"]}

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.options import Changes, DurationS, Engine, Parameters, SceneName, Seed
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
 
@@ -29,7 +30,7 @@ class Pace(StrEnum):
 
 
 def run(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")],
+    scene: SceneName,
     *,
     pace: Annotated[
         Pace, typer.Option(help="By the wall clock, by `rig step`, or as fast as everything attached keeps up.")
@@ -39,13 +40,11 @@ def run(
     ] = 10.0,
     listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = DEFAULT_ENDPOINT,
     expose: Annotated[bool, typer.Option("--expose", help="Allow --listen on a host other than 127.0.0.1.")] = False,
-    parameters: Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")] = None,
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
-    ] = None,
-    engine: Annotated[str | None, typer.Option(help="Integration method.")] = None,
-    duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")] = None,
+    parameters: Parameters = None,
+    changes: Changes = None,
+    engine: Engine = None,
+    duration_s: DurationS = None,
+    seed: Seed = None,
 ) -> None:
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
     overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)

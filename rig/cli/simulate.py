@@ -7,18 +7,18 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.options import Changes, DurationS, Engine, Parameters, SceneName, Seed
+
 
 def simulate(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")],
+    scene: SceneName,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .mcap, .parquet or .csv.")],
-    parameters: Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")] = None,
-    changes: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
-    ] = None,
-    engine: Annotated[str | None, typer.Option(help="Integration method.")] = None,
-    duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")] = None,
+    parameters: Parameters = None,
+    changes: Changes = None,
+    engine: Engine = None,
+    duration_s: DurationS = None,
+    seed: Seed = None,
     check: Annotated[bool, typer.Option("--check", help="Run it again by finer steps and tell the error.")] = False,
     force: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
 ) -> None:

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.options import Json
+from rig.cli.tables import new_table, table_console
+
 if TYPE_CHECKING:
     from rich.text import Text
 
@@ -29,7 +32,7 @@ def stability(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Draw the maps as well, as PNG and SVG.")
     ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="As a JSON document.")] = False,
+    json_output: Json = False,
 ) -> None:
     """Test where integration methods fail; exit status 1 if any does not do what theory expects."""
     import json
@@ -67,16 +70,13 @@ def stability(
 
 
 def _show(cells: list[Cell], names: list[str]) -> None:
-    from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
     from replays.stability.trials import TRIALS
 
-    console = Console(width=None if Console().is_terminal else 200)
+    console = table_console()
     ours = [cell for cell in cells if cell.method in names]
-    table = Table(title="trials by engine: measured, and whether that holds", box=None, header_style="bold",
-                  title_justify="left")  # fmt: skip
+    table = new_table("trials by engine: measured, and whether that holds")
     table.add_column("trial", no_wrap=True)
     table.add_column("case")
     for name in names:
@@ -92,8 +92,7 @@ def _show(cells: list[Cell], names: list[str]) -> None:
     console.print(table)
     others = [cell for cell in cells if cell.method not in names]
     if others:
-        peers = Table(title="\nother people's solvers, where they are known to fail or to hold", box=None,
-                      header_style="bold", title_justify="left")  # fmt: skip
+        peers = new_table("\nother people's solvers, where they are known to fail or to hold")
         for heading in ("trial", "case", "solver", "measured", "because"):
             peers.add_column(heading)
         for cell in others:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from numba import njit
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def peak(before, back, last, ahead, force):
     """Largest of the latest value and of the parabola through the latest three, where the middle one is the largest.
 

@@ -428,7 +428,6 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     force_span, force_step = memory[_BEFORE_SPAN], memory[_LAST_STEP]
     contacts, floored, clamps, contact_steps, kicks = 0.0, 0.0, 0.0, 0.0, 0.0
     dy = np.empty(S.N_VECTOR)
-    out = np.empty(S.N_OBSERVED)
     row = 0
     first = 0
     while first < steps:
@@ -438,9 +437,10 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         )
         _coordinates(constants, uxt, uyt, pxt, pyt, w, theta, x0t, x1t, x2, x3, y0t, y1t, y2, y3, y)
         # Rigid impacts have no force over time.
+        out = rows[row, S.N_VECTOR :]
         evaluate(constants, inputs, now, 0.0, onset_speed, phase if compliant else FLIGHT, True, y, dy, out)
-        rows[row, : S.N_VECTOR] = y
-        rows[row, S.N_VECTOR :] = out
+        for i in range(S.N_VECTOR):
+            rows[row, i] = y[i]
         row += 1
 
         # The steps up to the next row. Integrals of this row start at 0.

@@ -3,6 +3,9 @@
 numba's own cache looks only at the file of the function it loads: it returns stale machine code when a kernel or a
 constant in *another* file has changed. So the cache folder is named by a digest of every kernel and engine file
 (unless the user set NUMBA_CACHE_DIR), before the first kernel is defined.
+
+numba also hands a caller's `fastmath` on to what it calls. Kernels that engines share name theirs, so that their bits
+do not depend on which engine was compiled first.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ FLIGHT, TOUCHING, FORWARD, BACKWARD, ROLLING = range(5)
 v_t < 0; touching and rolling, the friction force being what keeps v_t at 0."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def elastic_force(penetration, stiffness, exponent):
     """Elastic part of the normal force, K delta^n [N], for a penetration >= 0 [m]."""
     if exponent == 1.5:
@@ -26,7 +26,7 @@ def elastic_force(penetration, stiffness, exponent):
     return stiffness * penetration**exponent
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def normal_force(penetration, rate, onset_speed, contact):
     """Compliant normal force, eq. 44 and its family.
 
@@ -50,7 +50,7 @@ def normal_force(penetration, rate, onset_speed, contact):
     return max(0.0, force), elastic
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def friction_force(law, phase, force, sliding_speed, contact):
     """Friction against the sliding speed of eq. 39 (not sgn(theta') of eq. 12), where the state or the phase decides.
 
@@ -79,7 +79,7 @@ def friction_force(law, phase, force, sliding_speed, contact):
     return 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def ring_force(ex, ey, vx, vy, surface_speed, onset_speed, law, phase, contact):
     """Force of the ring on the shaft, eqs. 12 and 44 in the plane of the ring.
 

@@ -31,7 +31,7 @@ KEYPHASOR_WIDTH = math.radians(10.0)
 """Angle over which the mark is seen [rad]."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def hammer_force(inputs, tick, fraction):
     """Half-sine pulse of the hammer [N] at `tick + fraction`: a whole tick and the part beyond, apart to stay exact."""
     if tick >= inputs.hammer_end or tick + fraction < inputs.hammer_start or inputs.hammer_end <= inputs.hammer_start:
@@ -40,13 +40,13 @@ def hammer_force(inputs, tick, fraction):
     return inputs.hammer_force * math.sin(math.pi * phase) if phase < 1.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def drive_speed(inputs, tick, fraction):
     """Speed that the drive aims at [rad/s]."""
     return inputs.speed + inputs.speed_slope * ((float(tick - inputs.speed_tick) + fraction) * inputs.tick_s)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def gap(constants, y):
     """Penetration of the shaft into the ring [m] (negative: gap) and its rate [m/s]."""
     contact = constants.contact
@@ -67,7 +67,7 @@ def gap(constants, y):
     return distance - contact.clearance, (ex * vx + ey * vy) / distance
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def unit_response(constants, inputs, sin_g, cos_g, sin_b, cos_b, nx, ny):
     """Rate of the sliding speed for a friction force of 1 N [m/s^2 per N]: -(inverse mass along the ring), below 0."""
     shaft = constants.shaft
@@ -88,7 +88,7 @@ def unit_response(constants, inputs, sin_g, cos_g, sin_b, cos_b, nx, ny):
     return response
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=False, forceinline=True)
 def evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy, out):
     """Rates of the state and of the integrals, and what is observed, at one instant.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from numba import njit
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=False)
 def pair_readings(displacement, pair_stiffness, preload):
     """Readings of one opposed, pre-compressed pair of transducers.
 

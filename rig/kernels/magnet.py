@@ -8,7 +8,7 @@ LINEAR, RADIAL, RIPPLED = range(3)
 """How many terms of the map take part: a spring; hardening with the radius; the magnets one by one as well."""
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@njit(cache=True, error_model="numpy", fastmath=False, forceinline=True)
 def magnet_force(x, y, magnet):
     """Restoring force and potential of the map.
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from replays.export import writer_for
-from replays.figure import draw, full_spectrum
+from replays.picture import draw, full_spectrum
 from replays.verdict import Verdict, hammer_time_s, judge
 from replays.whirl import parameter_si, whirl_figures, whirl_frequency
 from rig import wire
