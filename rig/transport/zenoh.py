@@ -155,6 +155,12 @@ class _Session:
                 thread.join(timeout=1.0)
 
 
+def _encoding(key: str, schema: str | None) -> str:
+    if schema is not None:
+        return f"application/cdr;{schema}"
+    return "application/octet-stream" if key.startswith(f"{wire.ROOT}/can/") else "application/json"
+
+
 def _fifo() -> Any:
     import zenoh
 
@@ -193,7 +199,6 @@ class ZenohServer:
         self._congestion_control = zenoh.CongestionControl.BLOCK if wait else zenoh.CongestionControl.DROP
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []
-        self._token: Any = None
         self._slow_puts = 0
         self._longest_put_s = 0.0
         self._stalls = 0
@@ -216,7 +221,7 @@ class ZenohServer:
         publisher = ext.declare_advanced_publisher(
             self._session.session,
             key,
-            encoding="application/json" if schema is None else f"application/cdr;{schema}",
+            encoding=_encoding(key, schema),
             congestion_control=self._congestion_control,
             cache=ext.CacheConfig(_CACHE),
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
@@ -247,9 +252,19 @@ class ZenohServer:
         self._declared.append(subscriber)
         self._session.drain(subscriber, lambda x: callback(str(x.key_expr), x.payload.to_bytes()), f"hears {key}")
 
-    def announce(self) -> None:
-        """Show the rig's token: it vanishes when this process ends, however it ends."""
-        self._token = self._session.session.liveliness().declare_token(wire.ALIVE)
+    def announce(self, key: str = wire.ALIVE) -> None:
+        """Show the rig's token, or another: it vanishes when this process ends, however it ends."""
+        self._declared.append(self._session.session.liveliness().declare_token(key))
+
+    def watch(self, key: str, callback: Callable[[str, bool], None]) -> None:
+        """Call back with key and True / False when tokens of clients on keys that match appear / vanish."""
+        import zenoh
+
+        subscriber = self._session.session.liveliness().declare_subscriber(key, _fifo(), history=True)
+        self._declared.append(subscriber)
+        self._session.drain(
+            subscriber, lambda x: callback(str(x.key_expr), x.kind == zenoh.SampleKind.PUT), f"watches {key}"
+        )
 
     def congestion(self) -> dict[str, float]:
         """What a stalled subscriber looks like from here.
@@ -598,6 +613,15 @@ class ZenohClient:
         self._declared.append(subscriber)
         self._session.drain(subscriber, lambda x: callback(x.kind == zenoh.SampleKind.PUT), f"watches {key}")
 
+    def announce(self, key: str) -> None:
+        """Show a token of this client: it vanishes when this process ends, however it ends."""
+        self._declared.append(self._session.session.liveliness().declare_token(key))
+
+    def tokens(self, key: str, *, timeout_s: float = 0.5) -> list[str]:
+        """Keys of the tokens that are there now, of those that match."""
+        replies = self._session.session.liveliness().get(key, timeout=timeout_s)
+        return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+
     def report(self, key: str, payload: bytes) -> None:
         """Send one payload to the rig; it is dropped where the link is congested."""
         import zenoh
@@ -605,7 +629,7 @@ class ZenohClient:
         self._session.session.put(
             key,
             payload,
-            encoding="application/json",
+            encoding=_encoding(key, None),
             congestion_control=zenoh.CongestionControl.DROP,
             # Not to the own subscriptions of this client.
             allowed_destination=zenoh.Locality.REMOTE,
