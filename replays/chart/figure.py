@@ -449,7 +449,7 @@ def _profile(axes: Any, rows: list[Row]) -> int:
         x = np.concatenate([[1.0], ratios, [top]]) if len(ratios) else np.array([1.0, top])
         y = np.concatenate([[0.0], share, [share[-1]]]) if len(ratios) else np.zeros(2)
         axes.step(x, 100.0 * y, where="post", gid=f"profile-{method}", clip_on=False, **style)
-    axes.set(xlim=(1.0, top), ylim=(0.0, 102.0), xlabel="wall time over that of the best [1]",
+    axes.set(xlim=(1.0, top), ylim=(0.0, 102.0), xlabel="processor time over that of the best [1]",
              ylabel=f"scenes within {TARGET:g} [%]")  # fmt: skip
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     _small(axes, f"performance profile, {scenes} random scenes")

@@ -47,7 +47,8 @@ class Run:
 
     states: np.ndarray
     """At the problem's instants, nan from where it stopped, shape (n, 14)."""
-    walls: list[float]
+    costs: list[float]
+    """Processor time of each run [s]: other load on the machine does not count."""
     contacts: int
     steps: int
     evaluations: int
@@ -91,7 +92,7 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
     failure, message, reached = "", "", n
     for turn in range(budget.runs):
         y, memory = begin()
-        begun = time.perf_counter()
+        begun, spent = time.perf_counter(), time.thread_time()
         for i in range(n):
             before = time.perf_counter()
             engine.advance(
@@ -109,20 +110,20 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         best = np.minimum(best, frames)
         if turn == 0 and frames.sum() > 0.1 * budget.solve_s:
             break
-    wall = float(frames[:reached].sum())
+    cost = time.thread_time() - spent
     last, note = y.copy(), memory.copy()
-    walls = [wall]
+    costs = [cost]
     if not failure:
         # One more row, at the window's end.
         end = problem.start_tick + n * frame_ticks
         engine.advance(constants, inputs, last, note, end, rung.step_us, 1, 1, rows[n:])
-        whole, walls = np.empty((n, N_ROW)), []
-        while len(walls) < budget.runs or (sum(walls) < _ENOUGH_S and len(walls) < _MOST):
-            clock = time.perf_counter()
+        whole, costs = np.empty((n, N_ROW)), []
+        while len(costs) < budget.runs or (sum(costs) < _ENOUGH_S and len(costs) < _MOST):
+            clock = time.thread_time()
             again, kept = begin()
             engine.advance(constants, inputs, again, kept, problem.start_tick, rung.step_us, n * stride, stride, whole)
-            walls.append(time.perf_counter() - clock)
-            if walls[-1] > budget.single_s:
+            costs.append(time.thread_time() - clock)
+            if costs[-1] > budget.single_s:
                 break
     else:
         rows[reached:] = np.nan
@@ -135,7 +136,7 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         residual = float(np.max(np.abs(balance["residual"])) / max(float(balance["dissipated"][-1]), 1e-6))
     return Run(
         states=states,
-        walls=walls,
+        costs=costs,
         contacts=int(memory[CONTACTS]),
         steps=int(memory[STEPS]),
         evaluations=int(memory[EVALUATIONS]),
@@ -151,15 +152,15 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
 
 def run_peer(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
     """Run a peer; the first run counts only where it is long, as it may load what the others find loaded."""
-    peer, walls, compile_s = PEERS[name], [], 0.0
+    peer, costs, compile_s = PEERS[name], [], 0.0
     solution: Solution | None = None
-    while solution is None or len(walls) < budget.runs:
+    while solution is None or len(costs) < budget.runs:
         fresh = solution is None
         solution = peer.solve(problem, rung.setting, budget_s=budget.solve_s)
         compile_s = max(compile_s, solution.compile_s)
-        if not fresh or solution.failure is not None or solution.wall_s > 0.2 or solution.wall_s > budget.single_s:
-            walls.append(solution.wall_s)
-        if solution.failure is not None or solution.wall_s > budget.single_s:
+        if not fresh or solution.failure is not None or solution.cpu_s > 0.2 or solution.cpu_s > budget.single_s:
+            costs.append(solution.cpu_s)
+        if solution.failure is not None or solution.cpu_s > budget.single_s:
             break
     good: np.ndarray = np.isfinite(solution.states.sum(axis=1))
     reached = len(good) if good.all() else int(np.argmin(good))
@@ -171,7 +172,7 @@ def run_peer(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         failure = next((kind for kind, holds in kinds if holds), "error")
     return Run(
         states=solution.states,
-        walls=walls,
+        costs=costs,
         contacts=solution.contacts,
         steps=solution.steps,
         evaluations=solution.evaluations,
@@ -281,17 +282,17 @@ def block_statistics(
 
 
 def _cost(done: Run, problem: Problem) -> dict[str, Any]:
-    walls = done.walls or [np.nan]
-    wall = statistics.median(walls)
+    costs = done.costs or [np.nan]
+    cost = statistics.median(costs)
     return {
         "simulated_s": problem.duration_s,
-        "runs": len(done.walls),
-        "wall_s": wall,
-        "wall_min_s": min(walls),
-        "wall_max_s": max(walls),
-        "speed": done.reached_s / wall,
-        "speed_min": done.reached_s / max(walls),
-        "speed_max": done.reached_s / min(walls),
+        "runs": len(done.costs),
+        "cpu_s": cost,
+        "cpu_min_s": min(costs),
+        "cpu_max_s": max(costs),
+        "speed": done.reached_s / cost,
+        "speed_min": done.reached_s / max(costs),
+        "speed_max": done.reached_s / min(costs),
         "compile_s": done.compile_s,
         "steps": done.steps,
         "evaluations": done.evaluations,

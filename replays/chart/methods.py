@@ -50,12 +50,14 @@ _STEPS = (50, 40, 25, 20, 10, 5, 2)
 _LADDERS: dict[str, tuple[tuple[int, float], ...]] = {
     "split": tuple((step, 0.0) for step in (100, *_STEPS, 1)),
     "rk8": tuple((25, 10.0**-n) for n in range(4, 13)),
+    "taylor": tuple((25, 10.0**-n) for n in (4, 5, 6, 7, 8, 9, 10, 12, 14)),
     "tsit5": tuple((500, 10.0**-n) for n in range(3, 11)),
     "rk4": tuple((step, 0.0) for step in _STEPS),
 }
 _QUICK: dict[str, tuple[tuple[int, float], ...]] = {
     "split": tuple((step, 0.0) for step in (50, 40, 25, 20, 10, 5)),
     "rk8": tuple((25, 10.0**-n) for n in (6, 8, 10, 12)),
+    "taylor": tuple((25, 10.0**-n) for n in (5, 7, 9, 11)),
     "tsit5": tuple((500, 10.0**-n) for n in (4, 6, 8, 10)),
     "rk4": tuple((step, 0.0) for step in (50, 20, 10, 5)),
     "verlet": tuple((step, 0.0) for step in (50, 10, 5)),

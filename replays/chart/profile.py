@@ -89,9 +89,9 @@ def shares(rows: list[dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray
         shape (n,); a method that solves none has empty ones.
     """
     scenes = sorted({row["phase"] for row in rows})
-    cost = {(row["phase"], row["method"]): row["wall_s"] for row in rows if not row["failure"]}
+    cost = {(row["phase"], row["method"]): row["cpu_s"] for row in rows if not row["failure"]}
     best = {
-        scene: min((wall for (where, _), wall in cost.items() if where == scene), default=np.inf) for scene in scenes
+        scene: min((spent for (where, _), spent in cost.items() if where == scene), default=np.inf) for scene in scenes
     }
     curves = {}
     for method in dict.fromkeys(row["method"] for row in rows):

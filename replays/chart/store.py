@@ -18,7 +18,7 @@ KEY = ("mode", "panel", "phase", "case", "method", "rung")
 """Columns that tell one point from another."""
 COLUMNS = (
     *KEY, "title", "family", "known_failure", "friction", "smoothing_speed", "step_us", "tolerance", "simulated_s",
-    "runs", "wall_s", "wall_min_s", "wall_max_s", "compile_s", "speed", "speed_min", "speed_max", "error",
+    "runs", "cpu_s", "cpu_min_s", "cpu_max_s", "compile_s", "speed", "speed_min", "speed_max", "error",
     "reference", "reference_error", "energy_residual", "steps", "evaluations", "contacts", "contacts_reference",
     "worst_frame_ms", "contact_fraction", "contact_fraction_low", "contact_fraction_high", "rms_force",
     "rms_force_low", "rms_force_high", "impacts_per_s", "impacts_per_s_low", "impacts_per_s_high", "failure",

@@ -53,7 +53,7 @@ class Solution:
         switches: Changes of phase: onsets, lift-offs, those between sliding and rolling, and of heyoka the clamps.
         steps: Accepted steps; 0 where the library does not tell.
         evaluations: Of the right-hand side, with those for a Jacobian; of a Taylor series, its order times its steps.
-        wall_s: Wall time of the solve, without compilation [s].
+        cpu_s: Processor time of the solve, without compilation [s].
         compile_s: What compiling took in this process before the first solve could start [s].
         failure: Why it failed, or None.
         phase: Phase of the contact at the end.
@@ -67,7 +67,7 @@ class Solution:
     switches: int
     steps: int
     evaluations: int
-    wall_s: float
+    cpu_s: float
     compile_s: float
     failure: str | None
     phase: int
@@ -91,6 +91,7 @@ class Journal:
     onset_speed: float = 0.0
     failure: str | None = None
     _begin: float = field(default_factory=time.perf_counter)
+    _cpu_begin: float = field(default_factory=time.thread_time)
 
     def __post_init__(self) -> None:
         self.states = np.full((len(self.times), N_STATE), np.nan)
@@ -112,7 +113,7 @@ class Journal:
 
     def close(self) -> Solution:
         """The solution as it stands."""
-        wall_s = time.perf_counter() - self._begin
+        cpu_s = time.thread_time() - self._cpu_begin
         if self.failure is None and not np.isfinite(self.states).all():
             self.failure = "the state is not finite"
         return Solution(
@@ -123,7 +124,7 @@ class Journal:
             switches=self.switches,
             steps=self.steps,
             evaluations=self.evaluations,
-            wall_s=wall_s,
+            cpu_s=cpu_s,
             compile_s=self.compile_s,
             failure=self.failure,
             phase=self.phase,

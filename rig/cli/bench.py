@@ -19,7 +19,7 @@ def bench(
     ] = True,
     frames: Annotated[int, typer.Option(min=0, max=1_000_000, help="Single frames of 1 ms to time.")] = 10_000,
 ) -> None:
-    """Measure simulated over wall time with the error beside it; medians of several runs, compile time apart."""
+    """Measure simulated over processor time with the error beside it; medians of several runs, compile time apart."""
     import json
     import sys
 

@@ -26,7 +26,7 @@ from rig.simulation import Simulation
 PACKAGE = Path(rig.__file__).parent
 FRICTION = {name: "exact" if "exact" in method.frictions else "smoothed" for name, method in ENGINES.items()}
 """The friction law that every engine is tested with, ..."""
-PAIRS = [*FRICTION.items(), ("rosenbrock", "switch"), ("verlet", "smoothed"), ("split", "none")]
+PAIRS = [*FRICTION.items(), ("rosenbrock", "switch"), ("verlet", "smoothed"), ("split", "none"), ("taylor", "smoothed")]
 """... and some more."""
 
 JIT_RUN = """

@@ -81,7 +81,7 @@ def hand_made(shift: float) -> tuple[Problem, Reference, Run]:
     object.__setattr__(solution, "states", np.zeros((4, N_STATE)))
     states = np.zeros((4, N_STATE))
     states[2:, 9] = 40.0 * shift
-    done = Run(states=states, walls=[0.5, 0.1, 0.2], contacts=0, steps=1, evaluations=1, reached_s=problem.duration_s)
+    done = Run(states=states, costs=[0.5, 0.1, 0.2], contacts=0, steps=1, evaluations=1, reached_s=problem.duration_s)
     return problem, Reference(solution, solution, ("a", "b"), 1e-9, True), done
 
 
@@ -97,7 +97,7 @@ def test_error_and_verdict_of_a_hand_made_run(
     monkeypatch.setattr(measure, "run", lambda *_: done)
     found = point(competitors(peers=False)["rk4"], Rung("5 us", 5), problem, reference, ONCE)
     assert found["failure"] == failure
-    assert (found["wall_s"], found["wall_min_s"], found["wall_max_s"]) == (0.2, 0.1, 0.5)
+    assert (found["cpu_s"], found["cpu_min_s"], found["cpu_max_s"]) == (0.2, 0.1, 0.5)
     assert found["speed"] == pytest.approx(problem.duration_s / 0.2)
     if failure == "nan":
         assert found["error"] is None
@@ -167,7 +167,7 @@ def test_elastic_force_is_hertz() -> None:
 
 def test_profile_shares_by_hand() -> None:
     points = [
-        {"phase": scene, "method": method, "wall_s": wall, "failure": failure}
+        {"phase": scene, "method": method, "cpu_s": wall, "failure": failure}
         for scene, method, wall, failure in (
             ("a", "quick", 1.0, ""), ("a", "slow", 4.0, ""), ("b", "quick", 6.0, ""), ("b", "slow", 3.0, ""),
             ("c", "quick", 1.0, ""), ("c", "slow", 0.1, "target"), ("c", "never", 0.1, "nan"),
