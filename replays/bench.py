@@ -71,7 +71,8 @@ CASES = (
     Case("split 25 us, hammer", "hammer", _engine("split", 25), goal=150, error_goal=6e-4),
     Case("split 20 us, hammer", "hammer", _engine("split", 20), goal=75, error_goal=1.6e-4),
     Case("tsit5 1e-6, hammer", "hammer", _engine("tsit5", 500, **{"engine.tolerance": 1e-6})),
-    Case("rk8 1e-8, hammer", "hammer", _engine("rk8", 25), error_goal=1e-6),
+    Case("rk8 1e-8, hammer", "hammer", _engine("rk8", 25)),
+    Case("taylor 1e-8, hammer", "hammer", _engine("taylor", 25, **{"engine.tolerance": 1e-8}), error_goal=1e-6),
     Case(
         "split 100 us, free flight, a row every 10 ms", "stable-run", _engine("split", 100, **SPARSE), 20.0, goal=5000
     ),

@@ -22,6 +22,7 @@ from rig.engines import ENGINES
 _STYLES: dict[str, tuple[str, str]] = {
     "split": (BLACK, "o"),
     "rk8": (BLUE, "s"),
+    "taylor": ("#882255", "h"),
     "tsit5": (SKY, "^"),
     "rk4": (RED, "D"),
     "verlet": (ORANGE, "v"),

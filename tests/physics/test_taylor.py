@@ -1,0 +1,235 @@
+"""The Taylor series: its coefficients, its events, and what it is for.
+
+| what                                   | must agree with                                          |
+|----------------------------------------|----------------------------------------------------------|
+| series of a ringing house              | the cosine, and the cosine's own remainder after order 16 |
+| first coefficients of any phase        | the kernels' equations, and how those change             |
+| first zero of a polynomial             | roots that the polynomial was made from                  |
+| one impact                             | its quadrature, to 1e-9                                  |
+| first impacts under Coulomb's friction | heyoka on equations of its own                           |
+| the two laws of a contact left open    | rk8, which steps through them in time                    |
+| steps of an impact                     | some 16, whatever is asked of the onset                  |
+| error over a ladder of tolerances      | falls with every rung                                    |
+| energy residual                        | 0, within some tolerances                                |
+| state at an instant                    | the same bits, however dense the rows are                |
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from replays.peers import PEERS, Setting, scaled_error
+from replays.peers.problem import Problem
+from replays.stability.motion import move, quiet_inputs, state
+from replays.stability.trials import first_impact, house_oscillator
+from rig import load_scene
+from rig.engines import taylor
+from rig.engines.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, MEMORY, ONSET, PHASE, STEPS
+from rig.kernels import signals as S
+from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
+from rig.kernels.dynamics import evaluate
+from rig.simulation import Simulation
+
+QUIET = {
+    "sensors.chain": "ideal",
+    "sensors.groups": ["hammer"],
+    "sensors.rate_hz": 1000,
+    "sensors.truth_rate_hz": 1000,
+    "sensors.noise": False,
+}
+
+
+def ready(scene: str = "hammer", engine: str = "taylor", tolerance: float = 1e-9, **changes: Any) -> Simulation:
+    """A simulation with rows 1 ms apart; dots of dotted keys as `__`."""
+    dotted = {key.replace("__", "."): value for key, value in changes.items()}
+    choice = {"engine.name": engine, "engine.tolerance": tolerance}
+    return Simulation(load_scene(scene, {**QUIET, **choice, **dotted}))
+
+
+def states(simulation: Simulation, duration_s: float) -> np.ndarray:
+    """States on a grid of 1 ms, shape (n, 14)."""
+    return simulation.advance(round(duration_s * 1e6)).rows[:, : S.N_STATE].copy()
+
+
+def test_series_of_a_cosine_ends_with_its_own_remainder() -> None:
+    constants, mode = house_oscillator()
+    angular, amplitude = 2.0 * math.pi * mode.frequency_hz, 1e-6
+    y = state(y_ih=amplitude * mode.inner, y_oh=amplitude * mode.outer)
+    memory, rows = np.zeros(MEMORY), np.empty((1, S.N_ROW))
+    inputs = quiet_inputs(tick_s=1e-6)
+    # Far more than is wanted, for a long series.
+    taylor.start(constants, inputs, y, memory, 1.0, 1e-1)
+    taylor.advance(constants, inputs, y, memory, 0, 1, 1, 1, rows)
+    series = memory[taylor._SERIES :][: (taylor.ORDER + 1) * taylor._WIDTH].reshape(taylor.ORDER + 1, -1)
+    times = np.array([2.0, 2.5, 3.0, 3.5]) / angular
+    errors = []
+    for time in times:
+        value = np.polynomial.polynomial.polyval(time, series[:, 4])
+        error = abs(value / (amplitude * mode.inner) - math.cos(angular * time))
+        # The cosine has even powers only: what is left out begins with the 18th.
+        assert error == pytest.approx((angular * time) ** 18 / math.factorial(18), rel=0.05)
+        errors.append(error)
+    slope = np.polyfit(np.log(times), np.log(errors), 1)[0]
+    assert slope == pytest.approx(taylor.ORDER + 2, abs=0.15)
+
+
+@pytest.mark.parametrize("phase", [FLIGHT, FORWARD, BACKWARD, ROLLING])
+@pytest.mark.parametrize("mode", ["torque", "ideal"])
+def test_first_coefficients_are_the_equations(phase: int, mode: str) -> None:
+    simulation = ready(drive__mode=mode, model__magnet="cylinders")
+    simulation.advance(22_000)  # into the blow
+    constants, inputs = simulation.model.constants, simulation._inputs()
+    # A state of that phase: in the ring or pushed into it, spinning either way.
+    contact = constants.contact
+    height = contact.clearance + contact.offset_y + (-2e-4 if phase == FLIGHT else 2e-5)
+    y = state(
+        Gamma=-height / constants.shaft.arm_ring, beta=3e-4, theta=0.7, x_ih=2e-6, y_ih=-1e-6, x_oh=1e-6, y_oh=2e-6,
+        Gamma_rate=-0.1, beta_rate=-0.7, theta_rate=-35.0 if phase == BACKWARD else 35.0, vx_ih=1e-3, vy_ih=2e-3,
+        vx_oh=-1e-3, vy_oh=1e-3,
+    )  # fmt: skip
+    memory = np.zeros(MEMORY)
+    taylor.start(constants, inputs, y, memory, 1.0, 1e-9)
+    memory[PHASE], memory[ONSET] = phase, 0.1
+    before = y.copy()
+    taylor.advance(constants, inputs, y, memory, simulation.tick, 1, 0, 1, np.empty((0, S.N_ROW)))
+    series = memory[taylor._SERIES :][: (taylor.ORDER + 1) * taylor._WIDTH].reshape(taylor.ORDER + 1, -1)
+
+    def rates(at: np.ndarray, fraction: float) -> np.ndarray:
+        dy, out = np.empty(S.N_VECTOR), np.empty(S.N_OBSERVED)
+        evaluate(constants, inputs, simulation.tick, fraction, memory[ONSET], phase, True, at, dy, out)
+        return dy
+
+    dy = rates(before, 0.0)
+    slow = series[0, taylor._ROOT] if phase in (FORWARD, BACKWARD) else 1.0
+    first = series[1] / slow
+    sure = [2, 3, 4, 5, 6, 10, 11, 12, 13, *range(S.N_STATE, S.N_VECTOR)]
+    np.testing.assert_allclose(first[sure], dy[sure], rtol=1e-9, atol=1e-12)
+    if phase in (FLIGHT, ROLLING):
+        # The second ones by a central difference along the motion.
+        step = 1e-7
+        ahead, behind = np.empty(S.N_VECTOR), np.empty(S.N_VECTOR)
+        for place, sign in ((ahead, 1.0), (behind, -1.0)):
+            x = np.array([np.polynomial.polynomial.polyval(sign * step, series[:, i]) for i in range(taylor._WIDTH)])
+            taylor._from_series(constants, inputs, x, place)
+        change = (rates(ahead, step / inputs.tick_s) - rates(behind, -step / inputs.tick_s)) / (2.0 * step)
+        size = np.abs(change) + np.abs(dy) / 1e-3
+        assert (np.abs(2.0 * series[2, sure] - change[sure]) / np.maximum(size[sure], 1e-9)).max() < 1e-5
+
+
+def test_first_zero_of_a_polynomial() -> None:
+    def column(roots: list[complex], sign: float = 1.0) -> np.ndarray:
+        table = np.zeros((taylor.ORDER + 1, taylor._WIDTH))
+        coefficients = np.real(np.polynomial.polynomial.polyfromroots(roots))
+        table[: len(coefficients), taylor._E] = sign * coefficients
+        return table
+
+    def zero(table: np.ndarray, shift: int = 0, length: float = 1.0) -> float:
+        return taylor._first_zero(table, taylor._E, shift, length)
+
+    assert zero(column([0.3, 0.7, 2.0], -1.0)) == pytest.approx(0.3, abs=1e-14)
+    assert zero(column([0.9, 1.5])) == pytest.approx(0.9, abs=1e-14)
+    assert zero(column([1.1, 1.5])) == math.inf
+    # Twice through 0 between two samples.
+    assert zero(column([0.55, 0.5501])) == pytest.approx(0.55, abs=1e-12)
+    # Touches nothing.
+    assert zero(column([0.55 + 1e-4j, 0.55 - 1e-4j])) == math.inf
+    # On the wrong side from the start; and at 0 by what went before, once or twice.
+    assert zero(column([-0.5])) == math.inf
+    assert zero(column([-0.5], -1.0)) == 0.0
+    assert zero(column([0.0, 0.4], -1.0), 1) == pytest.approx(0.4, abs=1e-14)
+    assert zero(column([0.0, 0.0, 0.8], -1.0), 2) == pytest.approx(0.8, abs=1e-14)
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.01])
+def test_an_impact_is_its_quadrature(speed: float) -> None:
+    errors = first_impact("taylor", speed, tolerance=1e-13)
+    assert max(errors.values()) < 1e-9, errors
+
+
+def test_first_impacts_agree_with_heyoka() -> None:
+    pytest.importorskip("heyoka")
+    problem = Problem.from_scene(load_scene("hammer"), end_s=0.05, sample_s=1e-3, friction="exact")
+    peer = PEERS["heyoka"].solve(problem, Setting("1e-15", 1e-15), budget_s=100.0)
+    assert peer.failure is None
+    simulation = ready(tolerance=1e-12)
+    assert scaled_error(states(simulation, 0.05), peer.states[:50]) < 1e-9
+    assert simulation._memory[CONTACTS] == len(peer.onsets) == 16
+    # Sixteen impacts, a hundred steps each by a series in time alone.
+    assert simulation._memory[CONTACT_STEPS] < 30 * 16
+
+
+def scaled(motion: np.ndarray) -> np.ndarray:
+    """States over what counts as 1 in each."""
+    from rig.engines.parts import PER_SCALE
+
+    return motion * PER_SCALE
+
+
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "transducers lose their preload": ("hammer", {"house__preload": 200.0}),
+    "the law would pull": ("hammer", {"contact__damping_factor": "kelvin-voigt"}),
+    "another exponent": ("hammer", {"contact__exponent": 1.3}),
+    "smoothed friction": ("hammer", {"model__friction": "smoothed"}),
+    "ideal drive": ("hammer", {"drive__mode": "ideal"}),
+    "magnets one by one": ("hammer", {"model__magnet": "cylinders"}),
+    "ideal drive and magnets one by one": ("hammer", {"model__magnet": "cylinders", "drive__mode": "ideal"}),
+    "gap as printed": ("hammer", {"parameters": "as-printed"}),
+    "small angles, fixed ring": ("hammer", {"model__shaft": "planar", "model__stator": "rigid"}),
+    "no outer house": ("hammer", {"model__stator": "inner-house"}),
+    "at rest along the ring": ("drop", {}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_agrees_with_rk8(case: str) -> None:
+    scene, changes = CASES[case]
+    one, other = ready(scene, tolerance=1e-11, **changes), ready(scene, "rk8", 1e-11, engine__step_us=5, **changes)
+    # Sixteen impacts make an error a thousand times larger: up to the fourth.
+    first, second = scaled(states(one, 0.034)), scaled(states(other, 0.034))
+    assert one._memory[CONTACTS] == other._memory[CONTACTS] > 0
+    assert np.sqrt(np.mean((first - second) ** 2)) < 1e-8
+    # The ledger's columns against the largest of their kind.
+    ledger = slice(S.N_STATE, S.N_VECTOR)
+    np.testing.assert_allclose(one._y[ledger], other._y[ledger], rtol=1e-7, atol=1e-9)
+    if "pull" in case:
+        assert one._memory[CLAMPS] > 0
+
+
+def test_the_error_falls_with_the_tolerance_and_the_ledger_closes() -> None:
+    exact = scaled(states(ready(tolerance=1e-13), 0.05))
+    errors = []
+    for tolerance in (1e-5, 1e-6, 1e-7, 1e-8, 1e-9):
+        simulation = ready(tolerance=tolerance)
+        errors.append(float(np.sqrt(np.mean((scaled(states(simulation, 0.05)) - exact) ** 2))))
+        assert abs(simulation.health()["energy"]["residual_share"]) < 100.0 * tolerance
+        assert simulation._memory[CEILING] == 0.0
+    assert all(fine < 0.3 * coarse for coarse, fine in pairwise(errors)), errors
+    assert errors[-1] < 1e-8
+
+
+def test_rows_change_no_bit_and_a_new_input_ends_a_series() -> None:
+    dense = ready(sensors__rate_hz=40_000, sensors__truth_rate_hz=40_000)
+    sparse = ready()
+    rows = np.concatenate([dense.advance(25).rows.copy() for _ in range(30_000 // 25)])
+    assert rows[::40].tobytes() == sparse.advance(30_000).rows.tobytes()
+    # A series of a quiet flight outlives the command: it must not be believed beyond it.
+    early, late = ready("stable-run"), ready("stable-run", "rk8", 1e-11)
+    for simulation in (early, late):
+        simulation.advance(7_000)
+        simulation.submit("hammer", {"force_n": 20.0, "duration_ms": 2.0})
+    one, other = scaled(states(early, 0.02)), scaled(states(late, 0.02))
+    assert np.abs(other[:, 8]).max() > 1e-2
+    assert np.abs(one - other).max() < 1e-9
+
+
+def test_a_long_flight_takes_few_steps() -> None:
+    simulation = ready("stable-run")
+    simulation.advance(500_000)
+    assert simulation._memory[STEPS] <= 150
+    motion = move("taylor", simulation.model.constants, quiet_inputs(magnets=True), state(beta=1e-4), ticks=1000)
+    assert motion.contacts == 0
