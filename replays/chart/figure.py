@@ -20,6 +20,7 @@ Row = dict[str, Any]
 # Strong colours for our engines; peers in quiet tones by family.
 _OURS = {
     "split": (RED, "o"),
+    "taylor": ("#882255", "h"),
     "rk8": (BLUE, "s"),
     "tsit5": (SKY, "D"),
     "rk4": (GREEN, "^"),

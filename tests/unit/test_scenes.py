@@ -69,7 +69,7 @@ def scenes(draw: st.DrawFn) -> dict[str, Any]:
         "seed": draw(st.integers(0, 2**63 - 1)),
         "drive": drive,
         "commands": draw(timed.flatmap(st.permutations)),
-        "engine": {"name": draw(st.sampled_from(["split", "rk4", "rk8", "tsit5"])), "step_us": step},
+        "engine": {"name": draw(st.sampled_from(["split", "rk4", "rk8", "tsit5", "taylor"])), "step_us": step},
         "sensors": {
             "groups": draw(st.permutations(list(default_table().groups)).map(lambda names: names[:3])),
             "rate_hz": draw(st.sampled_from([rate for rate in rates if rate >= 100])),
