@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.progress import reporting
+
 
 def chart(
     *,
@@ -29,8 +31,6 @@ def chart(
     import sys
 
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
 
     from replays.chart.session import Progress, make_chart
     from rig.errors import InputError
@@ -42,15 +42,8 @@ def chart(
     if not compiled_before():
         print(COMPILE_NOTICE, file=sys.stderr, flush=True)
     console = Console(stderr=True)
-    with Bar(
-        TextColumn("{task.percentage:3.0f} %"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("{task.description}"), console=console, transient=True, disable=not console.is_terminal,
-    ) as bar:  # fmt: skip
-        task = bar.add_task("references")
-
-        def step(text: str) -> None:
-            bar.update(task, description=text, advance=1)
-
+    with reporting() as reporter:
+        reporter.say("references")
         outcome = make_chart(
             output,
             mode=mode,
@@ -59,7 +52,7 @@ def chart(
             peers=not no_peers,
             fresh=fresh,
             command="rig chart --full" if full else "rig chart",
-            progress=Progress(begin=lambda total: bar.update(task, total=total), step=step),
+            progress=Progress(begin=reporter.begin, step=reporter.step),
         )
     if outcome.missing:
         console.print(

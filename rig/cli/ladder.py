@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.options import Changes, SceneName
+from rig.cli.progress import reporting
 from rig.cli.tables import new_table, table_console
 
 if TYPE_CHECKING:
@@ -40,9 +41,6 @@ def ladder(
 ) -> None:
     """Go down the ladder of models: what does each level cost, what does it err by, what is good enough here?"""
     import json
-    import sys
-
-    from rich.console import Console
 
     from replays.ladder.chart import draw
     from replays.ladder.document import ladder_document, pick_of
@@ -60,15 +58,14 @@ def ladder(
         check_target(write, scene, loaded)
     if not compiled_before():
         typer.echo(COMPILE_NOTICE, err=True)
-    console = Console(file=sys.stderr)
-    with console.status("") as status:
+    with reporting() as reporter:
         found = search(
             loaded,
             tolerances,
             keep=tuple(keep or ()),
             runs=runs,
             budget_s=budget_s,
-            progress=lambda what: status.update(f"ladder: {what}"),
+            progress=reporter.step,
         )
     document = ladder_document(found)
     paths: list[Path] = []

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.options import Json
+from rig.cli.progress import reporting
 from rig.cli.tables import new_table, table_console
 
 if TYPE_CHECKING:
@@ -36,23 +37,21 @@ def stability(
 ) -> None:
     """Test where integration methods fail; exit status 1 if any does not do what theory expects."""
     import json
-    import sys
 
     from replays.stability.table import chosen_engines, chosen_trials, run_trials
 
     trials, names = chosen_trials(only), chosen_engines(engines)
     cells: list[Cell] = []
-    for cell in run_trials(trials, names, quick=not full):
-        cells.append(cell)
-        if sys.stderr.isatty():
-            typer.echo(f"\r{cell.trial} {cell.method:<20}", nl=False, err=True)
-    if sys.stderr.isatty():
-        typer.echo("\r" + " " * 40 + "\r", nl=False, err=True)
     pictures: list[Path] = []
-    if output is not None:
-        from replays.stability.figure import draw_all
+    with reporting() as reporter:
+        for cell in run_trials(trials, names, quick=not full):
+            cells.append(cell)
+            reporter.step(f"{cell.trial} {cell.case}, {cell.method}")
+        if output is not None:
+            from replays.stability.figure import draw_all
 
-        pictures = draw_all(output, names, quick=not full)
+            reporter.say("pictures")
+            pictures = draw_all(output, names, quick=not full)
     wrong = [cell for cell in cells if not cell.agrees]
     if json_output:
         document = {

@@ -1,0 +1,58 @@
+"""Progress of long work on stderr: one live line on a terminal, else a line now and then."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+_EVERY_S = 15.0
+
+
+@dataclass
+class Reporter:
+    """Told how far the work has come."""
+
+    bar: Any = None
+    """A `rich.progress.Progress` with its one task, or None for lines."""
+    task: Any = None
+    total: int | None = None
+    done: int = 0
+    _printed_s: float = -1e9
+
+    def begin(self, total: int) -> None:
+        """There are this many steps."""
+        self.total = total
+        if self.bar is not None:
+            self.bar.update(self.task, total=total)
+
+    def step(self, text: str) -> None:
+        """One step is done; the next one is this."""
+        self.done += 1
+        self.say(text)
+
+    def say(self, text: str) -> None:
+        """This is being done."""
+        if self.bar is not None:
+            self.bar.update(self.task, description=text, completed=self.done)
+        elif time.monotonic() - self._printed_s > _EVERY_S:
+            self._printed_s = time.monotonic()
+            count = f"{self.done} of {self.total}: " if self.total else ""
+            print(f"{count}{text}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def reporting() -> Iterator[Reporter]:
+    """Show the progress of what is done inside."""
+    if not sys.stderr.isatty():
+        yield Reporter()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        yield Reporter(bar=bar, task=bar.add_task("", total=None))
