@@ -9,6 +9,8 @@ import typer
 
 from rig.cli import (
     bench,
+    can,
+    can_messages,
     chart,
     demo,
     hammer,
@@ -28,6 +30,7 @@ from rig.cli import (
     status,
     step,
     stop,
+    twins,
     view,
 )
 from rig.errors import InputError, SimulationError
@@ -64,6 +67,7 @@ _PANELS: dict[str, dict[str, Any]] = {
         "step": step.step,
         "status": status.status,
         "stop": stop.stop,
+        "twins": twins.twins,
     },
     "Recordings and pictures": {"record": record.record, "view": view.view, "info": info.info},
     "Without a clock": {
@@ -95,6 +99,10 @@ for _panel, _commands in _PANELS.items():
         # A negative value such as `rig speed -1` is a value, not an option: the rig explains what is wrong with it.
         _settings = {"ignore_unknown_options": True} if _name == "speed" else {}
         app.command(_name, rich_help_panel=_panel, context_settings=_settings)(_function)
+
+can.app.command()(can_messages.dbc)
+can.app.command()(can_messages.load)
+app.add_typer(can.app, name="can", rich_help_panel="The rig as a service")
 
 
 def main(arguments: list[str] | None = None) -> None:

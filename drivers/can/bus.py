@@ -1,0 +1,521 @@
+"""Model of a CAN bus: who sends when, how long it takes, what fails; no clock, no wire, no thread.
+
+Time is an integer that is passed in [ns]; a frame's length is rounded to it once. The same offers give the same
+results, in however many steps the time is advanced.
+
+Modelled (ISO 11898-1:2015): arbitration by identifier; serialisation of exact frames; acknowledge; error flags with
+their superposition, delimiter, retransmission; error counters, error passive with suspended transmission, bus-off and
+its recovery; bounded transmit queues. Frames take part in an arbitration when they were offered by its first bit.
+A bit error is one that the sender sees: the bit is inverted for all nodes.
+
+Not modelled: errors that only some nodes see, errors in error frames, overload frames, the last bit of the end of
+frame that receivers ignore, bit timing with its resynchronisation and delays of the line, and the error state
+indicator, which is sent as the frame has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from drivers.can import frame as frames
+from drivers.can import kernels
+from drivers.can.timing import Speed, speed
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    import can
+
+STATES = ("error active", "error passive", "bus-off")
+OUTCOMES = kernels.OUTCOMES
+"""What happened to a frame, by the number in `RESULT`; the empty text: it was sent."""
+
+RESULT = np.dtype(
+    [
+        ("start_ns", "<i8"),
+        ("end_ns", "<i8"),
+        ("offered_ns", "<i8"),
+        ("outcome", "u1"),
+        ("final", "u1"),
+        ("attempt", "<u2"),
+        ("node", "<u4"),
+        ("frame", frames.RECORD),
+    ]
+)
+"""What happened on the bus, in an array. `end_ns` is the end of frame's last bit, after an error the delimiter's last;
+`outcome` an index of `OUTCOMES`; `final` 0 where the frame will be tried again; `frame` has the end as its time."""
+
+_LATENCIES = 1 << 14
+_GROWTH = 1 << 10
+
+
+class Delivery(NamedTuple):
+    """What happened to a frame; the fields are those of `RESULT`.
+
+    Attributes:
+        frame: The frame.
+        node: Who offered it.
+        start_ns: Its first bit [ns].
+        end_ns: End of its last bit, before the intermission; after an error, end of the error delimiter [ns].
+        error: Empty where it was sent, else one of `OUTCOMES`.
+        offered_ns: When it was offered [ns].
+        attempt: Number of this attempt, from 1; 0 where it never came to one.
+        final: Whether the model is done with it; false where it will be sent again.
+    """
+
+    frame: frames.Frame
+    node: int
+    start_ns: int
+    end_ns: int
+    error: str
+    offered_ns: int
+    attempt: int
+    final: bool
+
+
+@dataclass(frozen=True, slots=True)
+class NodeState:
+    """A node's counters.
+
+    Attributes:
+        state: One of `STATES`.
+        tec: Transmit error counter.
+        rec: Receive error counter.
+        queued: Frames waiting.
+        deepest: Most frames that ever waited.
+        sent: Frames sent.
+        errors: Attempts that ended in an error.
+        unacknowledged: Those of them for want of an acknowledge.
+        dropped: Frames that found the queue full.
+        refused: Frames lost because the node was or went bus-off.
+        given_up: One-shot frames given up.
+        outbid: Arbitrations lost.
+        bus_offs: How often it went bus-off.
+    """
+
+    state: str
+    tec: int
+    rec: int
+    queued: int
+    deepest: int
+    sent: int
+    errors: int
+    unacknowledged: int
+    dropped: int
+    refused: int
+    given_up: int
+    outbid: int
+    bus_offs: int
+
+
+@dataclass(frozen=True, slots=True)
+class BusState:
+    """The bus as a whole, from the start to now. What is on the wire now counts when it ends.
+
+    Attributes:
+        now_ns: Time [ns].
+        load: Share of the time that it was taken, intermissions and errors with it.
+        window_load: The same in the last window that has ended.
+        peak_load: The highest of any window that has ended.
+        frames: Frames sent.
+        bits: Bits on the wire, intermissions with them.
+        errors: Transmissions that ended in an error.
+    """
+
+    now_ns: int
+    load: float
+    window_load: float
+    peak_load: float
+    frames: int
+    bits: int
+    errors: int
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Time from offer to end of frame, of all frames with one identifier.
+
+    Attributes:
+        count: Frames sent.
+        mean_s: Mean [s].
+        worst_s: Longest [s].
+    """
+
+    count: int
+    mean_s: float
+    worst_s: float
+
+
+def warm_up() -> None:
+    """Compile all that a bus runs, or load it from the cache: some 10 s once on a machine, so before a bus is live."""
+    model = BusModel("1M/5M")
+    node, _ = model.attach(), model.attach()
+    model.disturb(node)
+    model.offer(node, frames.Frame(0, b"\0", fd=True, brs=True))
+    model.advance(1_000_000)
+
+
+class BusModel:
+    """A bus with its nodes.
+
+    Args:
+        rate: Bit rates, as `drivers.can.timing.speed` takes them.
+        error_rate: Chance of an error a bit.
+        seed: Seed of these errors.
+        window_ns: Length of the windows of the load [ns].
+        start_ns: Time at which it starts [ns].
+
+    One thread at a time may use it.
+    """
+
+    def __init__(
+        self,
+        rate: str | float | Speed | can.BitTiming | can.BitTimingFd,
+        *,
+        error_rate: float = 0.0,
+        seed: int = 0,
+        window_ns: int = 100_000_000,
+        start_ns: int = 0,
+    ) -> None:
+        """Start with an idle bus that has no nodes."""
+        if window_ns <= 0:
+            raise InputError("window_ns", "above zero", window_ns)
+        if not 0 <= start_ns < 1 << 61:
+            raise InputError("start_ns", "not negative and below 2 ** 61", start_ns)
+        self.speed = speed(rate)
+        self._names: list[str] = []
+        self._offers = bytearray()
+        cells = np.zeros(kernels.CELLS, np.int64)
+        for cell in (kernels.NOW, kernels.FREE, kernels.WINDOW):
+            cells[cell] = start_ns
+        cells[kernels.WINDOW_LENGTH] = window_ns
+        self._start_ns = start_ns
+        self._bus = kernels.Bus(
+            cells=cells,
+            nodes=np.zeros((0, kernels.NODE_COLUMNS), np.int64),
+            queues=np.zeros((0, 1), np.int64),
+            slots=np.zeros((0, kernels.SLOT_COLUMNS), np.int64),
+            store=np.zeros(0, frames.RECORD),
+            arrivals=np.zeros(0, np.int64),
+            unused=np.zeros(0, np.int64),
+            senders=np.zeros(0, np.int64),
+            latencies=np.zeros((_LATENCIES, 4), np.int64),
+            random=np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64),
+        )
+        self._results = np.zeros((0, kernels.RESULT_COLUMNS), np.int64)
+        self._error_rate = 0.0
+        self.error_rate = error_rate
+
+    @property
+    def now_ns(self) -> int:
+        """Time up to which the bus was advanced [ns]."""
+        return int(self._bus.cells[kernels.NOW])
+
+    @property
+    def error_rate(self) -> float:
+        """Chance of an error a bit of a frame."""
+        return self._error_rate
+
+    @error_rate.setter
+    def error_rate(self, chance: float) -> None:
+        if not 0.0 <= chance <= 1.0:
+            raise InputError("error_rate", "between 0 and 1", chance)
+        self._error_rate = float(chance)
+        kernels.draw_gap(self._bus, self._error_rate)
+
+    def attach(
+        self,
+        name: str = "",
+        *,
+        queue: int = 64,
+        fifo: bool = False,
+        listen_only: bool = False,
+        automatic_recovery: bool = True,
+    ) -> int:
+        """Add a node.
+
+        Args:
+            name: What to call it in messages.
+            queue: Frames that can wait, the one on the wire with them; a frame beyond is dropped and counted.
+            fifo: Send in the order of offering. The default sends the highest priority first, as a controller with
+                buffers compares them; a first-in-first-out queue lets a frame of low priority hold up those behind it.
+            listen_only: It sends nothing, not even acknowledges.
+            automatic_recovery: Whether it recovers from bus-off by itself, or only by `recover`.
+
+        Returns:
+            Its number.
+        """
+        if not 1 <= queue <= 1 << 16:
+            raise InputError("queue", "between 1 and 65536 frames", queue)
+        node = self._vacant()
+        bus = self._bus
+        rows = max(len(self._names), node + 1)
+        if rows > len(bus.nodes) or queue > bus.queues.shape[1]:
+            width = max(queue, bus.queues.shape[1])
+            queues = np.zeros((rows, width), np.int64)
+            queues[: len(bus.queues), : bus.queues.shape[1]] = bus.queues
+            nodes = np.zeros((rows, kernels.NODE_COLUMNS), np.int64)
+            nodes[: len(bus.nodes)] = bus.nodes
+            senders = np.zeros(rows, np.int64)
+            senders[: len(bus.senders)] = bus.senders
+            self._bus = bus = bus._replace(queues=queues, nodes=nodes, senders=senders)
+            # One step of the kernel ends at most one transmission, or empties each queue once.
+            self._results = np.zeros((rows * (width + 2) + _GROWTH, kernels.RESULT_COLUMNS), np.int64)
+        if node == len(self._names):
+            self._names.append(name)
+        self._names[node] = name or f"node {node}"
+        row = bus.nodes[node]
+        row[:] = 0
+        row[kernels.ATTACHED] = 1
+        row[kernels.FIFO] = fifo
+        row[kernels.LISTENING] = listen_only
+        row[kernels.AUTOMATIC] = automatic_recovery
+        row[kernels.CAPACITY] = queue
+        row[kernels.HEAD] = -1
+        return node
+
+    def detach(self, node: int) -> None:
+        """Take a node off the bus: what waits in its queue is lost; a frame on the wire is still sent."""
+        row = self._row(node)
+        bus = self._bus
+        on_wire = set(bus.senders[: bus.cells[kernels.SENDERS]].tolist())
+        waiting = bus.queues[node, : row[kernels.COUNT]].tolist()
+        kept = [slot for slot in waiting if slot in on_wire]
+        self._free([slot for slot in waiting if slot not in on_wire])
+        bus.queues[node, : len(kept)] = kept
+        row[kernels.COUNT] = len(kept)
+        row[kernels.HEAD] = kept[0] if kept else -1
+        row[kernels.RECOVERING] = 0
+        row[kernels.ATTACHED] = 0
+
+    def offer(self, node: int, frame: frames.Frame, at_ns: int | None = None, *, one_shot: bool = False) -> None:
+        """Hand a frame to a node's controller.
+
+        Args:
+            node: Number of the node.
+            frame: The frame.
+            at_ns: When [ns]; a time that has passed, or none, is now.
+            one_shot: Give it up when it loses an arbitration or meets an error.
+        """
+        if self._row(node)[kernels.LISTENING]:
+            raise InputError("node", "one that may send", f"{self._names[node]} (listen only)")
+        if frame.fd and not self.speed.fd:
+            raise InputError("frame", f"classic on a bus of {self.speed}", frame)
+        time_ns = self.now_ns if at_ns is None else max(at_ns, self._start_ns)
+        self._offers += frames.pack(frame, node=node, time_ns=time_ns, one_shot=one_shot)
+
+    def offer_records(self, offers: np.ndarray) -> None:
+        """`offer` for many frames.
+
+        Args:
+            offers: Array of `drivers.can.frame.RECORD`, best in the order of its times; `node` by whom, `time_ns` when.
+        """
+        offers = frames.check_records(offers)
+        if not len(offers):
+            return
+        bus = self._bus
+        nodes = offers["node"]
+        highest = int(nodes.max())
+        if highest >= len(self._names):
+            raise InputError("node", "the number of a node of this bus", highest)
+        allowed = (bus.nodes[:, kernels.ATTACHED] != 0) & (bus.nodes[:, kernels.LISTENING] == 0)
+        if not allowed[nodes].all():
+            raise InputError("node", "attached and not listen only", int(nodes[~allowed[nodes]][0]))
+        if not self.speed.fd and (offers["flags"] & frames.FD).any():
+            raise InputError("frame", f"classic on a bus of {self.speed}", "a CAN FD frame")
+        self._offers += offers.tobytes()
+
+    def advance(self, until_ns: int) -> list[Delivery]:
+        """Let time pass.
+
+        Args:
+            until_ns: Up to when [ns]. A frame that could start just then waits, for a better one may yet be offered.
+
+        Returns:
+            All that ended by then, in the order of time. Where several nodes sent the very same frame at once, each
+            has its delivery, with the same times.
+        """
+        results = self.advance_records(until_ns)
+        if not len(results):
+            return []
+        sent = frames.frames(results["frame"])
+        rows = zip(
+            results["node"].tolist(),
+            results["start_ns"].tolist(),
+            results["end_ns"].tolist(),
+            results["outcome"].tolist(),
+            results["offered_ns"].tolist(),
+            results["attempt"].tolist(),
+            results["final"].tolist(),
+            strict=True,
+        )
+        return [
+            Delivery(frame, node, start, end, OUTCOMES[outcome], offered, attempt, final != 0)
+            for frame, (node, start, end, outcome, offered, attempt, final) in zip(sent, rows, strict=True)
+        ]
+
+    def advance_records(self, until_ns: int) -> np.ndarray:
+        """`advance` with an array of `RESULT`, shape (results,)."""
+        if not self.now_ns <= until_ns < 1 << 61:
+            raise InputError("until_ns", f"{self.now_ns} or later, and below 2 ** 61", until_ns)
+        self._take_offers()
+        parts = []
+        while True:
+            count = kernels.advance(
+                self._bus, until_ns, self._results, self.speed.nominal_ps, self.speed.data_ps, self._error_rate
+            )
+            if count:
+                parts.append(self._collect(self._results[:count]))
+            if not self._bus.cells[kernels.MORE]:
+                break
+        if len(parts) == 1:
+            return parts[0]
+        return np.concatenate(parts) if parts else np.zeros(0, RESULT)
+
+    def next_ns(self) -> int | None:
+        """Earliest time at which something can end or start [ns]; None where nothing is left to do."""
+        cells = self._bus.cells
+        if cells[kernels.SENDERS]:
+            return int(cells[kernels.END])
+        if self._offers or self._bus.nodes[:, kernels.COUNT].any():
+            return self.now_ns
+        if cells[kernels.NEXT] < cells[kernels.ARRIVALS]:
+            return int(self._bus.slots[self._bus.arrivals[cells[kernels.NEXT]], kernels.AT])
+        return None
+
+    def disturb(self, node: int, *, count: int = 1, bit: int = 24) -> None:
+        """Spoil the next frames that a node sends, each with one bit error.
+
+        Args:
+            node: Number of the node.
+            count: How many transmissions.
+            bit: Which bit, stuff bits counted, from the start of frame; the last one where the frame is shorter.
+        """
+        if count < 0 or bit < 0:
+            raise InputError("count and bit", "not negative", (count, bit))
+        row = self._row(node)
+        row[kernels.DISTURBED] = count
+        row[kernels.DISTURBED_BIT] = bit
+
+    def recover(self, node: int) -> None:
+        """Ask a node that is bus-off to join again; it does after 128 runs of 11 recessive bits from now."""
+        row = self._row(node)
+        if row[kernels.STATE] == kernels.OFF and not row[kernels.RECOVERING]:
+            row[kernels.RECOVERING] = 1
+            row[kernels.LEFT] = 128
+            row[kernels.QUIET] = max(self.now_ns, int(self._bus.cells[kernels.FREE]))
+
+    def node(self, node: int) -> NodeState:
+        """A node's counters."""
+        row = self._row(node, gone=True)
+        return NodeState(
+            state=STATES[row[kernels.STATE]],
+            tec=int(row[kernels.TEC]),
+            rec=int(row[kernels.REC]),
+            queued=int(row[kernels.COUNT]),
+            deepest=int(row[kernels.DEEPEST]),
+            sent=int(row[kernels.SENT]),
+            errors=int(row[kernels.ERRORS]),
+            unacknowledged=int(row[kernels.UNACKNOWLEDGED]),
+            dropped=int(row[kernels.DROPPED]),
+            refused=int(row[kernels.REFUSED]),
+            given_up=int(row[kernels.GIVEN_UP]),
+            outbid=int(row[kernels.OUTBID]),
+            bus_offs=int(row[kernels.BUS_OFFS]),
+        )
+
+    def state(self) -> BusState:
+        """The bus as a whole."""
+        cells = self._bus.cells
+        passed = max(self.now_ns - self._start_ns, int(cells[kernels.FREE]) - self._start_ns, 1)
+        window = int(cells[kernels.WINDOW_LENGTH])
+        return BusState(
+            now_ns=self.now_ns,
+            load=int(cells[kernels.BUSY]) / passed,
+            window_load=int(cells[kernels.WINDOW_LAST]) / window,
+            peak_load=int(cells[kernels.WINDOW_PEAK]) / window,
+            frames=int(cells[kernels.FRAMES]),
+            bits=int(cells[kernels.BITS]),
+            errors=int(cells[kernels.FAULTS]),
+        )
+
+    def latencies(self) -> dict[tuple[int, bool], Latency]:
+        """Latencies by identifier and whether it is extended; of the first 15000 or so identifiers."""
+        table = self._bus.latencies
+        result: dict[tuple[int, bool], Latency] = {}
+        for word, count, total, worst in table[table[:, kernels.LATENCY_COUNT] > 0].tolist():
+            key = (word & 0x1FFFFFFF, word & frames.EXTENDED != 0)
+            if key in result:  # A remote frame beside a data frame with the same identifier.
+                other = result[key]
+                total += round(other.mean_s * other.count * 1e9)
+                count, worst = count + other.count, max(worst, round(other.worst_s * 1e9))
+            result[key] = Latency(count, total / count * 1e-9, worst * 1e-9)
+        return dict(sorted(result.items()))
+
+    def _row(self, node: int, *, gone: bool = False) -> np.ndarray:
+        if not 0 <= node < len(self._names) or not (gone or self._bus.nodes[node, kernels.ATTACHED]):
+            raise InputError("node", "the number of a node of this bus", node)
+        return self._bus.nodes[node]
+
+    def _vacant(self) -> int:
+        """A row that no node, no frame on the wire and no coming frame uses any more; else a new one."""
+        self._take_offers()
+        bus = self._bus
+        cells = bus.cells
+        coming = set(bus.slots[bus.arrivals[cells[kernels.NEXT] : cells[kernels.ARRIVALS]], kernels.OWNER].tolist())
+        for node in range(len(self._names)):
+            if not bus.nodes[node, kernels.ATTACHED] and not bus.nodes[node, kernels.COUNT] and node not in coming:
+                return node
+        return len(self._names)
+
+    def _take_offers(self) -> None:
+        """Move what was offered since the last step into slots."""
+        if not self._offers:
+            return
+        batch = np.frombuffer(self._offers, frames.RECORD)
+        self._offers = bytearray()
+        cells = self._bus.cells
+        missing = len(batch) - int(cells[kernels.FREE_SLOTS])
+        if missing > 0:
+            self._grow(missing)
+        kernels.enlist(self._bus, batch, len(batch), self.speed.nominal_ps, self.speed.data_ps)
+
+    def _grow(self, missing: int) -> None:
+        bus = self._bus
+        before = len(bus.slots)
+        after = max(2 * before, before + missing, _GROWTH)
+        free = int(bus.cells[kernels.FREE_SLOTS])
+        slots = np.zeros((after, kernels.SLOT_COLUMNS), np.int64)
+        slots[:before] = bus.slots
+        store = np.zeros(after, frames.RECORD)
+        store[:before] = bus.store
+        arrivals = np.zeros(after, np.int64)
+        arrivals[:before] = bus.arrivals
+        unused = np.zeros(after, np.int64)
+        unused[:free] = bus.unused[:free]
+        unused[free : free + after - before] = np.arange(before, after)
+        bus.cells[kernels.FREE_SLOTS] = free + after - before
+        self._bus = bus._replace(slots=slots, store=store, arrivals=arrivals, unused=unused)
+
+    def _collect(self, rows: np.ndarray) -> np.ndarray:
+        slots = rows[:, kernels.R_SLOT]
+        results = np.zeros(len(rows), RESULT)
+        results["frame"] = self._bus.store[slots]
+        results["frame"]["time_ns"] = rows[:, kernels.R_END]
+        results["start_ns"] = rows[:, kernels.R_START]
+        results["end_ns"] = rows[:, kernels.R_END]
+        results["offered_ns"] = rows[:, kernels.R_AT]
+        results["outcome"] = rows[:, kernels.R_OUTCOME]
+        results["attempt"] = np.minimum(rows[:, kernels.R_ATTEMPT], 65535)
+        results["node"] = rows[:, kernels.R_NODE]
+        results["final"] = rows[:, kernels.R_FINAL]
+        self._free(slots[rows[:, kernels.R_FINAL] != 0])
+        return results
+
+    def _free(self, slots: np.ndarray | list[int]) -> None:
+        cells = self._bus.cells
+        free = int(cells[kernels.FREE_SLOTS])
+        self._bus.unused[free : free + len(slots)] = slots
+        cells[kernels.FREE_SLOTS] = free + len(slots)

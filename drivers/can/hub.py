@@ -1,0 +1,562 @@
+"""The hub of a virtual CAN bus: owns a bus model and lets it run by the wall clock, for endpoints in any process.
+
+Endpoints offer frames at any time; the model decides which is on the wire when. A frame is handed to all endpoints
+when the model says that its last bit has passed, at once where the bus is idle afterwards, else together with others
+once a tick. An endpoint that is slow or dead loses messages of its own and holds up nobody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drivers.can import medium
+from drivers.can.bus import OUTCOMES, STATES, BusModel
+from drivers.can.frame import RECORD, Frame
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    from rig.transport.zenoh import ZenohServer
+
+WINDOW = 512
+"""Frames that one endpoint may have waiting; what it offers beyond is dropped and counted."""
+MAX_ENDPOINTS = 64
+
+_TICK_NS = 1_000_000
+"""How long frames of a busy bus wait for others to travel with."""
+_MESSAGES_A_SECOND = 5000
+_BURST = 50
+"""Frames that may travel alone on a bus that is idle in between; beyond, they wait for the tick as well."""
+_ERRORS_A_SECOND = 1000
+_ERROR_BURST = 100
+"""Error frames that endpoints are told of; a bus that nothing works on has ten times as many."""
+_REPORT_NS = 100_000_000
+_HASTE_NS = 10_000_000
+"""How soon a report may follow another, and how often, where something has happened."""
+_GAP_NS = 20_000
+"""When to look again at a bus on which something waits for the end of an intermission or the like."""
+_PARTING_S = 1.0
+"""How long frames of an endpoint that has gone may wait for the bus."""
+_TOKENLESS_S = 10.0
+"""How long an endpoint may be without a token; it comes before the request to join, but on another way."""
+_LARGEST = 8 + medium.MAX_RECORDS * medium.RECORDS[medium.FD_WIDTH].itemsize
+_FEW = 8
+"""Frames that are offered one by one; arrays would cost more than they save."""
+
+_ON_WIRE = {
+    "bit error": (medium.PROTOCOL | medium.BUS_ERROR, bytes((0, 0, 0x80, 0))),
+    "collision of equal identifiers": (medium.PROTOCOL | medium.BUS_ERROR, bytes((0, 0, 0x80, 0))),
+    "no acknowledge": (medium.PROTOCOL | medium.BUS_ERROR | medium.NO_ACKNOWLEDGE, bytes((0, 0, 0x80, 0x19))),
+}
+"""Error frames of what all nodes see: class and first bytes as SocketCAN has them (0x80: on transmission; 0x19: in the
+acknowledge slot); other outcomes are the sender's affair."""
+_CONTROLLER_STATES = (medium.ACTIVE_AGAIN, medium.TRANSMIT_PASSIVE)
+
+
+@dataclass(slots=True)
+class _Endpoint:
+    name: str
+    number: int
+    """What it is called on the medium; given to another only after all other numbers."""
+    node: int
+    """Its number in the model."""
+    joined_s: float
+    listen_only: bool
+    token: bool
+    """Whether its token has been seen, or it needs none."""
+    offered: int = 0
+    done: int = 0
+    dropped: int = 0
+    left_s: float | None = None
+    """When it was found to have gone."""
+    reported: medium.Report | None = None
+    bus_offs: int = 0
+    """How often it had been bus-off when last reported."""
+
+
+class Hub:
+    """The one owner of a channel's bus.
+
+    Args:
+        model: The bus; nobody else may use it from now on.
+        channel: Name of the bus.
+        server: Where endpoints of other processes come in; None has only those of this process.
+        acknowledge: Let the hub's own node acknowledge, so that an only endpoint can send.
+        clock: Monotonic clock [ns].
+
+    Raises:
+        InputError: The channel's name is none.
+    """
+
+    def __init__(
+        self,
+        model: BusModel,
+        channel: str = "can0",
+        server: ZenohServer | None = None,
+        *,
+        acknowledge: bool = True,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        if not medium.is_name(channel):
+            raise InputError("channel", "letters, digits, - and _, such as can0", channel)
+        self.channel = channel
+        self._model = model
+        self._server = server
+        self._clock = clock
+        self._start_ns = clock()
+        self.epoch_ns = time.time_ns()
+        """Wall time at bus time 0 since the Unix epoch [ns]."""
+        self._lock = threading.Lock()
+        self._wake = threading.Event()
+        self._stopping = False
+        self._endpoints: dict[str, _Endpoint] = {}
+        self._by_node: dict[int, _Endpoint] = {}
+        self._numbers = np.full(256, medium.NO_NODE, np.uint16)
+        """Number on the medium by number in the model."""
+        self._locals: dict[str, tuple[Callable[[bytes], None], Callable[[], None]]] = {}
+        self._tokens: set[str] = set()
+        self._outbox: list[np.ndarray] = []
+        self._waiting = 0
+        """Frames that the model is not done with."""
+        self._report_due = False
+        self._next_report_ns = 0
+        self._last_report_ns = 0
+        self._errors_left = float(_ERROR_BURST)
+        self._errors_ns = 0
+        self._published_ns = -_TICK_NS
+        self._credit = float(_BURST)
+        self._credit_ns = 0
+        self._next_number = 1
+        self._counts: Counter[str] = Counter()
+        self._thread = threading.Thread(target=self._run, name=f"can hub {channel}", daemon=True)
+        model.attach("hub", listen_only=not acknowledge)
+
+    # Life.
+
+    def start(self) -> None:
+        """Take endpoints, and let the bus run on a thread of its own."""
+        _warm_up(self._model)
+        if self._server is not None:
+            for name in ("join", "set", "flush", "status"):
+                self._server.answer(medium.request_key(self.channel, name), self._answerer(name))
+            self._server.watch(medium.node_key(self.channel, "*"), self._watch)
+            self._server.hear(medium.offer_key(self.channel, "*"), self._hear)
+        self._thread.start()
+        if self._server is not None:
+            self._server.announce(medium.alive_key(self.channel))
+
+    def close(self) -> None:
+        """End the bus; the server stays open and is its owner's to close."""
+        with self._lock:
+            if self._stopping:
+                return
+            self._stopping = True
+            locals_ = list(self._locals.values())
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2.0)
+        for _, lost in locals_:
+            lost()
+
+    def __enter__(self) -> Hub:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # Endpoints.
+
+    def connect(self, name: str, take: Callable[[bytes], None], lost: Callable[[], None]) -> None:
+        """Make an endpoint of this process known, before it joins.
+
+        Args:
+            name: Its name.
+            take: Called with each message of the bus, on the hub's thread; must return at once.
+            lost: Called when the hub ends.
+        """
+        with self._lock:
+            self._locals[name] = (take, lost)
+
+    def disconnect(self, name: str) -> None:
+        """Forget an endpoint of this process; what it has offered is still sent."""
+        with self._lock:
+            self._locals.pop(name, None)
+            self._leave(name)
+
+    def offer(self, name: str, payload: bytes) -> None:
+        """Take a message of frames from an endpoint."""
+        with self._lock:
+            endpoint = self._endpoints.get(name)
+            if endpoint is None or endpoint.left_s is not None:
+                self._counts["strange"] += 1
+                return
+            try:
+                if len(payload) > _LARGEST:
+                    raise medium.MediumError("too long")
+                self._offer(endpoint, payload)
+            except medium.MediumError:
+                self._counts["malformed"] += 1
+        self._wake.set()
+
+    def _offer(self, endpoint: _Endpoint, payload: bytes) -> None:
+        records = medium.decode_array(payload)
+        endpoint.offered += len(records)
+        fd = self._model.speed.fd
+        room = 0 if endpoint.listen_only else WINDOW - (endpoint.offered - len(records) - endpoint.done)
+        fit = len(records) if len(records) > _FEW else 0
+        if fit:
+            good = medium.sendable(records, fd=fd)
+            invalid = fit - int(np.count_nonzero(good))
+            taken = _for_model(records[good][: max(room, 0)], endpoint.node, self._now())
+            self._model.offer_records(taken)
+            count = len(taken)
+        else:
+            invalid = count = 0
+            for record in medium.decode(payload):
+                if medium.fault_of(record, fd=fd) is not None:
+                    invalid += 1
+                elif count < room:
+                    self._model.offer(endpoint.node, _frame_of(record), self._now())
+                    count += 1
+        self._waiting += count
+        if count < len(records):
+            self._counts["invalid"] += invalid
+            self._counts["surplus"] += len(records) - invalid - count
+            endpoint.done += len(records) - count
+            endpoint.dropped += len(records) - count
+            self._report_due = True
+
+    def answer(self, name: str, document: dict[str, Any]) -> dict[str, Any]:
+        """Answer a request: `join`, `set`, `flush`, `status`.
+
+        Args:
+            name: Which.
+            document: Its arguments; `endpoint` is the name of the asking endpoint.
+
+        Returns:
+            The answer, or a document with the one entry `error`.
+        """
+        if name == "status":
+            return self.status()
+        asker = document.get("endpoint")
+        if not isinstance(asker, str) or not medium.is_name(asker):
+            return {"error": "a request names its endpoint"}
+        with self._lock:
+            if name == "join":
+                return self._join(asker, listen_only=document.get("listen_only") is True)
+            endpoint = self._endpoints.get(asker)
+            if endpoint is None:
+                return {"error": f"no endpoint {asker} has joined"}
+            if name == "set":
+                endpoint.listen_only = document.get("listen_only") is True
+            elif name != "flush":
+                return {"error": f"no request {name}"}
+            # Both restart the controller, as real ones must be for the one and mostly are for the other.
+            self._detach(endpoint)
+            self._attach(endpoint)
+            self._report_due = True
+        self._wake.set()
+        return {}
+
+    def _answerer(self, name: str) -> Callable[[bytes], bytes]:
+        def answer(payload: bytes) -> bytes:
+            document: Any = None
+            if len(payload) <= 4096:
+                with contextlib.suppress(ValueError, RecursionError):
+                    document = json.loads(payload or b"{}")
+            if not isinstance(document, dict):
+                with self._lock:
+                    self._counts["malformed"] += 1
+                return b'{"error": "a request is a JSON object"}'
+            return json.dumps(self.answer(name, document)).encode()
+
+        return answer
+
+    def _join(self, name: str, *, listen_only: bool) -> dict[str, Any]:
+        if (known := self._endpoints.get(name)) is not None:
+            self._remove(known)
+        if len(self._endpoints) >= MAX_ENDPOINTS:
+            return {"error": f"{MAX_ENDPOINTS} endpoints are there already"}
+        number = self._next_number
+        # Numbers are used again only after all others: a late frame must not be taken for one's own.
+        while True:
+            self._next_number = self._next_number % (medium.NO_NODE - 1) + 1
+            if all(self._next_number != endpoint.number for endpoint in self._endpoints.values()):
+                break
+        token = name in self._tokens or name in self._locals
+        endpoint = self._endpoints[name] = _Endpoint(name, number, -1, time.monotonic(), listen_only, token)
+        self._attach(endpoint)
+        return {
+            "node": number,
+            "window": WINDOW,
+            **self._bus(),
+            "epoch_ns": self.epoch_ns,
+        }
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        self.offer(key.rpartition("/")[2], payload)
+
+    def _watch(self, key: str, there: bool) -> None:
+        name = key.rpartition("/")[2]
+        with self._lock:
+            if not there:
+                self._tokens.discard(name)
+                self._leave(name)
+            elif len(self._tokens) < 16 * MAX_ENDPOINTS:
+                self._tokens.add(name)
+                if (endpoint := self._endpoints.get(name)) is not None:
+                    endpoint.token = True
+        self._wake.set()
+
+    def _leave(self, name: str) -> None:
+        if (endpoint := self._endpoints.get(name)) is not None and endpoint.left_s is None:
+            endpoint.left_s = time.monotonic()
+
+    def _remove(self, endpoint: _Endpoint) -> None:
+        del self._endpoints[endpoint.name]
+        self._detach(endpoint)
+
+    def _attach(self, endpoint: _Endpoint) -> None:
+        node = endpoint.node = self._model.attach(endpoint.name, queue=WINDOW, listen_only=endpoint.listen_only)
+        self._by_node[node] = endpoint
+        self._numbers[node] = endpoint.number
+
+    def _detach(self, endpoint: _Endpoint) -> None:
+        """Take its controller off the bus: what waits there is lost; a frame on the wire is still sent."""
+        lost = endpoint.offered - endpoint.done
+        endpoint.done += lost
+        endpoint.dropped += lost
+        self._waiting -= lost
+        del self._by_node[endpoint.node]
+        self._model.detach(endpoint.node)
+        endpoint.bus_offs = 0
+
+    def _bus(self) -> dict[str, Any]:
+        speed = self._model.speed
+        return {"fd": speed.fd, "nominal_bit_s": speed.nominal_bit_s, "data_bit_s": speed.data_bit_s}
+
+    # The bus by the clock.
+
+    def _now(self) -> int:
+        return self._clock() - self._start_ns
+
+    def _run(self) -> None:
+        _sharpen_sleep()
+        while not self._stopping:
+            self._wake.clear()
+            with self._lock:
+                now = self._now()
+                payloads, wake_ns, busy = self._step(now)
+            for payload in payloads:
+                self._publish(payload)
+            left_s = (wake_ns - self._now()) * 1e-9
+            if left_s <= 0:
+                continue
+            if busy:
+                # Nothing that is offered meanwhile can end earlier.
+                time.sleep(left_s)
+            else:
+                self._wake.wait(left_s)
+
+    def _step(self, now: int) -> tuple[list[bytes], int, bool]:
+        """Let the bus run until now: messages to send, when to come back, and whether only then."""
+        # One more: what was offered by now must have begun.
+        results = self._model.advance_records(max(now + 1, self._model.now_ns))
+        if len(results):
+            self._take_results(results)
+        next_ns = self._model.next_ns()
+        self._credit = min(_BURST, self._credit + (now - self._credit_ns) * 1e-9 * _MESSAGES_A_SECOND)
+        self._credit_ns = now
+        payloads = []
+        if self._outbox and (
+            now >= self._published_ns + _TICK_NS or (next_ns is None and self._credit >= 1 and not self._waiting)
+        ):
+            self._credit -= 1
+            self._published_ns = now
+            payloads = self._empty_outbox()
+        if now >= (self._last_report_ns + _HASTE_NS if self._report_due else self._next_report_ns):
+            reports = self._reports(now)
+            if reports:
+                # They count what was sent before them.
+                payloads += [*self._empty_outbox(), medium.encode_reports(reports)]
+            self._report_due = False
+            self._last_report_ns = now
+            self._next_report_ns = now + _REPORT_NS
+        wake_ns = self._last_report_ns + _HASTE_NS if self._report_due else self._next_report_ns
+        tick_ns = self._published_ns + _TICK_NS
+        if next_ns is not None:
+            next_ns = max(next_ns, now + _GAP_NS)
+            # More than this one: they travel together.
+            wake_ns = max(next_ns, tick_ns) if self._waiting > 1 or self._credit < 1 else next_ns
+        if self._outbox:
+            wake_ns = min(wake_ns, tick_ns)
+        return payloads, wake_ns, next_ns is not None or bool(self._outbox)
+
+    def _take_results(self, results: np.ndarray) -> None:
+        """Note what the model is done with, and keep what the endpoints must hear of."""
+        finals = results if results["final"].all() else results[results["final"] != 0]
+        for node, outcome in zip(finals["node"].tolist(), finals["outcome"].tolist(), strict=True):
+            endpoint = self._by_node.get(node)
+            # Where the controller has been taken off meanwhile, it is accounted for.
+            if endpoint is not None:
+                endpoint.done += 1
+                self._waiting -= 1
+                if outcome:
+                    endpoint.dropped += 1
+        records = results["frame"].view(medium.RECORDS[medium.FD_WIDTH])
+        records["time_ns"] += np.uint64(self.epoch_ns)
+        records["node"] = self._numbers[results["node"]]
+        records["flags"] &= medium.FD | medium.BIT_RATE_SWITCH | medium.ERROR_STATE
+        if results["outcome"].any():
+            records = self._with_errors(records, results)
+        self._counts["frames"] += len(results) - int(np.count_nonzero(results["outcome"]))
+        if len(records):
+            self._outbox.append(records)
+
+    def _with_errors(self, records: np.ndarray, results: np.ndarray) -> np.ndarray:
+        """The same with error frames in place of those that failed on the wire, and without others that failed."""
+        self._report_due = True
+        kept = np.ones(len(records), bool)
+        for row in np.flatnonzero(results["outcome"]).tolist():
+            text = OUTCOMES[results["outcome"][row]]
+            end_ns = int(results["end_ns"][row])
+            kept[row] = text in _ON_WIRE and self._may_tell(end_ns)
+            if text in _ON_WIRE:
+                self._counts["errors"] += 1
+                kind, data = _ON_WIRE[text]
+                number = int(records["node"][row])
+                error = medium.error_record(self.epoch_ns + end_ns, kind, data=data + bytes(4), node=number)
+                records[row] = medium.widen([error])[0]
+            else:
+                self._counts["unsent"] += 1
+        return records[kept]
+
+    def _may_tell(self, at_ns: int) -> bool:
+        refilled = (at_ns - self._errors_ns) * 1e-9 * _ERRORS_A_SECOND
+        self._errors_left = min(_ERROR_BURST, self._errors_left + refilled)
+        self._errors_ns = at_ns
+        if self._errors_left < 1:
+            return False
+        self._errors_left -= 1
+        return True
+
+    def _empty_outbox(self) -> list[bytes]:
+        if not self._outbox:
+            return []
+        records = self._outbox[0] if len(self._outbox) == 1 else np.concatenate(self._outbox)
+        self._outbox.clear()
+        if records["length"].max() <= medium.CLASSIC_WIDTH:
+            records = medium.narrow(records)
+        size = medium.MAX_RECORDS
+        return [medium.encode_array(records[first : first + size]) for first in range(0, len(records), size)]
+
+    def _reports(self, now: int) -> list[medium.Report]:
+        """What has changed at the endpoints; those that have gone are forgotten."""
+        found = []
+        seconds = time.monotonic()
+        for endpoint in list(self._endpoints.values()):
+            if not endpoint.token and endpoint.left_s is None and seconds - endpoint.joined_s > _TOKENLESS_S:
+                endpoint.left_s = seconds
+            if endpoint.left_s is not None and (
+                endpoint.done == endpoint.offered or seconds - endpoint.left_s > _PARTING_S
+            ):
+                self._remove(endpoint)
+                continue
+            report = self._report(endpoint)
+            before, endpoint.reported = endpoint.reported, report
+            if report == before:
+                continue
+            found.append(report)
+            # A recovery may be over before anybody has looked.
+            bus_offs = self._model.node(endpoint.node).bus_offs
+            if bus_offs > endpoint.bus_offs:
+                self._tell(now, report, medium.BUS_OFF, 0)
+            state = 2 if bus_offs > endpoint.bus_offs else 0 if before is None else before.state
+            endpoint.bus_offs = bus_offs
+            if state == 2 and report.state < 2:
+                self._tell(now, report, medium.RESTARTED, 0)
+            elif report.state != state:
+                self._tell(now, report, medium.CONTROLLER, _CONTROLLER_STATES[report.state])
+        return found
+
+    def _tell(self, now: int, report: medium.Report, kind: int, detail: int) -> None:
+        """An error frame about one node's controller."""
+        counters = (min(report.transmit_errors, 255), min(report.receive_errors, 255))
+        data = bytes((0, detail, 0, 0, 0, 0, *counters))
+        change = medium.error_record(self.epoch_ns + now, kind | medium.COUNTERS, data=data, node=report.node)
+        self._outbox.append(medium.widen([change]))
+
+    def _report(self, endpoint: _Endpoint) -> medium.Report:
+        node = self._model.node(endpoint.node)
+        state = STATES.index(node.state)
+        return medium.Report(endpoint.number, state, node.tec, node.rec, endpoint.done, endpoint.dropped)
+
+    def _publish(self, payload: bytes) -> None:
+        if self._server is not None:
+            self._server.publish(medium.bus_key(self.channel), payload)
+        for take, _ in list(self._locals.values()):
+            take(payload)
+
+    def status(self) -> dict[str, Any]:
+        """What goes on: endpoints, counts."""
+        with self._lock:
+            return {
+                "channel": self.channel,
+                **self._bus(),
+                "load": self._model.state().window_load,
+                "time_s": self._now() * 1e-9,
+                "counts": {name: self._counts[name] for name in _COUNTS},
+                "nodes": [
+                    {"name": endpoint.name, "listen_only": endpoint.listen_only, **self._report(endpoint)._asdict()}
+                    for endpoint in self._endpoints.values()
+                ],
+            }
+
+
+def _frame_of(record: medium.Record) -> Frame:
+    word, flags = record.identifier, record.flags
+    extended, remote = word & medium.EXTENDED != 0, word & medium.REMOTE != 0
+    return Frame(
+        word & medium.EXTENDED_MASK,
+        bytes(record.length) if remote else record.data,
+        extended,
+        remote,
+        flags & medium.FD != 0,
+        flags & medium.BIT_RATE_SWITCH != 0,
+        flags & medium.ERROR_STATE != 0,
+    )
+
+
+def _for_model(records: np.ndarray, node: int, now: int) -> np.ndarray:
+    """Offered frames as the model takes them."""
+    found = medium.widen(records)
+    found["node"] = node
+    found["time_ns"] = now
+    return found.view(RECORD)
+
+
+_COUNTS = ("frames", "errors", "unsent", "malformed", "invalid", "surplus", "strange")
+
+
+def _warm_up(model: BusModel) -> None:
+    """Load what is compiled, or compile it: not while frames wait."""
+    trial = BusModel(model.speed)
+    trial.attach("listener")
+    trial.offer(trial.attach("sender"), Frame(0))
+    trial.advance_records(1_000_000_000)
+
+
+def _sharpen_sleep() -> None:
+    """Let this thread's sleeps end within some microseconds, not 50 late (Linux)."""
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).prctl(29, 1, 0, 0, 0)  # PR_SET_TIMERSLACK [ns]

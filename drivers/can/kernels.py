@@ -1,0 +1,872 @@
+"""Compiled part of the bus: bits of frames, arbitration, queues, faults and error counters.
+
+All compiled code of the package is in this one file: numba's cache looks only at the file of the function it loads, so
+that a kernel calling another file's kernel could be served stale. Nothing is imported but numba and numpy.
+
+Bits of frames follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and extended format). Levels: 0 dominant,
+1 recessive. Time is an integer [ns]; bit times are integers [ps].
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+# Flags in the identifier's word, as SocketCAN has them, and in the byte of flags.
+EXTENDED = 1 << 31
+REMOTE = 1 << 30
+FD = 1
+BRS = 2
+ESI = 4
+ONE_SHOT = 16
+
+# Kinds of an encoded bit, added up.
+FAST = 1
+STUFF = 2
+FIXED = 4
+
+LONGEST = 800
+"""Room for the bits of any frame, stuffed (the longest has fewer than 740)."""
+
+INTERMISSION = 3
+TAIL = 10
+"""CRC delimiter 1, ACK 1, ACK delimiter 1, end of frame 7."""
+
+# Columns of `Bus.nodes`.
+ATTACHED, FIFO, LISTENING, AUTOMATIC, CAPACITY = 0, 1, 2, 3, 4
+TEC, REC, STATE, COUNT, HEAD, SUSPENDED, LEFT, RECOVERING, QUIET = 5, 6, 7, 8, 9, 10, 11, 12, 13
+DISTURBED, DISTURBED_BIT = 14, 15
+SENT, ERRORS, UNACKNOWLEDGED, DROPPED, REFUSED, GIVEN_UP, BUS_OFFS, DEEPEST, OUTBID = 16, 17, 18, 19, 20, 21, 22, 23, 24
+NODE_COLUMNS = 25
+
+ACTIVE, PASSIVE, OFF = 0, 1, 2
+
+# Columns of `Bus.slots`.
+KEY, AT, SEQUENCE, NOMINAL, QUICK, DURATION, ATTEMPTS, OWNER = 0, 1, 2, 3, 4, 5, 6, 7
+SLOT_COLUMNS = 8
+
+# Cells of `Bus.cells`.
+NOW, FREE, SENDERS, START, END, OUTCOME, NEXT, ARRIVALS = 0, 1, 2, 3, 4, 5, 6, 7
+BUSY, FRAMES, BITS, FAULTS, WINDOW, WINDOW_BUSY, WINDOW_LAST, WINDOW_PEAK = 8, 9, 10, 11, 12, 13, 14, 15
+GAP, MORE, SEQUENCES, FREE_SLOTS, WINDOW_LENGTH, FLAG_BITS = 16, 17, 18, 19, 20, 21
+CELLS = 22
+
+# Outcomes of a frame; those from SENT_OUTCOME on have no retry, unless the frame was one-shot.
+OUTCOMES = (
+    "",
+    "bit error",
+    "no acknowledge",
+    "collision of equal identifiers",
+    "queue full",
+    "bus-off",
+    "lost arbitration",
+    "detached",
+)
+GOOD, BIT_ERROR, NO_ACKNOWLEDGE, COLLISION, QUEUE_FULL, BUS_OFF, LOST_ARBITRATION, DETACHED = range(8)
+
+# Columns of a result.
+R_SLOT, R_START, R_END, R_OUTCOME, R_ATTEMPT, R_NODE, R_AT, R_FINAL = 0, 1, 2, 3, 4, 5, 6, 7
+RESULT_COLUMNS = 8
+
+LATENCY_KEY, LATENCY_COUNT, LATENCY_SUM, LATENCY_WORST = 0, 1, 2, 3
+
+_FAR = np.int64(1) << 62
+_RECESSIVE_RUN = 11
+_RECOVERY = 128
+_PROBES = 64
+"""Places of the table of latencies to look at; where it is full of others, a new identifier goes uncounted."""
+
+
+class Bus(NamedTuple):
+    """All state of a bus, in arrays that the kernels change.
+
+    Attributes:
+        cells: One value a cell, shape (CELLS,).
+        nodes: One row a node, shape (nodes, NODE_COLUMNS).
+        queues: Slots in each node's queue, in no order, shape (nodes, capacity).
+        slots: One row a frame that is queued or will be, shape (slots, SLOT_COLUMNS).
+        store: The frames of the slots, records of `drivers.can.frame.RECORD`, shape (slots,).
+        arrivals: Slots that are not queued yet, by time, shape (slots,).
+        unused: Stack of free slots, shape (slots,).
+        senders: Slots on the wire now; more than one only where nodes send the same identifier, shape (nodes,).
+        latencies: Open-addressed table of the identifiers' latencies, shape (power of two, 4).
+        random: State of the generator of bit errors, shape (1,).
+    """
+
+    cells: np.ndarray
+    nodes: np.ndarray
+    queues: np.ndarray
+    slots: np.ndarray
+    store: np.ndarray
+    arrivals: np.ndarray
+    unused: np.ndarray
+    senders: np.ndarray
+    latencies: np.ndarray
+    random: np.ndarray
+
+
+def _stuffing_of_bytes() -> tuple[np.ndarray, np.ndarray]:
+    """Run after a byte and stuff bits in it, by run before (level times 5, plus length) and value, shape (10, 256)."""
+    after = np.zeros((10, 256), np.uint8)
+    added = np.zeros((10, 256), np.uint8)
+    value = np.arange(256)
+    for state in range(10):
+        last = np.full(256, state // 5)
+        run = np.full(256, state % 5)
+        for k in range(7, -1, -1):
+            bit = (value >> k) & 1
+            run = np.where(bit == last, run + 1, 1)
+            full = run == 5
+            last = np.where(full, 1 - bit, bit)
+            run = np.where(full, 1, run)
+            added[state] += full.astype(np.uint8)
+        after[state] = last * 5 + run
+    return after, added
+
+
+_AFTER, _ADDED = _stuffing_of_bytes()
+
+
+@njit(cache=True, error_model="numpy")
+def code_of(length):
+    """Data length code of a number of bytes: 0 to 8, then 12, 16, 20, 24, 32, 48, 64 (ISO 11898-1, table 5)."""
+    if length <= 8:
+        return length
+    if length <= 24:
+        return 9 + (length - 12) // 4
+    if length == 32:
+        return 13
+    return 14 if length == 48 else 15
+
+
+@njit(cache=True, error_model="numpy")
+def header_and_data(identifier, length, flags, data, raw):
+    """Bits from start of frame to the end of the data field, not stuffed.
+
+    Returns:
+        Their number, and the index of the first bit that is sent at the data rate (LONGEST where none is).
+    """
+    n = 1
+    raw[0] = 0
+    extended = (identifier & EXTENDED) != 0
+    remote = 1 if (identifier & REMOTE) != 0 else 0
+    fd = (flags & FD) != 0
+    if extended:
+        for k in range(28, 17, -1):
+            raw[n] = (identifier >> k) & 1
+            n += 1
+        raw[n] = 1  # SRR
+        raw[n + 1] = 1  # IDE
+        n += 2
+        for k in range(17, -1, -1):
+            raw[n] = (identifier >> k) & 1
+            n += 1
+        raw[n] = 0 if fd else remote  # RRS or RTR
+        n += 1
+    else:
+        for k in range(10, -1, -1):
+            raw[n] = (identifier >> k) & 1
+            n += 1
+        raw[n] = 0 if fd else remote
+        raw[n + 1] = 0  # IDE
+        n += 2
+    switch = LONGEST
+    if fd:
+        raw[n] = 1  # FDF
+        raw[n + 1] = 0  # res
+        raw[n + 2] = 1 if (flags & BRS) != 0 else 0
+        raw[n + 3] = 1 if (flags & ESI) != 0 else 0
+        if (flags & BRS) != 0:
+            switch = n + 3
+        n += 4
+    else:
+        raw[n] = 0  # FDF
+        n += 1
+        if extended:
+            raw[n] = 0  # r0
+            n += 1
+    code = code_of(length)
+    for k in range(3, -1, -1):
+        raw[n] = (code >> k) & 1
+        n += 1
+    if remote == 0 or fd:
+        for i in range(length):
+            value = data[i]
+            for k in range(7, -1, -1):
+                raw[n] = (value >> k) & 1
+                n += 1
+    return n, switch
+
+
+@njit(cache=True, error_model="numpy")
+def crc15(raw, n):
+    """CRC-15 of n bits, polynomial 0x4599 (ISO 11898-1:2015, 10.4.2.6)."""
+    crc = 0
+    for i in range(n):
+        feed = raw[i] ^ (crc >> 14)
+        crc = (crc << 1) & 0x7FFF
+        if feed:
+            crc ^= 0x4599
+    return crc
+
+
+@njit(cache=True, error_model="numpy")
+def count_bits(identifier, length, flags, data, raw):
+    """Bits of a frame with stuffing and intermission: at the nominal rate and at the data rate.
+
+    The bit BRS and the CRC delimiter are each sent partly at one rate and partly at the other, cut at the sample
+    points; together they last exactly one nominal and one data bit time, and are counted so.
+
+    Args:
+        identifier: Identifier with its flags.
+        length: Bytes of data, or that a remote frame asks for.
+        flags: FD, BRS, ESI.
+        data: Bytes, at least `length`.
+        raw: Room to work in, uint8, shape (LONGEST,).
+    """
+    fd = (flags & FD) != 0
+    # Of an FD frame the first bits one by one, then whole bytes, and the last byte by bits again: after the very last
+    # bit of the data field a fixed stuff bit takes the place of one by content.
+    whole = max(length - 1, 0) if fd else 0
+    n, switch = header_and_data(identifier, 0 if whole > 0 else length, flags, data, raw)
+    if whole > 0:
+        code = code_of(length)
+        for k in range(4):
+            raw[n - 4 + k] = (code >> (3 - k)) & 1
+    stop = n if whole > 0 else n - 1
+    if not fd:
+        crc = crc15(raw, n)
+        for k in range(14, -1, -1):
+            raw[n] = (crc >> k) & 1
+            n += 1
+        stop = n
+    slow = min(n, switch)
+    quick = n - slow
+    last = 1
+    run = 1
+    for i in range(stop):
+        if raw[i] == last:
+            run += 1
+            if run == 5:
+                if i >= switch - 1:
+                    quick += 1
+                else:
+                    slow += 1
+                last ^= 1
+                run = 1
+        else:
+            last = raw[i]
+            run = 1
+    if whole > 0:
+        state = 5 * last + run
+        added = 0
+        for i in range(whole):
+            added += _ADDED[state, data[i]]
+            state = _AFTER[state, data[i]]
+        last = state // 5
+        run = state % 5
+        value = data[length - 1]
+        for k in range(7, 0, -1):
+            bit = (value >> k) & 1
+            run = run + 1 if bit == last else 1
+            last = bit
+            if run == 5:
+                added += 1
+                last ^= 1
+                run = 1
+        added += 8 * length
+        if (flags & BRS) != 0:
+            quick += added
+        else:
+            slow += added
+    if not fd:
+        return slow + TAIL + INTERMISSION, 0
+    # Stuff count and parity 4, CRC 17 or 21, fixed stuff bits: one before, one after each fourth bit.
+    tail = 4 + 17 + 6 if length <= 16 else 4 + 21 + 7
+    if (flags & BRS) != 0:
+        return slow + TAIL - 1 + INTERMISSION, quick + tail + 1
+    return slow + tail + TAIL + INTERMISSION, 0
+
+
+@njit(cache=True, error_model="numpy")
+def count_many(identifiers, lengths, flags, data, nominal, quick):
+    """`count_bits` for many frames: arrays of shape (frames,), data (frames, 64)."""
+    raw = np.empty(LONGEST, np.uint8)
+    for i in range(identifiers.shape[0]):
+        nominal[i], quick[i] = count_bits(np.int64(identifiers[i]), np.int64(lengths[i]), flags[i], data[i], raw)
+
+
+@njit(cache=True, error_model="numpy")
+def encode(identifier, length, flags, data, bits, kinds):
+    """All bits of a frame as they are on the wire when it is acknowledged, with the intermission.
+
+    Args:
+        identifier: Identifier with its flags.
+        length: Bytes of data, or that a remote frame asks for.
+        flags: FD, BRS, ESI.
+        data: Bytes, at least `length`.
+        bits: Out: levels, uint8, shape (LONGEST,).
+        kinds: Out: FAST, STUFF, FIXED added up, uint8, shape (LONGEST,).
+
+    Returns:
+        Number of bits, and the CRC.
+    """
+    raw = np.empty(LONGEST, np.uint8)
+    n, switch = header_and_data(identifier, length, flags, data, raw)
+    fd = (flags & FD) != 0
+    crc = 0
+    stop = n - 1
+    if not fd:
+        crc = crc15(raw, n)
+        for k in range(14, -1, -1):
+            raw[n] = (crc >> k) & 1
+            n += 1
+        stop = n
+    out = 0
+    last = 1
+    run = 1
+    stuffed = 0
+    for i in range(n):
+        bits[out] = raw[i]
+        kinds[out] = FAST if i >= switch else 0
+        out += 1
+        if raw[i] == last:
+            run += 1
+        else:
+            last = raw[i]
+            run = 1
+        if run == 5 and i < stop:
+            last ^= 1
+            run = 1
+            stuffed += 1
+            bits[out] = last
+            kinds[out] = STUFF + (FAST if i >= switch - 1 else 0)
+            out += 1
+    kind = FAST if (flags & BRS) != 0 and fd else 0
+    if fd:
+        width = 17 if length <= 16 else 21
+        polynomial = 0x1685B if length <= 16 else 0x102899
+        gray = (stuffed % 8) ^ ((stuffed % 8) >> 1)
+        parity = (gray ^ (gray >> 1) ^ (gray >> 2)) & 1
+        field = (gray << 1) | parity
+        # The CRC covers dynamic stuff bits and the stuff count, not the fixed stuff bits; it starts at 1, 0, 0, ...
+        crc = 1 << (width - 1)
+        top = width - 1
+        mask = (1 << width) - 1
+        for i in range(out):
+            feed = bits[i] ^ (crc >> top)
+            crc = (crc << 1) & mask
+            if feed:
+                crc ^= polynomial
+        for k in range(3, -1, -1):
+            feed = ((field >> k) & 1) ^ (crc >> top)
+            crc = (crc << 1) & mask
+            if feed:
+                crc ^= polynomial
+        for i in range(4 + width):
+            if i % 4 == 0:
+                bits[out] = 1 - bits[out - 1]
+                kinds[out] = FIXED + kind
+                out += 1
+            bits[out] = (field >> (3 - i)) & 1 if i < 4 else (crc >> (width + 3 - i)) & 1
+            kinds[out] = kind
+            out += 1
+    bits[out] = 1  # CRC delimiter
+    kinds[out] = kind
+    bits[out + 1] = 0  # ACK
+    kinds[out + 1] = 0
+    out += 2
+    for _ in range(1 + 7 + INTERMISSION):
+        bits[out] = 1
+        kinds[out] = 0
+        out += 1
+    return out, crc
+
+
+@njit(cache=True, error_model="numpy")
+def priority(identifier, flags):
+    """Arbitration field as the number that the bus compares: the lower wins.
+
+    Base identifier, RTR or SRR, IDE, extension, RTR, in the order on the wire; bits that a base frame has not are 0,
+    because at IDE it has won already.
+    """
+    remote = 1 if (identifier & REMOTE) != 0 and (flags & FD) == 0 else 0
+    if (identifier & EXTENDED) != 0:
+        value = identifier & 0x1FFFFFFF
+        return ((value >> 18) << 21) | (1 << 20) | (1 << 19) | ((value & 0x3FFFF) << 1) | remote
+    return ((identifier & 0x7FF) << 21) | (remote << 20)
+
+
+@njit(cache=True, error_model="numpy")
+def enlist(bus, batch, count, nominal_ps, data_ps):
+    """Take `count` frames of a batch of records into free slots and the list of arrivals.
+
+    Frames whose time has passed are offered now. Equal times keep the order of offering. There must be room.
+    """
+    cells, slots, store, arrivals, unused = bus.cells, bus.slots, bus.store, bus.arrivals, bus.unused
+    raw = np.empty(LONGEST, np.uint8)
+    waiting = cells[ARRIVALS] - cells[NEXT]
+    if cells[NEXT] > 0:
+        for k in range(waiting):
+            arrivals[k] = arrivals[cells[NEXT] + k]
+        cells[NEXT] = 0
+        cells[ARRIVALS] = waiting
+    for i in range(count):
+        cells[FREE_SLOTS] -= 1
+        s = unused[cells[FREE_SLOTS]]
+        store[s] = batch[i]
+        record = store[s]
+        identifier = np.int64(record["identifier"])
+        flags = np.int64(record["flags"])
+        nominal, quick = count_bits(identifier, np.int64(record["length"]), flags, record["data"], raw)
+        at = max(np.int64(record["time_ns"]), cells[NOW])
+        slots[s, KEY] = priority(identifier, flags)
+        slots[s, AT] = at
+        slots[s, NOMINAL] = nominal
+        slots[s, QUICK] = quick
+        slots[s, DURATION] = ((nominal - INTERMISSION) * nominal_ps + quick * data_ps + 500) // 1000
+        slots[s, ATTEMPTS] = 0
+        slots[s, OWNER] = record["node"]
+        k = cells[ARRIVALS]
+        while k > 0 and slots[arrivals[k - 1], AT] > at:
+            arrivals[k] = arrivals[k - 1]
+            k -= 1
+        arrivals[k] = s
+        cells[ARRIVALS] += 1
+
+
+@njit(cache=True, error_model="numpy")
+def _gap(random, chance):
+    """Good bits before the next bad one: geometric, by inversion; splitmix64 (Steele, Lea, Flood 2014)."""
+    random[0] += np.uint64(0x9E3779B97F4A7C15)
+    z = random[0]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    uniform = (np.float64(z >> np.uint64(11)) + 1.0) / 9007199254740993.0
+    if chance >= 1.0:
+        return np.int64(0)
+    return np.int64(min(np.log(uniform) / np.log1p(-chance), 4.0e18))
+
+
+@njit(cache=True, error_model="numpy")
+def draw_gap(bus, chance):
+    """Draw the distance to the next bit error anew; none where the chance is zero."""
+    bus.cells[GAP] = _gap(bus.random, chance) if chance > 0.0 else _FAR
+
+
+@njit(cache=True, error_model="numpy")
+def _put(out, count, slot, start, end, outcome, slots, final):
+    out[count, R_SLOT] = slot
+    out[count, R_START] = start
+    out[count, R_END] = end
+    out[count, R_OUTCOME] = outcome
+    out[count, R_ATTEMPT] = slots[slot, ATTEMPTS]
+    out[count, R_NODE] = slots[slot, OWNER]
+    out[count, R_AT] = slots[slot, AT]
+    out[count, R_FINAL] = final
+    return count + 1
+
+
+@njit(cache=True, error_model="numpy")
+def _find_head(bus, node):
+    """The frame that the node would send next: by priority, or the oldest; equal priorities keep their order."""
+    head = np.int64(-1)
+    fifo = bus.nodes[node, FIFO] != 0
+    for k in range(bus.nodes[node, COUNT]):
+        s = bus.queues[node, k]
+        if head < 0:
+            head = s
+            continue
+        key, best = bus.slots[s, KEY], bus.slots[head, KEY]
+        if fifo or key == best:
+            if bus.slots[s, SEQUENCE] < bus.slots[head, SEQUENCE]:
+                head = s
+        elif key < best:
+            head = s
+    bus.nodes[node, HEAD] = head
+
+
+@njit(cache=True, error_model="numpy")
+def _remove(bus, node, slot):
+    for k in range(bus.nodes[node, COUNT]):
+        if bus.queues[node, k] == slot:
+            bus.nodes[node, COUNT] -= 1
+            bus.queues[node, k] = bus.queues[node, bus.nodes[node, COUNT]]
+            break
+    _find_head(bus, node)
+
+
+@njit(cache=True, error_model="numpy")
+def _rejoin(bus, t, run_ns):
+    """Nodes that recover from bus-off join again when their 128 runs of 11 recessive bits were complete by t."""
+    nodes = bus.nodes
+    for n in range(nodes.shape[0]):
+        if nodes[n, RECOVERING] != 0 and nodes[n, QUIET] + nodes[n, LEFT] * run_ns <= t:
+            nodes[n, RECOVERING] = 0
+            nodes[n, STATE] = ACTIVE
+            nodes[n, TEC] = 0
+            nodes[n, REC] = 0
+
+
+@njit(cache=True, error_model="numpy")
+def _admit(bus, out, count):
+    """Put the next arrival into its node's queue; the newest frame is dropped where it is full."""
+    cells, nodes = bus.cells, bus.nodes
+    s = bus.arrivals[cells[NEXT]]
+    cells[NEXT] += 1
+    n = bus.slots[s, OWNER]
+    at = bus.slots[s, AT]
+    if nodes[n, ATTACHED] == 0:
+        return _put(out, count, s, at, at, DETACHED, bus.slots, 1)
+    if nodes[n, STATE] == OFF:
+        nodes[n, REFUSED] += 1
+        return _put(out, count, s, at, at, BUS_OFF, bus.slots, 1)
+    if nodes[n, COUNT] >= nodes[n, CAPACITY]:
+        nodes[n, DROPPED] += 1
+        return _put(out, count, s, at, at, QUEUE_FULL, bus.slots, 1)
+    bus.slots[s, SEQUENCE] = cells[SEQUENCES]
+    cells[SEQUENCES] += 1
+    bus.queues[n, nodes[n, COUNT]] = s
+    nodes[n, COUNT] += 1
+    nodes[n, DEEPEST] = max(nodes[n, DEEPEST], nodes[n, COUNT])
+    head = nodes[n, HEAD]
+    if head < 0 or (nodes[n, FIFO] == 0 and bus.slots[s, KEY] < bus.slots[head, KEY]):
+        nodes[n, HEAD] = s
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers):
+    """Time and length of an error that the sender sees in the bit at `position` of the frame on the wire.
+
+    The sender's flag starts with the next bit. Receivers see it when six equal bits have passed and answer with theirs:
+    superposed they last 6 to 12 bits (ISO 11898-1:2015, 10.4.4). In a field of fixed form, or where the bad bit itself
+    makes six equal ones, all see it at once. Then 8 bits of delimiter.
+
+    Returns:
+        Time from the start of frame to the end of the delimiter [ns], bits of the flags.
+    """
+    s = bus.senders[0]
+    record = bus.store[s]
+    bits = np.empty(LONGEST, np.uint8)
+    kinds = np.empty(LONGEST, np.uint8)
+    total, _ = encode(
+        np.int64(record["identifier"]),
+        np.int64(record["length"]),
+        np.int64(record["flags"]),
+        record["data"],
+        bits,
+        kinds,
+    )
+    time_ps = np.int64(0)
+    for k in range(position + 1):
+        time_ps += data_ps if (kinds[k] & FAST) != 0 else nominal_ps
+    passive = True
+    for k in range(bus.cells[SENDERS]):
+        if bus.nodes[bus.slots[bus.senders[k], OWNER], STATE] == ACTIVE:
+            passive = False
+    flag = 6
+    fixed = position >= total - INTERMISSION - TAIL or (kinds[position] & FIXED) != 0
+    if receivers and receivers_active and not fixed:
+        level = 1 - bits[position]
+        run = 1
+        k = position - 1
+        while k >= 0 and bits[k] == level:
+            run += 1
+            k -= 1
+        if run < 6:
+            flag = 12 - (run if level == (1 if passive else 0) else 0)
+    elif receivers_active and position == total - INTERMISSION - 9:
+        flag = 7  # The acknowledge is missing: receivers see it from the flag's first bit, in the delimiter.
+    return (time_ps + (flag + 8) * nominal_ps + 500) // 1000, flag
+
+
+@njit(cache=True, error_model="numpy")
+def _differ(bus):
+    """First bit in which the frames on the wire differ; -1 where they are the same."""
+    bits = np.empty(LONGEST, np.uint8)
+    other = np.empty(LONGEST, np.uint8)
+    kinds = np.empty(LONGEST, np.uint8)
+    a = bus.store[bus.senders[0]]
+    n, _ = encode(np.int64(a["identifier"]), np.int64(a["length"]), np.int64(a["flags"]), a["data"], bits, kinds)
+    first = np.int64(-1)
+    for k in range(1, bus.cells[SENDERS]):
+        b = bus.store[bus.senders[k]]
+        m, _ = encode(np.int64(b["identifier"]), np.int64(b["length"]), np.int64(b["flags"]), b["data"], other, kinds)
+        for i in range(min(n, m)):
+            if bits[i] != other[i]:
+                if first < 0 or i < first:
+                    first = i
+                break
+    return first
+
+
+@njit(cache=True, error_model="numpy")
+def _begin(bus, start, out, count, nominal_ps, data_ps, chance):
+    """Arbitrate at `start`, put the winner on the wire and decide when and how its transmission ends."""
+    cells, nodes, slots = bus.cells, bus.nodes, bus.slots
+    best = _FAR
+    rivals = 0
+    for n in range(nodes.shape[0]):
+        if nodes[n, COUNT] > 0 and nodes[n, SUSPENDED] <= start:
+            rivals += 1
+            best = min(best, slots[nodes[n, HEAD], KEY])
+    cells[SENDERS] = 0
+    for n in range(nodes.shape[0]):
+        if nodes[n, COUNT] > 0 and nodes[n, SUSPENDED] <= start:
+            s = nodes[n, HEAD]
+            if slots[s, KEY] == best:
+                bus.senders[cells[SENDERS]] = s
+                cells[SENDERS] += 1
+                slots[s, ATTEMPTS] += 1
+            else:
+                nodes[n, OUTBID] += 1
+                if (bus.store[s]["flags"] & ONE_SHOT) != 0:
+                    nodes[n, GIVEN_UP] += 1
+                    slots[s, ATTEMPTS] += 1
+                    count = _put(out, count, s, start, start, LOST_ARBITRATION, slots, 1)
+                    _remove(bus, n, s)
+    receivers = False
+    receivers_active = False
+    for n in range(nodes.shape[0]):
+        if nodes[n, ATTACHED] != 0 and nodes[n, STATE] != OFF and nodes[n, LISTENING] == 0:
+            sends = False
+            for k in range(cells[SENDERS]):
+                if slots[bus.senders[k], OWNER] == n:
+                    sends = True
+            if not sends:
+                receivers = True
+                if nodes[n, STATE] == ACTIVE:
+                    receivers_active = True
+    s = bus.senders[0]
+    total = slots[s, NOMINAL] + slots[s, QUICK] - INTERMISSION
+    position = np.int64(-1)
+    outcome = GOOD
+    if cells[SENDERS] > 1:
+        position = _differ(bus)
+        outcome = COLLISION
+    if position < 0:
+        outcome = BIT_ERROR
+        for k in range(cells[SENDERS]):
+            n = slots[bus.senders[k], OWNER]
+            if nodes[n, DISTURBED] > 0:
+                nodes[n, DISTURBED] -= 1
+                position = min(nodes[n, DISTURBED_BIT], total - 1)
+    if chance > 0.0 and position < 0:
+        if cells[GAP] < total:
+            position = cells[GAP]
+            cells[GAP] = _gap(bus.random, chance)
+        else:
+            cells[GAP] -= total
+    if position < 0 and not receivers and cells[SENDERS] == 1:
+        outcome = NO_ACKNOWLEDGE
+        position = total - 9
+    cells[START] = start
+    cells[FLAG_BITS] = 0
+    if position < 0:
+        cells[OUTCOME] = GOOD
+        cells[END] = start + slots[s, DURATION]
+    else:
+        cells[OUTCOME] = outcome
+        length, flag = _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers)
+        cells[END] = start + length
+        cells[FLAG_BITS] = flag
+        cells[BITS] += position + 1 + flag + 8
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _settle(bus, n):
+    """State from the counters: passive above 127, bus-off above 255 (ISO 11898-1:2015, 12.1.4.2 and following)."""
+    nodes = bus.nodes
+    if nodes[n, STATE] == OFF:
+        return False
+    if nodes[n, TEC] > 255:
+        nodes[n, STATE] = OFF
+        nodes[n, BUS_OFFS] += 1
+        return True
+    nodes[n, STATE] = PASSIVE if nodes[n, TEC] > 127 or nodes[n, REC] > 127 else ACTIVE
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+def _note_latency(bus, identifier, latency):
+    table = bus.latencies
+    mask = table.shape[0] - 1
+    k = (identifier * 0x9E3779B >> 20) & mask
+    for _ in range(_PROBES):
+        if table[k, LATENCY_COUNT] == 0:
+            table[k, LATENCY_KEY] = identifier
+        if table[k, LATENCY_KEY] == identifier:
+            table[k, LATENCY_COUNT] += 1
+            table[k, LATENCY_SUM] += latency
+            table[k, LATENCY_WORST] = max(table[k, LATENCY_WORST], latency)
+            return
+        k = (k + 1) & mask
+
+
+@njit(cache=True, error_model="numpy")
+def close_windows(cells, t):
+    """Close every window of the load that ended by t."""
+    length = cells[WINDOW_LENGTH]
+    if t >= cells[WINDOW] + length:
+        cells[WINDOW_LAST] = cells[WINDOW_BUSY]
+        cells[WINDOW_PEAK] = max(cells[WINDOW_PEAK], cells[WINDOW_BUSY])
+        cells[WINDOW_BUSY] = 0
+        cells[WINDOW] += length
+        if t >= cells[WINDOW] + length:
+            cells[WINDOW_LAST] = 0
+            cells[WINDOW] += (t - cells[WINDOW]) // length * length
+
+
+@njit(cache=True, error_model="numpy")
+def _occupy(cells, start, end):
+    """Count the bus as taken from start to end, each window its part."""
+    cells[BUSY] += end - start
+    close_windows(cells, start)
+    while end > cells[WINDOW] + cells[WINDOW_LENGTH]:
+        edge = cells[WINDOW] + cells[WINDOW_LENGTH]
+        cells[WINDOW_BUSY] += edge - start
+        start = edge
+        close_windows(cells, start)
+    cells[WINDOW_BUSY] += end - start
+
+
+@njit(cache=True, error_model="numpy")
+def _complete(bus, out, count, nominal_ps):
+    """End of what is on the wire: counters, states, queues, results."""
+    cells, nodes, slots = bus.cells, bus.nodes, bus.slots
+    start, end, outcome = cells[START], cells[END], cells[OUTCOME]
+    cells[FREE] = end + (INTERMISSION * nominal_ps + 500) // 1000
+    run_ns = (_RECESSIVE_RUN * nominal_ps + 500) // 1000
+    _occupy(cells, start, cells[FREE])
+    good = outcome == GOOD
+    if good:
+        cells[FRAMES] += 1
+        cells[BITS] += slots[bus.senders[0], NOMINAL] + slots[bus.senders[0], QUICK]
+    else:
+        cells[FAULTS] += 1
+        cells[BITS] += INTERMISSION
+    for n in range(nodes.shape[0]):
+        if nodes[n, ATTACHED] == 0:
+            continue
+        if nodes[n, RECOVERING] != 0:
+            # The acknowledge delimiter, end of frame and intermission are 11 recessive bits, an error's end too.
+            nodes[n, LEFT] -= max(np.int64(0), start - nodes[n, QUIET]) // run_ns + 1
+            nodes[n, QUIET] = cells[FREE]
+        if nodes[n, STATE] == OFF or nodes[n, LISTENING] != 0:
+            continue
+        sends = False
+        for k in range(cells[SENDERS]):
+            if slots[bus.senders[k], OWNER] == n:
+                sends = True
+        if sends:
+            continue
+        if good:
+            if nodes[n, REC] > 127:
+                nodes[n, REC] = 127
+            elif nodes[n, REC] > 0:
+                nodes[n, REC] -= 1
+        else:
+            nodes[n, REC] = min(nodes[n, REC] + 1, 255)
+        _settle(bus, n)
+    for k in range(cells[SENDERS]):
+        s = bus.senders[k]
+        n = slots[s, OWNER]
+        final = 1
+        off = False
+        if good:
+            nodes[n, SENT] += 1
+            nodes[n, TEC] = max(nodes[n, TEC] - 1, 0)
+            _note_latency(bus, np.int64(bus.store[s]["identifier"]), end - slots[s, AT])
+            _settle(bus, n)
+        else:
+            nodes[n, ERRORS] += 1
+            if outcome == NO_ACKNOWLEDGE:
+                nodes[n, UNACKNOWLEDGED] += 1
+            # A passive node that only misses the acknowledge counts no further: a lone node never goes bus-off.
+            if not (outcome == NO_ACKNOWLEDGE and nodes[n, STATE] == PASSIVE):
+                nodes[n, TEC] += 8
+            off = _settle(bus, n)
+            if off:
+                final = 1
+            elif (bus.store[s]["flags"] & ONE_SHOT) != 0:
+                nodes[n, GIVEN_UP] += 1
+            else:
+                final = 0
+        if nodes[n, ATTACHED] == 0:
+            final = 1
+        count = _put(out, count, s, start, end, outcome, slots, final)
+        if final:
+            _remove(bus, n, s)
+        if nodes[n, STATE] == PASSIVE:
+            nodes[n, SUSPENDED] = cells[FREE] + (8 * nominal_ps + 500) // 1000
+        if off:
+            for j in range(nodes[n, COUNT]):
+                nodes[n, REFUSED] += 1
+                count = _put(out, count, bus.queues[n, j], end, end, BUS_OFF, slots, 1)
+            nodes[n, COUNT] = 0
+            nodes[n, HEAD] = -1
+            nodes[n, SUSPENDED] = 0
+            nodes[n, LEFT] = _RECOVERY
+            nodes[n, QUIET] = cells[FREE]
+            nodes[n, RECOVERING] = nodes[n, AUTOMATIC]
+    cells[SENDERS] = 0
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def advance(bus, until, out, nominal_ps, data_ps, chance):
+    """Run the bus up to `until`: nothing starts just then, for a better frame may yet be offered.
+
+    Args:
+        bus: State.
+        until: Time [ns].
+        out: Results, shape (at least the queues' room + 2 nodes, RESULT_COLUMNS).
+        nominal_ps: Bit time of the arbitration [ps].
+        data_ps: Bit time of the data phase [ps].
+        chance: Chance of an error a bit.
+
+    Returns:
+        Number of results; `MORE` tells whether the room ran out before the time.
+    """
+    cells, nodes, slots = bus.cells, bus.nodes, bus.slots
+    run_ns = (_RECESSIVE_RUN * nominal_ps + 500) // 1000
+    room = out.shape[0] - bus.queues.shape[0] * (bus.queues.shape[1] + 2)
+    count = 0
+    cells[MORE] = 0
+    while True:
+        if count >= room:
+            cells[MORE] = 1
+            return count
+        arrival = _FAR
+        if cells[NEXT] < cells[ARRIVALS]:
+            arrival = slots[bus.arrivals[cells[NEXT]], AT]
+        if cells[SENDERS] > 0:
+            if arrival < until and arrival < cells[END]:
+                count = _admit(bus, out, count)
+                continue
+            if cells[END] > until:
+                break
+            count = _complete(bus, out, count, nominal_ps)
+            continue
+        start = _FAR
+        for n in range(nodes.shape[0]):
+            if nodes[n, COUNT] > 0:
+                start = min(start, max(cells[FREE], nodes[n, SUSPENDED]))
+        if arrival <= start and arrival < until:
+            cells[FREE] = max(cells[FREE], arrival)
+            _rejoin(bus, arrival, run_ns)
+            count = _admit(bus, out, count)
+            continue
+        if start >= until:
+            _rejoin(bus, until, run_ns)
+            break
+        _rejoin(bus, start, run_ns)
+        count = _begin(bus, start, out, count, nominal_ps, data_ps, chance)
+    cells[NOW] = until
+    close_windows(cells, cells[START] if cells[SENDERS] > 0 else until)
+    return count

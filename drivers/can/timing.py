@@ -1,0 +1,114 @@
+"""Bit rates of a bus, and how long its frames last."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from drivers.can import frame as frames
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    import can
+
+_SLOWEST_BIT_S = 1_000
+_FASTEST_NOMINAL_BIT_S = 1_000_000
+_FASTEST_DATA_BIT_S = 12_000_000
+_RATE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([kKM]?)\s*(?:bit/s)?\s*")
+_FORM = 'as "500k", "1M", or "1M/5M" for CAN FD'
+
+
+class Speed(NamedTuple):
+    """Bit rates of a bus.
+
+    Where the sample points lie does not matter here: an FD frame changes its rate at the sample point of BRS and back
+    at that of the CRC delimiter, and the two bits together last one nominal and one data bit time wherever that is.
+
+    Attributes:
+        nominal_bit_s: Rate of the arbitration, and of all of a classic frame [bit/s].
+        data_bit_s: Rate of the data phase of frames with bit rate switch [bit/s].
+        fd: Whether the bus takes CAN FD frames.
+        nominal_ps: Bit time of the arbitration, to the nearest [ps].
+        data_ps: Bit time of the data phase, to the nearest [ps].
+    """
+
+    nominal_bit_s: float
+    data_bit_s: float
+    fd: bool
+    nominal_ps: int
+    data_ps: int
+
+    def duration_ns(self, nominal: int, fast: int = 0) -> int:
+        """Time of so many bits [ns], to the nearest.
+
+        Args:
+            nominal: Bits at the nominal rate.
+            fast: Bits at the data rate.
+        """
+        return (nominal * self.nominal_ps + fast * self.data_ps + 500) // 1000
+
+    def duration(self, frame: frames.Frame) -> float:
+        """Time that a frame takes on the bus, with its intermission [s]."""
+        return self.duration_ns(*frames.frame_bits(frame)) * 1e-9
+
+    def durations(self, array: np.ndarray) -> np.ndarray:
+        """`duration` for an array of `drivers.can.frame.RECORD` [s], shape (frames,)."""
+        nominal, fast = frames.bits_of(array)
+        return (nominal * self.nominal_ps + fast * self.data_ps) * 1e-12
+
+    def __str__(self) -> str:
+        """The text that `speed` reads."""
+        return f"{_text(self.nominal_bit_s)}/{_text(self.data_bit_s)}" if self.fd else _text(self.nominal_bit_s)
+
+
+def speed(timing: str | float | Speed | can.BitTiming | can.BitTimingFd, data_bit_s: float | None = None) -> Speed:
+    """Bit rates from text, numbers or python-can's bit timings.
+
+    Args:
+        timing: "1M", "500k", "1M/5M" (CAN FD), a number [bit/s], or a `can.BitTiming` or `can.BitTimingFd`.
+        data_bit_s: Rate of the data phase beside a number [bit/s]: CAN FD.
+    """
+    if isinstance(timing, Speed):
+        return timing
+    if isinstance(timing, str):
+        parts = timing.split("/") if "bit/s" not in timing else re.split(r"/(?!s)", timing)
+        if len(parts) > 2 or data_bit_s is not None:
+            raise InputError("bit rate", _FORM, timing)
+        return _make(*[_rate(part, timing) for part in parts])
+    if isinstance(timing, (int, float)) and not isinstance(timing, bool):
+        return _make(float(timing), None if data_bit_s is None else float(data_bit_s))
+    nominal: Any = getattr(timing, "nom_bitrate", getattr(timing, "bitrate", None))
+    if nominal is None or data_bit_s is not None:
+        raise InputError("bit rate", f"{_FORM}, or a can.BitTiming or can.BitTimingFd", timing)
+    # The clock's own quotient: `bitrate` is rounded to whole bits per second.
+    clock = getattr(timing, "f_clock", None)
+    if hasattr(timing, "nom_bitrate"):
+        fd: Any = timing
+        return _make(clock / (fd.nom_brp * fd.nbt), clock / (fd.data_brp * fd.dbt)) if clock else _make(nominal)
+    classic: Any = timing
+    return _make(clock / (classic.brp * classic.nbt) if clock else nominal)
+
+
+def _rate(part: str, whole: str) -> float:
+    match = _RATE.fullmatch(part)
+    if match is None:
+        raise InputError("bit rate", _FORM, whole)
+    return float(match[1]) * {"": 1.0, "k": 1e3, "K": 1e3, "M": 1e6}[match[2]]
+
+
+def _make(nominal: float, data: float | None = None) -> Speed:
+    if not _SLOWEST_BIT_S <= nominal <= _FASTEST_NOMINAL_BIT_S:
+        raise InputError("bit rate", "between 1 kbit/s and 1 Mbit/s", nominal)
+    if data is not None and not nominal <= data <= _FASTEST_DATA_BIT_S:
+        raise InputError("data bit rate", "between the nominal bit rate and 12 Mbit/s", data)
+    fast = nominal if data is None else data
+    return Speed(nominal, fast, data is not None, round(1e12 / nominal), round(1e12 / fast))
+
+
+def _text(rate: float) -> str:
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if rate >= size:
+            return f"{rate / size:g}{letter}"
+    return f"{rate:g}"

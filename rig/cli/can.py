@@ -1,0 +1,82 @@
+"""`rig can`: the virtual CAN bus."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(help="The virtual CAN bus.", no_args_is_help=True)
+
+_LISTEN = "127.0.0.1:7461"
+_SPEED = "1M/5M"
+
+
+@app.callback()
+def _can() -> None:
+    # With this, one subcommand is still named.
+    pass
+
+
+@app.command()
+def hub(
+    channels: Annotated[list[str], typer.Argument(metavar="CHANNEL...", help="Names of the buses, such as can0.")],
+    *,
+    speed: Annotated[
+        str, typer.Option(metavar="RATE[/RATE]", help="Bit rate, and that of the data phase of CAN FD: 500k, 1M/5M.")
+    ] = _SPEED,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = _LISTEN,
+    expose: Annotated[bool, typer.Option("--expose", help="Allow --listen on a host other than 127.0.0.1.")] = False,
+    acknowledge: Annotated[
+        bool, typer.Option(help="Acknowledge frames, so that an only node on the bus can send.")
+    ] = True,
+    error_rate: Annotated[float, typer.Option(metavar="SHARE", help="Share of bits that arrive wrong.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Seed of the wrong bits.")] = 0,
+) -> None:
+    """Run virtual CAN buses of their own, without a rig, until Ctrl-C.
+
+    Programs reach one by python-can: can.Bus(interface="zenoh", channel="can0"), or can_logger -i zenoh -c can0.
+    """
+    from drivers.can.bus import BusModel
+    from drivers.can.hub import Hub
+    from drivers.can.timing import speed as parse_speed
+    from rig.errors import InputError
+    from rig.transport.zenoh import ZenohServer
+
+    if len(set(channels)) < len(channels):
+        raise InputError("CHANNEL", "named once each", " ".join(channels))
+    rates = parse_speed(speed)
+    models = [BusModel(rates, error_rate=error_rate, seed=seed + number) for number in range(len(channels))]
+    with ZenohServer(listen, expose=expose) as server, ExitStack() as stack:
+        hubs = [Hub(model, name, server, acknowledge=acknowledge) for model, name in zip(models, channels, strict=True)]
+        with _stopping_on_signals() as stopped:
+            for one in hubs:
+                stack.enter_context(one)
+            typer.echo(f"rig: CAN {', '.join(channels)} at {rates} on {listen}; Ctrl-C ends it", err=True)
+            while not stopped.wait(5.0):
+                for one in hubs:
+                    typer.echo(_line(one.status()), err=True)
+        for one in hubs:
+            typer.echo(_line(one.status()))
+
+
+@contextmanager
+def _stopping_on_signals() -> Iterator[threading.Event]:
+    stopped = threading.Event()
+    former = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stopped
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+def _line(status: dict[str, Any]) -> str:
+    counts = status["counts"]
+    lost = "  ".join(f"{name} {counts[name]}" for name in counts if name != "frames" and counts[name])
+    line = f"{status['channel']}  {status['time_s']:.1f} s  nodes {len(status['nodes'])}  frames {counts['frames']}"
+    return f"{line}  {lost}".rstrip()

@@ -1,0 +1,307 @@
+"""A virtual CAN hub, programs on its bus and python-can's own tools as processes of their own, over loopback."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import can  # noqa: TID253 - the subject
+import pytest
+
+from drivers.can import medium
+from drivers.can.interface import ZenohBus
+from rig.transport.zenoh import ZenohClient
+from tests.unit.test_transport_zenoh import free_endpoint, until
+
+pytestmark = pytest.mark.wallclock
+ROOT = Path(__file__).parents[2]
+PATIENCE_S = 60.0
+
+
+@contextmanager
+def process(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
+    """A Python process, ended for certain."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "stdin": subprocess.PIPE, **settings}
+    command = [sys.executable, *arguments]
+    with subprocess.Popen(command, text=True, cwd=ROOT, env=environment, **pipes) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+@contextmanager
+def hub_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`rig can hub` in a process of its own, and where it listens."""
+    endpoint = free_endpoint()
+    arguments = ("-m", "rig.cli.main", "can", "hub", "can0", "can1", "--speed", "1M/8M", "--listen", endpoint)
+    with process(*arguments) as child:
+        assert child.stdout is not None
+        # The first start after a change compiles.
+        assert "Ctrl-C ends it" in child.stdout.readline()
+        yield child, endpoint
+
+
+class Bench:
+    """A running hub, and what a test needs of it; all that it opens ends with it."""
+
+    def __init__(self, stack: ExitStack, child: subprocess.Popen[str], endpoint: str) -> None:
+        self.child, self.endpoint = child, endpoint
+        self._client = stack.enter_context(ZenohClient(self.endpoint, wait_s=10.0))
+        self._stack = stack
+        self.nodes(0)
+        self.nodes(0, "can1")
+
+    def status(self, channel: str = "can0") -> dict[str, Any]:
+        return json.loads(self._client.request(medium.request_key(channel, "status"), timeout_s=10.0))
+
+    def nodes(self, count: int, channel: str = "can0") -> None:
+        until(lambda: len(self.status(channel)["nodes"]) == count, timeout_s=PATIENCE_S)
+
+    def bus(self, channel: str = "can0", **settings: Any) -> ZenohBus:
+        return self._stack.enter_context(ZenohBus(channel, endpoint=self.endpoint, **settings))
+
+    def tool(self, name: str, *arguments: str, channel: str = "can0") -> subprocess.Popen[str]:
+        """One of python-can's tools, as it is."""
+        where = ("-i", "zenoh", "-c", channel, "--bus-kwargs", f"endpoint={self.endpoint}")
+        return self._stack.enter_context(process("-m", f"can.{name}", *where, *arguments))
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[tuple[subprocess.Popen[str], str]]:
+    with hub_process() as found:
+        yield found
+
+
+@pytest.fixture
+def hub(shared: tuple[subprocess.Popen[str], str]) -> Iterator[Bench]:
+    """A hub that other tests use as well."""
+    with ExitStack() as stack:
+        yield Bench(stack, *shared)
+
+
+@pytest.fixture
+def own_hub() -> Iterator[Bench]:
+    """A hub to end."""
+    with ExitStack() as stack:
+        yield Bench(stack, *stack.enter_context(hub_process()))
+
+
+def end(child: subprocess.Popen[str]) -> str:
+    """End it as Ctrl-C does, and what it has said."""
+    child.send_signal(signal.SIGINT)
+    output, _ = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 0, output
+    return output
+
+
+def messages(count: int) -> list[can.Message]:
+    """Classic, extended and FD frames, each other than all others."""
+    found = []
+    for number in range(count):
+        data = number.to_bytes(4, "big")
+        if number % 3 == 0:
+            found.append(can.Message(arbitration_id=0x100 + number % 7, data=data, is_extended_id=False))
+        elif number % 3 == 1:
+            found.append(can.Message(arbitration_id=0x18FF0000 + number, data=data + b"xyz"))
+        else:
+            settings: Any = {"is_fd": True, "bitrate_switch": True, "is_extended_id": False}
+            found.append(can.Message(arbitration_id=0x700, data=data + bytes(44), **settings))
+    return found
+
+
+def content(found: list[can.Message]) -> list[tuple[int, bool, bool, bytes]]:
+    """What a log must keep, in the order of the numbers."""
+    rows = [(item.arbitration_id, item.is_extended_id, item.is_fd, bytes(item.data)) for item in found]
+    return sorted(rows, key=lambda row: row[3][:4])
+
+
+def take(bus: can.BusABC, count: int) -> list[can.Message]:
+    found = [bus.recv(10.0) for _ in range(count)]
+    assert None not in found
+    return [item for item in found if item is not None]
+
+
+def log(path: Path) -> list[can.Message]:
+    with can.LogReader(path) as reader:
+        return list(reader)
+
+
+def test_stock_logger_and_player_keep_every_frame(hub: Bench, tmp_path: Path) -> None:
+    count = 3000
+    path = tmp_path / "bus.log"
+    before = hub.status()["counts"]
+    logger = hub.tool("logger", "-f", str(path))
+    hub.nodes(1)
+    sender = hub.bus()
+    for item in messages(count):
+        sender.send(item, timeout=10.0)
+    until(lambda: hub.status()["counts"]["frames"] - before["frames"] == count)
+    # The logger writes what it has read before it ends, but need not have read all.
+    time.sleep(0.5)
+    assert "Connected to ZenohBus: zenoh can0" in end(logger)
+    logged = log(path)
+    assert content(logged) == content(messages(count))
+    assert [item.timestamp for item in logged] == sorted(item.timestamp for item in logged)
+    sender.shutdown()
+
+    hub.nodes(0)
+    receiver = hub.bus()
+    player = hub.tool("player", "--ignore-timestamps", "-g", "0", str(path))
+    found = take(receiver, count)
+    output, _ = player.communicate(timeout=PATIENCE_S)
+    assert player.returncode == 0, output
+    assert content(found) == content(messages(count))
+    assert hub.status()["counts"] == {**before, "frames": before["frames"] + 2 * count}
+
+
+def test_stock_bridge_joins_two_channels(hub: Bench) -> None:
+    arguments = []
+    for bus, channel in (("bus1", "can0"), ("bus2", "can1")):
+        settings = {"interface": "zenoh", "channel": channel, "bus-kwargs": f"endpoint={hub.endpoint}"}
+        arguments += [text for name, value in settings.items() for text in (f"--{bus}-{name}", value)]
+    with process("-m", "can.bridge", *arguments) as bridge:
+        hub.nodes(1)
+        hub.nodes(1, "can1")
+        zero, one = hub.bus("can0"), hub.bus("can1")
+        zero.send(can.Message(arbitration_id=1, data=b"there"))
+        assert bytes(take(one, 1)[0].data) == b"there"
+        one.send(can.Message(arbitration_id=2, data=b"back"))
+        assert bytes(take(zero, 1)[0].data) == b"back"
+        end(bridge)
+
+
+def test_stock_viewer_knows_the_interface() -> None:
+    code = "import sys, can, can.viewer; sys.exit('zenoh' not in can.VALID_INTERFACES)"
+    with process("-c", code) as child:
+        output, _ = child.communicate(timeout=PATIENCE_S)
+    if "curses" in output:
+        pytest.skip("no curses here")
+    assert child.returncode == 0, output
+
+
+def test_a_signal_ends_the_hub_and_it_sums_up(own_hub: Bench) -> None:
+    hub = own_hub
+    with hub.bus() as one, hub.bus() as other:
+        one.send(can.Message(arbitration_id=1))
+        take(other, 1)
+    until(lambda: hub.status()["nodes"] == [])
+    output = end(hub.child)
+    assert [line.split()[0] for line in output.splitlines()] == ["can0", "can1"]
+    assert "frames 1" in output
+
+
+def test_a_hub_that_is_killed_is_told_to_its_nodes(own_hub: Bench) -> None:
+    bus = own_hub.bus()
+    own_hub.child.kill()
+    until(lambda: bus.state is can.BusState.ERROR)
+    with pytest.raises(can.CanOperationError, match="has gone"):
+        bus.send(can.Message(arbitration_id=1))
+
+
+CARELESS = """
+import sys, threading, can
+bus = can.Bus("can0", interface="zenoh", endpoint=sys.argv[1])
+notifier = can.Notifier(bus, [lambda message: None])
+threading.Thread(target=bus.recv, daemon=True).start()
+bus.send(can.Message(arbitration_id=7))
+print("sent", flush=True)
+"""
+
+
+def test_a_script_that_closes_nothing_ends(hub: Bench) -> None:
+    with process("-c", CARELESS, hub.endpoint) as child:
+        output, _ = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 0, output
+    assert "sent" in output
+    hub.nodes(0)
+
+
+IDLE = """
+import sys, time, can
+bus = can.Bus("can0", interface="zenoh", endpoint=sys.argv[1])
+bus.send(can.Message(arbitration_id=7))
+print("up", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL], ids=["stopped", "killed"])
+def test_an_endpoint_that_stalls_or_dies_slows_nobody(hub: Bench, how: signal.Signals) -> None:
+    count = 20_000
+    sender, receiver = hub.bus(), hub.bus()
+    with process("-c", IDLE, hub.endpoint) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "up\n"
+        assert take(receiver, 1)[0].arbitration_id == 7
+        child.send_signal(how)
+        data = bytes(60)
+        found: list[can.Message] = []
+        for first in range(0, count, 100):
+            rows = [
+                can.Message(
+                    arbitration_id=0x100, data=number.to_bytes(4, "big") + data, is_fd=True, bitrate_switch=True
+                )
+                for number in range(first, first + 100)
+            ]
+            sender.send_records(medium.records_of(rows), timeout=10.0)
+            while (item := receiver.recv(0)) is not None:
+                found.append(item)
+        found += take(receiver, count - len(found))
+        assert [int.from_bytes(item.data[:4], "big") for item in found] == list(range(count))
+        # The bus was never idle: what it took is what the frames take.
+        share = (found[-1].timestamp - found[0].timestamp) / (count * 123e-6)
+        assert 0.8 < share < 2.5
+        assert (receiver.missed, receiver.dropped) == (0, 0)
+        if how is signal.SIGKILL:
+            hub.nodes(2)
+
+
+def test_two_processes_answer_each_other_without_loss(hub: Bench) -> None:
+    echo = """
+import sys, can
+with can.Bus("can0", interface="zenoh", endpoint=sys.argv[1]) as bus:
+    print("up", flush=True)
+    while (message := bus.recv(30)).arbitration_id:
+        message.arbitration_id = 2
+        bus.send(message)
+"""
+    bus = hub.bus()
+    before = hub.status()["counts"]["frames"]
+    with process("-c", echo, hub.endpoint) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "up\n"
+        for number in range(1000):
+            bus.send(can.Message(arbitration_id=1, data=number.to_bytes(8, "big")))
+            (answer,) = take(bus, 1)
+            assert (answer.arbitration_id, int.from_bytes(answer.data, "big")) == (2, number)
+        bus.send(can.Message(arbitration_id=0))
+        output, _ = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 0, output
+    assert hub.status()["counts"]["frames"] - before == 2001
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("can 0",), "channel must be letters"),
+        (("can0", "can0"), "CHANNEL must be named once each"),
+        (("can0", "--speed", "fast"), "bit rate must be"),
+        (("can0", "--listen", "0.0.0.0:7999"), "--expose"),
+    ],
+)
+def test_wrong_options_of_the_hub_are_one_line(arguments: tuple[str, ...], line: str) -> None:
+    with process("-m", "rig.cli.main", "can", "hub", *arguments) as child:
+        output, _ = child.communicate(timeout=PATIENCE_S)
+    assert child.returncode == 2
+    assert line in output
+    assert len(output.splitlines()) == 1

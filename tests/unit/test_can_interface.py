@@ -1,0 +1,639 @@
+"""The hub of a virtual CAN bus and python-can's way to it, over zenoh and within a process."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import random
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import can  # noqa: TID253 - the subject
+import numpy as np
+import pytest
+from can.bus import BusState  # noqa: TID253
+
+from drivers.can import hub as hubs
+from drivers.can import medium
+from drivers.can.bus import BusModel
+from drivers.can.frame import Frame
+from drivers.can.hub import Hub
+from drivers.can.interface import HubBus, ZenohBus, _matching
+from drivers.can.timing import speed
+from rig.cli import can as can_command
+from rig.transport.zenoh import ZenohServer
+from tests.unit.test_transport_zenoh import free_endpoint, until
+
+pytestmark = pytest.mark.wallclock
+
+
+class Rig:
+    """A hub and what the tests need to make buses on it."""
+
+    def __init__(self, way: str, rate: str, **settings: Any) -> None:
+        self.way = way
+        self.stack = ExitStack()
+        self.model = BusModel(rate)
+        self.server: ZenohServer | None = None
+        if way == "zenoh":
+            self.endpoint = free_endpoint()
+            self.server = self.stack.enter_context(ZenohServer(self.endpoint))
+        self.hub = self.stack.enter_context(Hub(self.model, "can0", self.server, **settings))
+
+    def bus(self, **settings: Any) -> Any:
+        if self.way == "zenoh":
+            bus: can.BusABC = can.Bus("can0", interface="zenoh", ignore_config=True, endpoint=self.endpoint, **settings)
+        else:
+            bus = HubBus(self.hub, **settings)
+        return self.stack.enter_context(bus)
+
+    def node(self, bus: Any) -> int:
+        """Its number in the model."""
+        return self.hub._endpoints[bus._name].node
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stack.close()
+
+
+@pytest.fixture(params=["zenoh", "process"])
+def way(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def rig(way: str) -> Iterator[Rig]:
+    with Rig(way, "1M/8M") as rig:
+        yield rig
+
+
+def message(identifier: int = 0x123, data: bytes = b"abc", **settings: Any) -> can.Message:
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False, check=True, **settings)
+
+
+KINDS = [
+    message(),
+    message(0, b""),
+    message(0x7FF, bytes(8)),
+    can.Message(arbitration_id=0x1FFFFFFF, data=b"\x00\xff", check=True),
+    can.Message(arbitration_id=1, data=b"low", check=True),
+    can.Message(arbitration_id=0x321, is_extended_id=False, is_remote_frame=True, dlc=5, check=True),
+    message(0x10, bytes(range(64)), is_fd=True, bitrate_switch=True),
+    message(0x11, bytes(range(12)), is_fd=True, error_state_indicator=True),
+    message(0x12, b"", is_fd=True),
+]
+
+
+def same(one: can.Message, other: can.Message) -> bool:
+    return one.equals(other, timestamp_delta=None, check_channel=False, check_direction=False)
+
+
+def read(bus: can.BusABC, count: int, *, timeout_s: float = 5.0) -> list[can.Message]:
+    found = [bus.recv(timeout_s) for _ in range(count)]
+    assert None not in found
+    return [item for item in found if item is not None]
+
+
+# The medium.
+
+
+def test_a_record_has_the_layout_that_its_documentation_tells() -> None:
+    payload = medium.encode([medium.Record(7, 0x123 | medium.EXTENDED, 2, 0, 5, b"hi")])
+    assert payload == b"RCB1" + bytes((0, 8, 1, 0)) + struct.pack("<QIBBH", 7, 0x80000123, 2, 0, 5) + b"hi\0\0\0\0\0\0"
+    assert (medium.EXTENDED, medium.REMOTE, medium.ERROR) == (
+        socket.CAN_EFF_FLAG,
+        socket.CAN_RTR_FLAG,
+        socket.CAN_ERR_FLAG,
+    )
+    assert [layout.itemsize for layout in medium.RECORDS.values()] == [24, 80]
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_messages_survive_the_medium(many: bool) -> None:
+    if many:
+        payload = medium.encode_array(medium.records_of(KINDS))
+        found = medium.messages_of(medium.decode_array(payload), channel="x")
+    else:
+        payloads = [medium.encode([medium.record_of(kind)]) for kind in KINDS]
+        found = [medium.message_of(next(iter(medium.decode(payload))), channel="x") for payload in payloads]
+    assert all(map(same, KINDS, found))
+    assert {item.channel for item in found} == {"x"}
+
+
+def test_narrow_and_wide_records_hold_the_same() -> None:
+    narrow = medium.records_of(KINDS[:6])
+    assert narrow.dtype["data"].itemsize == 8
+    wide = medium.widen(narrow)
+    assert wide.dtype["data"].itemsize == 64
+    assert medium.narrow(wide).tobytes() == narrow.tobytes()
+    assert all(map(same, KINDS, medium.messages_of(wide)))
+
+
+def test_both_judges_of_frames_agree() -> None:
+    rng = np.random.default_rng(4)
+    rows = np.zeros(20_000, medium.RECORDS[64])
+    rows["identifier"] = rng.choice([0, 5, 0x7FF, 0x800, medium.EXTENDED_MASK], len(rows)) | rng.choice(
+        [0, medium.EXTENDED, medium.REMOTE, medium.ERROR, medium.EXTENDED | medium.REMOTE], len(rows)
+    )
+    rows["length"] = rng.integers(0, 70, len(rows))
+    rows["flags"] = rng.integers(0, 9, len(rows))
+    for fd, width in itertools.product([False, True], [8, 64]):
+        short = rows if width == 64 else medium.narrow(rows)
+        payloads = (short[first : first + 500] for first in range(0, len(short), 500))
+        records = [record for part in payloads for record in medium.decode(medium.encode_array(part))]
+        one_by_one = [medium.fault_of(record, fd=fd) is None for record in records]
+        assert medium.sendable(short, fd=fd).tolist() == one_by_one
+        assert 0 < sum(one_by_one) < len(rows)
+
+
+@pytest.mark.parametrize("identifier", [-1, 1 << 29, 1 << 31])
+def test_an_identifier_of_more_bits_is_none(identifier: int) -> None:
+    with pytest.raises(medium.MediumError, match="29 bits"):
+        medium.record_of(can.Message(arbitration_id=identifier))
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda payload: b"",
+        lambda payload: payload[:-1],
+        lambda payload: payload + b"\0",
+        lambda payload: b"X" + payload[1:],
+        lambda payload: payload[:4] + b"\x07" + payload[5:],
+        lambda payload: payload[:5] + b"\x09" + payload[6:],
+        lambda payload: payload[:6] + b"\xff\xff" + payload[8:],
+    ],
+)
+def test_malformed_payloads_are_told(spoil: Callable[[bytes], bytes]) -> None:
+    payload = spoil(medium.encode([medium.record_of(KINDS[0])]))
+    for decode in (medium.decode_array, medium.decode_reports, lambda payload: list(medium.decode(payload))):
+        with pytest.raises(medium.MediumError):
+            decode(payload)
+
+
+def test_filters_match_as_python_can_matches() -> None:
+    rng = random.Random(3)
+    with can.Bus("filters", interface="virtual", ignore_config=True) as bus:
+        for _ in range(50):
+            filters: Any = [
+                {"can_id": rng.getrandbits(rng.choice([11, 29, 32])), "can_mask": rng.choice([0, 0x7F0, 7, 1 << 31])}
+                | rng.choice([{}, {"extended": True}, {"extended": False}])
+                for _ in range(rng.randint(1, 3))
+            ]
+            bus.set_filters(filters)
+            messages = [
+                can.Message(arbitration_id=rng.getrandbits(11), is_extended_id=rng.random() < 0.5) for _ in range(50)
+            ]
+            words = medium.records_of(messages)["identifier"]
+            assert _matching(words, filters).tolist() == [bus._matches_filters(item) for item in messages]
+
+
+# Sending and receiving.
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=range(len(KINDS)))
+def test_every_kind_of_frame_arrives_as_it_was_sent(kind: can.Message) -> None:
+    with Rig("process", "1M/8M") as rig:
+        sender, receiver = rig.bus(), rig.bus()
+        sender.send(kind)
+        (found,) = read(receiver, 1)
+        assert same(found, kind)
+        assert found.is_rx
+        assert sender.recv(0.05) is None
+
+
+def test_others_get_all_frames_in_order_and_senders_theirs_if_asked(rig: Rig) -> None:
+    sender, own, other = rig.bus(), rig.bus(receive_own_messages=True), rig.bus()
+    for number in range(100):
+        sender.send(message(0x100, bytes((number,))))
+        own.send(message(0x101, bytes((number,))))
+    for bus in (own, other):
+        found = read(bus, 200)
+        for identifier in (0x100, 0x101):
+            assert [item.data[0] for item in found if item.arbitration_id == identifier] == list(range(100))
+        assert {(item.arbitration_id, item.is_rx) for item in found} == {(0x100, True), (0x101, bus is other)}
+    assert [item.data[0] for item in read(sender, 100)] == list(range(100))
+    assert sender.recv(0.05) is None
+
+
+def test_stamps_are_the_ends_of_frames_by_the_wall_clock(rig: Rig) -> None:
+    sender, receiver = rig.bus(), rig.bus()
+    before = time.time()
+    sender.send_records(medium.records_of([message(0x100, bytes(8))] * 100))
+    stamps = [item.timestamp for item in read(receiver, 100)]
+    assert before < stamps[0]
+    assert stamps[-1] < time.time()
+    # A classic frame is as long as it is at any data rate; doubles hold today's seconds to a quarter of a microsecond.
+    duration = speed("1M").duration(Frame(0x100, bytes(8)))
+    assert np.diff(stamps) == pytest.approx(duration, abs=1e-6)
+
+
+def test_the_lower_identifier_goes_first(rig: Rig) -> None:
+    sender, receiver = rig.bus(), rig.bus()
+    identifiers = list(range(0x7F0, 0x6F0, -1))
+    sender.send_records(medium.records_of([message(item) for item in identifiers]))
+    assert [item.arbitration_id for item in read(receiver, 256)] == sorted(identifiers)
+
+
+def test_filters_hold_for_few_and_many_and_change_at_once(rig: Rig) -> None:
+    sender = rig.bus()
+    receiver = rig.bus(can_filters=[{"can_id": 0x100, "can_mask": 0x7FE, "extended": False}])
+    sender.send(message(0x102))
+    sender.send(message(0x101))
+    sender.send_records(medium.records_of([message(0xF0 + item % 32) for item in range(320)]))
+    assert [item.arbitration_id for item in read(receiver, 21)] == [0x101] + [0x100] * 10 + [0x101] * 10
+    # What is left of them has less priority than what comes now.
+    until(lambda: sender._done == sender._offered)
+    sender.send(message(0x101))
+    sender.send(message(0x100))
+    until(lambda: bool(receiver._batches) and getattr(receiver._batches[-1][0][-1], "arbitration_id", 0) == 0x100)
+    receiver.set_filters([{"can_id": 0x100, "can_mask": 0x7FF}])
+    assert read(receiver, 1)[0].arbitration_id == 0x100
+    receiver.set_filters(None)
+    sender.send(message(0x55))
+    assert read(receiver, 1)[0].arbitration_id == 0x55
+
+
+def test_a_classic_node_of_an_fd_bus_has_classic_frames_only(rig: Rig) -> None:
+    sender, classic = rig.bus(), rig.bus(fd=False)
+    assert classic.protocol is can.CanProtocol.CAN_20
+    assert sender.protocol is can.CanProtocol.CAN_FD
+    fd = message(0x100, bytes(12), is_fd=True)
+    sender.send(fd)
+    sender.send_records(medium.records_of([fd] * 20))
+    sender.send(message(0x200))
+    assert read(classic, 1)[0].arbitration_id == 0x200
+    with pytest.raises(can.CanOperationError, match="can0 cannot send a CAN FD frame, on a bus for classic CAN"):
+        classic.send(fd)
+
+
+def test_a_bus_of_another_kind_is_refused(way: str) -> None:
+    with Rig(way, "500k") as rig:
+        with pytest.raises(can.CanInitializationError, match="classic CAN only; fd=True asks for CAN FD"):
+            rig.bus(fd=True)
+        with pytest.raises(can.CanInitializationError, match=r"bitrate must be that of .* 500000"):
+            rig.bus(bitrate=1_000_000)
+        timing = can.BitTiming.from_sample_point(f_clock=80_000_000, bitrate=500_000, sample_point=80)
+        assert rig.bus(timing=timing, bitrate=None).protocol is can.CanProtocol.CAN_20
+        until(lambda: len(rig.hub.status()["nodes"]) == 1)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        (can.Message(arbitration_id=0x800, is_extended_id=False), "more than 11 bits"),
+        (can.Message(arbitration_id=-1), "29 bits"),
+        (can.Message(data=bytes(9)), "9 bytes in a classic frame"),
+        (can.Message(data=bytes(9), is_fd=True), "no length of a CAN FD frame"),
+        (can.Message(is_error_frame=True), "error frame"),
+        (can.Message(is_fd=True, is_remote_frame=True), "remote frame"),
+    ],
+)
+def test_frames_that_do_not_exist_are_refused(wrong: can.Message, why: str) -> None:
+    with Rig("process", "1M/8M") as rig, pytest.raises(can.CanOperationError, match=why):
+        rig.bus().send(wrong)
+
+
+def fill(bus: can.BusABC) -> None:
+    # A few may go out meanwhile.
+    for _ in range(hubs.WINDOW + 10):
+        bus.send(message(0x100), timeout=0)
+
+
+def test_a_full_transmit_queue_is_waited_for_or_told_and_can_be_flushed(way: str) -> None:
+    with Rig(way, "10k") as rig:
+        sender, receiver = rig.bus(), rig.bus()
+        with pytest.raises(can.CanOperationError, match=r"transmit queue of can0 is full: 51[0-2] frames wait"):
+            fill(sender)
+        # One frame takes 8 ms here.
+        sender.send(message(0x100), timeout=5.0)
+        sender.flush_tx_buffer()
+        sender.send(message(0x300), timeout=0.5)
+        found = []
+        while not found or found[-1].arbitration_id != 0x300:
+            found += read(receiver, 1)
+        assert len(found) < 100
+        until(lambda: sender._done == sender._offered)
+        assert max(row["dropped"] for row in rig.hub.status()["nodes"]) > 400
+
+
+def test_what_was_sent_before_a_shutdown_is_on_the_bus(rig: Rig) -> None:
+    sender, receiver = rig.bus(), rig.bus()
+    for number in range(300):
+        sender.send(message(0x100, number.to_bytes(2, "big")))
+    sender.shutdown()
+    assert [int.from_bytes(item.data, "big") for item in read(receiver, 300)] == list(range(300))
+
+
+def test_many_small_steps_lose_nothing(rig: Rig) -> None:
+    sender, receiver = rig.bus(), rig.bus()
+    frames = medium.records_of([message(0x100, number.to_bytes(4, "big")) for number in range(20_000)])
+    taken: list[can.Message] = []
+    for first in range(0, len(frames), 40):
+        sender.send_records(frames[first : first + 40])
+        while (item := receiver.recv(0)) is not None:
+            taken.append(item)
+    taken += read(receiver, len(frames) - len(taken))
+    assert [int.from_bytes(item.data, "big") for item in taken] == list(range(20_000))
+
+
+def test_a_reader_that_is_late_loses_the_oldest_and_is_told(rig: Rig) -> None:
+    sender, receiver = rig.bus(), rig.bus(rx_queue_size=100)
+    for first in range(0, 400, 40):
+        rows = [message(0x100, number.to_bytes(2, "big")) for number in range(first, first + 40)]
+        sender.send_records(medium.records_of(rows))
+    until(lambda: sender._done == 400 and receiver._waiting + receiver.dropped == 400)
+    first, *rest = read(receiver, 1 + receiver._waiting)
+    assert first.is_error_frame
+    assert first.arbitration_id == medium.CONTROLLER
+    assert first.data[1] == medium.RECEIVE_OVERFLOW
+    assert [int.from_bytes(item.data, "big") for item in rest] == list(range(400 - len(rest), 400))
+    assert 0 < len(rest) <= 100
+    assert receiver.dropped == 400 - len(rest)
+
+
+# Errors and states.
+
+
+def test_a_spoiled_frame_is_an_error_frame_and_comes_again(rig: Rig) -> None:
+    sender, receiver = rig.bus(), rig.bus()
+    rig.model.disturb(rig.node(sender), count=1)
+    sender.send(message(0x100))
+    error, frame = read(receiver, 2)
+    assert error.is_error_frame
+    assert error.arbitration_id == medium.PROTOCOL | medium.BUS_ERROR
+    assert same(frame, message(0x100))
+    assert error.timestamp < frame.timestamp
+    assert read(sender, 1)[0].is_error_frame
+    # ISO 11898-1: +8 for the error, -1 for the frame sent.
+    until(lambda: sender.error_counters == (7, 0))
+    assert sender.state is BusState.ACTIVE
+
+
+def test_without_anybody_to_acknowledge_a_node_becomes_passive_and_never_bus_off(way: str) -> None:
+    with Rig(way, "1M", acknowledge=False) as rig:
+        sender = rig.bus()
+        sender.send(message(0x100))
+        until(lambda: sender.state is BusState.PASSIVE)
+        kinds = set()
+        while medium.CONTROLLER | medium.COUNTERS not in kinds:
+            kinds.add(read(sender, 1)[0].arbitration_id)
+        assert kinds == {
+            medium.PROTOCOL | medium.BUS_ERROR | medium.NO_ACKNOWLEDGE,
+            medium.CONTROLLER | medium.COUNTERS,
+        }
+        listener = rig.bus(listen_only=True)
+        time.sleep(0.05)
+        assert sender._done == 0
+        listener.state = BusState.ACTIVE
+        until(lambda: sender._done == 1)
+
+
+def test_bus_off_is_told_to_its_own_node_refuses_and_ends(rig: Rig) -> None:
+    sender, other = rig.bus(), rig.bus()
+    rig.model.disturb(rig.node(sender), count=40)
+    sender.send(message(0x100))
+    kinds: dict[can.BusABC, set[int]] = {sender: set(), other: set()}
+    while medium.BUS_OFF | medium.COUNTERS not in kinds[sender]:
+        kinds[sender].add(read(sender, 1)[0].arbitration_id)
+    while (item := other.recv(0.1)) is not None:
+        kinds[other].add(item.arbitration_id)
+    assert kinds[other] == {medium.PROTOCOL | medium.BUS_ERROR}
+    # 128 times 11 recessive bits: 1.4 ms.
+    until(lambda: sender.state is BusState.ACTIVE)
+    rig.model.disturb(rig.node(sender), count=0)
+    sender.send(message(0x101))
+    assert read(other, 1)[0].arbitration_id == 0x101
+
+
+def test_a_node_that_is_bus_off_refuses_to_send(rig: Rig) -> None:
+    sender: Any = rig.bus()
+    with sender._lock:
+        sender._report = sender._report._replace(state=2)
+    assert sender.state is BusState.ERROR
+    with pytest.raises(can.CanOperationError, match="this node of can0 is bus off"):
+        sender.send(message())
+
+
+def test_a_passive_node_only_listens(rig: Rig) -> None:
+    sender, listener = rig.bus(), rig.bus()
+    listener.state = BusState.PASSIVE
+    assert listener.state is BusState.PASSIVE
+    with pytest.raises(can.CanOperationError, match="only listens"):
+        listener.send(message())
+    sender.send(message(0x77))
+    assert read(listener, 1)[0].arbitration_id == 0x77
+    listener.state = BusState.ACTIVE
+    listener.send(message(0x78))
+    assert read(sender, 1)[0].arbitration_id == 0x78
+    with pytest.raises(can.CanOperationError, match="must be ACTIVE or PASSIVE"):
+        listener.state = BusState.ERROR
+
+
+# Opening, closing, hubs that come and go.
+
+
+def test_opening_without_a_hub_says_how_to_start_one() -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(can.CanInitializationError) as caught:
+        ZenohBus("can7", endpoint=endpoint, connect_s=0.1)
+    for part in ("can7", endpoint, "rig can hub can7", "rig run --can zenoh:can7"):
+        assert part in str(caught.value)
+
+
+def test_opening_another_channel_names_those_that_are_there() -> None:
+    with Rig("zenoh", "1M") as rig:
+        with pytest.raises(can.CanInitializationError, match=r"channel can1 .*\(channels there: can0\)"):
+            ZenohBus("can1", endpoint=rig.endpoint)
+        until(lambda: rig.hub.status()["nodes"] == [])
+
+
+@pytest.mark.parametrize(("endpoint", "why"), [("nowhere", "HOST:PORT"), ("192.0.2.1:7461", "unless expose=True")])
+def test_wrong_endpoints_are_refused(endpoint: str, why: str) -> None:
+    with pytest.raises(can.CanInitializationError, match=why):
+        ZenohBus("can0", endpoint=endpoint)
+
+
+@pytest.mark.parametrize("channel", ["", "can/0", "*", "**", "a b", "c" * 65])
+def test_wrong_channels_are_refused(channel: str) -> None:
+    with pytest.raises(can.CanInitializationError, match="channel must be"):
+        ZenohBus(channel, endpoint=free_endpoint())
+    with pytest.raises(ValueError, match="channel must be"):
+        Hub(BusModel("1M"), channel)
+
+
+def test_a_bus_that_was_shut_down_says_so_and_is_forgotten(rig: Rig) -> None:
+    bus = rig.bus()
+    until(lambda: len(rig.hub.status()["nodes"]) == 1)
+    bus.shutdown()
+    bus.shutdown()
+    for use in (lambda: bus.send(message()), lambda: bus.recv(0), bus.flush_tx_buffer):
+        with pytest.raises(can.CanOperationError, match="has been shut down"):
+            use()
+    until(lambda: rig.hub.status()["nodes"] == [])
+
+
+def test_a_hub_that_ends_is_told_to_those_who_send(rig: Rig) -> None:
+    bus, waiting = rig.bus(), rig.bus()
+    rig.hub.close()
+    if rig.server is not None:
+        rig.server.close()
+    until(lambda: bus.state is BusState.ERROR)
+    with pytest.raises(can.CanOperationError, match=r"the hub of CAN channel can0 .* has gone: nothing can be sent"):
+        bus.send(message())
+    assert waiting.recv(0.01) is None
+
+
+def test_a_hub_that_is_started_again_is_joined_again() -> None:
+    endpoint = free_endpoint()
+    with ExitStack() as stack:
+        with ZenohServer(endpoint) as server, Hub(BusModel("1M"), "can0", server):
+            buses = [stack.enter_context(ZenohBus("can0", endpoint=endpoint)) for _ in range(2)]
+            buses[0].send(message(1))
+            assert read(buses[1], 1)[0].arbitration_id == 1
+        until(lambda: all(bus.state is BusState.ERROR for bus in buses))
+        with ZenohServer(endpoint) as server, Hub(BusModel("1M"), "can0", server):
+            until(lambda: all(bus.state is BusState.ACTIVE for bus in buses))
+            buses[1].send(message(2))
+            assert read(buses[0], 1)[0].arbitration_id == 2
+
+
+def test_two_channels_at_one_address_do_not_mix() -> None:
+    endpoint = free_endpoint()
+    with (
+        ZenohServer(endpoint) as server,
+        Hub(BusModel("1M"), "can0", server),
+        Hub(BusModel("1M"), "can1", server),
+        ZenohBus("can0", endpoint=endpoint) as zero,
+        ZenohBus("can0", endpoint=endpoint) as sender,
+        ZenohBus("can1", endpoint=endpoint) as one,
+    ):
+        sender.send(message(1))
+        assert read(zero, 1)[0].channel == "can0"
+        assert one.recv(0.1) is None
+
+
+def test_the_command_listens_where_clients_look() -> None:
+    assert can_command._LISTEN == medium.DEFAULT_ENDPOINT
+
+
+def test_channels_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(medium, "DEFAULT_ENDPOINT", free_endpoint())
+    assert can.detect_available_configs(["zenoh"]) == []
+    with ZenohServer(medium.DEFAULT_ENDPOINT) as server, Hub(BusModel("1M"), "can5", server):
+        assert can.detect_available_configs(["zenoh"]) == [{"interface": "zenoh", "channel": "can5"}]
+
+
+# What python-can does with a bus.
+
+
+def test_notifier_listeners_and_periodic_tasks_work(rig: Rig) -> None:
+    sender, receiver = rig.bus(), rig.bus()
+    reader = can.BufferedReader()
+    with can.Notifier(receiver, [reader], timeout=0.1):
+        task = sender.send_periodic(message(0x42), 0.002)
+        found = [reader.get_message(2.0) for _ in range(20)]
+        task.stop()
+    assert {item.arbitration_id for item in found if item is not None} == {0x42}
+    assert None not in found
+
+
+def test_asyncio_readers_work(rig: Rig) -> None:
+    sender, receiver = rig.bus(), rig.bus()
+
+    async def run() -> list[int]:
+        reader = can.AsyncBufferedReader()
+        with can.Notifier(receiver, [reader], timeout=0.1, loop=asyncio.get_running_loop()):
+            for number in range(50):
+                sender.send(message(0x100, bytes((number,))))
+            return [(await asyncio.wait_for(reader.get_message(), 5.0)).data[0] for _ in range(50)]
+
+    assert asyncio.run(run()) == list(range(50))
+
+
+# The hub among others.
+
+
+def fuzz(rng: random.Random) -> bytes:
+    """Random bytes, or a message of frames with some of its bytes changed."""
+    if rng.random() < 0.3:
+        return rng.randbytes(rng.choice([0, 1, 7, 8, 32, 88, 500]))
+    payload = bytearray(medium.encode_array(medium.records_of(rng.choices(KINDS, k=rng.randint(1, 12)))))
+    for _ in range(rng.choice([0, 1, 3])):
+        payload[rng.randrange(len(payload))] = rng.getrandbits(8)
+    return bytes(payload)
+
+
+def test_random_payloads_leave_the_hub_as_it_was() -> None:
+    rng = random.Random(1)
+    with Rig("process", "1M/8M") as rig:
+        villain, sender, receiver = rig.bus(), rig.bus(), rig.bus()
+        answer = [rig.hub._answerer(name) for name in ("join", "set", "flush", "status")]
+        for number in range(100_000):
+            payload = fuzz(rng)
+            rig.hub.offer(villain._name if number % 2 else rng.choice(["", "x"]), payload)
+            if number % 50 == 0:
+                rng.choice(answer)(
+                    rng.choice([payload, b"[]", b'{"endpoint": 3}', b'{"endpoint": "fuzz"}', b"[" * 4000])
+                )
+        counts = rig.hub.status()["counts"]
+        assert counts["strange"] == 50_000
+        assert min(counts["malformed"], counts["invalid"], counts["surplus"], counts["frames"]) > 100
+        assert rig.hub._thread.is_alive()
+        villain.shutdown()
+        until(lambda: rig.hub._waiting == 0)
+        # A frame made so that all malformed ones differ from it.
+        sender.send(message(0x7A5, b"unique"))
+        while (found := read(receiver, 1)[0]).data != b"unique":
+            assert found.is_error_frame or medium.fault_of(medium.record_of(found)) is None
+        nodes = {row["name"]: row for row in rig.hub.status()["nodes"]}
+        assert nodes[receiver._name]["state"] == 0
+
+
+def test_random_payloads_over_zenoh_leave_the_hub_as_it_was() -> None:
+    rng = random.Random(2)
+    with Rig("zenoh", "1M/8M") as rig:
+        villain, sender, receiver = rig.bus(), rig.bus(), rig.bus()
+        client = villain._client
+        for number in range(5000):
+            name = villain._name if number % 2 else "stranger"
+            client.report(medium.offer_key("can0", name), fuzz(rng))
+            client.report(medium.bus_key("can0"), fuzz(rng))
+            client.report(f"rig/can/can0/{rng.choice(['join', 'offer', 'node/x'])}", fuzz(rng))
+        until(lambda: rig.hub.status()["counts"]["malformed"] > 100)
+        sender.send(message(0x7A5, b"unique"))
+        while read(receiver, 1)[0].data != b"unique":
+            pass
+
+
+def test_the_number_of_endpoints_is_bounded() -> None:
+    with Rig("process", "1M") as rig:
+        for number in range(hubs.MAX_ENDPOINTS):
+            assert "node" in rig.hub.answer("join", {"endpoint": f"e{number}"})
+        with pytest.raises(can.CanInitializationError, match="refuses another node: 64 endpoints are there already"):
+            rig.bus()
+        assert "node" in rig.hub.answer("join", {"endpoint": "e0"})
+
+
+def test_an_endpoint_that_never_shows_its_token_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hubs, "_TOKENLESS_S", 0.2)
+    with Rig("process", "1M") as rig:
+        rig.hub.answer("join", {"endpoint": "ghost"})
+        bus: Any = rig.bus()
+        until(lambda: [row["name"] for row in rig.hub.status()["nodes"]] == [bus._name])
+
+
+def test_numbers_of_nodes_are_not_used_again_at_once() -> None:
+    with Rig("process", "1M") as rig:
+        seen = set()
+        for _ in range(10):
+            bus: Any = rig.bus()
+            seen.add(bus._node)
+            bus.shutdown()
+        assert len(seen) == 10
