@@ -101,12 +101,12 @@ class Clock(Protocol):
         """How many ticks may run now, at most `ticks`; 0 after a `wake`, so that the caller can look around."""
         ...
 
-    def release(self, tick: int) -> None:
-        """Return when what was simulated up to `tick` is due."""
+    def release(self, tick: int) -> bool:
+        """Return True when what was simulated up to `tick` is due; False after a `wake`, and is to be called again."""
         ...
 
     def wake(self) -> None:
-        """Make a waiting `grant` return; from any thread."""
+        """Make a waiting `grant` or `release` return; from any thread."""
         ...
 
     def statistics(self) -> dict[str, object]:
@@ -139,9 +139,10 @@ class FreeRun:
         """All of them."""
         return ticks
 
-    def release(self, tick: int) -> None:
+    def release(self, tick: int) -> bool:
         """Results are due at once."""
         self._measure(tick, self._now_ns())
+        return True
 
     def wake(self) -> None:
         """Nothing waits here."""
@@ -177,7 +178,7 @@ class RealTime(FreeRun):
         spin_s: Wake this much earlier and poll the clock [s]. Costs that much CPU a block; sleeping alone is
             about 0.1 ms late.
         now_ns: Time source [ns], monotonic.
-        sleep: Sleeps for a number of seconds.
+        sleep: Sleeps for a number of seconds; None: in a way that `wake` ends.
     """
 
     pace = "real-time"
@@ -187,30 +188,42 @@ class RealTime(FreeRun):
         *,
         spin_s: float = 0.0,
         now_ns: Callable[[], int] = time.monotonic_ns,
-        sleep: Callable[[float], None] = time.sleep,
+        sleep: Callable[[float], object] | None = None,
     ) -> None:
         super().__init__(now_ns=now_ns)
         self._spin_ns = round(spin_s * _NS)
-        self._sleep = sleep
+        self._woken = threading.Event()
+        self._sleep = sleep or self._woken.wait
+        self._awaited: int | None = None
 
     def deadline_ns(self, tick: int) -> int:
         """When a tick is due, in the time of the time source [ns]."""
         return self._origin_ns + (tick - self._origin_tick) * _NS // self._tick_rate_hz
 
-    def release(self, tick: int) -> None:
-        """Return when the wall clock has reached the tick."""
+    def wake(self) -> None:
+        """Make a waiting `release` return False; from any thread."""
+        self._woken.set()
+
+    def release(self, tick: int) -> bool:
+        """Return True when the wall clock has reached the tick, False before that after a `wake`."""
         deadline = self.deadline_ns(tick)
         now = self._now_ns()
-        if now > deadline:
+        # Once a tick: a result that was ready in time is no overrun because a command came in between.
+        if now > deadline and self._awaited != tick:
             self._overruns += 1
+        self._awaited = tick
         while now < deadline:
             rest = deadline - now - self._spin_ns
             if rest > 0:
                 self._sleep(rest / _NS)
             now = self._now_ns()
+            if now < deadline and self._woken.is_set():
+                self._woken.clear()
+                return False
         self._last_s = (now - deadline) / _NS
         self._lateness_s.add(self._last_s)
         self._measure(tick, now)
+        return True
 
 
 class Lockstep(FreeRun):

@@ -475,10 +475,13 @@ class Service:
                 self._defer(events)
                 continue
             frame = simulation.advance(ticks)
-            clock.release(simulation.tick)
+            answered = []
+            while not clock.release(simulation.tick):
+                # A command that comes while the block is not yet due takes effect at its end, and is answered now.
+                answered += self._take_commands()
             self._tick = simulation.tick
             after = [{**event, "wall_s": time.time()} for event in frame.events]
-            after += self._refresh_health()
+            after += [*answered, *self._refresh_health()]
             self._overflow(queue.put(_Entry(events, frame, after, self._finished_steps())))
 
     def _defer(self, events: list[dict[str, Any]]) -> None:

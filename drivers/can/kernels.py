@@ -839,7 +839,7 @@ def advance(bus, until, out, nominal_ps, data_ps, chance):
     count = 0
     cells[MORE] = 0
     while True:
-        if count >= room:
+        if count >= max(room, 1):  # without a node there is no room, and no need of any
             cells[MORE] = 1
             return count
         arrival = _FAR

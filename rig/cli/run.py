@@ -6,12 +6,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.can_output import CanBitrate, CanBus, CanClassic, CanFd, CanOutput, CanOverload, CanRate
 from rig.cli.options import Changes, DurationS, Engine, Parameters, SceneName, Seed
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
@@ -45,6 +46,12 @@ def run(
     engine: Engine = None,
     duration_s: DurationS = None,
     seed: Seed = None,
+    can: CanBus = None,
+    can_rate: CanRate = None,
+    can_classic: CanClassic = False,
+    can_fd: CanFd = False,
+    can_bitrate: CanBitrate = None,
+    can_overload: CanOverload = False,
 ) -> None:
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
     overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
@@ -59,20 +66,36 @@ def run(
         from rig.transport.zenoh import ZenohServer
 
         loaded = load_scene(scene, overrides)
-    with ZenohServer(listen, expose=expose, wait=pace is not Pace.REAL_TIME) as server:
+        bus = None
+        if can is not None:
+            bus = CanOutput(
+                can, classic=can_classic, fd=can_fd, rate_hz=can_rate, bitrate=can_bitrate, overload=can_overload
+            )
+        elif can_rate is not None or can_classic or can_fd or can_bitrate is not None or can_overload:
+            raise InputError("--can", "given with the other --can options", None)
+    paced = pace is Pace.REAL_TIME
+    with ZenohServer(listen, expose=expose, wait=not paced) as server, ExitStack() as stack:
+        if bus is not None:
+            stack.enter_context(bus)
         with rare_collections():
             simulation = Simulation(loaded)
             block_ticks = _block_ticks(block_ms, simulation)
-            service = Service(simulation, server, _clock(pace), block_ticks=block_ticks)
+            everywhere = server if bus is None else bus.beside(server)
+            service = Service(simulation, everywhere, _clock(pace), block_ticks=block_ticks)
             notice = "preparing" if compiled_before() else COMPILE_NOTICE
             typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
             if loaded.fidelity_line:
                 typer.echo(f"rig: {loaded.fidelity_line}", err=True)
             service.prepare()
+            if bus is not None:
+                bus.start(paced=paced)
+                typer.echo(f"rig: {bus}", err=True)
         typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
         with _stopping_on_signals(service.stop), _showing(service):
             summary = service.run()
     _print_summary(summary)
+    if bus is not None:
+        typer.echo(bus.summary())
 
 
 def scene_overrides(

@@ -103,7 +103,17 @@ def status_table(document: dict[str, Any]) -> Table:
         table.add_row("error estimate", f"energy residual {share:.1e} of what was dissipated (alarm at 1e-3)")
     table.add_row("samples published", str(document["samples_published"]))
     table.add_row("commands taken", str(document["commands"]))
-    table.add_row("links", ", ".join(f"{name} {value:g}" for name, value in document["congestion"].items()) or "-")
+    counts = document["congestion"]
+    links = [f"{name} {value:g}" for name, value in counts.items() if not name.startswith("can_")]
+    table.add_row("links", ", ".join(links) or "-")
+    if "can_load" in counts:
+        shares = [f"load at most {100 * counts['can_load']:.1f} %"]
+        shares += [
+            f"{name.removeprefix('can_').replace('_', ' ')} {value:g}"
+            for name, value in counts.items()
+            if name.startswith("can_") and name != "can_load"
+        ]
+        table.add_row("CAN", ", ".join(shares))
     for name, client in document["clients"].items():
         text = f"lag {client['lag_s']:.3f} s, heard {client['last_heard_s']:.1f} s ago, lost {client['lost']}"
         table.add_row(f"client {name}", text)

@@ -615,3 +615,9 @@ def test_refusals():
         BusModel("1M", error_rate=1.5)
     with pytest.raises(InputError):
         bus.attach(queue=0)
+
+
+def test_bus_without_nodes_lets_time_pass() -> None:
+    bus = BusModel("1M")
+    assert bus.advance(1_000_000) == []
+    assert bus.now_ns == 1_000_000

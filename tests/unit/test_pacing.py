@@ -188,3 +188,28 @@ def test_histogram_memory_does_not_grow() -> None:
         histogram.add(n * 1e-6)
     assert len(histogram._counts) == bins
     assert sum(histogram._counts) == histogram.count == 100_000
+
+
+def test_a_wake_ends_the_wait_for_a_deadline_once() -> None:
+    clock = RealTime()
+    clock.start(0, 1)
+    clock.wake()
+    # An hour ahead: waiting for it would end the test.
+    assert clock.release(3600) is False
+    waker = threading.Timer(0.05, clock.wake)
+    waker.start()
+    assert clock.release(3600) is False
+    waker.join()
+    assert clock.release(0) is True
+    assert clock.statistics()["overruns"] == 1
+
+
+def test_a_result_that_was_ready_is_no_overrun_because_a_command_came() -> None:
+    now = [0]
+    clock = RealTime(now_ns=lambda: now[0], sleep=lambda seconds: None)
+    clock.start(0, 1)
+    clock.wake()
+    assert clock.release(1) is False
+    now[0] = 2_000_000_000
+    assert clock.release(1) is True
+    assert clock.statistics()["overruns"] == 0
