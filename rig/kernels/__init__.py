@@ -27,7 +27,7 @@ COMPILE_NOTICE = "compiling the kernels, once on this machine (about 20 s)"
 def source_digest() -> str:
     """Digest of all files that hold compiled code, and of their place: numba's cache serves no other."""
     digest = hashlib.sha256(str(Path(__file__).parent).encode())
-    for path in sorted(path for folder in _SOURCES for path in folder.glob("*.py")):
+    for path in sorted(path for folder in _SOURCES for path in folder.rglob("*.py")):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:16]
 

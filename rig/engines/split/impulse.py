@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from numba import njit
 
-from rig.engines.inner_motion import FAST, inlined
+from rig.engines.split.inner_motion import FAST, inlined
 from rig.kernels.contact import elastic_force
 
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rig.engines.inner_motion import FAST, Axis, Houses, inlined
+from rig.engines.split.inner_motion import FAST, Axis, Houses, inlined
 from rig.kernels.magnet import magnet_force
 
 GRID = 5

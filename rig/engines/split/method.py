@@ -38,33 +38,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rig.engines.flow import GRID, HALF, HOUSE_FLOW, LEVELS, PER_STEP, flow, house_flows, magnet_springs, shaft_flows
-from rig.engines.impulse import (
-    Impulse,
-    Law,
-    Push,
-    compliant_push,
-    crossing,
-    end_impulse,
-    flow_swerve,
-    friction_impulse,
-    law_at,
-    mobility_of,
-    onset_error,
-)
-from rig.engines.inner_motion import (
-    FAST,
-    Axis,
-    Houses,
-    eccentricity,
-    from_coordinates,
-    geometry_of,
-    house_energy,
-    inlined,
-    into_coordinates,
-    motion_of,
-    plant_of,
-)
 from rig.engines.memory import (
     CLAMPS,
     CONTACT_STEPS,
@@ -78,6 +51,43 @@ from rig.engines.memory import (
     STEPS,
 )
 from rig.engines.peak import peak
+from rig.engines.split.flow import (
+    GRID,
+    HALF,
+    HOUSE_FLOW,
+    LEVELS,
+    PER_STEP,
+    flow,
+    house_flows,
+    magnet_springs,
+    shaft_flows,
+)
+from rig.engines.split.impulse import (
+    Impulse,
+    Law,
+    Push,
+    compliant_push,
+    crossing,
+    end_impulse,
+    flow_swerve,
+    friction_impulse,
+    law_at,
+    mobility_of,
+    onset_error,
+)
+from rig.engines.split.inner_motion import (
+    FAST,
+    Axis,
+    Houses,
+    eccentricity,
+    from_coordinates,
+    geometry_of,
+    house_energy,
+    inlined,
+    into_coordinates,
+    motion_of,
+    plant_of,
+)
 from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
 from rig.kernels.dynamics import drive_speed, evaluate
