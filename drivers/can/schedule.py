@@ -1,0 +1,101 @@
+"""Which messages a rig has on a bus, how often, and what load and latency that makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.can import analysis
+from drivers.can.signals import CLASSIC_HZ, FD_HZ, Message, MessageTable, default_messages
+from drivers.can.timing import Speed
+from rig.errors import InputError
+
+SLOT_S = 1e-3
+"""The gateway hands over frames once in this time: that much later than due they may be queued [s]."""
+SAMPLE_DEADLINE_S = 10e-3
+"""Longest time that a sample frame may wait for the bus [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """Rates of the two sample layouts.
+
+    Attributes:
+        classic_hz: Rate of the classic layout [Hz]; None: not sent.
+        fd_hz: Rate of the FD layout [Hz]; None: not sent.
+    """
+
+    classic_hz: int | None = CLASSIC_HZ
+    fd_hz: int | None = None
+
+    def messages(self, table: MessageTable | None = None) -> dict[Message, float]:
+        """Every message and its period [s]."""
+        return (table or default_messages()).schedule(classic_hz=self.classic_hz, fd_hz=self.fd_hz)
+
+    def response_times(self, speed: Speed) -> list[tuple[Message, analysis.Response]]:
+        """Worst case of every message on a bus of that speed, the highest priority first.
+
+        The load of a message is `transmission_s / message.period_s`. What events send is taken at its most frequent.
+        Delays of the gateway's process by the operating system are not in it.
+
+        Raises:
+            InputError: FD frames on a bus for classic CAN only.
+        """
+        if self.fd_hz is not None and not speed.fd:
+            raise InputError("--can-bitrate", "two rates for CAN FD, such as 1M/8M", str(speed))
+        table = {message.identifier: message for message in self.messages()}
+        return [(table[row.message.identifier], row) for row in analysis.worst_case(self._shapes(), speed)]
+
+    def load(self, speed: Speed) -> float:
+        """Largest share of the bus that all messages together can take, with the most stuff bits there can be."""
+        return analysis.load(self._shapes(), speed)
+
+    def check(self, speed: Speed) -> float:
+        """The load, where the bus can carry it.
+
+        Raises:
+            InputError: It cannot; the message has the load.
+        """
+        if self.fd_hz is not None and not speed.fd:
+            raise InputError("--can-bitrate", "two rates for CAN FD, such as 1M/8M", str(speed))
+        share = self.load(speed)
+        if share > 1.0:
+            must = "a schedule of at most 100 % of the bus in the worst case (or add --can-overload)"
+            raise InputError("CAN load", must, f"{100 * share:.1f} % of {speed}")
+        return share
+
+    def _shapes(self) -> list[analysis.Message]:
+        return [
+            analysis.Message(
+                row.identifier,
+                period_s,
+                row.length,
+                jitter_s=SLOT_S if row.periodic else 0.0,
+                # Samples may wait behind others: their number says which they are, and a controller queues them.
+                deadline_s=period_s if row.samples is None else SAMPLE_DEADLINE_S,
+                fd=row.fd,
+                brs=row.fd,
+            )
+            for row, period_s in self.messages().items()
+        ]
+
+
+def schedule_from(*, classic: bool, fd: bool, rate_hz: int | None) -> Schedule:
+    """The schedule of the options of `rig run` and `rig can load`.
+
+    Args:
+        classic: Send the classic layout; also where neither is asked for.
+        fd: Send the FD layout.
+        rate_hz: Rate of the samples [Hz], for classic frames at most their usual one; None: the usual ones.
+
+    Raises:
+        InputError: A rate that is none.
+    """
+    if rate_hz is not None and not 1 <= rate_hz <= 20_000:
+        raise InputError("--can-rate", "between 1 and 20000 Hz", rate_hz)
+    classic = classic or not fd
+    if classic and not fd and rate_hz is not None and rate_hz > CLASSIC_HZ:
+        raise InputError("--can-rate", f"at most {CLASSIC_HZ} Hz for classic frames (add --can-fd)", rate_hz)
+    return Schedule(
+        classic_hz=min(rate_hz or CLASSIC_HZ, CLASSIC_HZ) if classic else None,
+        fd_hz=(rate_hz or FD_HZ) if fd else None,
+    )

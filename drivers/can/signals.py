@@ -1,0 +1,634 @@
+"""The one table of CAN messages, made from the channel table, and their bytes.
+
+Identifiers, lengths, bit positions, scaling and units of everything that the rig has on a bus stand here; the DBC, the
+gateway, the load and the drivers derive from it. All is little-endian ("Intel"), identifiers have 11 bits, and the
+lower wins the bus: commands, then the time base, then waveforms, then slow messages.
+
+Two layouts carry samples. `classic` has all channels at 1 kHz in 16 bits (the upper bits of the recorded counts), three
+channels and a running number a frame: five frames of 8 bytes an instant, below 70 % of 1 Mbit/s. `fd` has the counts as
+recorded in 24 bits at 10 kHz, one sensor group a message, as many instants as fill 64 bytes, with the number of the
+first one in the recording. Both pick every n-th sample of the stream as it is: what lies above half the slower rate
+folds back, which is the receiver's to know.
+
+A command must not arise from noise. It has a kind (4 of 256 values), a counter that goes on by 1 to 15 from that of
+the last command that reached the rig, a constant key, reserved bits at zero, and a CRC-8 over identifier and data; a
+blow is also limited in force and duration. Of random frames of 8 bytes on the very identifier of commands, one of
+`ODDS` passes all that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cache
+
+import numpy as np
+
+from rig.channels import Channel, ChannelTable, default_table
+
+CLASSIC_HZ = 1_000
+FD_HZ = 10_000
+"""Usual rates of the two layouts [Hz]."""
+CLASSIC_SHARE = 0.7
+"""Most that the classic layout may take of a bus of 1 Mbit/s, with everything that goes with it."""
+
+ABSENT = -32768
+"""Value of a channel that a run does not have, in a classic frame; counts stop one above it."""
+
+KEY = 0x9D
+"""What every command carries."""
+AHEAD = 15
+"""How far the counter of a command may be ahead of that of the last one that reached the rig."""
+ODDS = 2.7e9
+"""Random frames of 8 bytes on the identifier of commands for one that is taken: a blow of the hammer by nearly all of
+it, 256 kinds x 256 / 15 counters x 256 keys x 256 checksums x 1 / (0.15 forces x 0.78 durations x 0.94 directions)."""
+
+RIG = "Rig"
+CONTROLLER = "Controller"
+
+
+class Kind(IntEnum):
+    """What a command asks for; any two differ in at least four bits."""
+
+    RELEASE = 0x36
+    SPEED = 0x5C
+    HAMMER = 0xA1
+    STOP = 0xC7
+
+
+class Result(IntEnum):
+    """What became of a command."""
+
+    ACCEPTED = 0
+    BAD_LENGTH = 1
+    BAD_CHECKSUM = 2
+    BAD_KEY = 3
+    BAD_KIND = 4
+    RESERVED_BITS = 5
+    STALE_COUNTER = 6
+    OUT_OF_RANGE = 7
+    REFUSED = 8
+    TIMED_OUT = 9
+    BUSY = 10
+
+
+class Field(IntEnum):
+    """Which value of a command was out of range."""
+
+    NONE = 0
+    FORCE = 1
+    DURATION = 2
+    DIRECTION = 3
+    SPEED = 4
+
+
+class State(IntEnum):
+    """What the rig does."""
+
+    PREPARING = 0
+    RUNNING = 1
+    ENDED = 2
+
+
+class EventKind(IntEnum):
+    """What has happened."""
+
+    START = 1
+    COMMAND = 2
+    HAMMER = 3
+    SPEED = 4
+    RELEASE = 5
+    WARNING = 6
+    END = 7
+    OTHER = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """A number in a message.
+
+    Attributes:
+        name: Unique in its message.
+        start: Position of its lowest bit in the little-endian message.
+        bits: Width.
+        signed: Two's complement.
+        scale: Unit per step.
+        offset: Value at 0.
+        unit: Engineering unit.
+        label: What it is.
+        choices: Names of values.
+        selects: It tells which of the signals with `selected_by` are there.
+        selected_by: Value of the selecting signal with which this one is there.
+        channel: Channel that it carries a sample of, or None.
+    """
+
+    name: str
+    start: int
+    bits: int
+    signed: bool = False
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: str = ""
+    label: str = ""
+    choices: Mapping[int, str] | None = None
+    selects: bool = False
+    selected_by: tuple[int, ...] = ()
+    channel: Channel | None = None
+
+    @property
+    def raw_range(self) -> tuple[int, int]:
+        """Least and largest value that the bits can hold."""
+        return (-(1 << self.bits - 1), (1 << self.bits - 1) - 1) if self.signed else (0, (1 << self.bits) - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """How samples lie in a message: a running number, then instant after instant, channel after channel.
+
+    Attributes:
+        channels: What is in it, in order.
+        rows: Instants a frame.
+        width: Bytes a value.
+        index_width: Bytes of the running number.
+    """
+
+    channels: tuple[Channel, ...]
+    rows: int
+    width: int
+    index_width: int
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Sensor groups that the channels come from."""
+        return tuple(dict.fromkeys(channel.group for channel in self.channels))
+
+    @property
+    def shifts(self) -> np.ndarray:
+        """Lower bits of the recorded counts that are left out, shape (channels,)."""
+        return np.array([max(0, channel.adc_bits - 8 * self.width) for channel in self.channels])
+
+    def pack(self, numbers: np.ndarray, counts: np.ndarray, length: int) -> np.ndarray:
+        """Data of frames.
+
+        Args:
+            numbers: Running number of each frame's first instant; what does not fit is cut off, shape (frames,).
+            counts: Recorded counts, int32, shape (frames * rows, channels).
+            length: Bytes of a frame.
+
+        Returns:
+            uint8, shape (frames, length).
+        """
+        frames = len(numbers)
+        values = counts >> self.shifts
+        if self.width == 2:
+            values = np.maximum(values, ABSENT + 1)
+        out = np.zeros((frames, length), np.uint8)
+        head = np.ascontiguousarray(numbers, "<i8").view(np.uint8).reshape(frames, 8)
+        out[:, : self.index_width] = head[:, : self.index_width]
+        body = np.ascontiguousarray(values, "<i4").view(np.uint8).reshape(frames, -1, 4)[:, :, : self.width]
+        out[:, self.index_width : self.index_width + body.shape[1] * self.width] = body.reshape(frames, -1)
+        return out
+
+    def unpack(self, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Running numbers and values of frames.
+
+        Args:
+            data: uint8, shape (frames, length).
+
+        Returns:
+            Number of each frame's first instant, int64, shape (frames,), and the values as they are in the frames,
+            int32, shape (frames * rows, channels).
+        """
+        frames, size = len(data), self.rows * len(self.channels)
+        head = np.zeros((frames, 8), np.uint8)
+        head[:, : self.index_width] = data[:, : self.index_width]
+        body = np.zeros((frames, size, 4), np.uint8)
+        end = self.index_width + size * self.width
+        body[:, :, 4 - self.width :] = data[:, self.index_width : end].reshape(frames, size, self.width)
+        values = body.view("<i4").reshape(-1, len(self.channels)) >> (32 - 8 * self.width)
+        return head.view("<i8").reshape(frames), values
+
+    def engineering(self, values: np.ndarray) -> np.ndarray:
+        """Values of `unpack` in each channel's unit, float64, shape (instants, channels); nan where it is absent."""
+        scale = np.array([channel.scale for channel in self.channels]) * 2.0**self.shifts
+        out = values * scale + np.array([channel.offset for channel in self.channels])
+        if self.width == 2:
+            out[values == ABSENT] = np.nan
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """A kind of frame.
+
+    Attributes:
+        name: Unique.
+        identifier: 11 bits.
+        length: Bytes.
+        fd: A CAN FD frame with bit rate switch.
+        period_s: How often it is sent, or at most sent where nothing but events sends it [s].
+        periodic: Whether it is sent by the clock.
+        sender: Node.
+        label: What it is.
+        signals: What is in it.
+        samples: Where it carries samples, how.
+    """
+
+    name: str
+    identifier: int
+    length: int
+    fd: bool
+    period_s: float
+    periodic: bool
+    sender: str
+    label: str
+    signals: tuple[Signal, ...]
+    samples: Samples | None = None
+
+    def encode(self, **raw: int) -> bytes:
+        """Data with these raw values; signals that are not named are 0.
+
+        Raises:
+            ValueError: A value does not fit its bits.
+        """
+        total = 0
+        known = {signal.name: signal for signal in self.signals}
+        for name, value in raw.items():
+            signal = known[name]
+            low, high = signal.raw_range
+            if not low <= value <= high:
+                raise ValueError(f"{self.name}.{name} must be between {low} and {high}; instead received {value}")
+            total |= (value & (1 << signal.bits) - 1) << signal.start
+        return total.to_bytes(self.length, "little")
+
+    def decode(self, data: bytes) -> dict[str, int]:
+        """Raw values by name; of signals that take turns, those that are there."""
+        total = int.from_bytes(data, "little")
+        values: dict[str, int] = {}
+        selected = None
+        for signal in self.signals:
+            value = total >> signal.start & (1 << signal.bits) - 1
+            if signal.signed and value >> signal.bits - 1:
+                value -= 1 << signal.bits
+            if signal.selects:
+                selected = value
+            if not signal.selected_by or selected in signal.selected_by:
+                values[signal.name] = value
+        return values
+
+
+@dataclass(frozen=True, slots=True)
+class MessageTable:
+    """All messages of a rig."""
+
+    messages: tuple[Message, ...]
+    by_name: dict[str, Message] = field(init=False)
+    by_identifier: dict[int, Message] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "by_name", {message.name: message for message in self.messages})
+        object.__setattr__(self, "by_identifier", {message.identifier: message for message in self.messages})
+        if not len(self.by_name) == len(self.by_identifier) == len(self.messages):
+            raise ValueError("names and identifiers of CAN messages must be unique")
+
+    @property
+    def classic(self) -> tuple[Message, ...]:
+        """Messages of the classic sample layout."""
+        return tuple(row for row in self.messages if row.samples is not None and not row.fd)
+
+    @property
+    def fd(self) -> tuple[Message, ...]:
+        """Messages of the FD sample layout."""
+        return tuple(row for row in self.messages if row.samples is not None and row.fd)
+
+    @property
+    def others(self) -> tuple[Message, ...]:
+        """Messages without samples."""
+        return tuple(row for row in self.messages if row.samples is None)
+
+    def schedule(self, *, classic_hz: float | None = None, fd_hz: float | None = None) -> dict[Message, float]:
+        """What is on the bus, and how often [s].
+
+        Args:
+            classic_hz: Rate of the classic layout [Hz], or None where it is not sent.
+            fd_hz: Rate of the FD layout [Hz], or None where it is not sent.
+        """
+        rows = {row: row.period_s for row in self.others}
+        for messages, rate in ((self.classic, classic_hz), (self.fd, fd_hz)):
+            if rate is not None:
+                rows |= {row: row.samples.rows / rate for row in messages if row.samples is not None}
+        return rows
+
+
+def _choices(names: type[IntEnum]) -> dict[int, str]:
+    return {member.value: member.name.lower() for member in names}
+
+
+_TIME = "Simulated time, modulo 2^32 us (71.6 min)"
+
+_HEAD = (
+    Signal("counter", 8, 8, label=f"1 to {AHEAD} above that of the last one that reached the rig, modulo 256"),
+    Signal("key", 48, 8, label=f"Always {KEY:#x}"),
+    Signal("checksum", 56, 8, label="CRC-8 (SAE J1850) over identifier, low byte first, and the other seven bytes"),
+)
+_STOP_SIGNALS = (
+    Signal("kind", 0, 8, label="What to do", choices={int(Kind.STOP): "stop"}),
+    Signal("reserved", 16, 32, label="Always 0"),
+    *_HEAD,
+)
+_HAMMER, _SPEED, _RELEASE = (int(Kind.HAMMER),), (int(Kind.SPEED),), (int(Kind.RELEASE),)
+_COMMAND_SIGNALS = (
+    Signal(
+        "kind", 0, 8, label="What to do", selects=True,
+        choices={value: name for value, name in _choices(Kind).items() if value != Kind.STOP},
+    ),
+    Signal("force", 16, 16, scale=0.1, unit="N", label="Peak force, 1 to 1000", selected_by=_HAMMER),
+    Signal("duration", 32, 8, scale=0.25, unit="ms", label="Of the half sine, 0.5 to 50", selected_by=_HAMMER),
+    Signal("direction", 40, 8, scale=1.5, unit="deg", label="From x (EAST) toward y (up)", selected_by=_HAMMER),
+    Signal("speed", 16, 24, scale=0.001, unit="Hz", label="Speed that the drive holds", selected_by=_SPEED),
+    Signal("reserved_speed", 40, 8, label="Always 0", selected_by=_SPEED),
+    Signal("reserved", 16, 32, label="Always 0", selected_by=_RELEASE),
+    *_HEAD,
+)  # fmt: skip
+_DIRECTIONS = 240
+"""Steps of the direction in a full turn."""
+
+
+def _other_messages() -> list[Message]:
+    command = (
+        "A command: 8 bytes; kind, counter, key, checksum are checked, bits that the kind does not use must be 0. "
+        "The rig checks ranges and says at which simulated time it takes effect (Acknowledge)"
+    )
+    spin = Signal(
+        "spin", 8, 16, scale=0.001, unit="Hz", label="Spin speed of the shaft, as the status has it; 65.535: more"
+    )
+    return [
+        Message("Stop", 0x010, 8, False, 0.1, False, CONTROLLER, f"Ends the run. {command}", _STOP_SIGNALS),
+        Message("Command", 0x020, 8, False, 0.1, False, CONTROLLER, command, _COMMAND_SIGNALS),
+        Message(
+            "Acknowledge", 0x021, 8, False, 0.05, False, RIG,
+            "What became of a command; beyond a burst of 20, at most 50 refusals a second are acknowledged",
+            (
+                Signal("counter", 0, 8, label="That of the command"),
+                Signal("result", 8, 4, label="What became of it", choices=_choices(Result)),
+                Signal("field", 12, 4, label="Value that was out of range", choices=_choices(Field)),
+                Signal("time", 16, 32, unit="us", label=f"When an accepted command takes effect, else now. {_TIME}"),
+                Signal("limit", 48, 16, scale=0.1, label="Limit that was passed, in the unit of the field"),
+            ),
+        ),
+        Message(
+            "Event", 0x310, 8, False, 0.1, False, RIG, "Something took effect; behind all samples before it",
+            (
+                Signal("event", 0, 8, label="What", choices=_choices(EventKind)),
+                Signal("number", 8, 8, label="Running number, modulo 256"),
+                Signal("time", 16, 32, unit="us", label=_TIME),
+                Signal("value", 48, 16, scale=0.1, label="Force of a blow, N, or speed, Hz; else 0"),
+            ),
+        ),
+        Message(
+            "Sync", 0x080, 8, False, 0.1, True, RIG,
+            "Ties bus time to the stream: sent when the sample of this number is due, Rates.latency after its time",
+            (
+                Signal("index", 0, 32, label="Number of the sample in the recording"),
+                Signal("time", 32, 32, unit="us", label=f"Its time. {_TIME}"),
+            ),
+        ),
+        Message(
+            "Keyphasor", 0x300, 8, False, 0.02, False, RIG,
+            "An exact edge of the keyphasor (the load assumes at most 50 a second)",
+            (
+                Signal("number", 0, 16, label="Number of the edge, modulo 65536"),
+                Signal("time", 16, 32, unit="us", label=f"Whole microseconds. {_TIME}"),
+                Signal("fraction", 48, 16, scale=1.0 / 65536, unit="us", label="Rest of the time"),
+            ),
+        ),
+        Message(
+            "Status", 0x700, 8, False, 0.5, True, RIG, "How the rig does; rig/status has it all",
+            (
+                Signal("state", 0, 4, label="What the rig does", choices=_choices(State)),
+                Signal("warnings", 4, 4, label="Number of warnings; 15: more"),
+                spin,
+                Signal("lateness", 24, 16, scale=0.01, unit="ms", label="p99 of the lateness of blocks; 655.35: more"),
+                Signal("dropped", 40, 12, label="Sample frames that were not sent, modulo 4096"),
+                Signal("refused", 52, 12, label="Commands refused, modulo 4096"),
+            ),
+        ),
+        Message(
+            "Heartbeat", 0x701, 8, False, 1.0, True, RIG, "The rig is there; without it for 3 s, it has gone",
+            (
+                Signal("state", 0, 8, label="What the rig does", choices=_choices(State)),
+                Signal("beat", 8, 8, label="Running number, modulo 256"),
+                Signal("counter", 16, 8, label="Of the last command that reached the rig; the next has one more"),
+                Signal("time", 24, 32, unit="us", label=f"End of the last block. {_TIME}"),
+            ),
+        ),
+        Message(
+            "Rates", 0x702, 8, False, 1.0, True, RIG, "How samples were picked",
+            (
+                Signal("rate", 0, 24, unit="Hz", label="Rate of the recording"),
+                Signal("fd_step", 24, 12, label="Samples from one to the next in FD frames; 0: not sent"),
+                Signal("classic_step", 36, 12, label="Samples from one to the next in classic frames"),
+                Signal("latency", 48, 16, scale=0.01, unit="ms", label="From a sample to when its frame is due"),
+            ),
+        ),
+    ]  # fmt: skip
+
+
+def _decimation(channel: Channel) -> str:
+    return (
+        f"{channel.label}. {channel.kind.capitalize()} calibration: {channel.sensitivity_v:g} V per {channel.unit}, "
+        f"bias {channel.bias_v:g} V, low-pass {channel.bandwidth_hz:g} Hz"
+    )
+
+
+def _sample_signals(samples: Samples, index_label: str) -> tuple[Signal, ...]:
+    width = 8 * samples.width
+    rows = [Signal("index", 0, 8 * samples.index_width, label=index_label)]
+    for row in range(samples.rows):
+        for column, channel in enumerate(samples.channels):
+            start = 8 * samples.index_width + width * (row * len(samples.channels) + column)
+            name = channel.name if samples.rows == 1 else f"{channel.name}_{row}"
+            scale = channel.scale * 2.0 ** int(samples.shifts[column])
+            label = _decimation(channel) if row == 0 else ""
+            rows.append(
+                Signal(name, start, width, True, scale, channel.offset, channel.unit, label, channel=channel)
+            )  # fmt: skip
+    return tuple(rows)
+
+
+def _fd_messages(table: ChannelTable) -> list[Message]:
+    found = []
+    for position, group in enumerate(table.groups.values()):
+        if any(channel.adc_bits > 24 for channel in group.channels):
+            raise ValueError(f"channels of {group.name} must have at most 24 bits for CAN FD frames")
+        rows = 60 // (3 * len(group.channels))
+        if not rows:
+            raise ValueError(f"group {group.name} must have at most 20 channels for CAN FD frames")
+        samples = Samples(group.channels, rows, 3, 4)
+        label = (
+            f"{group.title}: {rows} instants of counts as recorded. Every n-th sample of the {group.rate_hz} Hz stream "
+            f"(n = {group.rate_hz // FD_HZ} at {FD_HZ} Hz; Rates.fd_step), not filtered again: "
+            "what lies above half the slower rate folds back"
+        )
+        index = "Number of the first instant in the recording, modulo 2^32; the others follow by Rates.fd_step"
+        length = next(size for size in (8, 12, 16, 20, 24, 32, 48, 64) if size >= 4 + 3 * rows * len(group.channels))
+        found.append(
+            Message(
+                group.name.capitalize(), 0x100 + 0x10 * position, length, True, rows / FD_HZ, True, RIG, label,
+                _sample_signals(samples, index), samples,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _classic_messages(table: ChannelTable) -> list[Message]:
+    channels = tuple(table.channels.values())
+    found = []
+    for number, first in enumerate(range(0, len(channels), 3), start=1):
+        samples = Samples(channels[first : first + 3], 1, 2, 2)
+        step = samples.channels[0].rate_hz // CLASSIC_HZ
+        label = (
+            f"{', '.join(channel.name for channel in samples.channels)}: upper 16 bits of counts; -32768: not there. "
+            f"Every n-th sample of the stream (n = {step} at {CLASSIC_HZ} Hz; Rates.classic_step), not filtered again: "
+            "what lies above half the slower rate folds back"
+        )
+        index = "Number in the recording divided by Rates.classic_step, modulo 65536"
+        found.append(
+            Message(
+                f"Samples_{number}", 0x200 + number, 2 + 2 * len(samples.channels), False, 1.0 / CLASSIC_HZ, True, RIG,
+                label, _sample_signals(samples, index), samples,
+            )
+        )  # fmt: skip
+    return found
+
+
+@cache
+def _default_messages() -> MessageTable:
+    return make_table(default_table())
+
+
+def make_table(channels: ChannelTable) -> MessageTable:
+    """All messages for a channel table."""
+    rows = [*_other_messages(), *_fd_messages(channels), *_classic_messages(channels)]
+    return MessageTable(tuple(sorted(rows, key=lambda row: row.identifier)))
+
+
+def default_messages() -> MessageTable:
+    """The messages of the rig's own channel table."""
+    return _default_messages()
+
+
+def _crc_table() -> bytes:
+    rows = []
+    for value in range(256):
+        for _ in range(8):
+            value = (value << 1 ^ 0x1D) & 0xFF if value & 0x80 else value << 1
+        rows.append(value)
+    return bytes(rows)
+
+
+_CRC = _crc_table()
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8 SAE J1850: polynomial 0x1D, initial value and final xor 0xFF; 0x4B for b"123456789"."""
+    value = 0xFF
+    for byte in data:
+        value = _CRC[value ^ byte]
+    return value ^ 0xFF
+
+
+def checksum(identifier: int, data: bytes) -> int:
+    """What the last byte of a command must be, from its identifier and its first seven bytes."""
+    return crc8(identifier.to_bytes(2, "little") + data[:7])
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command as it travels.
+
+    Attributes:
+        kind: What to do.
+        counter: 0 to 255.
+        values: Values in the units of the rig's own commands: `force_n` [N], `duration_ms` [ms], `direction` [degrees],
+            `speed_hz` [Hz].
+    """
+
+    kind: Kind
+    counter: int
+    values: dict[str, float]
+
+
+_REQUEST_FIELDS = {
+    Kind.HAMMER: {"force": "force_n", "duration": "duration_ms", "direction": "direction"},
+    Kind.SPEED: {"speed": "speed_hz"},
+    Kind.RELEASE: {},
+    Kind.STOP: {},
+}
+FIELDS = {"force_n": Field.FORCE, "duration_ms": Field.DURATION, "direction": Field.DIRECTION, "speed_hz": Field.SPEED}
+
+
+def command_frame(
+    kind: Kind,
+    counter: int,
+    *,
+    force_n: float = 0.0,
+    duration_ms: float = 0.0,
+    direction: float = 0.0,
+    speed_hz: float = 0.0,
+) -> tuple[int, bytes]:
+    """Identifier and data of a command, as a controller sends it.
+
+    Args:
+        kind: What to do.
+        counter: One more than that of the last one (see Heartbeat), modulo 256; the first has 1.
+        force_n: Peak force [N], to 0.1.
+        duration_ms: Length of the half sine [ms], to 0.25.
+        direction: From x toward y [degrees], to 1.5.
+        speed_hz: Speed that the drive holds [Hz], to 0.001.
+    """
+    message = default_messages().by_name["Stop" if kind is Kind.STOP else "Command"]
+    raw = {"kind": int(kind), "counter": counter & 0xFF, "key": KEY}
+    if kind is Kind.HAMMER:
+        raw |= {
+            "force": round(force_n / 0.1),
+            "duration": round(duration_ms / 0.25),
+            "direction": round(direction / 1.5) % _DIRECTIONS,
+        }
+    elif kind is Kind.SPEED:
+        raw["speed"] = round(speed_hz / 0.001)
+    data = message.encode(**raw)
+    return message.identifier, data[:7] + bytes([checksum(message.identifier, data)])
+
+
+def parse_command(identifier: int, data: bytes, last_counter: int) -> Command | Result:
+    """A command from the bus, or why it is none.
+
+    Args:
+        identifier: Of Stop or Command.
+        data: What came.
+        last_counter: Counter of the last command that reached the rig.
+    """
+    if len(data) != 8:
+        return Result.BAD_LENGTH
+    if data[7] != checksum(identifier, data):
+        return Result.BAD_CHECKSUM
+    if data[6] != KEY:
+        return Result.BAD_KEY
+    try:
+        kind = Kind(data[0])
+    except ValueError:
+        return Result.BAD_KIND
+    message = default_messages().by_identifier[identifier]
+    if (message.name == "Stop") != (kind is Kind.STOP):
+        return Result.BAD_KIND
+    raw = message.decode(data)
+    if raw.get("reserved", 0) or raw.get("reserved_speed", 0) or raw.get("direction", 0) >= _DIRECTIONS:
+        return Result.RESERVED_BITS
+    if not 1 <= (data[1] - last_counter) % 256 <= AHEAD:
+        return Result.STALE_COUNTER
+    scales = {signal.name: signal.scale for signal in message.signals}
+    # Rounded to the steps of the wire, so that 0.1 N x 800 is 80 N.
+    values = {name: round(raw[key] * scales[key], 6) for key, name in _REQUEST_FIELDS[kind].items()}
+    return Command(kind, data[1], values)

@@ -1,0 +1,219 @@
+"""`rig run --can`: the rig as a node of a CAN bus, beside its own transport."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    import can
+
+    from drivers.can.gateway import Gateway
+    from drivers.can.schedule import Schedule
+    from drivers.can.timing import Speed
+    from rig.transport import Server
+
+_PANEL = "CAN"
+CanBus = Annotated[
+    str | None,
+    typer.Option(
+        "--can",
+        metavar="INTERFACE:CHANNEL",
+        help="Also be a node of a CAN bus: zenoh:can0 (with its hub), virtual:rig, socketcan:vcan0, slcan:/dev/pts/3; "
+        "python-can's further settings as ?NAME=VALUE&...",
+        rich_help_panel=_PANEL,
+    ),
+]
+CanRate = Annotated[
+    int | None,
+    typer.Option(
+        "--can-rate", metavar="HZ", help="Rate of samples: usually 1000 classic, 10000 FD.", rich_help_panel=_PANEL
+    ),
+]
+CanClassic = Annotated[
+    bool, typer.Option("--can-classic", help="Samples in classic frames; so by default.", rich_help_panel=_PANEL)
+]
+CanFd = Annotated[
+    bool, typer.Option("--can-fd", help="Samples in CAN FD frames, counts as recorded.", rich_help_panel=_PANEL)
+]
+CanBitrate = Annotated[
+    str | None,
+    typer.Option(
+        "--can-bitrate",
+        metavar="RATE[/RATE]",
+        help="Bit rate, and that of the data phase of CAN FD; 1M and 1M/8M by default.",
+        rich_help_panel=_PANEL,
+    ),
+]
+CanOverload = Annotated[
+    bool,
+    typer.Option(
+        "--can-overload",
+        help="Run even where the bus cannot carry all: frames that find no room are dropped and counted.",
+        rich_help_panel=_PANEL,
+    ),
+]
+
+
+class CanOutput:
+    """A CAN bus as one more transport of the rig.
+
+    Args:
+        spec: INTERFACE:CHANNEL, with ?NAME=VALUE&... for more of python-can's settings.
+        classic: Send the classic layout.
+        fd: Send the FD layout.
+        rate_hz: Rate of samples [Hz]; None: the usual ones.
+        bitrate: Bit rates; None: 1M, or 1M/8M with FD frames.
+        overload: Run even where the bus cannot carry all.
+
+    Raises:
+        InputError: What was asked for does not make a bus, or not one that can carry the messages.
+    """
+
+    def __init__(
+        self,
+        spec: str,
+        *,
+        classic: bool = False,
+        fd: bool = False,
+        rate_hz: int | None = None,
+        bitrate: str | None = None,
+        overload: bool = False,
+    ) -> None:
+        from rig.transport.memory import MemoryServer
+
+        self.interface, self.channel, self._settings = parse_spec(spec)
+        self.schedule, self.speed = plan(classic=classic, fd=fd, rate_hz=rate_hz, bitrate=bitrate)
+        if overload:
+            self.load = self.schedule.load(self.speed)
+        else:
+            self.load = self.schedule.check(self.speed)
+        if self.interface == "slcan" and self.schedule.fd_hz is not None:
+            raise InputError("--can", "an interface that has CAN FD", spec)
+        self._memory = MemoryServer(cache=0)
+        self._gateway: Gateway | None = None
+        self._stack = ExitStack()
+        self._bus: can.BusABC | None = None
+
+    def __enter__(self) -> CanOutput:
+        with ExitStack() as stack:
+            self._bus = stack.enter_context(self._open())
+            stack.callback(self._memory.close)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def beside(self, server: Server) -> Server:
+        """The rig's server together with the bus."""
+        from rig.transport.fanout import Fanout
+
+        return Fanout([server, self._memory], figures=self._figures)
+
+    def start(self, *, paced: bool) -> None:
+        """Begin, once the rig can be asked.
+
+        Args:
+            paced: The rig runs by the wall clock.
+        """
+        from drivers.can.gateway import Gateway
+        from rig.transport.memory import MemoryClient
+
+        assert self._bus is not None
+        client = MemoryClient(self._memory)
+        gateway = Gateway(client, self._bus, self.schedule, paced=paced, load=self.load)
+        self._gateway = self._stack.enter_context(gateway)
+
+    def summary(self) -> str:
+        """What became of the bus, in a line."""
+        counts = self._figures()
+        reasons = ", ".join(
+            f"{name.removeprefix('can_refused_').replace('_', ' ')} {count:g}"
+            for name, count in counts.items()
+            if name.startswith("can_refused_")
+        )
+        return (
+            f"CAN: {counts['can_frames']:g} frames sent, {counts['can_dropped']:g} dropped, commands taken "
+            f"{counts['can_accepted']:g}, refused {counts['can_refused']:g}" + (f" ({reasons})" if reasons else "")
+        )
+
+    def __str__(self) -> str:
+        rates = [("classic", self.schedule.classic_hz), ("FD", self.schedule.fd_hz)]
+        sent = " and ".join(f"{rate} Hz in {name} frames" for name, rate in rates if rate is not None)
+        return (
+            f"CAN {self.interface}:{self.channel} at {self.speed}, all channels at {sent}; "
+            f"load at most {100 * self.load:.1f} %"
+        )
+
+    def _figures(self) -> dict[str, float]:
+        return self._gateway.figures() if self._gateway is not None else {}
+
+    @contextmanager
+    def _open(self) -> Iterator[can.BusABC]:
+        if self.interface == "zenoh":
+            with self._with_hub() as bus:
+                yield bus
+            return
+        import can
+
+        settings: dict[str, Any] = dict(self._settings)
+        if self.interface == "socketcan":
+            settings.setdefault("fd", self.schedule.fd_hz is not None)
+        elif self.interface != "virtual":
+            settings.setdefault("bitrate", round(self.speed.nominal_bit_s))
+        try:
+            bus = can.Bus(interface=self.interface, channel=self.channel, **settings)
+        except (can.CanError, OSError, ValueError, TypeError) as error:
+            raise InputError("--can", "a bus that can be opened", f"{self.interface}:{self.channel}: {error}") from None
+        with bus:
+            yield bus
+
+    @contextmanager
+    def _with_hub(self) -> Iterator[can.BusABC]:
+        """The hub of a virtual bus in this process, and a node on it."""
+        from drivers.can import medium
+        from drivers.can.bus import BusModel
+        from drivers.can.hub import Hub
+        from drivers.can.interface import HubBus
+        from rig.transport.zenoh import ZenohServer
+
+        settings = dict(self._settings)
+        endpoint = str(settings.pop("endpoint", medium.DEFAULT_ENDPOINT))
+        if settings:
+            raise InputError("--can", "zenoh:CHANNEL, or zenoh:CHANNEL?endpoint=HOST:PORT", "&".join(settings))
+        with (
+            ZenohServer(endpoint) as server,
+            Hub(BusModel(self.speed), self.channel, server) as hub,
+            HubBus(hub) as bus,
+        ):
+            yield bus
+
+
+def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
+    """Interface, channel and further settings of INTERFACE:CHANNEL?NAME=VALUE&...
+
+    Raises:
+        InputError: It is not of that form.
+    """
+    from drivers.link.can import parse_spec as parse
+
+    try:
+        return parse(spec)
+    except InputError:
+        must = "INTERFACE:CHANNEL such as zenoh:can0, with ?NAME=VALUE&... for more settings"
+        raise InputError("--can", must, spec) from None
+
+
+def plan(*, classic: bool, fd: bool, rate_hz: int | None, bitrate: str | None) -> tuple[Schedule, Speed]:
+    """What is sent at which bit rates."""
+    from drivers.can.schedule import schedule_from
+    from drivers.can.timing import speed
+
+    schedule = schedule_from(classic=classic, fd=fd, rate_hz=rate_hz)
+    return schedule, speed(bitrate or ("1M" if schedule.fd_hz is None else "1M/8M"))

@@ -1,0 +1,55 @@
+"""`rig twins`: the rig's instruments, as drivers find them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rig.cli.connection import Connect
+from rig.errors import InputError, RefusedError
+from rig.transport import DEFAULT_ENDPOINT, NoReplyError
+
+_LISTEN = "127.0.0.1:7462"
+
+
+def twins(
+    *,
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Serve them over zenoh, at --listen.")] = False,
+    pty: Annotated[bool, typer.Option("--pty", help="Serve each at a pseudo-terminal of its own.")] = False,
+    can: Annotated[
+        str | None, typer.Option(metavar="SPEC", help="Serve them on a CAN bus, INTERFACE:CHANNEL, such as zenoh:can0.")
+    ] = None,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where they listen with --zenoh.")] = _LISTEN,
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Serve the six instruments of a running rig to their drivers; Ctrl-C switches them off."""
+    import signal
+    import threading
+
+    from drivers.twins import Twins
+    from rig.transport.zenoh import ZenohClient
+
+    if not (zenoh or pty or can):
+        raise InputError("rig twins", "given --zenoh, --pty or --can SPEC, or several of them", "none")
+    done = threading.Event()
+    try:
+        with ZenohClient(connect) as client, Twins(client) as serving:
+            if zenoh:
+                serving.serve_zenoh(listen)
+            if pty:
+                serving.serve_pty()
+            if can:
+                serving.serve_can(can)
+            for twin in serving.twins:
+                typer.echo(f"{twin.CODEC.address.name:14s}{twin.url}")
+            typer.echo("rig: open one with its driver, such as drivers.hammer.driver.Hammer; Ctrl-C ends", err=True)
+            ends = (signal.SIGINT, signal.SIGTERM)
+            before = {number: signal.signal(number, lambda *_: done.set()) for number in ends}
+            try:
+                done.wait()
+            finally:
+                for number, handler in before.items():
+                    signal.signal(number, handler)
+    except NoReplyError as error:
+        raise RefusedError(str(error)) from None

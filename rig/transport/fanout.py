@@ -1,0 +1,52 @@
+"""One service on several transports at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from rig.transport import Server
+
+
+class Fanout:
+    """The rig's side of several transports: what is published goes to all, and each may ask and report.
+
+    Args:
+        servers: The transports, in the order in which they are given each payload; each stays its owner's to close.
+        figures: Further counts for the status, named as `congestion` names its own.
+    """
+
+    def __init__(self, servers: Sequence[Server], *, figures: Callable[[], dict[str, float]] | None = None) -> None:
+        self._servers = tuple(servers)
+        self._figures = figures
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send one payload to all subscribers of all transports."""
+        for server in self._servers:
+            server.publish(key, payload)
+
+    def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
+        """Answer requests on a key on all transports."""
+        for server in self._servers:
+            server.answer(key, handler)
+
+    def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+        """Receive what clients of all transports report."""
+        for server in self._servers:
+            server.hear(key, callback)
+
+    def announce(self) -> None:
+        """Show the rig's token on all transports."""
+        for server in self._servers:
+            server.announce()
+
+    def congestion(self) -> dict[str, float]:
+        """The counts of all transports, and the further ones."""
+        counts: dict[str, float] = {}
+        for server in self._servers:
+            counts |= server.congestion()
+        return counts | (self._figures() if self._figures is not None else {})
+
+    def close(self) -> None:
+        """Close all transports."""
+        for server in self._servers:
+            server.close()

@@ -1,0 +1,120 @@
+"""The DBC: its committed copy, and cantools' own decoding of what the rig packs."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from drivers.can import dbc
+from drivers.can.signals import CLASSIC_HZ, FD_HZ, Command, Kind, command_frame, default_messages, parse_command
+from rig.channels import default_table
+from rig.cli.main import app
+
+TABLE = default_messages()
+DATABASE = dbc.database()
+SAMPLED = (*TABLE.classic, *TABLE.fd)
+
+
+def test_the_committed_copy_is_up_to_date() -> None:
+    assert dbc.COPY.read_text(encoding="utf-8") == dbc.text(), "run `rig can dbc -o drivers/can/rig.dbc`"
+
+
+def test_the_command_shows_and_writes_it(tmp_path: Path) -> None:
+    shown = CliRunner().invoke(app, ["can", "dbc"], catch_exceptions=False)
+    assert shown.output == dbc.text()
+    CliRunner().invoke(app, ["can", "dbc", "-o", str(tmp_path / "rig.dbc")], catch_exceptions=False)
+    assert (tmp_path / "rig.dbc").read_text(encoding="utf-8") == dbc.text()
+
+
+def test_the_load_command_shows_every_message() -> None:
+    result = CliRunner().invoke(app, ["can", "load"], catch_exceptions=False)
+    for name in (row.name for row in (*TABLE.others, *TABLE.classic)):
+        assert name in result.output
+    assert "load: at most 69.0 % of the bus" in result.output
+    result = CliRunner().invoke(app, ["can", "load", "--can-fd", "--can-bitrate", "1M/5M"], catch_exceptions=False)
+    assert "load: at most 125.9 % of the bus" in result.output
+
+
+def test_cantools_sees_the_messages_of_the_table() -> None:
+    assert {row.name for row in DATABASE.messages} == set(TABLE.by_name)
+    for row in TABLE.messages:
+        found = DATABASE.get_message_by_name(row.name)
+        assert (found.frame_id, found.length, found.is_fd) == (row.identifier, row.length, row.fd)
+        assert found.senders == [row.sender]
+        assert found.comment == f"{row.label}."
+        assert {signal.name for signal in found.signals} == {signal.name for signal in row.signals}
+
+
+def test_every_channel_says_unit_and_provenance_and_every_layout_how_it_was_thinned() -> None:
+    for row in SAMPLED:
+        found = DATABASE.get_message_by_name(row.name)
+        assert row.samples is not None
+        rate = FD_HZ if row.fd else CLASSIC_HZ
+        assert f"(n = {20_000 // rate} at {rate} Hz;" in (found.comment or "")
+        for channel in row.samples.channels:
+            signal = found.get_signal_by_name(channel.name if row.samples.rows == 1 else f"{channel.name}_0")
+            assert signal.unit == channel.unit
+            assert channel.label in (signal.comment or "")
+            assert "Assumed calibration" in (signal.comment or "")
+
+
+@pytest.mark.parametrize("row", SAMPLED, ids=lambda row: row.name)
+def test_cantools_decodes_to_the_values_of_the_channel_table(row) -> None:  # type: ignore[no-untyped-def]
+    samples = row.samples
+    random = np.random.default_rng(7)
+    # Below the converter's range, as all conditioners are; full scale is -32767 in classic frames.
+    counts = random.integers(-(2**23) + 512, 2**23, (samples.rows, len(samples.channels)), dtype=np.int32)
+    decoded = DATABASE.decode_message(row.identifier, samples.pack(np.array([40]), counts, row.length).tobytes())
+    assert decoded["index"] == 40
+    for column, channel in enumerate(samples.channels):
+        group = default_table().groups[channel.group]
+        place = group.names.index(channel.name)
+        whole = np.zeros((samples.rows, len(group.channels)))
+        whole[:, place] = counts[:, column]
+        exact = group.engineering(whole)[:, place]
+        names = [channel.name] if samples.rows == 1 else [f"{channel.name}_{n}" for n in range(samples.rows)]
+        got = np.array([decoded[name] for name in names])
+        step = channel.scale * (1 if row.fd else 256)
+        assert np.all(np.abs(got - exact) <= (1e-6 if row.fd else 1.0) * step)
+
+
+def test_a_command_made_by_cantools_alone_is_taken() -> None:
+    from drivers.can.signals import checksum
+
+    values = {"kind": "hammer", "counter": 3, "force": 80, "duration": 5, "direction": 0, "key": 0x9D, "checksum": 0}
+    data = DATABASE.encode_message("Command", values)
+    data = data[:7] + bytes([checksum(0x020, data)])
+    expected = Command(Kind.HAMMER, 3, {"force_n": 80.0, "duration_ms": 5.0, "direction": 0.0})
+    assert parse_command(0x020, data, 2) == expected
+
+
+def test_cantools_decodes_every_command() -> None:
+    for kind in Kind:
+        decoded = DATABASE.decode_message(*command_frame(kind, 9, force_n=100.0, duration_ms=5.0, speed_hz=6.2))
+        assert str(decoded["kind"]) == kind.name.lower()
+        assert decoded["counter"] == 9
+
+
+def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    from cantools import _main
+
+    probes = TABLE.by_name["Probes"]
+    assert probes.samples is not None
+    data = probes.samples.pack(np.array([10]), np.full((5, 4), 0x1000, np.int32), 64).tobytes()
+    lines = [
+        f"(1700000000.000000) can0 {probes.identifier:03X}##1{data.hex().upper()}",
+        f"(1700000000.000100) can0 {0x020:03X}#{command_frame(Kind.HAMMER, 1, force_n=50.0)[1].hex().upper()}",
+    ]
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines) + "\n"))
+    monkeypatch.setattr(sys, "argv", ["cantools", "decode", str(dbc.COPY)])
+    _main()
+    output = capsys.readouterr().out
+    assert "Probes(" in output
+    assert "index: 10" in output
+    assert "disk_x_4: " in output
+    assert "force: 50.0 N" in output

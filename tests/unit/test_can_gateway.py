@@ -1,0 +1,504 @@
+"""The gateway between a rig in this process and python-can's virtual bus."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import can  # noqa: TID253 - the subject
+import numpy as np
+import pytest
+
+from drivers.can import dbc
+from drivers.can.gateway import Gateway
+from drivers.can.schedule import Schedule
+from drivers.can.signals import ABSENT, Kind, Result, State, command_frame, default_messages
+from rig import wire
+from rig.channels import default_table
+from rig.errors import InputError
+from rig.pacing import FreeRun, RealTime
+from rig.service import Service
+from rig.transport.fanout import Fanout
+from rig.transport.memory import MemoryClient, MemoryServer
+from tests.unit.service_fake import GROUPS, FakeSimulation
+from tests.unit.test_transport_zenoh import until
+
+pytestmark = pytest.mark.wallclock
+TABLE = default_messages()
+BLOCK = 10_000
+_channels = itertools.count()
+
+
+class Fake(FakeSimulation):
+    """The simulation that counts, with the rig's channel table or a part of it."""
+
+    groups = tuple(GROUPS)
+
+    def catalogue(self) -> dict[str, Any]:
+        return {**super().catalogue(), "table": default_table().only(self.groups).model_dump(mode="json")}
+
+    def advance(self, ticks: int) -> Any:
+        frame = super().advance(ticks)
+        frame.samples = {name: frame.samples[name] for name in self.groups}
+        return frame
+
+
+class Tap:
+    """A node that reads everything, on a thread of its own."""
+
+    def __init__(self, channel: str) -> None:
+        self.bus = can.Bus(channel, interface="virtual", ignore_config=True)
+        self.frames: list[can.Message] = []
+        self._stop = False
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        while not self._stop:
+            if (message := self.bus.recv(0.05)) is not None:
+                self.frames.append(message)
+
+    def of(self, name: str) -> list[bytes]:
+        return [bytes(row.data) for row in list(self.frames) if row.arbitration_id == TABLE.by_name[name].identifier]
+
+    def decoded(self, name: str) -> list[dict[str, int]]:
+        return [TABLE.by_name[name].decode(data) for data in self.of(name)]
+
+    def send(self, identifier: int, data: bytes, **settings: Any) -> None:
+        self.bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False, **settings))
+
+    def ask(self, identifier: int, data: bytes) -> dict[str, int]:
+        """Send a command and wait for the next acknowledge."""
+        before = len(self.of("Acknowledge"))
+        self.send(identifier, data)
+        until(lambda: len(self.of("Acknowledge")) > before)
+        return self.decoded("Acknowledge")[before]
+
+    def close(self) -> None:
+        self._stop = True
+        self._thread.join()
+        self.bus.shutdown()
+
+
+class Setup:
+    def __init__(
+        self,
+        simulation: FakeSimulation,
+        clock: Any,
+        schedule: Schedule,
+        bus: Any,
+        tap: Tap,
+        *,
+        block_ticks: int,
+        **options: Any,
+    ) -> None:
+        self.server = MemoryServer(cache=0)
+        self.tap = tap
+        self.service = Service(simulation, Fanout([self.server]), clock, block_ticks=block_ticks)
+        self.service.prepare()
+        self.gateway = Gateway(MemoryClient(self.server), bus, schedule, **options)
+        self.summary: dict[str, Any] = {}
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        self.summary = self.service.run()
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def join(self) -> None:
+        self._thread.join(timeout=30.0)
+        assert not self._thread.is_alive()
+
+
+@contextmanager
+def rig(
+    simulation: FakeSimulation,
+    *,
+    schedule: Schedule | None = None,
+    paced: bool = False,
+    bus: Any = None,
+    block_ticks: int = BLOCK,
+    **options: Any,
+) -> Iterator[Setup]:
+    channel = f"gateway-{next(_channels)}"
+    own = bus or can.Bus(channel, interface="virtual", ignore_config=True)
+    tap = Tap(channel)
+    try:
+        clock = RealTime() if paced else FreeRun()
+        settings = {"block_ticks": block_ticks, "paced": paced, **options}
+        setup = Setup(simulation, clock, schedule or Schedule(1000, 10_000), own, tap, **settings)
+        with setup.gateway:
+            try:
+                yield setup
+            finally:
+                setup.service.stop()
+                if setup._thread.ident is not None:
+                    setup.join()
+    finally:
+        tap.close()
+        own.shutdown()
+
+
+def samples_of(tap: Tap, name: str) -> tuple[np.ndarray, np.ndarray]:
+    samples = TABLE.by_name[name].samples
+    assert samples is not None
+    return samples.unpack(np.frombuffer(b"".join(tap.of(name)), np.uint8).reshape(-1, TABLE.by_name[name].length))
+
+
+@pytest.mark.parametrize("paced", [False, True])
+def test_every_sample_is_there_in_both_layouts(paced: bool) -> None:
+    with rig(Fake(duration_s=0.4), paced=paced) as setup:
+        setup.start()
+        setup.join()
+        last = {"Probes": 800, "Drive": 400, "Hammer": 200, "Samples_1": 400, "Samples_5": 400}
+        until(lambda: all(len(setup.tap.of(name)) == count for name, count in last.items()))
+    for message in (*TABLE.fd, *TABLE.classic):
+        samples = message.samples
+        assert samples is not None
+        numbers, values = samples_of(setup.tap, message.name)
+        step = 2 if message.fd else 20
+        assert np.array_equal(numbers, np.arange(len(numbers)) * samples.rows * (step if message.fd else 1))
+        # The fake's counts are the number of the sample.
+        expected = np.arange(0, 8000, step)[:, None] >> (0 if message.fd else 8)
+        assert np.array_equal(values, np.broadcast_to(expected, values.shape))
+    figures = setup.gateway.figures()
+    assert figures["can_dropped"] == 0
+    assert figures["can_frames"] == len(setup.tap.frames)
+    assert [row["index"] for row in setup.tap.decoded("Sync")] == [0, 2000, 4000, 6000]
+    assert [row["time"] for row in setup.tap.decoded("Sync")] == [0, 100_000, 200_000, 300_000]
+    events = [TABLE.by_name["Event"].signals[0].choices[row["event"]] for row in setup.tap.decoded("Event")]  # type: ignore[index]
+    assert events == ["start", "end"]
+    until(lambda: setup.tap.decoded("Heartbeat")[-1]["state"] == State.ENDED)
+    names = [TABLE.by_identifier[row.arbitration_id].name for row in setup.tap.frames]
+    last_beat = len(names) - 1 - names[::-1].index("Heartbeat")
+    last_sample = max(n for n, name in enumerate(names) if TABLE.by_name[name].samples is not None)
+    assert last_sample < last_beat
+
+
+def test_slow_messages_say_how_it_goes_and_how_samples_were_picked() -> None:
+    with rig(Fake(duration_s=None), paced=True) as setup:
+        setup.start()
+        until(lambda: len(setup.tap.of("Heartbeat")) >= 2 and len(setup.tap.of("Status")) >= 3)
+    database = dbc.database()
+    beats = [database.decode_message("Heartbeat", data) for data in setup.tap.of("Heartbeat")]
+    assert [int(row["beat"]) for row in beats[:2]] == [1, 2]
+    assert str(beats[1]["state"]) == "running"
+    rates = setup.tap.decoded("Rates")[1]
+    assert (rates["rate"], rates["fd_step"], rates["classic_step"]) == (20_000, 2, 20)
+    assert rates["latency"] * 10 >= 10_000
+    status = database.decode_message("Status", setup.tap.of("Status")[2])
+    assert status["spin"] == pytest.approx(6.2)
+    assert setup.gateway.figures()["can_dropped"] == 0
+
+
+def test_edges_keep_the_fraction_of_their_microsecond() -> None:
+    with rig(Fake(duration_s=None), paced=True) as setup:
+        block = wire.Block(1000, 7, 1e6, 1e6, np.array([[12.25], [2_000_000.5]]))
+        setup.gateway._on_edges(block)
+        setup.gateway._send_due(time.monotonic())
+        until(lambda: len(setup.tap.of("Keyphasor")) == 2)
+    found = setup.tap.decoded("Keyphasor")
+    assert [row["number"] for row in found] == [7, 8]
+    assert [row["time"] + row["fraction"] / 65536 for row in found] == [1012.25, 2_001_000.5]
+
+
+def test_channels_that_a_run_does_not_have_are_marked() -> None:
+    class Part(Fake):
+        groups = ("forces", "hammer")
+
+    with rig(Part(duration_s=0.05)) as setup:
+        setup.start()
+        setup.join()
+        until(lambda: len(setup.tap.of("Samples_5")) == 50 and len(setup.tap.of("Hammer")) == 25)
+    assert not setup.tap.of("Probes")
+    assert not setup.tap.of("Samples_1")
+    _, values = samples_of(setup.tap, "Samples_2")
+    assert set(values[:, 0]) == {ABSENT}
+    assert set(values[:, 1]) == {0, 1, 2, 3}
+
+
+def test_a_gap_of_the_stream_loses_whole_frames_and_is_counted() -> None:
+    with rig(Fake(duration_s=None), schedule=Schedule(None, 10_000)) as setup:
+        for index in (0, 200, 430):
+            values = np.repeat(np.arange(index, index + 200, dtype=np.int32)[:, None], 4, axis=1)
+            block = wire.Block(50 * index, index, 20_000.0, 1e6, values)
+            setup.gateway._on_samples("probes", block)
+        setup.gateway._send_due(time.monotonic())
+        until(lambda: len(setup.tap.of("Probes")) == 60)
+        assert setup.gateway.figures()["can_dropped"] == 3
+    numbers, values = samples_of(setup.tap, "Probes")
+    assert np.array_equal(numbers, [*range(0, 400, 10), *range(430, 630, 10)])
+    assert np.array_equal(values[::5, 0], numbers)
+
+
+class Stubborn(can.BusABC):
+    """A bus that takes nothing, or takes its time."""
+
+    def __init__(self, *, seconds: float = 0.0, refuse: bool = False) -> None:
+        self.seconds, self.refuse = seconds, refuse
+        self.taken: list[tuple[int, bytes]] = []
+        super().__init__("stubborn")
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        time.sleep(self.seconds)
+        if self.refuse:
+            raise can.CanOperationError("transmit buffer full")
+        self.taken.append((msg.arbitration_id, bytes(msg.data)))
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        time.sleep(min(timeout or 0.05, 0.05))
+        return None, False
+
+
+def test_a_stalled_bus_loses_the_oldest_blocks_and_does_not_slow_the_rig() -> None:
+    bus = Stubborn(seconds=0.05)
+    with rig(Fake(duration_s=1.0), paced=True, bus=bus, queue_seconds=0.1) as setup:
+        setup.start()
+        setup.join()
+        assert setup.summary["reason"] == "completed"
+        assert setup.summary["queue"]["dropped"] == 0
+        # A block that waits for no bus is over in 10 ms; a frame takes this one 50 ms.
+        assert setup.summary["real_time_factor"] > 0.9
+        assert setup.gateway.counts.blocks_dropped > 50
+        bus.seconds = 0.0
+        setup.gateway.close()
+
+
+def test_what_the_bus_refuses_is_counted() -> None:
+    with rig(Fake(duration_s=0.6), paced=True, bus=Stubborn(refuse=True)) as setup:
+        setup.start()
+        setup.join()
+    counts = setup.gateway.counts
+    assert counts.frames == 0
+    # Samples of 0.6 s, sync and events; status and the like.
+    assert 12_500 * 0.6 + 6 + 2 <= counts.dropped <= 12_500 * 0.6 + 30
+
+
+def test_what_finds_no_room_for_a_moment_is_sent_afterwards_in_its_order() -> None:
+    bus = Stubborn(refuse=True)
+    with rig(Fake(duration_s=0.5), paced=True, bus=bus, schedule=Schedule(None, 10_000)) as setup:
+        setup.start()
+        until(lambda: setup.gateway._waiting_frames > 1000)
+        bus.refuse = False
+        setup.join()
+    assert setup.gateway.counts.dropped == 0
+    probes = TABLE.by_name["Probes"]
+    numbers = [probes.decode(data)["index"] for identifier, data in bus.taken if identifier == probes.identifier]
+    assert numbers == list(range(0, 10_000, 10))
+    # Answers do not wait behind samples, nor does the status.
+    assert bus.taken[0][0] >= 0x700
+
+
+def test_a_run_without_the_clock_waits_for_the_bus() -> None:
+    bus = Stubborn(seconds=2e-5)
+    with rig(Fake(duration_s=1.0), bus=bus) as setup:
+        setup.start()
+        setup.join()
+        expected = 7500 + 5000 + 10
+        until(lambda: len(bus.taken) >= expected)
+        assert setup.gateway.figures()["can_dropped"] == 0
+        assert setup.gateway.counts.blocks_dropped == 0
+
+
+def test_a_hammer_blow_is_acknowledged_with_its_time() -> None:
+    with rig(Fake(duration_s=None), paced=True) as setup:
+        setup.start()
+        until(lambda: bool(setup.tap.of("Probes")))
+        reply = setup.tap.ask(*command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
+        assert (reply["counter"], reply["result"]) == (1, Result.ACCEPTED)
+        until(lambda: any(row["event"] == 3 for row in setup.tap.decoded("Event")))
+        blow = next(row for row in setup.tap.decoded("Event") if row["event"] == 3)
+        # The fake carries it out at the start of the next block.
+        assert blow["time"] == reply["time"]
+        assert reply["time"] % BLOCK == 0
+        until(lambda: any(row["counter"] == 1 for row in setup.tap.decoded("Heartbeat")))
+
+
+def test_the_acknowledge_does_not_wait_for_the_end_of_a_block() -> None:
+    with rig(Fake(duration_s=None), paced=True, block_ticks=500_000) as setup:
+        setup.start()
+        until(lambda: bool(setup.tap.of("Probes")))
+        commands = [command_frame(Kind.SPEED, counter, speed_hz=6.2) for counter in range(1, 11)]
+        times = [setup.tap.ask(*command)["time"] for command in commands]
+    # One after another: each would wait for a block of its own.
+    assert len(set(times)) <= 2
+
+
+def test_refusals_name_their_reason_and_are_counted() -> None:
+    with rig(Fake(duration_s=None), paced=True) as setup:
+        setup.start()
+        until(lambda: bool(setup.tap.of("Probes")))
+        identifier, good = command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
+        assert setup.tap.ask(identifier, good[:7] + b"\0")["result"] == Result.BAD_CHECKSUM
+        assert setup.tap.ask(identifier, good[:7])["result"] == Result.BAD_LENGTH
+        assert setup.tap.ask(identifier, good)["result"] == Result.ACCEPTED
+        assert setup.tap.ask(identifier, good)["result"] == Result.STALE_COUNTER
+        reply = setup.tap.ask(*command_frame(Kind.HAMMER, 2, force_n=5000.0, duration_ms=5.0))
+        assert (reply["result"], reply["field"], reply["limit"]) == (Result.OUT_OF_RANGE, 1, 10_000)
+        # Used up by the refusal.
+        assert setup.tap.ask(*command_frame(Kind.HAMMER, 2, force_n=50.0))["result"] == Result.STALE_COUNTER
+        assert dict(setup.gateway.counts.refused) == {
+            "bad_checksum": 1, "bad_length": 1, "stale_counter": 2, "out_of_range": 1,
+        }  # fmt: skip
+        assert setup.gateway.counts.accepted == 1
+        until(lambda: any(row["refused"] == 5 for row in setup.tap.decoded("Status")))
+
+
+def test_other_frames_on_the_identifier_of_commands_are_ignored() -> None:
+    with rig(Fake(duration_s=None), paced=True) as setup:
+        setup.start()
+        identifier, data = command_frame(Kind.STOP, 1)
+        setup.tap.bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=True))
+        setup.tap.bus.send(can.Message(arbitration_id=identifier, is_remote_frame=True, dlc=8, is_extended_id=False))
+        setup.tap.bus.send(can.Message(arbitration_id=identifier, is_error_frame=True, data=data))
+        setup.tap.send(0x011, data)
+        assert setup.tap.ask(*command_frame(Kind.SPEED, 1, speed_hz=5.0))["result"] == Result.ACCEPTED
+        assert setup.gateway.counts.refused.total() == 0
+
+
+def test_a_stop_ends_the_run() -> None:
+    with rig(Fake(duration_s=None), paced=True) as setup:
+        setup.start()
+        until(lambda: bool(setup.tap.of("Probes")))
+        assert setup.tap.ask(*command_frame(Kind.STOP, 1))["result"] == Result.ACCEPTED
+        setup.join()
+        assert setup.summary["reason"] == "stopped"
+        until(lambda: setup.gateway._state == State.ENDED)
+
+
+class Silent(MemoryClient):
+    """A rig that does not answer commands until it is told to."""
+
+    def __init__(self, server: MemoryServer) -> None:
+        super().__init__(server)
+        self.go = threading.Event()
+
+    def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
+        if key.startswith(wire.COMMAND):
+            self.go.wait(10.0)
+        return super().request(key, payload, timeout_s=timeout_s)
+
+
+def test_a_command_that_the_rig_does_not_answer_times_out_and_too_many_are_refused() -> None:
+    channel = f"gateway-{next(_channels)}"
+    tap, own = Tap(channel), can.Bus(channel, interface="virtual", ignore_config=True)
+    server = MemoryServer(cache=0)
+    service = Service(Fake(duration_s=None), server, FreeRun(), block_ticks=BLOCK)
+    service.prepare()
+    client = Silent(server)
+    try:
+        with Gateway(client, own, Schedule(), command_timeout_s=0.3) as gateway:
+            for counter in range(1, 18):
+                tap.send(*command_frame(Kind.SPEED, counter, speed_hz=5.0))
+            until(lambda: len(tap.of("Acknowledge")) == 17)
+            results = [(row["counter"], Result(row["result"])) for row in tap.decoded("Acknowledge")]
+            assert results[0] == (17, Result.BUSY)
+            assert sorted(results[1:]) == [(counter, Result.TIMED_OUT) for counter in range(1, 17)]
+            assert gateway.counts.refused == {"busy": 1, "timed_out": 16}
+            client.go.set()
+    finally:
+        tap.close()
+        own.shutdown()
+
+
+def test_100_000_random_frames_are_no_command_and_few_are_answered() -> None:
+    with rig(Fake(duration_s=None), paced=True) as setup:
+        random = np.random.default_rng(1)
+        data = random.integers(0, 256, (100_000, 8), dtype=np.uint8).tobytes()
+        start = time.monotonic()
+        for number in range(100_000):
+            setup.gateway._on_command((0x010, 0x020)[number & 1], data[8 * number : 8 * number + 8])
+        counts = setup.gateway.counts
+        assert counts.accepted == 0
+        assert counts.refused.total() == 100_000
+        answered = 20 + 50 * (time.monotonic() - start) + 1
+        time.sleep(0.05)
+        assert len(setup.tap.of("Acknowledge")) <= answered
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.only(("probes",), 16_000), "--can-rate must be a divisor of the samples' rate, 16000 Hz"),
+        (lambda table: _calibrated(table), "channel disk_x must be calibrated as in the channel table"),
+        (lambda table: _mixed(table), "sample rates must be the same for all sensor groups"),
+    ],
+)
+def test_a_rig_that_does_not_fit_the_messages_is_refused(change: Any, message: str) -> None:
+    server = MemoryServer()
+    document = {"tick_rate_hz": 1_000_000, "table": change(default_table()).model_dump(mode="json")}
+    server.answer(wire.CATALOGUE, lambda _: wire.encode_document(document))
+    with pytest.raises(InputError) as caught:
+        Gateway(MemoryClient(server), Stubborn(), Schedule(None, 10_000))
+    assert str(caught.value).startswith(message)
+
+
+def _calibrated(table: Any) -> Any:
+    group = table.groups["probes"]
+    rows = (group.channels[0].model_copy(update={"sensitivity_v": 4.0}), *group.channels[1:])
+    return table.model_copy(update={"groups": {"probes": group.model_copy(update={"channels": rows})}})
+
+
+def _mixed(table: Any) -> Any:
+    return table.model_copy(update={"groups": {**table.groups, **table.only(("hammer",), 10_000).groups}})
+
+
+class Firmware:
+    """The other end of a serial line: a converter that speaks the slcan protocol."""
+
+    def __init__(self) -> None:
+        self.fd, end = os.openpty()
+        tty.setraw(self.fd)
+        tty.setraw(end)
+        self.path = os.ttyname(end)
+        self.frames: list[tuple[int, bytes]] = []
+        self._stop = False
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        rest = b""
+        while not self._stop:
+            if not select.select([self.fd], [], [], 0.05)[0]:
+                continue
+            *lines, rest = (rest + os.read(self.fd, 65536)).split(b"\r")
+            for line in lines:
+                if line[:1] == b"t":
+                    self.frames.append((int(line[1:4], 16), bytes.fromhex(line[5:].decode())))
+
+    def send(self, identifier: int, data: bytes) -> None:
+        os.write(self.fd, b"t%03X%d%s\r" % (identifier, len(data), data.hex().upper().encode()))
+
+    def of(self, name: str) -> list[bytes]:
+        return [data for identifier, data in list(self.frames) if identifier == TABLE.by_name[name].identifier]
+
+    def close(self) -> None:
+        self._stop = True
+        self._thread.join()
+        os.close(self.fd)
+
+
+def test_a_serial_converter_works_as_well() -> None:
+    pytest.importorskip("serial", reason="slcan needs python-can's extra serial")
+    firmware = Firmware()
+    try:
+        own = can.Bus(firmware.path, interface="slcan", ignore_config=True, sleep_after_open=0.0)
+        with rig(Fake(duration_s=None), schedule=Schedule(), paced=True, bus=own) as setup:
+            setup.start()
+            until(lambda: len(firmware.of("Samples_5")) >= 100)
+            firmware.send(*command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
+            until(lambda: bool(firmware.of("Acknowledge")))
+        (reply,) = [TABLE.by_name["Acknowledge"].decode(data) for data in firmware.of("Acknowledge")]
+        assert (reply["counter"], reply["result"]) == (1, Result.ACCEPTED)
+        numbers = [int.from_bytes(data[:2], "little") for data in firmware.of("Samples_5")]
+        assert numbers == list(range(len(numbers)))
+    finally:
+        firmware.close()

@@ -1,0 +1,45 @@
+"""One service on two transports."""
+
+from __future__ import annotations
+
+from rig import wire
+from rig.transport.fanout import Fanout
+from rig.transport.memory import MemoryClient, MemoryServer
+
+
+class Counting(MemoryServer):
+    def __init__(self, **counts: float) -> None:
+        super().__init__()
+        self.counts = counts
+
+    def congestion(self) -> dict[str, float]:
+        return self.counts
+
+
+def test_clients_of_all_transports_hear_ask_report_and_see_the_token() -> None:
+    servers = [MemoryServer(), MemoryServer()]
+    both = Fanout(servers)
+    heard: list[tuple[int, str, bytes]] = []
+    reports: list[bytes] = []
+    tokens: list[tuple[int, bool]] = []
+    both.hear("rig/clients/*", lambda _, payload: reports.append(payload))
+    both.answer(wire.STATUS, lambda payload: payload + b"!")
+    for number, server in enumerate(servers):
+        client = MemoryClient(server)
+        client.subscribe("rig/**", lambda key, payload, number=number: heard.append((number, key, payload)))
+        client.watch(wire.ALIVE, lambda there, number=number: tokens.append((number, there)))
+    both.publish(wire.EVENTS, b"1")
+    assert heard == [(0, wire.EVENTS, b"1"), (1, wire.EVENTS, b"1")]
+    for server in servers:
+        assert MemoryClient(server).request(wire.STATUS, b"?") == b"?!"
+        MemoryClient(server).report("rig/clients/a", b"here")
+    assert reports == [b"here", b"here"]
+    both.announce()
+    both.close()
+    assert tokens == [(0, True), (1, True), (0, False), (1, False)]
+
+
+def test_the_counts_of_all_are_in_the_status() -> None:
+    both = Fanout([Counting(links=1), Counting(other=2)], figures=lambda: {"can_frames": 3})
+    assert both.congestion() == {"links": 1, "other": 2, "can_frames": 3}
+    assert Fanout([Counting(links=1)]).congestion() == {"links": 1}
