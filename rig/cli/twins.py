@@ -6,11 +6,10 @@ from typing import Annotated
 
 import typer
 
+from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
 from rig.cli.connection import Connect
 from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
-
-_LISTEN = "127.0.0.1:7462"
 
 
 def twins(
@@ -20,7 +19,7 @@ def twins(
     can: Annotated[
         str | None, typer.Option(metavar="SPEC", help="Serve them on a CAN bus, INTERFACE:CHANNEL, such as zenoh:can0.")
     ] = None,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where they listen with --zenoh.")] = _LISTEN,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where they listen with --zenoh.")] = INSTRUMENTS,
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
     """Serve the six instruments of a running rig to their drivers; Ctrl-C switches them off."""

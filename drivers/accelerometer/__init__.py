@@ -1,0 +1,1 @@
+"""An IEPE accelerometer conditioner: protocol, driver, twin."""

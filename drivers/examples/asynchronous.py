@@ -1,0 +1,24 @@
+"""Read the force and the DAQ client at the same time with asyncio."""
+
+import asyncio
+import sys
+
+from drivers.daq import Daq
+from drivers.force.driver import AsyncForce
+
+
+async def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.0.0.1:7462") -> float:
+    """Compare the same rows, got in two ways."""
+    with Daq.open(rig, channels=["P_N"]) as daq:
+        async with await AsyncForce.open(instruments) as force:
+            await force.configure(channels=["P_N"])
+            await force.start()
+            one, other = await asyncio.gather(force.read(2000), daq.aread(2000))
+    shift = one.index - other.index
+    difference = abs(one.values[max(-shift, 0) :][:500] - other.values[max(shift, 0) :][:500]).max()
+    print(f"largest difference {difference} {one.units[0]}")
+    return difference
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))

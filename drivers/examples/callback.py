@@ -1,0 +1,20 @@
+"""Have a function called with each block while the program does something else."""
+
+import sys
+import time
+
+from drivers.daq import Daq
+
+
+def main(url: str = "zenoh:127.0.0.1:7460", seconds: float = 1.0) -> int:
+    """Count rows for a while."""
+    rows: list[int] = []
+    with Daq.open(url, channels=["P_N", "P_E"], rate_hz=1000) as daq:
+        daq.call(lambda samples: rows.append(len(samples)))
+        time.sleep(seconds)
+    print(f"{sum(rows)} rows in {len(rows)} blocks; lost {daq.lost}, dropped {daq.dropped}")
+    return sum(rows)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1]) if sys.argv[1:] else main()

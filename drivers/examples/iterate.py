@@ -1,0 +1,17 @@
+"""Print the shaft's largest excursion in each tenth of a second, block after block."""
+
+import sys
+
+from drivers.daq import Daq
+
+
+def main(url: str = "zenoh:127.0.0.1:7460", blocks: int = 10) -> None:
+    """Read some blocks from a rig."""
+    with Daq.open(url, channels=["ring_x", "ring_y"]) as daq:
+        for _, samples in zip(range(blocks), daq.blocks(round(daq.rate_hz / 10)), strict=False):
+            furthest = abs(samples["ring_x"] + 1j * samples["ring_y"]).max()
+            print(f"{samples.times_s[0]:8.3f} s  {furthest:.3f} {samples.units[0]}  missing before: {samples.gap}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1]) if sys.argv[1:] else main()

@@ -1,0 +1,1 @@
+"""A force transducer's charge amplifier: protocol, driver, twin."""

@@ -1,0 +1,1 @@
+"""A pendulum hammer with its force transducer: protocol, driver, twin."""

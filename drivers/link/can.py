@@ -1,0 +1,232 @@
+"""Instruments over CAN: messages cut into frames and put together by ISO 15765-2 (ISO-TP), by the library can-isotp.
+
+Identifiers are of 11 bits: 0x600 + number to the instrument, 0x640 + number from it. They lose arbitration against
+everything else on the rig's bus. A message is limited to 4095 bytes, which every ISO-TP implementation takes. On a bus
+with CAN FD the frames are of up to 64 bytes. Rates beyond what a bus carries do not fit: see `rate_hz` of `configure`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from drivers.link import FORMS, ROOM, Address, LinkClosedError, LinkTimeoutError
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    import can
+    import isotp
+
+TO_INSTRUMENT = 0x600
+FROM_INSTRUMENT = 0x640
+_MAX_BYTES = 4095
+_SEND_S = 0.5
+"""How long a frame may wait for room in the transmit queue."""
+
+
+_LOGGER = "drivers.link.can"
+# What the library would warn of is counted as lost; it is logged where a program has set up logging.
+logging.getLogger(_LOGGER).addHandler(logging.NullHandler())
+
+
+class CanMedium:
+    """One node of a bus, for any number of links.
+
+    Args:
+        spec: INTERFACE:CHANNEL, and `?NAME=VALUE&...` with further settings of python-can's bus.
+        receive: Identifiers that are listened to.
+
+    Raises:
+        InputError: python-can has no such bus.
+    """
+
+    def __init__(self, spec: str, receive: list[int]) -> None:
+        import can
+
+        interface, channel, settings = parse_spec(spec)
+        filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in receive]
+        try:
+            self.bus: can.BusABC = can.Bus(channel, interface, can_filters=filters, **settings)  # pyright: ignore
+        except (can.CanError, OSError, ValueError, TypeError) as error:
+            raise InputError("can", f"a bus that can be opened ({' '.join(str(error).split())})", spec) from None
+        self._receivers: dict[int, Callable[[can.Message], None]] = {}
+        self.fd = settings.get("fd") is True or self.bus.protocol is can.CanProtocol.CAN_FD
+        self._notifier = can.Notifier(self.bus, [self._take], timeout=0.1)
+
+    def listen(self, identifier: int, take: Callable[[can.Message], None]) -> None:
+        """Hand the frames of one identifier to a function, which must not wait."""
+        self._receivers[identifier] = take
+
+    def leave(self, identifier: int) -> None:
+        """Hand on no more of them."""
+        self._receivers.pop(identifier, None)
+
+    def _take(self, message: can.Message) -> None:
+        take = self._receivers.get(message.arbitration_id)
+        if take is not None and not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
+            take(message)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._notifier.stop(timeout=2.0)
+        self.bus.shutdown()
+
+
+def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
+    """Split INTERFACE:CHANNEL?NAME=VALUE&...; values as python-can reads them.
+
+    Raises:
+        InputError: It is not of that form.
+    """
+    from can.util import cast_from_string
+
+    place, question, text = spec.partition("?")
+    interface, colon, channel = place.partition(":")
+    pairs = [pair.partition("=") for pair in text.split("&")] if question else []
+    if not colon or not interface or not channel or any(not (name and equals) for name, equals, _ in pairs):
+        raise InputError("url", f"one of {FORMS}", f"can:{spec}")
+    return interface, channel, {name: cast_from_string(value) for name, _, value in pairs}
+
+
+class CanLink:
+    """One end of the way between a host and an instrument.
+
+    Args:
+        spec: The bus, as `CanMedium` takes it.
+        address: The instrument.
+        medium: A node to share instead of one of its own.
+        instrument: Whether this is the instrument's end.
+
+    Raises:
+        InputError: There is no such bus.
+    """
+
+    def __init__(
+        self, spec: str, address: Address, *, medium: CanMedium | None = None, instrument: bool = False
+    ) -> None:
+        import isotp
+
+        down, up = TO_INSTRUMENT + address.number, FROM_INSTRUMENT + address.number
+        send, receive = (up, down) if instrument else (down, up)
+        self._own = medium is None
+        self._medium = CanMedium(spec, [receive]) if medium is None else medium
+        fd = self._medium.fd
+        self._name = address.name
+        self._receive_identifier = receive
+        self._frames: queue.SimpleQueue[can.Message | None] = queue.SimpleQueue()
+        self._stack = isotp.TransportLayer(
+            self._receive_frame,
+            self._send_frame,
+            address=isotp.Address(isotp.AddressingMode.Normal_11bits, txid=send, rxid=receive),
+            error_handler=self._spoilt,
+            params={
+                "stmin": 0,
+                "blocksize": 0,
+                "blocking_send": True,
+                "max_frame_size": _MAX_BYTES,
+                "can_fd": fd,
+                "bitrate_switch": fd,
+                "tx_data_length": 64 if fd else 8,
+                "logger_name": _LOGGER,
+            },
+        )
+        self._sending = threading.Lock()
+        self._changed = threading.Condition()
+        self._messages: deque[bytes] = deque()
+        self._closed = False
+        self.max_bytes = _MAX_BYTES
+        self.lost = 0
+        self._stack.start()
+        self._medium.listen(receive, self._frames.put)
+        self._reader = threading.Thread(target=self._read, name=f"can {address.name} reads", daemon=True)
+        self._reader.start()
+
+    def _spoilt(self, _: Exception) -> None:
+        self.lost += 1
+
+    def _receive_frame(self, _: float) -> isotp.CanMessage | None:
+        """The next frame for the library; waits longer than asked, and is woken by `close`."""
+        import isotp
+
+        message = None if self._closed else self._frames.get()
+        if message is None:
+            return None
+        return isotp.CanMessage(arbitration_id=message.arbitration_id, data=bytes(message.data), is_fd=message.is_fd)
+
+    def _send_frame(self, message: isotp.CanMessage) -> None:
+        """Send a frame of the library's; one that the bus does not take spoils its message, which times out."""
+        import can
+
+        frame = can.Message(
+            arbitration_id=message.arbitration_id,
+            data=message.data,
+            is_extended_id=False,
+            is_fd=message.is_fd,
+            bitrate_switch=message.bitrate_switch,
+        )
+        try:
+            self._medium.bus.send(frame, timeout=_SEND_S)
+        except can.CanError:
+            self.lost += 1
+
+    def _read(self) -> None:
+        # The library's own queue has no bound.
+        while not self._closed:
+            message = self._stack.recv(block=True, timeout=1.0)
+            if not message:
+                continue
+            with self._changed:
+                if len(self._messages) >= ROOM:
+                    self._messages.popleft()
+                    self.lost += 1
+                self._messages.append(bytes(message))
+                self._changed.notify_all()
+
+    def send(self, message: bytes, *, timeout_s: float) -> None:
+        """Send one message; returns when its last frame has been handed to the bus."""
+        import isotp
+
+        if len(message) > _MAX_BYTES:
+            raise InputError("message", f"of at most {_MAX_BYTES} bytes", len(message))
+        deadline = time.monotonic() + timeout_s
+        with self._sending:
+            if self._closed:
+                raise LinkClosedError("the link is closed")
+            try:
+                self._stack.send(message, send_timeout=max(0.0, deadline - time.monotonic()))
+            except isotp.BlockingSendFailure:
+                with contextlib.suppress(Exception):
+                    self._stack.stop_sending()
+                if self._closed:
+                    raise LinkClosedError("the link is closed") from None
+                raise LinkTimeoutError(f"no {self._name} takes messages on this bus") from None
+
+    def receive(self, *, timeout_s: float) -> bytes | None:
+        """The next message, or None where none came in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._messages or self._closed, timeout_s)
+            if self._closed:
+                raise LinkClosedError("the link is closed")
+            return self._messages.popleft() if self._messages else None
+
+    def close(self) -> None:
+        """Close; leaves the bus where the node is its own."""
+        with self._changed:
+            if self._closed:
+                return
+            self._closed = True
+            self._changed.notify_all()
+        self._medium.leave(self._receive_identifier)
+        # Both wake their readers.
+        self._frames.put(None)
+        self._stack.rx_queue.put(bytearray())
+        self._reader.join(timeout=2.0)
+        self._stack.stop()
+        if self._own:
+            self._medium.close()

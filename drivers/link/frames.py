@@ -1,0 +1,107 @@
+"""Messages in a stream of bytes, sans-IO: consistent overhead byte stuffing and a CRC-16.
+
+A frame is a zero byte, the message and its CRC-16 (CCITT polynomial 0x1021, start 0, as XMODEM; most significant byte
+first) without any zero byte, and a zero byte. A reader that comes in the middle, or meets a spoilt frame, is in step
+again at the next zero. Stuffing: S. Cheshire and M. Baker, "Consistent overhead byte stuffing", IEEE/ACM Transactions
+on Networking 7 (1999) 159-172.
+"""
+
+from __future__ import annotations
+
+import binascii
+import struct
+
+_RUN = 254
+_CRC = struct.Struct(">H")
+
+
+def stuff(data: bytes) -> bytes:
+    """The same data without a zero byte, at most 1 byte in 254 longer, and one."""
+    out = bytearray()
+    parts = data.split(b"\0")
+    for number, part in enumerate(parts):
+        while len(part) >= _RUN:
+            out.append(_RUN + 1)
+            out += part[:_RUN]
+            part = part[_RUN:]
+            # A full run stands for no zero; where the data ends with it, nothing need follow.
+            if not part and number == len(parts) - 1:
+                return bytes(out)
+        out.append(len(part) + 1)
+        out += part
+    return bytes(out)
+
+
+def unstuff(data: bytes) -> bytes:
+    """The data of what `stuff` made.
+
+    Raises:
+        ValueError: It was not made by `stuff`.
+    """
+    out = bytearray()
+    position = 0
+    while position < len(data):
+        code = data[position]
+        end = position + code
+        if code == 0 or end > len(data):
+            raise ValueError(f"stuffed bytes must hold whole runs; instead received one of {code} at {position}")
+        out += data[position + 1 : end]
+        position = end
+        if code <= _RUN and position < len(data):
+            out.append(0)
+    return bytes(out)
+
+
+def frame(message: bytes) -> bytes:
+    """A message as it goes over the line."""
+    return b"\0" + stuff(message + _CRC.pack(binascii.crc_hqx(message, 0))) + b"\0"
+
+
+class Deframer:
+    """Takes bytes in portions of any size, gives messages.
+
+    Args:
+        max_bytes: Length of the longest message [bytes]; a longer one is spoilt, and no memory is spent on it.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._longest = max_bytes + 2 + (max_bytes + 2) // _RUN + 1
+        self._part = bytearray()
+        self._too_long = False
+        self.spoilt = 0
+        """Frames that were cut, too long, or had a wrong CRC."""
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The messages that these bytes complete."""
+        messages = []
+        *ended, rest = data.split(b"\0")
+        for part in ended:
+            self._append(part)
+            if (message := self._end()) is not None:
+                messages.append(message)
+        self._append(rest)
+        return messages
+
+    def _append(self, part: bytes) -> None:
+        if len(self._part) + len(part) > self._longest:
+            self._too_long = True
+            self._part.clear()
+        elif not self._too_long:
+            self._part += part
+
+    def _end(self) -> bytes | None:
+        stuffed, too_long = bytes(self._part), self._too_long
+        self._part.clear()
+        self._too_long = False
+        if not stuffed and not too_long:
+            return None
+        try:
+            data = b"" if too_long else unstuff(stuffed)
+        except ValueError:
+            data = b""
+        if len(data) < _CRC.size or binascii.crc_hqx(data, 0) or len(data) > self._max_bytes + _CRC.size:
+            # The CRC over a message and its own CRC is zero.
+            self.spoilt += 1
+            return None
+        return data[: -_CRC.size]

@@ -1,0 +1,149 @@
+"""Instruments over zenoh: a request is a query, data is published; the keys are `rig/instruments/NAME/...`."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from drivers.link import ROOM, Address, LinkClosedError, LinkTimeoutError
+from drivers.link.port import Outbox
+from rig.transport import NoReplyError, Server
+
+_ROOT = "rig/instruments"
+_MAX_BYTES = 1 << 16
+
+
+def request_key(name: str) -> str:
+    """Key on which an instrument answers."""
+    return f"{_ROOT}/{name}/request"
+
+
+def data_key(name: str) -> str:
+    """Key of an instrument's data."""
+    return f"{_ROOT}/{name}/data"
+
+
+class ZenohLink:
+    """The host's end.
+
+    Args:
+        endpoint: HOST:PORT where the instruments listen.
+        address: The instrument.
+        wait_s: How long to wait for them to be there [s].
+
+    Raises:
+        InputError: The endpoint is malformed.
+        LinkClosedError: Nobody is there.
+    """
+
+    def __init__(self, endpoint: str, address: Address, *, wait_s: float = 1.0) -> None:
+        from rig.transport.zenoh import ZenohClient, parse_endpoint
+
+        parse_endpoint(endpoint, field="zenoh")
+        self._name = address.name
+        self._endpoint = endpoint
+        self._changed = threading.Condition()
+        self._replies: deque[bytes] = deque()
+        self._data: deque[bytes] = deque()
+        self._closed = False
+        self.max_bytes = _MAX_BYTES
+        self.lost = 0
+        try:
+            self._client = ZenohClient(endpoint, wait_s=wait_s)
+            try:
+                self._client.subscribe(data_key(address.name), self._take, on_miss=self._missed)
+            except BaseException:
+                self._client.close()
+                raise
+        except NoReplyError:
+            raise LinkClosedError(
+                f"no instruments answer at {endpoint}; start them with: rig twins --zenoh (see rig twins --help)"
+            ) from None
+
+    def _take(self, _: str, payload: bytes) -> None:
+        with self._changed:
+            # Never waits: a host that does not read loses the oldest, and sees it in the numbers of the rows.
+            if len(self._data) >= ROOM:
+                self._data.popleft()
+                self.lost += 1
+            self._data.append(payload)
+            self._changed.notify_all()
+
+    def _missed(self, _: str, count: int) -> None:
+        self.lost += count
+
+    def send(self, message: bytes, *, timeout_s: float) -> None:
+        """Ask; when this returns, the reply is there to be received."""
+        if self._closed:
+            raise LinkClosedError("the link is closed")
+        try:
+            reply = self._client.request(request_key(self._name), message, timeout_s=timeout_s)
+        except NoReplyError:
+            raise LinkTimeoutError(f"no {self._name} answers at {self._endpoint}") from None
+        with self._changed:
+            self._replies.append(reply)
+            self._changed.notify_all()
+
+    def receive(self, *, timeout_s: float) -> bytes | None:
+        """The next reply, or else the next data, or None where none came in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._replies or self._data or self._closed, timeout_s)
+            if self._closed:
+                raise LinkClosedError("the link is closed")
+            for queue in (self._replies, self._data):
+                if queue:
+                    return queue.popleft()
+            return None
+
+    def close(self) -> None:
+        """Close the connection."""
+        with self._changed:
+            if self._closed:
+                return
+            self._closed = True
+            self._changed.notify_all()
+        self._client.close()
+
+
+class ZenohPort:
+    """The instrument's end, on a server that many instruments share and that stays open.
+
+    Args:
+        server: Transport.
+        address: The instrument.
+        url: What a host opens.
+    """
+
+    def __init__(self, server: Server, address: Address, url: str) -> None:
+        self._server = server
+        self._address = address
+        self._outbox = Outbox(self._publish, f"{url} {address.name} publishes")
+        self.url = url
+        self.max_bytes = _MAX_BYTES
+
+    def serve(self, answer: Callable[[bytes], bytes], on_idle: Callable[[], None]) -> None:
+        """Answer requests from now on."""
+        self._outbox.start(on_idle)
+        self._server.answer(request_key(self._address.name), answer)
+
+    @property
+    def idle(self) -> bool:
+        """Whether what is pushed now leaves at once."""
+        return self._outbox.idle
+
+    def push(self, message: bytes) -> bool:
+        """Queue data; False where the queue is full."""
+        return self._outbox.push(message)
+
+    def discard(self) -> None:
+        """Forget data that wait to be sent."""
+        self._outbox.discard()
+
+    def _publish(self, message: bytes) -> bool:
+        self._server.publish(data_key(self._address.name), message)
+        return True
+
+    def close(self) -> None:
+        """Publish what waits, and nothing more; the server is closed by its owner."""
+        self._outbox.close()

@@ -1,0 +1,1 @@
+"""An eddy-current proximity probe conditioner: protocol, driver, twin."""

@@ -1,0 +1,159 @@
+"""Samples in engineering units, as drivers and the DAQ client hand them out."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+class StreamEndedError(EOFError):
+    """Nothing more will come; the message says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Consecutive rows of some channels.
+
+    Attributes:
+        index: Number of the first row since the start of the rig's stream, at `rate_hz`.
+        tick: Time of the first row [ticks of the simulated clock].
+        rate_hz: Rows per second [Hz].
+        tick_rate_hz: Ticks per second [Hz].
+        channels: Names of the columns.
+        units: Unit of each column.
+        values: Engineering values, float64, shape (rows, columns).
+        gap: Rows that are missing right before the first one.
+    """
+
+    index: int
+    tick: int
+    rate_hz: float
+    tick_rate_hz: float
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    values: np.ndarray
+    gap: int = 0
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, channel: str) -> np.ndarray:
+        """Values of one channel, shape (rows,)."""
+        return self.values[:, self.channels.index(channel)]
+
+    @property
+    def times_s(self) -> np.ndarray:
+        """Simulated time of each row [s], shape (rows,)."""
+        return self.tick / self.tick_rate_hz + np.arange(len(self.values)) / self.rate_hz
+
+    def rows(self, start: int, stop: int) -> Samples:
+        """Some of the rows."""
+        return replace(
+            self,
+            index=self.index + start,
+            tick=self.tick + round(start * self.tick_rate_hz / self.rate_hz),
+            values=self.values[start:stop],
+            gap=0 if start else self.gap,
+        )
+
+
+RESTART_S = 5.0
+"""Rows that are further behind than this belong to another run, not to a block that came twice or late."""
+
+
+class Sequence:
+    """Follows the row numbers of one stream."""
+
+    def __init__(self) -> None:
+        self._next: int | None = None
+        self.lost = 0
+        """Rows that never came."""
+        self.stale = 0
+        """Rows that came twice, or after later ones."""
+        self.runs = 0
+        """How often the numbers began anew."""
+
+    def follow(self, samples: Samples) -> Samples | None:
+        """The same rows without those that came before, with the gap before them; None where nothing is new."""
+        expected = samples.index if self._next is None else self._next
+        behind = expected - samples.index
+        if behind > 0 and (samples.index == 0 or behind > RESTART_S * samples.rate_hz):
+            self.runs += 1
+            expected, behind = samples.index, 0
+        stale = min(max(behind, 0), len(samples))
+        self.stale += stale
+        gap = max(0, -behind)
+        self.lost += gap
+        if stale == len(samples):
+            return None
+        self._next = samples.index + len(samples)
+        return replace(samples.rows(stale, len(samples)), gap=gap)
+
+
+class Pile:
+    """Rows that wait to be read.
+
+    Args:
+        most: Number of rows that are kept; beyond, the oldest go, and the next ones tell of the gap.
+    """
+
+    def __init__(self, most: int | None = None) -> None:
+        self._most = most
+        self._parts: deque[Samples] = deque()
+        self.rows = 0
+        self.dropped = 0
+        """Rows that went unread."""
+
+    def add(self, samples: Samples) -> None:
+        """Put rows on top."""
+        self._parts.append(samples)
+        self.rows += len(samples)
+        while self._most is not None and self.rows > self._most and len(self._parts) > 1:
+            oldest = self._parts.popleft()
+            self.rows -= len(oldest)
+            self.dropped += len(oldest)
+            heir = self._parts[0]
+            if heir.index > oldest.index:
+                self._parts[0] = replace(heir, gap=heir.gap + len(oldest) + oldest.gap)
+
+    def take(self, rows: int | None, *, ended: bool) -> Samples | None:
+        """The lowest rows, if there are as many as asked for, or all that there will be before a gap or the end.
+
+        Args:
+            rows: How many; None takes a part as it came.
+            ended: Whether nothing more will be added.
+        """
+        parts = self._parts
+        if not parts:
+            return None
+        run, count = 1, len(parts[0])
+        if rows is not None:
+            while count < rows and run < len(parts) and _follows(parts[run - 1], parts[run]):
+                count += len(parts[run])
+                run += 1
+            if count < rows and run == len(parts) and not ended:
+                return None
+        whole = _join([parts.popleft() for _ in range(run)])
+        if rows is not None and count > rows:
+            parts.appendleft(whole.rows(rows, count))
+            whole = whole.rows(0, rows)
+        self.rows -= len(whole)
+        return whole
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._parts.clear()
+        self.rows = 0
+
+
+def _follows(one: Samples, other: Samples) -> bool:
+    same = one.channels == other.channels and one.rate_hz == other.rate_hz
+    return same and other.gap == 0 and other.index == one.index + len(one)
+
+
+def _join(parts: list[Samples]) -> Samples:
+    if len(parts) == 1:
+        return parts[0]
+    return replace(parts[0], values=np.concatenate([part.values for part in parts]))

@@ -1,0 +1,195 @@
+"""The sensor blocks of one rig for any number of listeners in this process: what twins and the DAQ client read from.
+
+Only sensor keys, the catalogue, the events and the rig's token are asked for: whoever reads here cannot see the truth.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pydantic import ValidationError
+
+from rig import wire
+from rig.channels import ChannelTable, Group
+from rig.errors import InputError
+from rig.transport import Client
+
+RIG_GONE = "the rig has gone"
+
+
+def whole_step(native_hz: float, rate_hz: float) -> int:
+    """Every so many rows make a rate.
+
+    Raises:
+        InputError: The rate is not a whole fraction of the native one.
+    """
+    ratio = native_hz / rate_hz if rate_hz > 0.0 else 0.0
+    step = round(ratio) if ratio < 1e9 else 0
+    if step < 1 or abs(ratio - step) > 1e-9 * step:
+        raise InputError("rate_hz", f"{native_hz:g} divided by a whole number", rate_hz)
+    return step
+
+
+def thin(block: wire.Block, step: int) -> wire.Block:
+    """Every so many rows of a block: those whose number is a multiple of `step`; they are numbered anew."""
+    if step == 1:
+        return block
+    first = -block.index % step
+    return wire.Block(
+        tick=block.tick + round(first * block.tick_rate_hz / block.rate_hz),
+        index=(block.index + first) // step,
+        rate_hz=block.rate_hz / step,
+        tick_rate_hz=block.tick_rate_hz,
+        values=block.values[first::step],
+    )
+
+
+@dataclass(slots=True, eq=False)
+class _Listener:
+    on_block: Callable[[wire.Block], None]
+    on_end: Callable[[str], None]
+
+
+class RigStream:
+    """Hands each block of a group to whoever listens to that group.
+
+    Args:
+        client: Transport to the rig; stays open, and is closed by its owner.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._lock = threading.Lock()
+        self._listeners: dict[str, list[_Listener]] = {}
+        self._subscribed: set[str] = set()
+        self._watching = False
+        self._next: dict[str, int] = {}
+        """Number of the row that comes next, by group."""
+        self._ends: dict[str, tuple[int, str]] = {}
+        """Groups of which the run's end was announced: number of rows in all, and the reason."""
+        self.malformed = 0
+        """Payloads that were not what their key promises."""
+        self.missed = 0
+        """Messages that the transport could not bring back; the rows show the gaps too."""
+
+    def table(self) -> ChannelTable:
+        """The channel table as the rig runs it.
+
+        Raises:
+            NoReplyError: No rig answers.
+            InputError: What answers is no rig of this version.
+        """
+        catalogue = wire.decode_document(self._client.request(wire.CATALOGUE))
+        try:
+            return ChannelTable.model_validate(catalogue.get("table"))
+        except ValidationError:
+            raise InputError("catalogue", "that of a rig of this version", sorted(catalogue)) from None
+
+    def group(self, name: str) -> Group:
+        """One group of the table.
+
+        Raises:
+            NoReplyError: No rig answers.
+            InputError: This rig does not publish that group.
+        """
+        groups = self.table().groups
+        if name not in groups:
+            raise InputError("group", f"one that this rig publishes ({', '.join(groups)})", name)
+        return groups[name]
+
+    def listen(
+        self, group: str, on_block: Callable[[wire.Block], None], on_end: Callable[[str], None]
+    ) -> Callable[[], None]:
+        """Take all blocks of a group from now on; returns what ends that.
+
+        Args:
+            group: Name in the channel table.
+            on_block: Takes blocks in order, on a thread of the transport; must not wait.
+            on_end: Takes the reason for which nothing more comes: the run has ended, or the rig has gone. Where another
+                run begins, its blocks come, numbered from 0.
+        """
+        listener = _Listener(on_block, on_end)
+        with self._lock:
+            self._listeners.setdefault(group, []).append(listener)
+            new, watch = group not in self._subscribed, not self._watching
+            self._subscribed.add(group)
+            self._watching = True
+        # Not under the lock: a transport may deliver at once.
+        if watch:
+            self._client.subscribe(wire.EVENTS, self._on_event, on_miss=self._on_miss)
+            self._client.watch(wire.ALIVE, self._on_alive)
+        if new:
+            self._client.subscribe(
+                wire.sensor_key(group), lambda _, payload: self._on_block(group, payload), on_miss=self._on_miss
+            )
+
+        def leave() -> None:
+            with self._lock:
+                if listener in self._listeners[group]:
+                    self._listeners[group].remove(listener)
+
+        return leave
+
+    def _of(self, group: str) -> list[_Listener]:
+        with self._lock:
+            return list(self._listeners.get(group, ()))
+
+    def _on_miss(self, _: str, count: int) -> None:
+        self.missed += count
+
+    def _on_block(self, group: str, payload: bytes) -> None:
+        try:
+            block = wire.decode_block(payload, wire.SAMPLE_SCHEMA)
+        except ValueError:
+            self.malformed += 1
+            return
+        with self._lock:
+            end = block.index + len(block.values)
+            if block.index < self._next.get(group, 0):
+                # Another run.
+                self._ends.pop(group, None)
+            self._next[group] = end
+            rows, reason = self._ends.get(group, (end + 1, ""))
+            done = end >= rows
+            if done:
+                del self._ends[group]
+        for listener in self._of(group):
+            listener.on_block(block)
+            if done:
+                listener.on_end(reason)
+
+    def _on_event(self, _: str, payload: bytes) -> None:
+        try:
+            event = wire.decode_document(payload)
+            if event["event"] != "end":
+                return
+            rows, reason = dict(event["rows"]), f"the rig's run has ended: {event['reason']}"
+        except (ValueError, KeyError, TypeError):
+            self.malformed += 1
+            return
+        done = []
+        with self._lock:
+            for group in self._subscribed:
+                # Blocks and events travel apart: the last blocks may be still to come.
+                total = rows.get(wire.sensor_key(group), 0)
+                if self._next.get(group, 0) >= total:
+                    done.append(group)
+                else:
+                    self._ends[group] = (total, reason)
+        self._end(done, reason)
+
+    def _on_alive(self, alive: bool) -> None:
+        if alive:
+            return
+        with self._lock:
+            groups = list(self._subscribed)
+            self._ends.clear()
+            self._next.clear()
+        self._end(groups, RIG_GONE)
+
+    def _end(self, groups: list[str], reason: str) -> None:
+        for group in groups:
+            for listener in self._of(group):
+                listener.on_end(reason)

@@ -1,0 +1,142 @@
+"""Drivers and the DAQ client on a real, short `rig run`, with `rig twins` in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.accelerometer.driver import Accelerometer
+from drivers.console import Console
+from drivers.daq import Daq
+from drivers.drive.driver import Drive
+from drivers.force.driver import Force
+from drivers.hammer.driver import Hammer
+from drivers.instrument.driver import Sampler
+from drivers.magnet.driver import Magnet
+from drivers.proximity.driver import Proximity
+from drivers.samples import StreamEndedError
+from rig.errors import RefusedError
+from rig.transport.zenoh import ZenohClient
+from tests.system.test_service_run import COMPILE_S, rig_run
+from tests.unit.test_transport_zenoh import free_endpoint
+
+pytestmark = pytest.mark.wallclock
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def twins(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, list[str]]]]:
+    """`rig twins`, and its URLs by instrument."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    links = sum(name in arguments for name in ("--zenoh", "--pty"))
+    with subprocess.Popen(
+        [sys.executable, "-u", "-m", "rig.cli.main", "twins", *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment,
+    ) as child:  # fmt: skip
+        try:
+            assert child.stdout is not None
+            urls: dict[str, list[str]] = {}
+            for _ in range(6 * links):
+                name, _, url = child.stdout.readline().strip().partition(" ")
+                urls.setdefault(name, []).append(url.strip())
+            yield child, urls
+        finally:
+            child.kill()
+
+
+def read_on(driver: Sampler) -> None:
+    for _ in range(1000):
+        driver.read()
+
+
+def test_drivers_and_daq_show_the_same_rig() -> None:
+    drivers: dict[str, type[Sampler]] = {
+        "proximity": Proximity, "force": Force, "accelerometer": Accelerometer, "drive": Drive, "hammer": Hammer,
+    }  # fmt: skip
+    with (
+        rig_run("hammer", "--duration-s", "120", "--seed", "3") as (rig, endpoint),
+        ZenohClient(endpoint, wait_s=COMPILE_S) as client,
+    ):
+        assert Console(client, timeout_s=COMPILE_S).status()["state"] == "running"
+        with twins("--zenoh", "--pty", "--listen", free_endpoint(), "--connect", endpoint) as (child, urls):
+            assert set(urls) == {*drivers, "magnet"}
+            assert all([url.partition(":")[0] for url in found] == ["zenoh", "pty"] for found in urls.values())
+            with Daq.open(f"zenoh:{endpoint}") as daq:
+                for name, kind in drivers.items():
+                    over_zenoh, over_pty = (kind.open(url) for url in urls[name])
+                    with over_zenoh, over_pty:
+                        assert over_zenoh.identify() == over_pty.identify()
+                        for driver in (over_zenoh, over_pty):
+                            driver.configure()
+                            driver.start()
+                        rows = [driver.read(4000) for driver in (over_zenoh, over_pty)]
+                    index = max(each.index for each in rows)
+                    direct = daq.read(200)
+                    while direct.index + len(direct) < index + 2000:
+                        direct = daq.read(200)
+                        if direct.index >= index:
+                            break
+                    for each in rows:
+                        assert (each.gap, each.rate_hz) == (0, 20_000.0)
+                        columns = [direct.channels.index(channel) for channel in each.channels]
+                        same = each.values[direct.index - each.index :][: len(direct)]
+                        np.testing.assert_array_equal(same, direct.values[:, columns][: len(same)])
+                        assert len(same) == len(direct)
+                assert (daq.dropped, set(daq.lost.values())) == (0, {0})
+
+            with Hammer.open(urls["hammer"][1]) as hammer, Daq.open(f"zenoh:{endpoint}", channels=["hammer"]) as daq:
+                done = hammer.trigger(force_n=200.0, duration_ms=5.0, direction="y")
+                blow = daq.read(20)
+                force = [blow]
+                while force[-1].times_s[-1] < done.time_s + 0.01:
+                    force.append(daq.read(20))
+                peak = max(each["hammer"].max() for each in force)
+                assert peak == pytest.approx(200.0, rel=0.02)
+                with pytest.raises(RefusedError, match=r"force_n must be .*1000.*; instead received 5000"):
+                    hammer.trigger(force_n=5000.0)
+            with Drive.open(urls["drive"][0]) as drive:
+                assert drive.set_speed(5.0).time_s > done.time_s
+                with pytest.raises(RefusedError, match="speed_hz"):
+                    drive.set_speed(-1.0)
+            with Magnet.open(urls["magnet"][1]) as magnet:
+                assert magnet.identify().acts == ("Release",)
+                assert magnet.release().tick > done.tick
+
+            proximity = Proximity.open(urls["proximity"][1])
+            proximity.start()
+            child.send_signal(signal.SIGTERM)
+            with pytest.raises((StreamEndedError, ConnectionError)):
+                read_on(proximity)
+            proximity.close()
+            _, errors = child.communicate(timeout=20.0)
+            assert child.returncode == 0, errors
+            assert "Traceback" not in errors
+        status = Console(client).status()
+        assert (status["state"], status["queue"]["dropped"]) == ("running", 0)
+        rig.send_signal(signal.SIGTERM)
+        rig.communicate(timeout=60.0)
+        assert rig.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "rig: rig twins must be given --zenoh, --pty or --can SPEC, or several of them"),
+        (("--pty", "--connect", "127.0.0.1:1"), "rig: no rig answers at 127.0.0.1:1"),
+        (("--zenoh", "--connect", "nowhere"), "rig: connect must be HOST:PORT"),
+    ],
+)
+def test_what_is_wrong_is_one_line(arguments: tuple[str, ...], message: str) -> None:
+    with twins(*arguments) as (child, _):
+        _, errors = child.communicate(timeout=60.0)
+    assert child.returncode == 2
+    assert errors.startswith(message)
+    assert errors.count("\n") == 1
