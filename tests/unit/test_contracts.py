@@ -14,7 +14,7 @@ from rig.cli.main import app
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("rig", "drivers", "recorder", "replays")
-HEAVY = ("numba", "scipy", "zenoh", "mcap", "rerun", "matplotlib", "pyarrow")
+HEAVY = ("numba", "scipy", "zenoh", "mcap", "rerun", "matplotlib", "pyarrow", "can", "cantools", "isotp")
 
 
 def lint(folder: Path) -> subprocess.CompletedProcess[str]:
@@ -55,6 +55,7 @@ def test_contracts_hold() -> None:
         ("rig/engines/rk4.py", "from rig.simulation import Simulation"),
         ("recorder/views.py", "from rig.kernels.signals import ROW"),
         ("drivers/console.py", "from rig.model import build_model"),
+        ("drivers/hammer/driver.py", "from drivers.hammer.twin import HammerTwin"),
         ("rig/service.py", "from replays.whirl import whirl_frequency"),
     ],
 )

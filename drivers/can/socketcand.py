@@ -1,0 +1,423 @@
+"""A socketcand server: a CAN bus for clients in any language, as text over loopback TCP.
+
+The protocol is that of the Linux daemon socketcand (github.com/linux-can/socketcand, doc/protocol.md), spoken by
+python-can (interface `socketcand`), Kayak and others. Each connection is a node of its own on the bus.
+
+Understood: open, rawmode, bcmmode, controlmode, send, sendrtr, subscribe, unsubscribe, echo, statistics. Not: cyclic
+sending (add, update, delete), content filters, ISO-TP, the settings of a bus, and the beacon, which is a broadcast.
+They are answered with an error. The protocol has no CAN FD frames: they are left out and counted.
+
+An error that is not one of the bus is told as `< error 000 TIME TEXT >`: like an error frame of no class, since
+clients such as python-can's read every error as a frame and stumble over mere text.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from drivers.can import medium
+from drivers.can.backlog import PATIENCE_S, ROOM, OpenBus, Outlet, Tap
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    import can
+
+PORT = 29536
+"""Where the daemon listens unless told otherwise."""
+MAX_CLIENTS = 16
+
+_LONGEST = 512
+"""Characters that a command may have."""
+_SENDING = 1 << 16
+"""Bytes that the system may hold for a client beyond our backlog."""
+_HOLD_S = 0.05
+"""How long frames wait after rawmode's answer: clients read that answer by itself and would lose what comes with it."""
+_SHORTEST_MS = 10
+_LONGEST_MS = 3_600_000
+_MAX_SUBSCRIPTIONS = 4096
+_HEX = re.compile(r"[0-9A-Fa-f]{1,8}")
+_BYTE = re.compile(r"[0-9A-Fa-f]{1,2}")
+_NUMBER = re.compile(r"[0-9]{1,9}")
+
+
+class CommandError(ValueError):
+    """A command that is none, or not now."""
+
+
+class Splitter:
+    """Commands out of a stream of text; what is between them is dropped."""
+
+    def __init__(self) -> None:
+        self._text = b""
+
+    def feed(self, data: bytes) -> Iterator[str | None]:
+        """The commands that are complete with this data, without brackets; None stands for text that is none.
+
+        Args:
+            data: The next bytes, in portions of any size.
+        """
+        self._text += data
+        while self._text:
+            start = self._text.find(b"<")
+            strange = self._text if start < 0 else self._text[:start]
+            self._text = b"" if start < 0 else self._text[start:]
+            if strange.strip():
+                yield None
+            end = self._text.find(b">")
+            if end < 0:
+                if len(self._text) > _LONGEST:
+                    self._text = b""
+                    yield None
+                return
+            command, self._text = self._text[1:end], self._text[end + 1 :]
+            text = command.decode("ascii", errors="replace")
+            yield text if end < _LONGEST and text.isascii() and text.isprintable() and text.strip() else None
+
+
+def parse_frame(words: list[str], *, remote: bool = False) -> can.Message:
+    """The frame of a `send` or `sendrtr` command.
+
+    Args:
+        words: Identifier, length and bytes in text: 8 digits make the identifier an extended one.
+        remote: Whether it is a remote frame, which has a length only.
+
+    Raises:
+        CommandError: They make no classic frame.
+    """
+    import can
+
+    identifier, extended = parse_identifier(words[0] if words else "")
+    if len(words) < 2 or not _BYTE.fullmatch(words[1]) or int(words[1], 16) > 8:
+        raise CommandError("a length of 0 to 8 must follow the identifier")
+    length, given = int(words[1], 16), words[2:]
+    if not all(_BYTE.fullmatch(byte) for byte in given):
+        raise CommandError("data must be bytes of one or two hexadecimal digits")
+    if len(given) != (0 if remote else length):
+        raise CommandError(f"{len(given)} bytes of data for a length of {length}")
+    return can.Message(
+        arbitration_id=identifier,
+        is_extended_id=extended,
+        is_remote_frame=remote,
+        dlc=length,
+        data=None if remote else bytes(int(byte, 16) for byte in given),
+    )
+
+
+def parse_identifier(text: str) -> tuple[int, bool]:
+    """An identifier, and whether it is an extended one.
+
+    Raises:
+        CommandError: It is none.
+    """
+    extended = len(text) == 8
+    if not _HEX.fullmatch(text) or not (extended or len(text) <= 3):
+        raise CommandError("an identifier must have 1 to 3 or 8 hexadecimal digits")
+    identifier = int(text, 16)
+    if identifier > (medium.EXTENDED_MASK if extended else medium.STANDARD_MASK):
+        raise CommandError("an identifier must have 11 bits, or 29 where it has 8 digits")
+    return identifier, extended
+
+
+def show(message: can.Message) -> bytes | None:
+    """A frame as the server tells it; None: a CAN FD frame, which the protocol does not have."""
+    if message.is_fd:
+        return None
+    time_s = f"{message.timestamp:.6f}"
+    if message.is_error_frame:
+        return f"< error {message.arbitration_id:03X} {time_s} >".encode()
+    identifier = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
+    if message.is_remote_frame:
+        return f"< rtr {identifier} {time_s} {message.dlc} >".encode()
+    return f"< frame {identifier} {time_s} {message.data.hex().upper()} >".encode()
+
+
+def show_error(text: str) -> bytes:
+    """An error that is not one of the bus."""
+    return f"< error 000 {time.time():.6f} {text} >".encode()
+
+
+class _Client(Outlet):
+    """One connection, from hi to its end."""
+
+    def __init__(
+        self, connection: socket.socket, buses: Mapping[str, OpenBus], *, number: int, room: int, patience_s: float
+    ) -> None:
+        super().__init__(connection.fileno(), name=f"socketcand {number}", room=room, patience_s=patience_s)
+        self._connection = connection
+        self._buses = buses
+        self._number = number
+        self._splitter = Splitter()
+        self._tap: Tap | None = None
+        self._raw = False
+        self._held_until_s = 0.0
+        self._subscribed: dict[tuple[int, bool], tuple[float, float]] = {}
+        """Shortest time between two frames [s], and when the next may come, by identifier."""
+        self._every_s = 0.0
+        self._next_s = 0.0
+        self._traffic = [0, 0, 0, 0]
+        """Bytes and frames received, bytes and frames sent."""
+        self._answer(b"< hi >")
+
+    @property
+    def dropped(self) -> int:
+        return self._tap.dropped if self._tap is not None else 0
+
+    # From the client.
+
+    def _take(self, data: bytes) -> None:
+        for command in self._splitter.feed(data):
+            if self._ending:
+                return
+            try:
+                if command is None:
+                    raise CommandError("a command must be of the form < word ... >")
+                self._obey(command.split())
+            except CommandError as error:
+                self.counts["malformed"] += 1
+                self._answer(show_error(str(error)))
+
+    def _obey(self, words: list[str]) -> None:
+        import can
+
+        word, *rest = words
+        if word == "echo":
+            self._answer(b"< echo >")
+        elif word == "open":
+            self._open(rest)
+        elif self._tap is None:
+            raise CommandError("a bus must be opened first")
+        elif word in ("send", "sendrtr"):
+            message = parse_frame(rest, remote=word == "sendrtr")
+            try:
+                self._tap.send(message)
+            except can.CanError as error:
+                self.counts["refused"] += 1
+                # Brackets would end the text early.
+                self._answer(show_error(f"not sent: {' '.join(re.sub('[<>]', ' ', str(error)).split())}"))
+            else:
+                self._traffic[2] += len(message.data)
+                self._traffic[3] += 1
+        elif word in ("rawmode", "bcmmode", "controlmode") and not rest:
+            self._held_until_s = time.monotonic() + _HOLD_S
+            self._answer(b"< ok >")
+            self._backlog.flush()
+            self._raw = word == "rawmode"
+        elif word == "statistics":
+            self._every_s = self._number_of(rest, 1)[0] / 1000
+            if self._every_s and not _SHORTEST_MS <= self._every_s * 1000 <= _LONGEST_MS:
+                self._every_s = 0.0
+                raise CommandError(f"an interval must be 0 or from {_SHORTEST_MS} to {_LONGEST_MS} ms")
+            self._next_s = time.monotonic() + self._every_s
+        elif word == "subscribe" and len(rest) == 3:
+            seconds, microseconds = self._number_of(rest[:2], 2)
+            if len(self._subscribed) >= _MAX_SUBSCRIPTIONS:
+                raise CommandError(f"there may be {_MAX_SUBSCRIPTIONS} subscriptions")
+            self._subscribed[parse_identifier(rest[2])] = (seconds + microseconds * 1e-6, 0.0)
+        elif word == "unsubscribe" and len(rest) == 1:
+            self._subscribed.pop(parse_identifier(rest[0]), None)
+        else:
+            raise CommandError("unknown command")
+
+    def _open(self, words: list[str]) -> None:
+        import can
+
+        if self._tap is not None:
+            raise CommandError("a bus is open already")
+        open_bus = self._buses.get(words[0]) if len(words) == 1 else None
+        try:
+            if open_bus is None:
+                raise InputError("bus", " or ".join(self._buses), " ".join(words))
+            bus = open_bus()
+        except (can.CanError, OSError, ValueError):
+            # As the daemon does; a bus that cannot be had now may be there at the next connection.
+            self.counts["malformed"] += 1
+            self._answer(b"< error could not open bus >")
+            self._ending = True
+            return
+        self._tap = Tap(
+            bus,
+            self._backlog,
+            show=self._show,
+            overflow=self._overflow,
+            tick=self._tick,
+            name=f"socketcand {self._number} bus",
+        )
+        self._answer(b"< ok >")
+
+    @staticmethod
+    def _number_of(words: list[str], count: int) -> list[int]:
+        if len(words) != count or not all(_NUMBER.fullmatch(word) for word in words):
+            raise CommandError(f"{count} whole numbers must follow")
+        return [int(word) for word in words]
+
+    # To the client, on the tap's thread.
+
+    def _show(self, message: can.Message) -> bytes | None:
+        text = show(message)
+        if text is None:
+            self.counts["fd_left_out"] += 1
+            return None
+        if not message.is_error_frame:
+            self._traffic[0] += len(message.data)
+            self._traffic[1] += 1
+        if not self._raw:
+            key = (message.arbitration_id, message.is_extended_id)
+            every_s, next_s = self._subscribed.get(key, (0.0, float("inf")))
+            now = time.monotonic()
+            if message.is_error_frame or now < next_s:
+                return None
+            self._subscribed[key] = (every_s, now + every_s)
+        if (wait_s := self._held_until_s - time.monotonic()) > 0:
+            time.sleep(wait_s)
+        return text
+
+    def _overflow(self) -> bytes:
+        return f"< error {medium.CONTROLLER:03X} {time.time():.6f} >".encode()
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        if self._every_s and now >= self._next_s:
+            self._next_s = now + self._every_s
+            self._backlog.put(f"< stat {' '.join(map(str, self._traffic))} >".encode())
+
+    # End.
+
+    def _give_up(self) -> None:
+        self.counts["given_up"] += 1
+        self._ending = True
+
+    def _finish(self) -> None:
+        if self._tap is not None:
+            self._tap.close()
+        self._backlog.flush()
+        with contextlib.suppress(OSError):
+            self._connection.shutdown(socket.SHUT_RDWR)
+        self._connection.close()
+
+
+class SocketcandServer:
+    """Serves buses to socketcand clients.
+
+    Args:
+        buses: By name, what makes a node on the bus: one for each connection.
+        host: Where to listen.
+        port: Likewise; 0 takes a free one.
+        expose: Allow a host other than 127.0.0.1: there is no password, and all can send.
+        room: Bytes that may wait for one client.
+        patience_s: How long a client may take nothing of what waits before it is disconnected [s].
+
+    Raises:
+        InputError: The host is not of this machine alone, or the port is taken.
+    """
+
+    def __init__(
+        self,
+        buses: Mapping[str, OpenBus],
+        *,
+        host: str = "127.0.0.1",
+        port: int = PORT,
+        expose: bool = False,
+        room: int = ROOM,
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        from rig.transport.zenoh import LOOPBACK_HOSTS
+
+        if host not in LOOPBACK_HOSTS and not expose:
+            raise InputError("socketcand", "on 127.0.0.1 unless --expose is given as well", f"{host}:{port}")
+        self._buses = dict(buses)
+        self._room = room
+        self._patience_s = patience_s
+        try:
+            self._listener = socket.create_server(("127.0.0.1" if host == "localhost" else host, port))
+        except OSError as error:
+            raise InputError("socketcand", f"a free HOST:PORT ({error.strerror})", f"{host}:{port}") from None
+        self._listener.settimeout(0.2)
+        self.host, self.port = self._listener.getsockname()[:2]
+        self._ended: Counter[str] = Counter()
+        """Counts of connections that have ended."""
+        self._clients: list[_Client] = []
+        self._lock = threading.Lock()
+        self._closed = False
+        self._thread = threading.Thread(target=self._accept, name="socketcand", daemon=True)
+
+    def start(self) -> None:
+        """Take clients from now on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End all connections."""
+        self._closed = True
+        if self._thread.is_alive():
+            self._thread.join(timeout=2.0)
+        self._listener.close()
+        with self._lock:
+            clients = list(self._clients)
+        for client in clients:
+            client._ending = True
+        for client in clients:
+            client.close()
+
+    def __enter__(self) -> SocketcandServer:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def counts(self) -> dict[str, int]:
+        """What has happened: `clients` now, `dropped` frames, `fd_left_out`, `malformed`, `refused`, `given_up`."""
+        with self._lock:
+            self._sweep()
+            total = Counter(self._ended)
+            for client in self._clients:
+                total.update(client.counts)
+                total["dropped"] += client.dropped
+            names = ("dropped", "fd_left_out", "malformed", "refused", "given_up", "turned_away")
+            return {"clients": len(self._clients), **{name: total[name] for name in names}}
+
+    def _sweep(self) -> None:
+        """Add up connections that have ended; the lock is held."""
+        for client in [client for client in self._clients if not client.alive]:
+            self._clients.remove(client)
+            self._ended.update(client.counts)
+            self._ended["dropped"] += client.dropped
+
+    def _accept(self) -> None:
+        number = 0
+        while not self._closed:
+            try:
+                connection, _ = self._listener.accept()
+            except TimeoutError:
+                continue
+            except OSError:
+                if self._closed:
+                    return
+                # For instance too many open files: others may end.
+                time.sleep(0.2)
+                continue
+            with self._lock:
+                self._sweep()
+                full = len(self._clients) >= MAX_CLIENTS
+                if full:
+                    self._ended["turned_away"] += 1
+            connection.setblocking(False)
+            if full:
+                with contextlib.suppress(OSError):
+                    connection.send(b"< error too many clients >")
+                connection.close()
+                continue
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SENDING)
+            number += 1
+            client = _Client(connection, self._buses, number=number, room=self._room, patience_s=self._patience_s)
+            client._backlog.flush()
+            client.start()
+            with self._lock:
+                self._clients.append(client)
