@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import termios
@@ -117,8 +118,9 @@ class Tap:
         bus: The node; closed with the tap, by its thread.
         backlog: Where the text goes.
         show: Text of a frame, or None where the client is not to have it.
-        overflow: Called once for frames that found no room; returns what to tell the client when there is room again.
+        overflow: What to tell the client of frames that found no room, when there is some again.
         tick: Called every now and then, at least every 0.1 s.
+        on_lost: Called when the bus fails.
         name: Of the thread.
     """
 
@@ -130,6 +132,7 @@ class Tap:
         show: Callable[[can.Message], bytes | None],
         overflow: Callable[[], bytes] = lambda: b"",
         tick: Callable[[], None] = lambda: None,
+        on_lost: Callable[[], None] = lambda: None,
         name: str,
     ) -> None:
         self.bus = bus
@@ -138,11 +141,10 @@ class Tap:
         self._overflow = overflow
         self._tick = tick
         self._closed = False
-        self._lost = False
+        self._on_lost = on_lost
+        self._overflowed = False
         self.dropped = 0
         """Frames that found no room."""
-        self.lost = False
-        """Whether the bus has gone."""
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -173,20 +175,21 @@ class Tap:
                 self._tick()
                 self._backlog.flush()
         except (can.CanError, OSError):
-            self.lost = True
+            self._on_lost()
         finally:
-            self.bus.shutdown()
+            with contextlib.suppress(can.CanError, OSError):
+                self.bus.shutdown()
 
     def _put(self, message: can.Message) -> None:
         text = self._show(message)
         if text is None:
             return
-        if self._lost:
+        if self._overflowed:
             text = self._overflow() + text
         if self._backlog.put(text):
-            self._lost = False
+            self._overflowed = False
         else:
-            self._lost = True
+            self._overflowed = True
             self.dropped += 1
 
 

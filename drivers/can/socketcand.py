@@ -157,7 +157,7 @@ class _Client(Outlet):
         self._tap: Tap | None = None
         self._raw = False
         self._held_until_s = 0.0
-        self._subscribed: dict[tuple[int, bool], tuple[float, float]] = {}
+        self._subscribed: dict[tuple[int, bool], list[float]] = {}
         """Shortest time between two frames [s], and when the next may come, by identifier."""
         self._every_s = 0.0
         self._next_s = 0.0
@@ -219,7 +219,7 @@ class _Client(Outlet):
             seconds, microseconds = self._number_of(rest[:2], 2)
             if len(self._subscribed) >= _MAX_SUBSCRIPTIONS:
                 raise CommandError(f"there may be {_MAX_SUBSCRIPTIONS} subscriptions")
-            self._subscribed[parse_identifier(rest[2])] = (seconds + microseconds * 1e-6, 0.0)
+            self._subscribed[parse_identifier(rest[2])] = [seconds + microseconds * 1e-6, 0.0]
         elif word == "unsubscribe" and len(rest) == 1:
             self._subscribed.pop(parse_identifier(rest[0]), None)
         else:
@@ -247,6 +247,7 @@ class _Client(Outlet):
             show=self._show,
             overflow=self._overflow,
             tick=self._tick,
+            on_lost=self._lose,
             name=f"socketcand {self._number} bus",
         )
         self._answer(b"< ok >")
@@ -268,12 +269,11 @@ class _Client(Outlet):
             self._traffic[0] += len(message.data)
             self._traffic[1] += 1
         if not self._raw:
-            key = (message.arbitration_id, message.is_extended_id)
-            every_s, next_s = self._subscribed.get(key, (0.0, float("inf")))
+            wanted = self._subscribed.get((message.arbitration_id, message.is_extended_id))
             now = time.monotonic()
-            if message.is_error_frame or now < next_s:
+            if message.is_error_frame or wanted is None or now < wanted[1]:
                 return None
-            self._subscribed[key] = (every_s, now + every_s)
+            wanted[1] = now + wanted[0]
         if (wait_s := self._held_until_s - time.monotonic()) > 0:
             time.sleep(wait_s)
         return text
@@ -286,6 +286,10 @@ class _Client(Outlet):
         if self._every_s and now >= self._next_s:
             self._next_s = now + self._every_s
             self._backlog.put(f"< stat {' '.join(map(str, self._traffic))} >".encode())
+
+    def _lose(self) -> None:
+        self.counts["bus_lost"] += 1
+        self._ending = True
 
     # End.
 

@@ -32,16 +32,17 @@ class Reporter:
     def step(self, text: str) -> None:
         """One step is done; the next one is this."""
         self.done += 1
-        self.say(text)
+        if self.bar is not None or time.monotonic() - self._printed_s > _EVERY_S:
+            self.say(text)
 
     def say(self, text: str) -> None:
         """This is being done."""
         if self.bar is not None:
             self.bar.update(self.task, description=text, completed=self.done)
-        elif time.monotonic() - self._printed_s > _EVERY_S:
-            self._printed_s = time.monotonic()
-            count = f"{self.done} of {self.total}: " if self.total else ""
-            print(f"{count}{text}", file=sys.stderr, flush=True)
+            return
+        self._printed_s = time.monotonic()
+        count = f"{self.done} of {self.total}: " if self.total else ""
+        print(f"{count}{text}", file=sys.stderr, flush=True)
 
 
 @contextmanager
