@@ -177,7 +177,7 @@ class _Client(Outlet):
                 return
             try:
                 if command is None:
-                    raise CommandError("a command must be of the form < word ... >")
+                    raise CommandError("a command must be words in angle brackets")
                 self._obey(command.split())
             except CommandError as error:
                 self.counts["malformed"] += 1

@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -13,7 +14,7 @@ import typer
 app = typer.Typer(help="The virtual CAN bus.", no_args_is_help=True)
 
 _LISTEN = "127.0.0.1:7461"
-_SPEED = "1M/5M"
+_SPEED = "1M/8M"
 
 
 @app.callback()
@@ -27,10 +28,21 @@ def hub(
     channels: Annotated[list[str], typer.Argument(metavar="CHANNEL...", help="Names of the buses, such as can0.")],
     *,
     speed: Annotated[
-        str, typer.Option(metavar="RATE[/RATE]", help="Bit rate, and that of the data phase of CAN FD: 500k, 1M/5M.")
+        str, typer.Option(metavar="RATE[/RATE]", help="Bit rate, and that of the data phase of CAN FD: 500k, 1M/8M.")
     ] = _SPEED,
     listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = _LISTEN,
-    expose: Annotated[bool, typer.Option("--expose", help="Allow --listen on a host other than 127.0.0.1.")] = False,
+    socketcand: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT", help="Also serve socketcand clients (classic frames), usually at 127.0.0.1:29536."
+        ),
+    ] = None,
+    slcan: Annotated[
+        bool, typer.Option("--slcan", help="Also play an SLCAN adapter on a port of its own for each bus.")
+    ] = False,
+    expose: Annotated[
+        bool, typer.Option("--expose", help="Allow --listen and --socketcand on a host other than 127.0.0.1.")
+    ] = False,
     acknowledge: Annotated[
         bool, typer.Option(help="Acknowledge frames, so that an only node on the bus can send.")
     ] = True,
@@ -43,7 +55,9 @@ def hub(
     """
     from drivers.can.bus import BusModel
     from drivers.can.hub import Hub
+    from drivers.can.interface import HubBus
     from drivers.can.timing import speed as parse_speed
+    from rig.cli.can_outlets import CanOutlets
     from rig.errors import InputError
     from rig.transport.zenoh import ZenohServer
 
@@ -56,12 +70,16 @@ def hub(
         with _stopping_on_signals() as stopped:
             for one in hubs:
                 stack.enter_context(one)
+            buses = {one.channel: partial(HubBus, one) for one in hubs}
+            outlets = stack.enter_context(CanOutlets(buses, rates, socketcand=socketcand, slcan=slcan, expose=expose))
+            for line in outlets.lines():
+                typer.echo(f"rig: {line}", err=True)
             typer.echo(f"rig: CAN {', '.join(channels)} at {rates} on {listen}; Ctrl-C ends it", err=True)
             while not stopped.wait(5.0):
                 for one in hubs:
                     typer.echo(_line(one.status()), err=True)
-        for one in hubs:
-            typer.echo(_line(one.status()))
+        for line in (*(_line(one.status()) for one in hubs), *outlets.summary()):
+            typer.echo(line)
 
 
 @contextmanager

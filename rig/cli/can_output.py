@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,9 +14,11 @@ from rig.errors import InputError
 if TYPE_CHECKING:
     import can
 
+    from drivers.can.backlog import OpenBus
     from drivers.can.gateway import Gateway
     from drivers.can.schedule import Schedule
     from drivers.can.timing import Speed
+    from rig.cli.can_outlets import CanOutlets
     from rig.transport import Server
 
 _PANEL = "CAN"
@@ -58,6 +61,21 @@ CanOverload = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
+CanSocketcand = Annotated[
+    str | None,
+    typer.Option(
+        "--can-socketcand",
+        metavar="HOST:PORT",
+        help="Serve the bus to socketcand clients (classic frames), usually at 127.0.0.1:29536.",
+        rich_help_panel=_PANEL,
+    ),
+]
+CanSlcan = Annotated[
+    bool,
+    typer.Option("--can-slcan", help="Play an SLCAN adapter of the bus on a port of its own.", rich_help_panel=_PANEL),
+]
+_SHARED = ("zenoh", "virtual", "socketcan")
+"""Interfaces on which one process can have many nodes."""
 
 
 class CanOutput:
@@ -70,6 +88,9 @@ class CanOutput:
         rate_hz: Rate of samples [Hz]; None: the usual ones.
         bitrate: Bit rates; None: 1M, or 1M/8M with FD frames.
         overload: Run even where the bus cannot carry all.
+        socketcand: HOST:PORT of a server for socketcand clients, or none.
+        slcan: Whether to play an SLCAN adapter of the bus.
+        expose: Allow a socketcand host other than 127.0.0.1.
 
     Raises:
         InputError: What was asked for does not make a bus, or not one that can carry the messages.
@@ -84,6 +105,9 @@ class CanOutput:
         rate_hz: int | None = None,
         bitrate: str | None = None,
         overload: bool = False,
+        socketcand: str | None = None,
+        slcan: bool = False,
+        expose: bool = False,
     ) -> None:
         from rig.transport.memory import MemoryServer
 
@@ -95,6 +119,12 @@ class CanOutput:
             self.load = self.schedule.check(self.speed)
         if self.interface == "slcan" and self.schedule.fd_hz is not None:
             raise InputError("--can", "an interface that has CAN FD", spec)
+        if (socketcand is not None or slcan) and self.interface not in _SHARED:
+            must = f"on {', '.join(_SHARED[:-1])} or {_SHARED[-1]} with --can-socketcand and --can-slcan"
+            raise InputError("--can", must, spec)
+        self._outlet_settings: dict[str, Any] = {"socketcand": socketcand, "slcan": slcan, "expose": expose}
+        self._outlets: CanOutlets | None = None
+        self._open_more: OpenBus | None = None
         self._memory = MemoryServer(cache=0)
         self._gateway: Gateway | None = None
         self._stack = ExitStack()
@@ -104,6 +134,12 @@ class CanOutput:
         with ExitStack() as stack:
             self._bus = stack.enter_context(self._open())
             stack.callback(self._memory.close)
+            if self._outlet_settings["socketcand"] is not None or self._outlet_settings["slcan"]:
+                from rig.cli.can_outlets import CanOutlets
+
+                assert self._open_more is not None
+                buses = {self.channel: self._open_more}
+                self._outlets = stack.enter_context(CanOutlets(buses, self.speed, **self._outlet_settings))
             self._stack = stack.pop_all()
         return self
 
@@ -141,7 +177,7 @@ class CanOutput:
         return (
             f"CAN: {counts['can_frames']:g} frames sent, {counts['can_dropped']:g} dropped, commands taken "
             f"{counts['can_accepted']:g}, refused {counts['can_refused']:g}" + (f" ({reasons})" if reasons else "")
-        )
+        ) + "".join(f"\n{line}" for line in (self._outlets.summary() if self._outlets is not None else []))
 
     def __str__(self) -> str:
         rates = [("classic", self.schedule.classic_hz), ("FD", self.schedule.fd_hz)]
@@ -149,7 +185,7 @@ class CanOutput:
         return (
             f"CAN {self.interface}:{self.channel} at {self.speed}, all channels at {sent}; "
             f"load at most {100 * self.load:.1f} %"
-        )
+        ) + "".join(f"\nrig: {line}" for line in (self._outlets.lines() if self._outlets is not None else []))
 
     def _figures(self) -> dict[str, float]:
         return self._gateway.figures() if self._gateway is not None else {}
@@ -167,8 +203,9 @@ class CanOutput:
             settings.setdefault("fd", self.schedule.fd_hz is not None)
         elif self.interface != "virtual":
             settings.setdefault("bitrate", round(self.speed.nominal_bit_s))
+        self._open_more = partial(can.Bus, interface=self.interface, channel=self.channel, **settings)
         try:
-            bus = can.Bus(interface=self.interface, channel=self.channel, **settings)
+            bus = self._open_more()
         except (can.CanError, OSError, ValueError, TypeError) as error:
             raise InputError("--can", "a bus that can be opened", f"{self.interface}:{self.channel}: {error}") from None
         with bus:
@@ -192,6 +229,7 @@ class CanOutput:
             Hub(BusModel(self.speed), self.channel, server) as hub,
             HubBus(hub) as bus,
         ):
+            self._open_more = partial(HubBus, hub)
             yield bus
 
 

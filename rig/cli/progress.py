@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 _EVERY_S = 15.0
@@ -21,7 +21,7 @@ class Reporter:
     task: Any = None
     total: int | None = None
     done: int = 0
-    _printed_s: float = -1e9
+    _printed_s: float = field(default_factory=time.monotonic)
 
     def begin(self, total: int) -> None:
         """There are this many steps."""

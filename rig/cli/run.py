@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.can_output import CanBitrate, CanBus, CanClassic, CanFd, CanOutput, CanOverload, CanRate
+from rig.cli.can_output import (
+    CanBitrate,
+    CanBus,
+    CanClassic,
+    CanFd,
+    CanOutput,
+    CanOverload,
+    CanRate,
+    CanSlcan,
+    CanSocketcand,
+)
 from rig.cli.options import Changes, DurationS, Engine, Parameters, SceneName, Seed
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
@@ -40,7 +50,9 @@ def run(
         float, typer.Option(help="Length of a published block, in ms; the last 3000 are kept for clients that stall.")
     ] = 10.0,
     listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = DEFAULT_ENDPOINT,
-    expose: Annotated[bool, typer.Option("--expose", help="Allow --listen on a host other than 127.0.0.1.")] = False,
+    expose: Annotated[
+        bool, typer.Option("--expose", help="Allow --listen and --can-socketcand on a host other than 127.0.0.1.")
+    ] = False,
     parameters: Parameters = None,
     changes: Changes = None,
     engine: Engine = None,
@@ -52,6 +64,8 @@ def run(
     can_fd: CanFd = False,
     can_bitrate: CanBitrate = None,
     can_overload: CanOverload = False,
+    can_socketcand: CanSocketcand = None,
+    can_slcan: CanSlcan = False,
 ) -> None:
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
     overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
@@ -69,9 +83,20 @@ def run(
         bus = None
         if can is not None:
             bus = CanOutput(
-                can, classic=can_classic, fd=can_fd, rate_hz=can_rate, bitrate=can_bitrate, overload=can_overload
+                can,
+                classic=can_classic,
+                fd=can_fd,
+                rate_hz=can_rate,
+                bitrate=can_bitrate,
+                overload=can_overload,
+                socketcand=can_socketcand,
+                slcan=can_slcan,
+                expose=expose,
             )
-        elif can_rate is not None or can_classic or can_fd or can_bitrate is not None or can_overload:
+        elif any(
+            setting is not None and setting is not False
+            for setting in (can_rate, can_classic, can_fd, can_bitrate, can_overload, can_socketcand, can_slcan)
+        ):
             raise InputError("--can", "given with the other --can options", None)
     paced = pace is Pace.REAL_TIME
     with ZenohServer(listen, expose=expose, wait=not paced) as server, ExitStack() as stack:
