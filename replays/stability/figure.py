@@ -164,10 +164,10 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
 
     able = [engine for engine in engines if friction_of(engine) == "exact"]
     points = 12 if quick else 28
-    right = boundary.chart("tsit5", points=points, tolerance=1e-9)
+    right = boundary.chart("taylor", points=points, tolerance=1e-12)
     figure = new_figure(
         (3.3 * max(1, len(able)) + 0.6, 4.9),
-        "A 5 ms blow at 6.2 Hz, after 0.6 s; line: boundary by tsit5 at 1e-9; x: another class than there",
+        "A 5 ms blow at 6.2 Hz, after 0.6 s; line: boundary by taylor at 1e-12; x: another class than there",
         title_size=12,
     )
     panels = figure.subplots(1, max(1, len(able)), squeeze=False)[0]
