@@ -117,7 +117,19 @@ def page() -> str:
         fields = "; ".join(_field(key, field) for key, field in command.model_fields.items() if key != "command")
         lines.append(f"| `{wire.command_key(name)}` | {fields or 'no fields'} |")
     lines += [f"| `{wire.command_key(name)}` | {what} |" for name, what in _OTHER_COMMANDS.items()]
-    lines += ["", f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.", ""]
+    lines += [
+        "",
+        f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.",
+        "",
+        "## Other ports",
+        "",
+        "`rig twins` listens on 127.0.0.1:7462: requests to an instrument are queries, its data is published, under "
+        "`rig/instruments/NAME/`. A CAN bus (`rig run --can zenoh:CHANNEL`, `rig can hub`) listens on 127.0.0.1:7461; "
+        "its frames travel under `rig/can/CHANNEL/`. Both are for their drivers and for python-can's interface `zenoh`; "
+        "what they carry is described in drivers/instrument/protocol.py and drivers/can/medium.py, the CAN frames in "
+        "drivers/can/rig.dbc.",
+        "",
+    ]
     return "\n".join(lines)
 
 
