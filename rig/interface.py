@@ -125,7 +125,7 @@ def page() -> str:
         "",
         "`rig twins` listens on 127.0.0.1:7462: requests to an instrument are queries, its data is published, under "
         "`rig/instruments/NAME/`. A CAN bus (`rig run --can zenoh:CHANNEL`, `rig can hub`) listens on 127.0.0.1:7461; "
-        "its frames travel under `rig/can/CHANNEL/`. Both are for their drivers and for python-can's interface `zenoh`; "
+        "its frames travel under `rig/can/CHANNEL/`. Both are for their drivers and python-can's interface `zenoh`: "
         "what they carry is described in drivers/instrument/protocol.py and drivers/can/medium.py, the CAN frames in "
         "drivers/can/rig.dbc.",
         "",
