@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import termios
 import threading
 import time
 from collections import Counter
@@ -265,7 +264,7 @@ class Outlet:
                 self._backlog.flush()
                 if self._backlog.stalled_s > self._patience_s:
                     self._give_up()
-        except (OSError, termios.error):
+        except OSError:
             # The client has gone in the midst of it.
             pass
         finally:

@@ -206,9 +206,10 @@ class _Client(Outlet):
                 self._traffic[3] += 1
         elif word in ("rawmode", "bcmmode", "controlmode") and not rest:
             self._held_until_s = time.monotonic() + _HOLD_S
+            # In this order: no frame before the answer, none lost after it.
             self._answer(b"< ok >")
-            self._backlog.flush()
             self._raw = word == "rawmode"
+            self._backlog.flush()
         elif word == "statistics":
             self._every_s = self._number_of(rest, 1)[0] / 1000
             if self._every_s and not _SHORTEST_MS <= self._every_s * 1000 <= _LONGEST_MS:
@@ -293,6 +294,12 @@ class _Client(Outlet):
 
     # End.
 
+    def stop(self) -> None:
+        """Begin to end, without waiting."""
+        self._ending = True
+        with contextlib.suppress(OSError):
+            self._connection.shutdown(socket.SHUT_RD)
+
     def _give_up(self) -> None:
         self.counts["given_up"] += 1
         self._ending = True
@@ -358,13 +365,16 @@ class SocketcandServer:
     def close(self) -> None:
         """End all connections."""
         self._closed = True
+        with contextlib.suppress(OSError):
+            # Wakes who waits there, on Linux; elsewhere the time-out does.
+            self._listener.shutdown(socket.SHUT_RDWR)
         if self._thread.is_alive():
             self._thread.join(timeout=2.0)
         self._listener.close()
         with self._lock:
             clients = list(self._clients)
         for client in clients:
-            client._ending = True
+            client.stop()
         for client in clients:
             client.close()
 
