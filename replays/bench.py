@@ -6,12 +6,14 @@ clock, because real time is what they are for.
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -84,7 +86,7 @@ CASES = (
 )
 """The first is what the others are compared with."""
 
-PEER_CASES = (("cvode-bdf", 2e-3), ("heyoka", 2e-3), ("heyoka", 1e-6))
+PEER_CASES = (("cvode-bdf", 2e-3), ("cvode-adams", 2e-3), ("heyoka", 2e-3), ("heyoka", 1e-6))
 """Peer, and the total error at which it is timed: at the cheapest setting of its ladder that reaches it."""
 
 
@@ -208,9 +210,9 @@ def _reference(problem: Problem) -> tuple[np.ndarray, float | None, str]:
 def _cheapest(
     name: str, wanted: float, problem: Problem, reference: np.ndarray
 ) -> list[tuple[str, float, Setting, float]]:
-    """The quickest setting of a peer's ladder whose error is at most the one wanted, if there is one."""
+    """The quickest setting of a peer's ladder, with steps between, whose error is at most the one wanted, if any."""
     found: tuple[float, Setting, float] | None = None
-    for setting in PEERS[name].ladder:
+    for setting in _with_steps_between(PEERS[name].ladder):
         solution = PEERS[name].solve(problem, setting, budget_s=30.0)
         if solution.failure is not None:
             continue
@@ -218,6 +220,18 @@ def _cheapest(
         if error <= wanted and (found is None or solution.cpu_s < found[0]):
             found = (solution.cpu_s, setting, error)
     return [] if found is None else [(name, wanted, found[1], found[2])]
+
+
+def _with_steps_between(ladder: tuple[Setting, ...]) -> list[Setting]:
+    """A ladder of tolerances with three steps a decade: a coarse one would hold a peer to a rung below the goal."""
+    finer = list(ladder)
+    for above, below in pairwise(ladder):
+        if above.absolute is None and below.absolute is None:
+            steps = round(3.0 * math.log10(above.tolerance / below.tolerance))
+            for n in range(1, steps):
+                tolerance = above.tolerance * (below.tolerance / above.tolerance) ** (n / steps)
+                finer.append(Setting(f"{tolerance:.1e}".replace("e-0", "e-"), tolerance))
+    return finer
 
 
 def _summary(name: str, values: list[float], base: list[float]) -> dict[str, Any]:
