@@ -9,7 +9,7 @@ import random
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -269,26 +269,47 @@ def test_instruments_find_a_rig_that_is_started_again() -> None:
     endpoint = free_endpoint()
     with ExitStack() as closing:
         first = ZenohServer(endpoint)
+        closing.callback(first.close)
         rig = FakeRig(first)
         twins = closing.enter_context(Twins(closing.enter_context(ZenohClient(endpoint))))
         near, far = memory.pair()
         twins.serve(KINDS["force"], MessagePort(near, "memory:"))
         force = closing.enter_context(Force(far, timeout_s=20.0))
         force.start()
-        rig.publish("forces", blocks=3)
-        assert len(force.read(3 * BLOCK)) == 3 * BLOCK
+        with publishing(rig):
+            assert len(force.read(3 * BLOCK, timeout_s=20.0)) == 3 * BLOCK
         first.close()
         with pytest.raises(StreamEndedError, match="the rig has gone"):
-            force.read(1)
+            read_on(force)
         rig = FakeRig(closing.enter_context(ZenohServer(endpoint)))
         until(lambda: answers(force))
         force.start()
-        # The subscription is back when a block comes through.
-        publishing = threading.Timer(0.5, lambda: rig.publish("forces", blocks=3))
-        publishing.start()
-        samples = force.read(3 * BLOCK, timeout_s=20.0)
-        publishing.join()
+        with publishing(rig):
+            samples = force.read(3 * BLOCK, timeout_s=20.0)
         np.testing.assert_allclose(samples.values, values_of("forces", samples.index, len(samples)), atol=1e-9)
+
+
+def read_on(force: Force) -> None:
+    while True:
+        force.read(1)
+
+
+@contextmanager
+def publishing(rig: FakeRig) -> Iterator[None]:
+    """Blocks again and again: a subscription may take its time to arrive."""
+    done = threading.Event()
+
+    def work() -> None:
+        while not done.wait(0.02):
+            rig.publish("forces")
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 def answers(driver: Instrument) -> bool:
