@@ -90,9 +90,10 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
     counts = np.zeros(n + 1)
     best = np.full(n, np.inf)
     failure, message, reached = "", "", n
+    begun_cpu = 0.0
     for turn in range(budget.runs):
         y, memory = begin()
-        begun, spent = time.perf_counter(), time.thread_time()
+        begun, begun_cpu = time.perf_counter(), time.thread_time()
         for i in range(n):
             before = time.perf_counter()
             engine.advance(
@@ -110,7 +111,7 @@ def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         best = np.minimum(best, frames)
         if turn == 0 and frames.sum() > 0.1 * budget.solve_s:
             break
-    cost = time.thread_time() - spent
+    cost = time.thread_time() - begun_cpu
     last, note = y.copy(), memory.copy()
     costs = [cost]
     if not failure:
