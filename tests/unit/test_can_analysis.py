@@ -36,8 +36,8 @@ def test_three_messages_that_the_old_analysis_gets_wrong():
 
 
 # The SAE benchmark as Tindell and Burns (1994), Guaranteeing message latencies on Control Area Network (CAN), have it
-# at 125 kbit/s, quoted from memory and not held against the print: bytes, jitter [ms], period [ms], response time without
-# the jitter [ms], for the first nine messages.
+# at 125 kbit/s, quoted from memory and not held against the print: bytes, jitter [ms], period [ms], response time
+# without the jitter [ms], for the first nine messages.
 SAE = (
     (1, 0.1, 50.0, 1.544),
     (2, 0.1, 5.0, 2.128),
