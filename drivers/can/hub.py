@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivers.can import medium
-from drivers.can.bus import OUTCOMES, STATES, BusModel
+from drivers.can.bus import OUTCOMES, STATES, BusModel, warm_up
 from drivers.can.frame import RECORD, Frame
 from rig.errors import InputError
 
@@ -144,7 +144,7 @@ class Hub:
 
     def start(self) -> None:
         """Take endpoints, and let the bus run on a thread of its own."""
-        _warm_up(self._model)
+        warm_up()
         if self._server is not None:
             for name in ("join", "set", "flush", "status"):
                 self._server.answer(medium.request_key(self.channel, name), self._answerer(name))
@@ -546,14 +546,6 @@ def _for_model(records: np.ndarray, node: int, now: int) -> np.ndarray:
 
 
 _COUNTS = ("frames", "errors", "unsent", "malformed", "invalid", "surplus", "strange")
-
-
-def _warm_up(model: BusModel) -> None:
-    """Load what is compiled, or compile it: not while frames wait."""
-    trial = BusModel(model.speed)
-    trial.attach("listener")
-    trial.offer(trial.attach("sender"), Frame(0))
-    trial.advance_records(1_000_000_000)
 
 
 def _sharpen_sleep() -> None:
