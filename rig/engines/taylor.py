@@ -49,7 +49,7 @@ from rig.engines.memory import (
 )
 from rig.engines.parts import PER_SCALE, rates
 from rig.kernels import signals as S
-from rig.kernels.angles import arc_sine, sin_cos
+from rig.kernels.axis import angles_of, axis_of
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, SMOOTHED, TOUCHING
 from rig.kernels.magnet import LINEAR, RIPPLED
 
@@ -124,15 +124,10 @@ def _to_series(constants, inputs, y, x):
     """State and integrals as the series has them, into x."""
     for i in range(S.N_VECTOR):
         x[i] = y[i]
-    if constants.levels.euler:
-        sG, cG = sin_cos(y[0])
-        sb, cb = sin_cos(y[1])
-        x[0], x[1] = sb, -sG * cb
-        x[7], x[8] = cb * y[8], -(cG * cb * y[7] - sG * sb * y[8])
-        if not inputs.ideal_drive:
-            x[9] = y[9] + y[7] * sb
-    else:
-        x[0], x[1], x[7], x[8] = y[1], -y[0], y[8], -y[7]
+    euler = constants.levels.euler
+    x[0], x[1], x[7], x[8] = axis_of(euler, y[0], y[1], y[7], y[8])
+    if euler and not inputs.ideal_drive:
+        x[9] = y[9] + y[7] * x[0]
 
 
 @njit(cache=True, error_model="numpy")
@@ -140,20 +135,10 @@ def _from_series(constants, inputs, x, y):
     """Back again."""
     for i in range(S.N_VECTOR):
         y[i] = x[i]
-    ux, uy, px, py = x[0], x[1], x[7], x[8]
-    if constants.levels.euler:
-        cb2 = 1.0 - ux * ux
-        cb = math.sqrt(cb2)
-        uz = math.sqrt(cb2 - uy * uy)
-        pz = -(ux * px + uy * py) / uz
-        y[0] = arc_sine(-uy / cb)
-        y[1] = arc_sine(ux)
-        y[7] = (uy * pz - uz * py) / cb2
-        y[8] = px / cb
-        if not inputs.ideal_drive:
-            y[9] = x[9] - ux * y[7]
-    else:
-        y[0], y[1], y[7], y[8] = -uy, ux, -py, px
+    euler = constants.levels.euler
+    y[0], y[1], y[7], y[8] = angles_of(euler, x[0], x[1], x[7], x[8])
+    if euler and not inputs.ideal_drive:
+        y[9] = x[9] - x[0] * y[7]
 
 
 @njit(cache=True, error_model="numpy")

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from numba import njit
 
-from rig.kernels.angles import arc_sine, sin_cos
+from rig.kernels.axis import angles_of, axis_of
 from rig.kernels.contact import NO_FRICTION
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
@@ -144,34 +144,20 @@ def plant_of(constants, inputs, rest, spring_x, spring_y):
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def from_coordinates(constants, y):
     """Generalised coordinates y as axis, spin about it [rad/s], spin angle [rad], houses."""
-    if constants.levels.euler:
-        sG, cG = sin_cos(y[0])
-        sb, cb = sin_cos(y[1])
-        axis = Axis(sb, -sG * cb, cb * y[8], -(cG * cb * y[7] - sG * sb * y[8]))
-        w = y[9] + y[7] * sb
-    else:
-        axis = Axis(y[1], -y[0], y[8], -y[7])
-        w = y[9]
+    euler = constants.levels.euler
+    ux, uy, px, py = axis_of(euler, y[0], y[1], y[7], y[8])
+    axis = Axis(ux, uy, px, py)
+    w = y[9] + y[7] * ux if euler else y[9]
     return axis, w, y[2], Houses(y[3], y[10], y[5], y[12], y[4], y[11], y[6], y[13])
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def into_coordinates(constants, axis, w, theta, houses, y):
     """The same the other way, into y."""
-    ux, uy, px, py = axis
+    euler = constants.levels.euler
     y[2] = theta
-    if constants.levels.euler:
-        cb2 = 1.0 - ux * ux
-        cb = math.sqrt(cb2)
-        uz = math.sqrt(cb2 - uy * uy)
-        pz = -(ux * px + uy * py) / uz
-        y[0] = arc_sine(-uy / cb)
-        y[1] = arc_sine(ux)
-        y[7] = (uy * pz - uz * py) / cb2
-        y[8] = px / cb
-        y[9] = w - ux * y[7]
-    else:
-        y[0], y[1], y[7], y[8], y[9] = -uy, ux, -py, px, w
+    y[0], y[1], y[7], y[8] = angles_of(euler, axis.ux, axis.uy, axis.px, axis.py)
+    y[9] = w - axis.ux * y[7] if euler else w
     y[3], y[10], y[5], y[12] = houses.x0, houses.x1, houses.x2, houses.x3
     y[4], y[11], y[6], y[13] = houses.y0, houses.y1, houses.y2, houses.y3
 
