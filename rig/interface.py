@@ -23,7 +23,7 @@ _DOCUMENTS = {
     ),
     wire.CATALOGUE: "on request: the channel table with calibration, truth tables with units",
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",
-    wire.SCENE: "on request: the scene as it runs, with its seed",
+    wire.SCENE: "on request: the scene as it runs, with its seed, and as `taken` the commands sent to it so far",
     f"{wire.CLIENTS}/NAME": "sent by clients twice a second, and with `done` when they leave; shown in the status: "
     "how far they have come",
 }

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,14 @@ from rig.scenes import Scene, parse_scene
 from rig.simulation import Frame, Simulation, energy_balance
 
 UNITS = {signal.name: signal.unit for signal in ROW}
+
+
+class SentCommand(NamedTuple):
+    """A command that came from outside a scene, at the tick at which it was taken."""
+
+    tick: int
+    name: str
+    request: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -62,17 +71,30 @@ class Run:
         return energy_balance(self.signals, self.signals[0])
 
 
-def frames(simulation: Simulation, *, chunk_s: float = 0.1) -> Iterator[Frame]:
-    """Advance a simulation to the end of its scene, chunk by chunk."""
+def frames(simulation: Simulation, *, chunk_s: float = 0.1, commands: Iterable[SentCommand] = ()) -> Iterator[Frame]:
+    """Advance a simulation to the end of its scene, chunk by chunk.
+
+    Args:
+        simulation: What to advance.
+        chunk_s: Longest chunk [s].
+        commands: What is sent on the way beside the scene's own commands, each at a tick that is a multiple of the
+            simulation's `block_ticks`.
+    """
     chunk = max(1, round(chunk_s * simulation.tick_rate_hz) // simulation.block_ticks) * simulation.block_ticks
+    due = deque(sorted(commands, key=lambda command: command.tick))
     while simulation.tick < simulation.end_tick:
-        yield simulation.advance(min(chunk, simulation.end_tick - simulation.tick))
+        while due and due[0].tick <= simulation.tick:
+            command = due.popleft()
+            simulation.submit(command.name, dict(command.request))
+        stop = min(simulation.tick + chunk, simulation.end_tick, *(command.tick for command in list(due)[:1]))
+        yield simulation.advance(stop - simulation.tick)
 
 
 def simulate(
     scene: Scene,
     *,
     duration_s: float | None = None,
+    commands: Iterable[SentCommand] = (),
     progress: Callable[[float], None] | None = None,
 ) -> Run:
     """Run a scene as fast as it goes.
@@ -80,6 +102,7 @@ def simulate(
     Args:
         scene: What to run.
         duration_s: Another duration than the scene's [s].
+        commands: What is sent on the way, as for `frames`.
         progress: Called with the part done, 0 to 1.
 
     Returns:
@@ -95,7 +118,7 @@ def simulate(
     every = simulation.tick_rate_hz // scene.sensors.rate_hz // simulation.row_ticks
     signals, edges, events = [], [], []
     counts: dict[str, list[np.ndarray]] = {group: [] for group in simulation.table.groups}
-    for frame in frames(simulation):
+    for frame in frames(simulation, commands=commands):
         signals.append(frame.rows[::every].copy())
         for group, block in frame.samples.items():
             counts[group].append(block.values)

@@ -436,6 +436,20 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
     return scene
 
 
+def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
+    """A loaded scene with other values, by dotted key as in `load_scene`; another engine comes with its own step.
+
+    Raises:
+        InputError: The one thing that is wrong, with its field.
+    """
+    data = scene.model_dump()
+    if "engine.name" in changes:
+        data["engine"] = {}
+    for key, value in changes.items():
+        _override(data, key, value)
+    return parse_scene(data)
+
+
 def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scene:
     """The scene with its stored pick in force, if that is of this very scene."""
     by_hand = [key for key in overrides if key.split(".")[0] in ("model", "engine") or key in _PICKED]

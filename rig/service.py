@@ -31,6 +31,8 @@ _PENDING_COMMANDS = 256
 _REQUEST_BYTES = 10_000
 _STEP_S = 3600
 """Longest single step [s of simulated time]."""
+_TAKEN = 10_000
+"""Commands that are told to latecomers."""
 _CLIENTS = 64
 _CLIENT_FORGOTTEN_S = 600.0
 _CLIENT_GONE_S = 3.0
@@ -272,6 +274,8 @@ class Service:
         self._pending_lock = threading.Lock()
         self._accepting = True
         self._accepted = 0
+        self._taken: tuple[dict[str, Any], ...] = ()
+        """Commands that the simulation took: whoever comes later cannot run the scene again without them."""
         self._steps: list[tuple[int, Future[dict[str, Any]], dict[str, Any]]] = []
         self._step_target: int | None = None
 
@@ -350,10 +354,10 @@ class Service:
         for key, document in (
             (wire.CATALOGUE, self._simulation.catalogue()),
             (wire.PARAMETERS, self._simulation.parameters_document()),
-            (wire.SCENE, self._scene),
         ):
             payload = wire.encode_document(document)
             self._server.answer(key, lambda _, payload=payload: payload)
+        self._server.answer(wire.SCENE, lambda _: wire.encode_document({**self._scene, "taken": self._taken}))
         self._server.answer(wire.STATUS, lambda _: wire.encode_document(self.status()))
         for name in COMMANDS:
             self._server.answer(wire.command_key(name), lambda payload, name=name: self._on_command(name, payload))
@@ -523,6 +527,8 @@ class Service:
             done_tick = self._check_step(pending.request)
         else:
             tick = simulation.submit(pending.command, dict(pending.request))
+            taken = {"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request}
+            self._taken = (*self._taken, taken)[-_TAKEN:]  # a new one, as other threads read it
         self._accepted += 1
         reply = {"accepted": True, "id": self._accepted, "command": pending.command}
         if done_tick is None:

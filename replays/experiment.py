@@ -1,0 +1,116 @@
+"""What was done to the rig in a recording, so that it can be done again: scene, parameters, commands with their times.
+
+On the same build the same experiment gives the same payloads, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+from recorder.reader import Recording
+from rig.errors import InputError
+from rig.offline import Run, SentCommand, frames, simulate
+from rig.parameters import DEFAULT_SET, load_parameters, set_names
+from rig.scenes import COMMANDS, Scene, change_scene, parse_scene
+from rig.simulation import TICK_RATE_HZ, Frame, Simulation
+from rig.wire import EDGES
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A scene with the commands that were sent to it.
+
+    Attributes:
+        scene: The scene, on the recorded parameters; it ends where the recording does.
+        commands: What was sent to the rig beside the scene's own commands.
+        first_s: Simulated time at which the recording begins [s]; the experiment itself always begins at 0.
+    """
+
+    scene: Scene
+    commands: tuple[SentCommand, ...] = ()
+    first_s: float = 0.0
+
+    @classmethod
+    def of(cls, recording: Recording) -> Self:
+        """Take the experiment from a recording of this rig.
+
+        Raises:
+            InputError: The recording is none of this rig's, or of a version whose scene or parameters mean nothing
+                here.
+        """
+        document = recording.scene.get("scene")
+        streams = [stream for stream in recording.streams.values() if stream.rows]
+        if not isinstance(document, dict) or not streams:
+            raise InputError("file", "a recording of this rig, with the scene it ran and samples", str(recording.path))
+        duration_s = max(_end_s(recording), 1.0 / TICK_RATE_HZ)
+        scene = parse_scene(
+            {**document, **_parameters(recording, document), "duration_s": duration_s, "fidelity": "given"}
+        )
+        return cls(
+            scene=scene, commands=_sent(recording), first_s=min(float(stream.first_time_s) for stream in streams)
+        )
+
+    def changed(self, changes: dict[str, Any]) -> Experiment:
+        """The same with other values of scene or parameters, by dotted key, each in its own unit.
+
+        Raises:
+            InputError: An unknown key, or a value that it must not have.
+        """
+        return replace(self, scene=change_scene(self.scene, changes))
+
+    def simulation(self) -> Simulation:
+        """A simulation of the scene, at its start; `frames` sends it the commands."""
+        return Simulation(self.scene)
+
+    def frames(self, simulation: Simulation, *, chunk_s: float = 0.1) -> Iterator[Frame]:
+        """Do it again on a simulation, chunk by chunk."""
+        return frames(simulation, chunk_s=chunk_s, commands=self.commands)
+
+    def run(self, *, duration_s: float | None = None, progress: Callable[[float], None] | None = None) -> Run:
+        """Do it again, and keep everything.
+
+        Args:
+            duration_s: End at another time [s].
+            progress: Called with the part done, 0 to 1.
+        """
+        return simulate(self.scene, duration_s=duration_s, commands=self.commands, progress=progress)
+
+
+def _end_s(recording: Recording) -> float:
+    """Simulated time behind the last row of any stream [s]."""
+    ends = [0.0]
+    for key, stream in recording.streams.items():
+        if key != EDGES and stream.rows > 1:  # edges come once a turn, not at a rate
+            period_s = (stream.last_time_s - stream.first_time_s) / (stream.rows + stream.lost - 1)
+            ends.append(stream.last_time_s + period_s)
+    return math.floor(max(ends) * TICK_RATE_HZ + 0.5) / TICK_RATE_HZ
+
+
+def _parameters(recording: Recording, document: dict[str, Any]) -> dict[str, Any]:
+    """The scene's fields that give the recorded parameters, whatever has become of the files that they were from."""
+    recorded = {key: entry["value"] for key, entry in recording.parameters["values"].items()}
+    name, changes = document.get("parameters", DEFAULT_SET), document.get("set", {})
+    if name in set_names():
+        now = load_parameters(name).override(changes) if changes else load_parameters(name)
+        if {key: entry.value for key, entry in now.entries.items()} == recorded:
+            return {"parameters": name, "set": changes}
+    base = load_parameters().entries
+    unknown = sorted(set(recorded) - set(base))
+    if unknown:
+        raise InputError("file", "a recording whose parameters this version knows", ", ".join(unknown))
+    different = {key: value for key, value in recorded.items() if base[key].value != value}
+    return {"parameters": DEFAULT_SET, "set": different}
+
+
+def _sent(recording: Recording) -> tuple[SentCommand, ...]:
+    """The commands that came from outside: before the recording began, and in it."""
+    taken = recording.scene.get("taken", [])
+    told = [event for event in recording.events if event.get("event") == "command"]
+    found: dict[int, SentCommand] = {}
+    for entry in [*taken, *told]:
+        if entry.get("command") in COMMANDS:
+            found[int(entry["id"])] = SentCommand(int(entry["tick"]), str(entry["command"]), dict(entry["request"]))
+    return tuple(found[number] for number in sorted(found))

@@ -1,0 +1,158 @@
+"""What a report holds, whatever it is written as."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".html", ".pdf")
+
+Mark = Literal["good", "bad", "open", "plain"]
+"""What a row of a table says: as it must be, not so, undecided, or nothing to be judged."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a table."""
+
+    cells: tuple[str, ...]
+    mark: Mark = "plain"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading; level 1 opens a part, level 2 a section in it."""
+
+    text: str
+    level: int = 1
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """Running text."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with headings; the first column is text, further ones may be numbers."""
+
+    headings: tuple[str, ...]
+    rows: tuple[Row, ...]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with a caption.
+
+    Attributes:
+        png: Its bytes.
+        caption: Says what it shows, and how it was made.
+    """
+
+    png: bytes
+    caption: str
+
+
+Part = Heading | Paragraph | Table | Picture
+
+
+class Report:
+    """A report that grows part by part and is written once.
+
+    Attributes:
+        title: Its title.
+        lead: What it is and what comes out of it, in a sentence or two.
+        parts: What has been added, in order.
+    """
+
+    def __init__(self, title: str, lead: str = "") -> None:
+        self.title = title
+        self.lead = lead
+        self.parts: list[Part] = []
+
+    def heading(self, text: str, *, level: int = 1) -> None:
+        """Add a heading; level 1 or 2."""
+        self.parts.append(Heading(text, level))
+
+    def text(self, text: str) -> None:
+        """Add a paragraph."""
+        self.parts.append(Paragraph(text))
+
+    def table(self, headings: Sequence[str], rows: Iterable[Row | Sequence[str]], *, caption: str = "") -> None:
+        """Add a table.
+
+        Args:
+            headings: Of the columns.
+            rows: Each with as many cells as there are headings; a bare sequence is a row without a mark.
+            caption: Said above it.
+
+        Raises:
+            ValueError: A row of another length.
+        """
+        whole = tuple(row if isinstance(row, Row) else Row(tuple(row)) for row in rows)
+        for row in whole:
+            if len(row.cells) != len(headings):
+                raise ValueError(f"row must have {len(headings)} cells; instead received {row.cells}")
+        self.parts.append(Table(tuple(headings), whole, caption))
+
+    def picture(self, figure: Figure, caption: str, *, dpi: int = 110) -> None:
+        """Add a figure of matplotlib as a picture."""
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=dpi)
+        self.parts.append(Picture(buffer.getvalue(), caption))
+
+    def write(self, path: Path) -> None:
+        """Write the report to a file that is whole or not there; the same report gives the same bytes.
+
+        Raises:
+            InputError: The file is neither .html nor .pdf.
+            OSError: The disk refused; what stood in the file before stands there still.
+        """
+        check_suffix(path)
+        if path.suffix == ".html":
+            from replays.report.html import render
+        else:
+            from replays.report.pdf import render
+        part = path.with_name(path.name + ".part")
+        try:
+            part.write_bytes(render(self))
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a file that no report is written to.
+
+    Raises:
+        InputError: It is neither .html nor .pdf.
+    """
+    if path.suffix not in SUFFIXES:
+        raise InputError("report", f"a file name that ends in {' or '.join(SUFFIXES)}", str(path))
+
+
+def check_report(path: Path, *, force: bool) -> None:
+    """Refuse a file that no report can be written to, before anything is computed.
+
+    Raises:
+        InputError: Another suffix, a folder that is missing or read-only, or an existing file.
+    """
+    check_suffix(path)
+    if not path.parent.is_dir():
+        raise InputError("report", "in a folder that exists", str(path))
+    if path.is_dir() or (path.exists() and not force):
+        raise InputError("report", "a new file (--force replaces one)", f"{path}, which exists")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError("report", "in a folder that can be written", str(path))
