@@ -1,0 +1,150 @@
+"""What a recording says was done to the rig is enough to do it again, bit for bit."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording
+from recorder.session import RecordingSession
+from replays.experiment import Experiment
+from replays.export import writer_for
+from rig import wire
+from rig.errors import InputError
+from rig.offline import SentCommand, frames
+from rig.pacing import Lockstep
+from rig.scenes import load_scene
+from rig.service import Service
+from rig.simulation import Simulation
+from rig.transport.memory import MemoryClient, MemoryServer
+
+_SMALL = {"sensors.truth_rate_hz": 500, "sensors.rate_hz": 5000}
+
+
+def _record(path: Path, scene: str, changes: dict[str, Any]) -> Recording:
+    simulation = Simulation(load_scene(scene, {**_SMALL, **changes}))
+    with writer_for(path, simulation) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+    return Recording.open(path)
+
+
+def _assert_same(recording: Recording, experiment: Experiment) -> None:
+    """Every block of sensors, truth and edges comes out again, from the recording's first row to its last."""
+    simulation = experiment.simulation()
+    made: dict[str, list[wire.Block]] = {}
+    for frame in experiment.frames(simulation, chunk_s=0.05):
+        for key, block in [(wire.sensor_key(name), block) for name, block in frame.samples.items()] + [
+            (wire.truth_key(name), block) for name, block in frame.truth.items()
+        ]:
+            made.setdefault(key, []).append(block)
+    assert len(made) == 9
+    for key, blocks in made.items():
+        recorded = list(recording.blocks(key))
+        first = recorded[0].index
+        old = np.concatenate([block.values for block in recorded])
+        new = np.concatenate([block.values for block in blocks])
+        assert len(old) > 10
+        assert first + len(old) == len(new)
+        np.testing.assert_array_equal(old, new[first:], err_msg=key)
+
+
+def test_a_scene_on_a_users_parameters_whose_file_is_gone(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text('title = "Mine"\nbase = "as-printed"\n[contact]\nfriction = 0.3\n[magnet]\nstiffness = 1.9\n')
+    recording = _record(
+        tmp_path / "own.mcap", "hammer", {"parameters": str(own), "contact.restitution": 0.8, "duration_s": 0.2}
+    )
+    own.unlink()
+    experiment = Experiment.of(recording)
+    parameters = experiment.scene.load_parameters()
+    assert parameters.entries["contact.friction"].value == 0.3
+    assert parameters.entries["contact.restitution"].value == 0.8
+    assert experiment.scene.duration_s == 0.2
+    _assert_same(recording, experiment)
+
+
+def test_a_set_of_the_rigs_own_is_named_as_it_was(tmp_path: Path) -> None:
+    recording = _record(tmp_path / "a.mcap", "drop", {"parameters": "as-printed", "duration_s": 0.05})
+    scene = Experiment.of(recording).scene
+    assert (scene.parameters, scene.set) == ("as-printed", {})
+
+
+def test_changes_are_of_the_scene_or_its_parameters(tmp_path: Path) -> None:
+    experiment = Experiment.of(_record(tmp_path / "a.mcap", "hammer", {"duration_s": 0.05}))
+    changed = experiment.changed({"contact.friction": 0.2, "engine.name": "rk8", "seed": 5})
+    assert changed.scene.set == {"contact.friction": 0.2}
+    assert (changed.scene.engine.name, changed.scene.seed) == ("rk8", 5)
+    assert changed.scene.engine.tolerance > 0.0, "another engine comes with its own tolerance"
+    with pytest.raises(InputError, match=r"contact\.fricton must be a field"):
+        experiment.changed({"contact.fricton": 0.2})
+
+
+def test_commands_from_before_and_during_a_live_recording(tmp_path: Path) -> None:
+    """The recorder comes after a blow, and a change of speed and another blow come after it."""
+    simulation = Simulation(load_scene("stable-run", {**_SMALL, "duration_s": 0.6}))
+    server = MemoryServer()
+    clock = Lockstep()
+    service = Service(simulation, server, clock, block_ticks=10_000)
+    service.prepare()
+    running = threading.Thread(target=service.run)
+    running.start()
+    client = MemoryClient(server)
+
+    def ask(name: str, **request: Any) -> dict[str, Any]:
+        reply = wire.decode_document(
+            client.request(wire.command_key(name), wire.encode_document(request), timeout_s=30)
+        )
+        assert reply["accepted"], reply
+        return reply
+
+    ask("step", ticks=50_000)
+    ask("hammer", force_n=80.0, duration_ms=4.0, direction=30.0)
+    ask("step", ticks=100_000)
+    session = RecordingSession(MemoryClient(server), tmp_path / "live.mcap")
+    recording_thread = threading.Thread(target=session.run)
+    recording_thread.start()
+    _until(lambda: bool(service.status()["clients"]))
+    ask("step", ticks=100_000)
+    ask("speed", speed_hz=5.0)
+    ask("hammer", force_n=60.0, duration_ms=5.0, direction="-y")
+    ask("step", ticks=350_000)
+    running.join(timeout=60)
+    recording_thread.join(timeout=60)
+
+    recording = Recording.open(tmp_path / "live.mcap")
+    experiment = Experiment.of(recording)
+    assert [(command.tick, command.name) for command in experiment.commands] == [
+        (50_000, "hammer"),
+        (250_000, "speed"),
+        (250_000, "hammer"),
+    ]
+    assert experiment.first_s >= 0.15
+    _assert_same(recording, experiment)
+
+
+def _until(true: Callable[[], bool]) -> None:
+    for _ in range(400):
+        if true():
+            return
+        time.sleep(0.01)
+    pytest.fail("it never came")
+
+
+def test_commands_are_sent_at_their_ticks_however_long_the_chunks_are() -> None:
+    scene = load_scene("stable-run", {**_SMALL, "duration_s": 0.3})
+    commands = [SentCommand(120_000, "speed", {"speed_hz": 5.0}), SentCommand(40_000, "hammer", {"force_n": 50.0})]
+    ends = []
+    for chunk_s in (0.01, 1.0):
+        simulation = Simulation(scene)
+        made = list(frames(simulation, chunk_s=chunk_s, commands=commands))
+        events = [(event["event"], event["tick"]) for frame in made for event in frame.events]
+        assert events == [("hammer", 40_000), ("speed", 120_000)]
+        ends.append(made[-1].rows[-1].copy())
+    np.testing.assert_array_equal(ends[0], ends[1])

@@ -1,0 +1,103 @@
+"""Reports: whole, the same bytes for the same numbers, and safe against what stands in a name."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from replays.canvas import new_figure
+from replays.report import Report, Row, check_report
+from rig.errors import InputError
+
+
+def _report() -> Report:
+    report = Report("Validation of <b>a & b</b>.mcap", "One of two criteria is met.")
+    report.heading("Free run")
+    report.text("μ = 0.25")
+    report.table(
+        ("quantity", "value", "verdict"),
+        [Row(("whirl", "83.1 Hz", "agrees"), "good"), ("force", "553 N", "told")],
+        caption="At 6.2 Hz",
+    )
+    figure = new_figure((4.0, 2.0))
+    figure.subplots().plot([0.0, 1.0])
+    report.picture(figure, "A line")
+    return report
+
+
+class _Page(HTMLParser):
+    """Collects tags and the text of cells, and refuses tags that do not close in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.text: list[str] = []
+        self.outside: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.outside += [value for name, value in attrs if name in ("src", "href") and value and "data:" not in value]
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data.strip())
+
+
+def test_html_is_one_file_that_needs_nothing_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    _report().write(path)
+    page = _Page()
+    page.feed(path.read_text(encoding="utf-8"))
+    assert page.open == []
+    assert page.outside == []
+    assert "script" not in page.tags
+    assert "b" not in page.tags, "what stands in a name is text"
+    for text in ("Validation of <b>a & b</b>.mcap", "At 6.2 Hz", "83.1 Hz", "told", "A line", "μ = 0.25"):
+        assert text in page.text
+    assert page.tags.count("img") == 1
+
+
+@pytest.mark.parametrize("name", ["report.html", "report.pdf"])
+def test_the_same_report_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
+    written = []
+    for _ in range(2):
+        _report().write(tmp_path / name)
+        written.append((tmp_path / name).read_bytes())
+    assert written[0] == written[1]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_pdf_is_one(tmp_path: Path) -> None:
+    path = tmp_path / "report.pdf"
+    _report().write(path)
+    data = path.read_bytes()
+    assert data.startswith(b"%PDF-")
+    assert data.rstrip().endswith(b"%%EOF")
+    assert b"/Subtype /Image" in data
+
+
+def test_a_row_of_another_length_is_refused() -> None:
+    with pytest.raises(ValueError, match="row must have 2 cells"):
+        Report("x").table(("a", "b"), [("1", "2", "3")])
+
+
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [("r.txt", "ends in .html or .pdf"), ("none/r.html", "in a folder that exists"), ("old.pdf", "a new file")],
+)
+def test_places_that_no_report_can_go_to(tmp_path: Path, name: str, complaint: str) -> None:
+    (tmp_path / "old.pdf").write_bytes(b"")
+    with pytest.raises(InputError, match=complaint):
+        check_report(tmp_path / name, force=False)
+
+
+def test_an_existing_report_is_replaced_when_asked(tmp_path: Path) -> None:
+    (tmp_path / "old.pdf").write_bytes(b"")
+    check_report(tmp_path / "old.pdf", force=True)
