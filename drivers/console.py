@@ -92,6 +92,54 @@ class Console:
         """
         return self._command("step", timeout_s, ticks=ticks)
 
+    def step_blocks(self, blocks: int, *, timeout_s: float = 600.0) -> Accepted:
+        """Let a recording whose replay is paused go on by so many blocks; returns when they have been published.
+
+        Raises:
+            RefusedError: It is no replay that is paused, or the number is none.
+        """
+        return self._command("step", timeout_s, blocks=blocks)
+
+    def pause(self) -> Accepted:
+        """Hold the replay of a recording.
+
+        Raises:
+            RefusedError: A rig cannot be held.
+        """
+        return self._command("pause")
+
+    def resume(self) -> Accepted:
+        """Let the replay of a recording go on.
+
+        Raises:
+            RefusedError: It is no replay.
+        """
+        return self._command("resume")
+
+    def seek(self, time_s: float) -> Accepted:
+        """Let the replay of a recording go on from another position [s of its simulated time].
+
+        Raises:
+            RefusedError: It is no replay, or it has no such position.
+        """
+        return self._command("seek", time_s=time_s)
+
+    def rate(self, rate: float) -> Accepted:
+        """Set how many recorded seconds a replay plays a second.
+
+        Raises:
+            RefusedError: It is no replay with a rate, or there is no such rate.
+        """
+        return self._command("rate", rate=rate)
+
+    def note(self, text: str, *, tags: list[str] | None = None) -> Accepted:
+        """Put a note into the stream's events, and so into every recording of it.
+
+        Raises:
+            RefusedError: The rig refused, for the reason in the message.
+        """
+        return self._command("note", text=text, tags=tags or [])
+
     def status(self) -> dict[str, Any]:
         """The rig's status document, as published twice a second."""
         return wire.decode_document(self._client.request(wire.STATUS, timeout_s=self._timeout_s))

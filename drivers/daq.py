@@ -172,13 +172,14 @@ class Daq:
         columns = {name: [list(available[name]).index(channel) for channel in wanted[name]] for name in wanted}
         order = [self.channels.index(channel) for chosen in wanted.values() for channel in chosen]
         self._running = set(wanted)
+        self._begun = False
         self._early: list[tuple[str, Samples]] | None = []
         # What arrives before the rate is known waits.
         self.rate_hz = source.start(list(wanted), rate_hz, self._on_samples, self._on_end)
-        room = max(1, round(buffer_s * self.rate_hz))
+        self._room = max(1, round(buffer_s * self.rate_hz))
         with self._changed:
-            self._aligner = Aligner(columns, order, room)
-            self._pile = Pile(room)
+            self._aligner = Aligner(columns, order, self._room)
+            self._pile = Pile(self._room)
             early, self._early = self._early or [], None
             for name, samples in early:
                 self._feed(name, samples)
@@ -340,6 +341,9 @@ class Daq:
         ready = self._pile.take(rows, ended=self._ended is not None)
         if ready is None and self._ended is not None:
             raise StreamEndedError(self._ended)
+        if ready is not None:
+            lost = sum(self._aligner.lost.values())
+            self._source.taken(ready.index + len(ready), room=self._room, lost=lost)
         return ready
 
     def _on_samples(self, stream: str, samples: Samples) -> None:
@@ -352,6 +356,10 @@ class Daq:
     def _feed(self, stream: str, samples: Samples) -> None:
         if self._ended is not None:
             return
+        if not self._begun:
+            # What is to come will be measured from here.
+            self._begun = True
+            self._source.taken(samples.index, room=self._room, lost=0)
         made = self._aligner.feed(stream, samples)
         for joint in made:
             self._pile.add(joint)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQII")
+_PIECE = 4096
 _DOCUMENTS = ("catalogue", "parameters", "scene")
 _OURS = "a recording made by `rig record`"
 
@@ -98,6 +101,8 @@ class _Chunk:
     length: int
     channels: frozenset[int] | None
     """Channels with messages in it, where the file says so."""
+    cut: bool = False
+    """The file ends in it."""
 
 
 class Recording:
@@ -106,7 +111,8 @@ class Recording:
     Attributes:
         path: The file.
         complete: The file was finished; False for a .part file or one that was cut off, of which everything up to the
-            last whole chunk is read.
+            last whole message is read.
+        damaged: Chunks of a file that was not finished that could not be read, and are passed over.
         catalogue: The rig's catalogue document.
         table: The channel table in it.
         parameters: The rig's parameter document.
@@ -115,10 +121,16 @@ class Recording:
         messages: Number of messages by topic.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Scan the records of a file; `Recording.open` reads the same."""
+    def __init__(self, path: Path, *, salvage: bool = False) -> None:
+        """Scan the records of a file; `Recording.open` reads the same.
+
+        Args:
+            path: The file.
+            salvage: Take what can be read of a finished file, too, where it is damaged.
+        """
         self.path = path
         self.complete = False
+        self.damaged = 0
         self.metadata: dict[str, dict[str, str]] = {}
         self.messages: dict[str, int] = {}
         self._attachments: dict[str, bytes] = {}
@@ -126,7 +138,7 @@ class Recording:
         self._channels: dict[int, Channel] = {}
         try:
             with path.open("rb") as file, self._intact():
-                self._scan(file)
+                self._scan(file, salvage=salvage)
         except OSError as error:
             raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
         about = self.metadata.get("rig", {})
@@ -156,6 +168,16 @@ class Recording:
             InputError: The file cannot be read, or is no recording.
         """
         return cls(Path(path))
+
+    @property
+    def attachments(self) -> dict[str, bytes]:
+        """All attachments by name; catalogue, parameters and scene are among them."""
+        return dict(self._attachments)
+
+    @property
+    def parts(self) -> tuple[Recording, ...]:
+        """The files that it is read from."""
+        return (self,)
 
     @property
     def end_reason(self) -> str:
@@ -270,6 +292,17 @@ class Recording:
             if block is not None:
                 yield block
 
+    def blocks_of(self, keys: set[str]) -> Iterator[tuple[str, Block]]:
+        """Keys and blocks of several streams in one pass, in file order; without payloads that are none."""
+        for key, _, payload in self._messages(keys):
+            block = self._block(key, payload)
+            if block is not None:
+                yield key, block
+
+    def everything(self) -> Iterator[tuple[str, int, int, bytes]]:
+        """Every message in file order: topic, simulated time [ns], wall time of arrival [unix ns] and payload."""
+        yield from self._stamped(set(self.messages))
+
     def payloads(self, key: str) -> Iterator[tuple[int, bytes]]:
         """The payloads of one key, byte for byte as they came: pairs of simulated time [ns] and bytes."""
         for _, log_time, payload in self._messages({key}):
@@ -334,7 +367,7 @@ class Recording:
                 continue
         return found
 
-    @contextmanager
+    @contextlib.contextmanager
     def _intact(self) -> Iterator[None]:
         """Whatever a damaged file makes the parsers raise becomes one clear error."""
         import zstandard
@@ -347,7 +380,7 @@ class Recording:
         except (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError) as error:
             raise InputError("file", "an intact recording", f"{self.path} ({error})") from None
 
-    def _scan(self, file: BinaryIO) -> None:
+    def _scan(self, file: BinaryIO, *, salvage: bool) -> None:
         """Walk over the top-level records: where the chunks are, and everything that is not in a chunk.
 
         A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through.
@@ -368,6 +401,10 @@ class Recording:
             file.seek(position)
             opcode, length = _RECORD.unpack(file.read(_RECORD.size))
             end = position + _RECORD.size + length
+            if end > size and opcode == Opcode.CHUNK:
+                self._chunks.append(
+                    _Chunk(offset=position, length=size - position - _RECORD.size, channels=None, cut=True)
+                )
             if end > size or opcode == 0:  # cut off, or zeros where a power cut left unwritten pages
                 break
             if opcode == Opcode.CHUNK:
@@ -399,7 +436,7 @@ class Recording:
             position = end
         if footer:
             file.seek(position)
-            self.complete = file.read(len(_MAGIC)) == _MAGIC
+            self.complete = file.read(len(_MAGIC)) == _MAGIC and not salvage
         if self.complete:
             self._chunks = [
                 _Chunk(offset=chunk.offset, length=chunk.length, channels=frozenset(indexed.get(chunk.offset, ())))
@@ -410,7 +447,7 @@ class Recording:
         self.messages = {self._channels[number].topic: count for number, count in sorted(counts.items())}
 
     def _scan_chunks(self, file: BinaryIO) -> dict[int, int]:
-        """Find channels and counts of a cut file in its chunks; a chunk that does not unpack ends it."""
+        """Find channels and counts of a cut file in its chunks; a chunk that does not unpack is passed over."""
         import zstandard
         from mcap.data_stream import ReadDataStream
         from mcap.exceptions import McapError
@@ -423,7 +460,8 @@ class Recording:
             try:
                 data = _unpack(file, chunk)
             except (McapError, struct.error, zstandard.ZstdError, ValueError):
-                break
+                self.damaged += 1
+                continue
             good.append(chunk)
             for opcode, start, end in _records(data):
                 if opcode == Opcode.MESSAGE:
@@ -433,10 +471,15 @@ class Recording:
                     channel = Channel.read(ReadDataStream(BytesIO(data[start:end])))
                     self._channels[channel.id] = channel
         self._chunks = good
-        return counts
+        return {number: count for number, count in counts.items() if number in self._channels}
 
     def _messages(self, topics: set[str]) -> Iterator[tuple[str, int, bytes]]:
         """Topic, log time and payload of every message on some topics, in file order."""
+        for topic, log_time, _, payload in self._stamped(topics):
+            yield topic, log_time, payload
+
+    def _stamped(self, topics: set[str]) -> Iterator[tuple[str, int, int, bytes]]:
+        """Topic, log time, publish time and payload of every message on some topics, in file order."""
         from mcap.opcode import Opcode
 
         wanted = {number: channel.topic for number, channel in self._channels.items() if channel.topic in topics}
@@ -449,19 +492,20 @@ class Recording:
                 data = _unpack(file, chunk)
                 for opcode, start, end in _records(data):
                     if opcode == Opcode.MESSAGE:
-                        number, _, log_time, _ = _MESSAGE.unpack_from(data, start)
+                        number, _, log_time, publish_time = _MESSAGE.unpack_from(data, start)
                         if number in wanted:
-                            yield wanted[number], log_time, data[start + _MESSAGE.size : end]
+                            yield wanted[number], log_time, publish_time, data[start + _MESSAGE.size : end]
 
 
 def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of the body of each record of a chunk."""
+    """Opcode, start and end of the body of each whole record of a chunk."""
     position = 0
-    while position < len(data):
+    while position + _RECORD.size <= len(data):
         opcode, length = _RECORD.unpack_from(data, position)
         start = position + _RECORD.size
         position = start + length
-        yield opcode, start, position
+        if position <= len(data):
+            yield opcode, start, position
 
 
 def _unpack(file: BinaryIO, chunk: _Chunk) -> bytes:
@@ -471,6 +515,107 @@ def _unpack(file: BinaryIO, chunk: _Chunk) -> bytes:
     from mcap.stream_reader import get_chunk_data_stream
 
     file.seek(chunk.offset + _RECORD.size)
+    if chunk.cut:
+        return _unpack_cut(file.read(chunk.length))
     record = Chunk.read(ReadDataStream(BytesIO(file.read(chunk.length))))
     stream, length = get_chunk_data_stream(record, validate_crc=True)
     return stream.read(length)
+
+
+def _unpack_cut(data: bytes) -> bytes:
+    """What can be unpacked of a chunk that the file ends in; the last record in it may be cut."""
+    import zstandard
+
+    if len(data) < _CHUNK.size:
+        return b""
+    *_, name_length = _CHUNK.unpack_from(data)
+    start = _CHUNK.size + name_length + 8
+    compression, packed = data[_CHUNK.size : _CHUNK.size + name_length], data[start:]
+    if compression == b"":
+        return packed
+    if compression != b"zstd":
+        return b""
+    unpacker = zstandard.ZstdDecompressor().decompressobj()
+    found = []
+    # In small pieces: where it ends in zeros or in nothing, the blocks before that are good.
+    with contextlib.suppress(zstandard.ZstdError):
+        for at in range(0, len(packed), _PIECE):
+            found.append(unpacker.decompress(packed[at : at + _PIECE]))
+    return b"".join(found)
+
+
+class Joined(Recording):
+    """Several files of one run, such as the parts of a rotation, read as one recording; see `join`."""
+
+    def __init__(self, parts: tuple[Recording, ...]) -> None:
+        """Join recordings in the given order."""
+        first, last = parts[0], parts[-1]
+        self._parts = parts
+        self.path = first.path
+        self.complete = all(part.complete for part in parts)
+        self.damaged = sum(part.damaged for part in parts)
+        self.metadata = {**last.metadata, **first.metadata, "end": last.metadata.get("end", {})}
+        self.messages = {}
+        for part in parts:
+            for topic, count in part.messages.items():
+                self.messages[topic] = self.messages.get(topic, 0) + count
+        self._attachments = first.attachments
+        self.catalogue, self.table = first.catalogue, first.table
+        self.parameters, self.scene = first.parameters, first.scene
+
+    @property
+    def parts(self) -> tuple[Recording, ...]:
+        """The files that it is read from."""
+        return self._parts
+
+    @property
+    def end_reason(self) -> str:
+        """Why the recording ended."""
+        return self._parts[-1].end_reason
+
+    def _stamped(self, topics: set[str]) -> Iterator[tuple[str, int, int, bytes]]:
+        for part in self._parts:
+            yield from part._stamped(topics)
+
+
+def join(paths: list[Path]) -> Recording:
+    """Open one file, or several of one run as one recording, whatever their order.
+
+    Args:
+        paths: The files.
+
+    Raises:
+        InputError: A file cannot be read, or they are not of one run or not behind each other.
+    """
+    parts = [Recording.open(path) for path in paths]
+    if len(parts) == 1:
+        return parts[0]
+    series = {part.metadata.get("series", {}).get("id") for part in parts}
+    if len(series) == 1 and None not in series:
+        parts.sort(key=lambda part: int(part.metadata["series"]["number"]))
+        numbers = [part.metadata["series"]["number"] for part in parts]
+        if len(set(numbers)) < len(numbers):
+            raise InputError("files", "different parts of a recording", ", ".join(str(part.path) for part in parts))
+        return Joined(tuple(parts))
+    for part in parts[1:]:
+        if _run_of(part) != _run_of(parts[0]):
+            raise InputError("files", "recordings of one run", f"{parts[0].path} and {part.path}")
+    parts.sort(key=lambda part: _extent_s(part)[0])
+    for earlier, later in pairwise(parts):
+        if _extent_s(later)[0] < _extent_s(earlier)[1]:
+            raise InputError("files", "recordings behind each other", f"{earlier.path} and {later.path}, which overlap")
+    return Joined(tuple(parts))
+
+
+def _run_of(recording: Recording) -> tuple[Any, ...]:
+    scene = {name: value for name, value in recording.scene.items() if name != "taken"}
+    return scene, recording.parameters, recording.catalogue
+
+
+def _extent_s(recording: Recording) -> tuple[float, float]:
+    """Simulated times of the first and the last row [s]."""
+    streams = [stream for key, stream in recording.streams.items() if stream.rows and key != EDGES]
+    return (
+        min((stream.first_time_s for stream in streams), default=0.0),
+        max((stream.last_time_s for stream in streams), default=0.0),
+    )

@@ -126,7 +126,7 @@ class JointStateRows:
         )
         self._template = np.frombuffer(template, np.uint8)
 
-    def encode(self, times_ns: np.ndarray, values: dict[str, np.ndarray]) -> list[bytes]:
+    def encode(self, times_ns: np.ndarray, values: dict[str, np.ndarray]) -> np.ndarray:
         """Encode rows.
 
         Args:
@@ -134,17 +134,16 @@ class JointStateRows:
             values: For each filled slot its values, shape (n, names); nan where a column has none.
 
         Returns:
-            One CDR message a row.
+            One CDR message a row, uint8, shape (n, bytes).
         """
-        size = self._dtype.itemsize
-        raw = np.tile(self._template, len(times_ns))
-        rows = raw.view(self._dtype)
+        raw = np.empty((len(times_ns), len(self._template)), np.uint8)
+        raw[:] = self._template
+        rows = raw.reshape(-1).view(self._dtype)
         rows["sec"] = times_ns // 1_000_000_000
         rows["nanosec"] = times_ns % 1_000_000_000
         for slot in self._slots:
             rows[slot] = values[slot]
-        data = raw.tobytes()
-        return [data[start : start + size] for start in range(0, len(data), size)]
+        return raw
 
 
 def encode_log(time_ns: int, level: int, name: str, text: str) -> bytes:
@@ -161,6 +160,9 @@ def event_text(event: dict[str, Any]) -> tuple[int, str]:
     """Log level and one readable line of an event."""
     kind = str(event.get("event", "event"))
     reason = str(event.get("reason", ""))
+    if kind == "note":
+        tags = "".join(f" #{tag}" for tag in event.get("tags") or ())
+        return LOG_INFO, f"note: {event.get('text', '')}{tags}"
     if kind == "warning":
         return LOG_WARN, str(event.get("text", "warning"))
     level = LOG_ERROR if kind == "end" and reason.startswith("failed") else LOG_INFO

@@ -9,8 +9,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
-from recorder.writer import NS, RecordingError, RecordingWriter, check_destination, check_view_rate
+from recorder.series import Limits, Series, check_room, check_series
+from recorder.trigger import Capture, Captures, check_captures
+from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_view_rate
+from rig.channels import ChannelTable
 from rig.errors import InputError
 from rig.transport import Client
 from rig.wire import (
@@ -52,6 +56,9 @@ class Progress:
         lost: Rows of all block streams that never arrived.
         size_bytes: Size of the file.
         waiting: Payloads in the inbox.
+        backlog_bytes: Bytes in the inbox.
+        dropped: Payloads that found the inbox full.
+        files: Finished files.
     """
 
     time_s: float
@@ -59,6 +66,9 @@ class Progress:
     lost: int
     size_bytes: int
     waiting: int
+    backlog_bytes: int = 0
+    dropped: int = 0
+    files: int = 0
 
 
 @dataclass(frozen=True)
@@ -66,9 +76,9 @@ class Summary:
     """Outcome of a session.
 
     Attributes:
-        path: The file; the .part file if it could not be finished.
+        path: The last file; the .part file if it could not be finished.
         reason: Why the session ended.
-        error: What went wrong at the disk; empty if nothing did.
+        error: What went wrong at the disk, or that there was no more room; empty if nothing did.
         first_time_s: Simulated time of the first row [s].
         duration_s: Simulated time from the first to the last row [s].
         rows: Rows received by key.
@@ -77,7 +87,10 @@ class Summary:
         missed: Messages that the transport gave up, by key.
         dropped: Payloads that found the inbox full; they are among the lost.
         malformed: Payloads that were not what their key promises; they are in the file as they came.
-        size_bytes: Size of the file.
+        size_bytes: Size of the files.
+        files: All files that are there, in order; among them a .part file that could not be finished.
+        removed: Files that were removed for want of room.
+        high_water_bytes: Most that ever waited in the inbox.
     """
 
     path: Path
@@ -92,6 +105,62 @@ class Summary:
     dropped: int
     malformed: int
     size_bytes: int
+    files: tuple[Path, ...] = ()
+    removed: int = 0
+    high_water_bytes: int = 0
+
+
+class Sink(Protocol):
+    """Where payloads go: a `Series`, or `Captures`."""
+
+    path: Path
+    files: list[Path]
+    removed: int
+    ended: str
+    out_of_room: bool
+
+    @property
+    def part(self) -> Path:
+        """Name of the file that is being written."""
+        ...
+
+    @property
+    def table(self) -> ChannelTable:
+        """The channel table."""
+        ...
+
+    @property
+    def next_index(self) -> dict[str, int]:
+        """Number of the row that is due next, by key."""
+        ...
+
+    def counts(self) -> Counts:
+        """What was received so far."""
+        ...
+
+    def write(self, key: str, payload: bytes, wall_ns: int) -> dict[str, Any] | None:
+        """Take one payload."""
+        ...
+
+    def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
+        """Record that the transport lost messages for good."""
+        ...
+
+    def short_of(self, rows: dict[str, int]) -> dict[str, int]:
+        """Streams that have not come to the end of what was published."""
+        ...
+
+    def note_short(self, rows: dict[str, int], wall_ns: int) -> None:
+        """Record what is missing at the end of streams."""
+        ...
+
+    def sync_if_due(self) -> None:
+        """Flush to the disk if the last flush was long enough ago."""
+        ...
+
+    def finish(self, reason: str, *, notes: dict[str, str] | None = None) -> None:
+        """Close the last file."""
+        ...
 
 
 class _Inbox:
@@ -107,6 +176,7 @@ class _Inbox:
         self._closed = False
         self._ready = threading.Condition()
         self.dropped = 0
+        self.high_water_bytes = 0
 
     def __len__(self) -> int:
         return len(self._items)
@@ -120,7 +190,12 @@ class _Inbox:
                 return
             self._items.append((key, payload, wall_ns))
             self._bytes += len(payload)
+            self.high_water_bytes = max(self.high_water_bytes, self._bytes)
             self._ready.notify()
+
+    @property
+    def waiting_bytes(self) -> int:
+        return self._bytes
 
     def take(self, timeout_s: float) -> list[tuple[str, bytes, int]] | None:
         """Everything that waits, oldest first; None when it is closed and empty."""
@@ -155,6 +230,8 @@ class RecordingSession:
         view_rate_hz: float = 500.0,
         history: bool = False,
         force: bool = False,
+        limits: Limits | None = None,
+        capture: Capture | None = None,
         inbox_bytes: int = INBOX_BYTES,
         wall_ns: Callable[[], int] = time.time_ns,
         monotonic_s: Callable[[], float] = time.monotonic,
@@ -170,6 +247,8 @@ class RecordingSession:
             history: Also record what the rig's cache still holds from before; rows since the start of the run that it
                 no longer holds count as lost.
             force: Replace an existing file.
+            limits: Size of the files, and what they may take of the disk.
+            capture: Record only around triggers.
             inbox_bytes: Capacity of the inbox between transport and disk.
             wall_ns: Wall clock [unix ns].
             monotonic_s: Clock of waits and deadlines [s].
@@ -180,7 +259,15 @@ class RecordingSession:
         if duration_s is not None and not duration_s > 0.0:
             raise InputError("duration_s", "above 0", duration_s)
         check_view_rate(view_rate_hz)
-        check_destination(path, force=force)
+        self._limits = limits or Limits()
+        self._capture = capture
+        if capture is None:
+            check_series(path, self._limits, force=force)
+        else:
+            if self._limits.rotates or self._limits.budget_mb is not None:
+                raise InputError("limits", "without rotation and budget for triggered recording", self._limits)
+            check_captures(path, capture, force=force)
+            check_room(path, self._limits)
         self.path = path
         self._client = client
         self._name = name
@@ -222,17 +309,7 @@ class RecordingSession:
         catalogue, parameters, scene = (
             decode_document(self._client.request(key)) for key in (CATALOGUE, PARAMETERS, SCENE)
         )
-        writer = RecordingWriter(
-            self.path,
-            catalogue=catalogue,
-            parameters=parameters,
-            scene=scene,
-            view_rate_hz=self._view_rate_hz,
-            from_start=self._history,
-            force=self._force,
-            wall_ns=self._wall_ns,
-            monotonic_s=self._monotonic_s,
-        )
+        writer = self._open_sink(catalogue, parameters, scene)
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
         thread.start()
         reason = "failed"
@@ -252,6 +329,40 @@ class RecordingSession:
             self._report(writer, done=True)  # lets the rig drop its cache at once
         return self._summary(writer, reason, trouble)
 
+    def _open_sink(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> Sink:
+        def open_writer(path: Path, *, from_start: bool, **options: Any) -> RecordingWriter:
+            return RecordingWriter(
+                path,
+                catalogue=catalogue,
+                parameters=parameters,
+                view_rate_hz=self._view_rate_hz,
+                from_start=from_start and self._history,
+                force=self._force,
+                wall_ns=self._wall_ns,
+                monotonic_s=self._monotonic_s,
+                **options,
+            )
+
+        if self._capture is None:
+            return Series(
+                self.path,
+                scene=scene,
+                limits=self._limits,
+                open_writer=open_writer,
+                force=self._force,
+                monotonic_s=self._monotonic_s,
+            )
+        return Captures(
+            self.path,
+            self._capture,
+            table=ChannelTable.model_validate(catalogue["table"]),
+            tick_rate_hz=round(catalogue["tick_rate_hz"]),
+            scene=scene,
+            open_writer=open_writer,
+            keep_free_mb=self._limits.keep_free_mb,
+            force=self._force,
+        )
+
     # On the transport's threads.
 
     def _on_message(self, key: str, payload: bytes) -> None:
@@ -269,13 +380,17 @@ class RecordingSession:
 
     # On the writer thread.
 
-    def _write_all(self, writer: RecordingWriter) -> None:
+    def _write_all(self, writer: Sink) -> None:
         try:
             while (items := self._inbox.take(0.1)) is not None:
                 for key, payload, wall_ns in items:
                     document = writer.write(key, payload, wall_ns)
                     if document is not None:
                         self._follow(key, document)
+                    if writer.ended:
+                        self._inbox.close()
+                        self._wake.set()
+                        return
                 while self._misses:
                     writer.write_missed(*self._misses.popleft())
                 writer.sync_if_due()
@@ -296,7 +411,7 @@ class RecordingSession:
 
     # On the calling thread.
 
-    def _wait_for_end(self, writer: RecordingWriter, on_progress: Callable[[Progress], None] | None) -> str:
+    def _wait_for_end(self, writer: Sink, on_progress: Callable[[Progress], None] | None) -> str:
         """Watch, report and return why the session ends."""
         heartbeat_s = -1e9
         ended_s = None
@@ -306,8 +421,10 @@ class RecordingSession:
                 return "disk error" if isinstance(self._failure, RecordingError) else f"failed: {self._failure}"
             if self._stop_reason:
                 return self._stop_reason
-            first_ns = writer.first_time_ns
-            if first_ns is not None and writer.last_time_ns - first_ns >= self._duration_ns:
+            if writer.ended:
+                return writer.ended
+            counts = writer.counts()
+            if counts.first_time_ns is not None and counts.last_time_ns - counts.first_time_ns >= self._duration_ns:
                 return "duration reached"
             if ended_s is None and (self._end_reason or self._rig_lost):
                 ended_s = now_s
@@ -321,7 +438,7 @@ class RecordingSession:
             self._wake.wait(0.2 if ended_s is None else 0.05)
             self._wake.clear()
 
-    def _nothing_left(self, writer: RecordingWriter, now_s: float, ended_s: float) -> bool:
+    def _nothing_left(self, writer: Sink, now_s: float, ended_s: float) -> bool:
         """After the end: whatever may still come has had its time."""
         if now_s - ended_s > PATIENCE_S:
             return True
@@ -330,30 +447,32 @@ class RecordingSession:
         quiet_s = now_s - max(ended_s, self._heard_s)
         return quiet_s > (QUIET_S if whole or self._rig_lost else RECOVERY_S)
 
-    def _report(self, writer: RecordingWriter, *, done: bool = False) -> None:
+    def _report(self, writer: Sink, *, done: bool = False) -> None:
         groups = list(writer.table.groups)
         first = sensor_key("probes" if "probes" in groups or not groups else groups[0])
         beat = {
             "name": self._name,
             "received_index": writer.next_index.get(first, 0),
-            "lost": sum(dict(writer.continuity.lost).values()),
+            "lost": sum(writer.counts().lost.values()),
             "wall_s": self._wall_ns() / NS,
             "done": done,
         }
         self._client.report(f"{CLIENTS}/{self._name}", encode_document(beat))
 
-    def _progress(self, writer: RecordingWriter) -> Progress:
-        received = dict(writer.continuity.received)
-        first_ns = writer.first_time_ns
+    def _progress(self, writer: Sink) -> Progress:
+        counts = writer.counts()
         return Progress(
-            time_s=0.0 if first_ns is None else (writer.last_time_ns - first_ns) / NS,
-            rows=sum(rows for key, rows in received.items() if key.startswith(SENSORS + "/")),
-            lost=sum(dict(writer.continuity.lost).values()),
-            size_bytes=writer.size_bytes,
+            time_s=0.0 if counts.first_time_ns is None else (counts.last_time_ns - counts.first_time_ns) / NS,
+            rows=sum(rows for key, rows in counts.rows.items() if key.startswith(SENSORS + "/")),
+            lost=sum(counts.lost.values()),
+            size_bytes=counts.size_bytes,
             waiting=len(self._inbox),
+            backlog_bytes=self._inbox.waiting_bytes,
+            dropped=self._inbox.dropped,
+            files=len(writer.files),
         )
 
-    def _finish(self, writer: RecordingWriter, reason: str) -> str:
+    def _finish(self, writer: Sink, reason: str) -> str:
         """Close the file; return what the disk had against it."""
         if isinstance(self._failure, RecordingError):
             return str(self._failure)
@@ -362,25 +481,35 @@ class RecordingSession:
                 writer.write_missed(*self._misses.popleft())
             if reason == self._end_reason and self._end_rows:
                 writer.note_short(self._end_rows, self._wall_ns())
-            writer.finish(reason, notes={"dropped_payloads": str(self._inbox.dropped)})
+            notes = {
+                "dropped_payloads": str(self._inbox.dropped),
+                "backlog_high_water_bytes": str(self._inbox.high_water_bytes),
+            }
+            writer.finish(reason, notes=notes)
         except RecordingError as error:
             return str(error)
         return ""
 
-    def _summary(self, writer: RecordingWriter, reason: str, trouble: str) -> Summary:
-        path = writer.part if trouble else writer.path
-        first_ns = writer.first_time_ns or 0
+    def _summary(self, writer: Sink, reason: str, trouble: str) -> Summary:
+        files = tuple(writer.files)
+        if trouble and writer.part.exists():
+            files = (*files, writer.part)
+        counts = writer.counts()
+        first_ns = counts.first_time_ns or 0
         return Summary(
-            path=path,
+            path=files[-1] if files else writer.path,
             reason=reason,
-            error=trouble,
+            error=trouble or (writer.ended if writer.out_of_room else ""),
             first_time_s=first_ns / NS,
-            duration_s=(writer.last_time_ns - first_ns) / NS if writer.first_time_ns is not None else 0.0,
-            rows=dict(writer.continuity.received),
-            lost={key: lost for key, lost in writer.continuity.lost.items() if lost},
-            gaps=len(writer.gaps),
-            missed=dict(writer.missed),
+            duration_s=(counts.last_time_ns - first_ns) / NS if counts.first_time_ns is not None else 0.0,
+            rows=counts.rows,
+            lost={key: lost for key, lost in counts.lost.items() if lost},
+            gaps=counts.gaps,
+            missed=counts.missed,
             dropped=self._inbox.dropped,
-            malformed=writer.malformed,
-            size_bytes=path.stat().st_size,
+            malformed=counts.malformed,
+            size_bytes=sum(file.stat().st_size for file in files if file.exists()),
+            files=files,
+            removed=writer.removed,
+            high_water_bytes=self._inbox.high_water_bytes,
         )

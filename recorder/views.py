@@ -9,6 +9,7 @@ only sort the channels into plots; the unit stands in each name, and a column is
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import groupby
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from rig.wire import Block
 
 _LENGTHS = frozenset({"m", "mm", "um", "\u00b5m", "mil"})
 _FORCES = frozenset({"N", "kN"})
+_BATCH = 16
+"""Instants of blocks whose messages are made in one go: many small ones cost more."""
 _PATIENCE = 4000
 """Blocks of one group that wait for the same instants of another before they are written without: more than a rig's
 cache holds, for history comes key by key. A block keeps few rows here."""
@@ -28,6 +31,25 @@ def slot_of(channel: Channel) -> str:
     if channel.unit in _LENGTHS:
         return "position"
     return "effort" if channel.unit in _FORCES else "velocity"
+
+
+@dataclass(frozen=True)
+class Messages:
+    """Messages of one topic, oldest first.
+
+    Attributes:
+        times_ns: Simulated time of each [ns], int64, shape (n,).
+        data: Their CDR bytes, uint8, shape (n, bytes).
+    """
+
+    times_ns: np.ndarray
+    data: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.times_ns)
+
+
+_NONE = Messages(np.empty(0, np.int64), np.empty((0, 0), np.uint8))
 
 
 @dataclass
@@ -43,7 +65,9 @@ class View:
     groups: list[str] = field(default_factory=list)
     channels: list[Channel] = field(default_factory=list)
     slots: list[str] = field(default_factory=list)
-    _first: dict[str, int] = field(default_factory=dict)
+    _places: dict[str, list[tuple[str, slice, slice]]] = field(default_factory=dict)
+    """Of each group, array by array: columns of the message, and columns of the group that go there."""
+    _settled: list[dict[str, tuple[np.ndarray, np.ndarray]]] = field(default_factory=list)
     _waiting: dict[int, dict[str, tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
     _rows: JointStateRows | None = None
 
@@ -64,12 +88,19 @@ class View:
 
     def join(self, group: Group) -> None:
         """Add a group's channels behind the others."""
-        self._first[group.name] = len(self.channels)
+        first, slots = len(self.channels), [slot_of(channel) for channel in group.channels]
+        # Neighbours that share an array go there together.
+        self._places[group.name] = []
+        start = 0
+        for slot, neighbours in groupby(slots):
+            end = start + len(list(neighbours))
+            self._places[group.name].append((slot, slice(first + start, first + end), slice(start, end)))
+            start = end
         self.groups.append(group.name)
         self.channels += group.channels
-        self.slots += [slot_of(channel) for channel in group.channels]
+        self.slots += slots
 
-    def add(self, group: Group, tick: int, times_ns: np.ndarray, values: np.ndarray) -> list[tuple[int, bytes]]:
+    def add(self, group: Group, tick: int, times_ns: np.ndarray, values: np.ndarray) -> Messages:
         """Take rows of one group; give the messages that are complete with them.
 
         Args:
@@ -78,41 +109,49 @@ class View:
             times_ns: Simulated time of each row [ns], shape (n,).
             values: Engineering values, shape (n, channels of the group).
 
-        Returns:
-            Simulated time [ns] and CDR message, oldest first.
         """
         self._waiting.setdefault(tick, {})[group.name] = (times_ns, values)
         if len(self._waiting[tick]) == len(self.groups):
             # Each group's blocks come in order: what is older and still waits for another group waits in vain.
-            due = [earlier for earlier in self._waiting if earlier <= tick]
+            self._settle([earlier for earlier in self._waiting if earlier <= tick])
         elif len(self._waiting) > _PATIENCE:
-            due = [next(iter(self._waiting))]
-        else:
-            due = []
-        return self._encode(due)
+            self._settle([next(iter(self._waiting))])
+        return self.settled() if len(self._settled) >= _BATCH else _NONE
 
-    def rest(self) -> list[tuple[int, bytes]]:
+    def settled(self) -> Messages:
+        """Give the messages that are complete, however few."""
+        parts, self._settled = self._settled, []
+        return self._encode(parts)
+
+    def rest(self) -> Messages:
         """Give what still waits."""
-        return self._encode(list(self._waiting))
+        self._settle(list(self._waiting))
+        return self.settled()
 
-    def _encode(self, ticks: list[int]) -> list[tuple[int, bytes]]:
-        if not ticks:
-            return []
+    def _settle(self, ticks: list[int]) -> None:
+        self._settled += [self._waiting.pop(tick) for tick in sorted(ticks)]
+
+    def _encode(self, parts: list[dict[str, tuple[np.ndarray, np.ndarray]]]) -> Messages:
+        """Join what came of each group, instant by instant."""
+        if not parts:
+            return _NONE
         used = tuple(dict.fromkeys(self.slots))
         if self._rows is None:
             self._rows = JointStateRows(self.names, used)
-        messages: list[tuple[int, bytes]] = []
-        for tick in sorted(ticks):
-            parts = self._waiting.pop(tick)
-            instants = np.unique(np.concatenate([times_ns for times_ns, _ in parts.values()]))
-            filled = {slot: np.full((len(instants), len(self.channels)), np.nan) for slot in used}
-            for name, (times_ns, values) in parts.items():
-                rows = np.searchsorted(instants, times_ns)
-                for column in range(values.shape[1]):
-                    place = self._first[name] + column
-                    filled[self.slots[place]][rows, place] = values[:, column]
-            messages += zip(instants.tolist(), self._rows.encode(instants, filled), strict=True)
-        return messages
+        joined = {}
+        for name in self.groups:
+            found = [part[name] for part in parts if name in part]
+            if found:
+                joined[name] = tuple(np.concatenate(columns) for columns in zip(*found, strict=True))
+        instants = next(iter(joined.values()))[0]
+        if any(not np.array_equal(times_ns, instants) for times_ns, _ in joined.values()):
+            instants = np.unique(np.concatenate([times_ns for times_ns, _ in joined.values()]))
+        filled = {slot: np.full((len(instants), len(self.channels)), np.nan) for slot in used}
+        for name, (times_ns, values) in joined.items():
+            rows = slice(None) if len(times_ns) == len(instants) else np.searchsorted(instants, times_ns)
+            for slot, place, columns in self._places[name]:
+                filled[slot][rows, place] = values[:, columns]
+        return Messages(instants, self._rows.encode(instants, filled))
 
 
 class Views:
@@ -128,6 +167,7 @@ class Views:
         self.rate_hz = rate_hz
         self.all: list[View] = []
         self._of: dict[str, View] = {}
+        self._calibration: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         for group in table.groups.values() if rate_hz else ():
             view = next((view for view in self.all if view.takes(group)), None)
             if view is None:
@@ -135,8 +175,11 @@ class Views:
                 self.all.append(view)
             view.join(group)
             self._of[group.name] = view
+            scale = np.array([channel.scale for channel in group.channels])
+            offset = np.array([channel.offset for channel in group.channels])
+            self._calibration[group.name] = scale, offset
 
-    def add(self, group: Group, block: Block, time_ns: int) -> tuple[View, list[tuple[int, bytes]]] | None:
+    def add(self, group: Group, block: Block, time_ns: int) -> tuple[View, Messages] | None:
         """Take a block; give its view and the messages that are complete with it.
 
         Rows are picked by their number, unfiltered, so the messages do not depend on the size of the blocks.
@@ -154,4 +197,5 @@ class Views:
         if not len(picked):
             return None
         times_ns = time_ns + np.rint(picked * (1e9 / block.rate_hz)).astype(np.int64)
-        return view, view.add(group, block.tick, times_ns, group.engineering(block.values[picked]))
+        scale, offset = self._calibration[group.name]
+        return view, view.add(group, block.tick, times_ns, block.values[picked] * scale + offset)

@@ -8,13 +8,14 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 from recorder import schemas
-from recorder.views import View, Views
+from recorder.container import Container
+from recorder.views import Messages, View, Views
 from rig.channels import ChannelTable, Group
 from rig.errors import InputError
 from rig.wire import (
@@ -39,6 +40,48 @@ NS = 1_000_000_000
 
 class RecordingError(RuntimeError):
     """The disk ended the recording; everything written before is kept."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What was written, to one file or to several in turn.
+
+    Attributes:
+        first_time_ns: Simulated time of the first row [ns]; None before it.
+        last_time_ns: Simulated time of the last row [ns].
+        rows: Rows received by key.
+        lost: Rows lost by key.
+        gaps: Number of gaps that they are in.
+        missed: Messages that the transport gave up, by key.
+        malformed: Payloads that were not what their key promises.
+        size_bytes: Bytes on the disk.
+    """
+
+    first_time_ns: int | None = None
+    last_time_ns: int = 0
+    rows: dict[str, int] = field(default_factory=dict)
+    lost: dict[str, int] = field(default_factory=dict)
+    gaps: int = 0
+    missed: dict[str, int] = field(default_factory=dict)
+    malformed: int = 0
+    size_bytes: int = 0
+
+    def __add__(self, later: Counts) -> Counts:
+        firsts = [each.first_time_ns for each in (self, later) if each.first_time_ns is not None]
+        return Counts(
+            first_time_ns=min(firsts, default=None),
+            last_time_ns=max(self.last_time_ns, later.last_time_ns),
+            rows=_sum(self.rows, later.rows),
+            lost=_sum(self.lost, later.lost),
+            gaps=self.gaps + later.gaps,
+            missed=_sum(self.missed, later.missed),
+            malformed=self.malformed + later.malformed,
+            size_bytes=self.size_bytes + later.size_bytes,
+        )
+
+
+def _sum(first: dict[str, int], second: dict[str, int]) -> dict[str, int]:
+    return {key: first.get(key, 0) + second.get(key, 0) for key in {**first, **second}}
 
 
 def check_destination(path: Path, *, force: bool = False) -> None:
@@ -85,7 +128,7 @@ def _open_part(part: Path, *, replace: bool) -> BinaryIO:
                 raise InputError("output", "a file that no other recording is writing to", str(part)) from None
             # A new file under the name, not the old one emptied: nobody else can have it open.
             part.unlink()
-    file = part.open("xb")
+    file = part.open("x+b")  # readable, to save it if somebody removes it
     fcntl.flock(file, fcntl.LOCK_EX)
     return file
 
@@ -135,6 +178,9 @@ class RecordingWriter:
         view_rate_hz: float = 500.0,
         from_start: bool = False,
         force: bool = False,
+        due: dict[str, int] | None = None,
+        metadata: dict[str, dict[str, str]] | None = None,
+        attachments: dict[str, bytes] | None = None,
         sync_every_s: float = 0.25,
         wall_ns: Callable[[], int] = time.time_ns,
         monotonic_s: Callable[[], float] = time.monotonic,
@@ -149,6 +195,9 @@ class RecordingWriter:
             view_rate_hz: Rate of the plottable messages [Hz of simulated time]; 0 writes none.
             from_start: Every stream is meant to be recorded from its row 0: what is missing there is a gap, too.
             force: Replace an existing file.
+            due: Number of the row that is to come first, by key, where this file goes on from another one.
+            metadata: More metadata records for the start of the file, by name; entries under `rig` replace its own.
+            attachments: More attachments, by name.
             sync_every_s: Longest time between two flushes to the disk while messages arrive [s].
             wall_ns: Wall clock [unix ns].
             monotonic_s: Clock that times the flushes [s].
@@ -156,8 +205,6 @@ class RecordingWriter:
         Raises:
             InputError: The destination, the view rate or the catalogue cannot be used.
         """
-        from mcap.writer import CompressionType, Writer
-
         check_view_rate(view_rate_hz)
         check_destination(path, force=force)
         self.path = path
@@ -190,17 +237,21 @@ class RecordingWriter:
         self._monotonic_s = monotonic_s
         self._synced_s = monotonic_s()
         self._clock_ns = 0
+        self._begun = False
         self._topics: dict[str, _Topic] = {}
         self._schema_ids: dict[str, int] = {}
+        for key, index in (due or {}).items():
+            self.continuity.follow(key, index, 0)
+            self.next_index[key] = index
         try:
             self._file = _open_part(self.part, replace=force)
         except OSError as error:
             raise InputError("output", "a file that can be written", f"{self.part} ({error.strerror})") from None
-        mcap = Writer(self._file, compression=CompressionType.ZSTD, chunk_size=1 << 20)
-        self._mcap: Writer | None = mcap
+        mcap = Container(self._file)
+        self._mcap: Container | None = mcap
         with self._guard():
             mcap.start(profile="ros2", library="rotor-stator-rig recorder")
-            self._write_head(catalogue, parameters, scene)
+            self._write_head(catalogue, parameters, scene, metadata or {}, attachments or {})
             for group in self.table.groups:
                 self._topic(sensor_key(group))
             for table in self._truth:
@@ -219,6 +270,7 @@ class RecordingWriter:
             if view_rate_hz:
                 self._view_events = self._channel(schemas.VIEW_EVENTS, schemas.LOG_SCHEMA, {"source": EVENTS})
             self._sync()
+            self._begun = True
 
     def __enter__(self) -> Self:
         return self
@@ -280,6 +332,19 @@ class RecordingWriter:
         with self._guard():
             self._write_gap({"kind": "messages", "key": key, "index": -1, "size": messages}, wall_ns)
 
+    def counts(self) -> Counts:
+        """What was written so far; from any thread."""
+        return Counts(
+            first_time_ns=self.first_time_ns,
+            last_time_ns=self.last_time_ns,
+            rows=dict(self.continuity.received),
+            lost=dict(self.continuity.lost),
+            gaps=len(self.gaps),
+            missed=dict(self.missed),
+            malformed=self.malformed,
+            size_bytes=self.size_bytes,
+        )
+
     def short_of(self, rows: dict[str, int]) -> dict[str, int]:
         """Streams that have not come to the end of what was published.
 
@@ -337,6 +402,8 @@ class RecordingWriter:
             self._mcap.finish()
             self._file.flush()
             os.fsync(self._file.fileno())
+            self._check_name()
+            self.size_bytes = self._file.tell()
             self._file.close()
             if self.path.exists() and not self._force:
                 raise FileExistsError(errno.EEXIST, f"{self.path} was created by someone else meanwhile")
@@ -360,12 +427,43 @@ class RecordingWriter:
             self._mcap = None
             with contextlib.suppress(OSError):
                 self._file.close()
-            raise RecordingError(
-                f"recording stopped by the disk: {error.strerror or error}; "
-                f"what was written before is kept in {self.part}"
-            ) from error
+            kept = f"what was written before is kept in {self.part}; `rig recover` makes a finished file of it"
+            if not self._begun:
+                # Without its calibration it is of no use to anybody.
+                self.part.unlink(missing_ok=True)
+                kept = f"{self.part} could not be begun"
+            elif not self.part.exists():
+                kept = f"nothing is left at {self.part}"
+            raise RecordingError(f"recording stopped by the disk: {error.strerror or error}; {kept}") from error
 
-    def _write_head(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> None:
+    def _check_name(self) -> None:
+        """See that the file still has its name: a removed one can be written to, and is gone when it is closed.
+
+        Raises:
+            OSError: It was removed; it has been copied to the nearest folder that still exists, where that was
+                possible.
+        """
+        if os.fstat(self._file.fileno()).st_nlink:
+            return
+        gone = self.part
+        folder = next(folder for folder in gone.absolute().parents if folder.is_dir())
+        with contextlib.suppress(OSError):
+            self.part = folder / gone.name
+            with self.part.open("xb") as copy:
+                position = 0
+                while data := os.pread(self._file.fileno(), 1 << 20, position):
+                    copy.write(data)
+                    position += len(data)
+        raise OSError(errno.ENOENT, f"{gone} was removed while it was written")
+
+    def _write_head(
+        self,
+        catalogue: dict[str, Any],
+        parameters: dict[str, Any],
+        scene: dict[str, Any],
+        metadata: dict[str, dict[str, str]],
+        more: dict[str, bytes],
+    ) -> None:
         assert self._mcap is not None
         now = self._wall_ns()
         attachments = {"catalogue.json": catalogue, "parameters.json": parameters, "scene.json": scene}
@@ -382,12 +480,18 @@ class RecordingWriter:
                 "seed": str(scene.get("seed", "")),
                 "parameter_set": str(parameters.get("set", "")),
                 "view_rate_hz": f"{self.view_rate_hz:g}",
+                **metadata.get("rig", {}),
             },
         )
+        for name, entries in metadata.items():
+            if name != "rig":
+                self._mcap.add_metadata(name, entries)
         self._mcap.add_attachment(now, 0, "README.txt", "text/plain", self._readme(catalogue).encode())
         for name, document in attachments.items():
             text = json.dumps(document, indent=1, allow_nan=False)
             self._mcap.add_attachment(now, 0, name, "application/json", text.encode())
+        for name, data in more.items():
+            self._mcap.add_attachment(now, 0, name, "application/octet-stream", data)
 
     def _end_metadata(self, reason: str) -> dict[str, str]:
         first = 0 if self.first_time_ns is None else self.first_time_ns
@@ -477,10 +581,14 @@ class RecordingWriter:
         if shown is not None:
             self._add_view(*shown, wall_ns)
 
-    def _add_view(self, view: View, messages: list[tuple[int, bytes]], wall_ns: int) -> None:
+    def _add_view(self, view: View, messages: Messages, wall_ns: int) -> None:
+        assert self._mcap is not None
+        if not len(messages):
+            return
         topic = self._topics[view.topic]
-        for time_ns, message in messages:
-            self._add(topic, message, time_ns, wall_ns)
+        self._mcap.add_rows(topic.channel, messages.times_ns, messages.data, wall_ns, topic.sequence)
+        topic.sequence = (topic.sequence + len(messages)) & 0xFFFFFFFF
+        self.messages += len(messages)
 
     def _write_document(self, topic: _Topic, key: str, payload: bytes, document: dict[str, Any], wall_ns: int) -> None:
         tick = document.get("tick")
@@ -506,8 +614,11 @@ class RecordingWriter:
 
     def _sync(self) -> None:
         assert self._mcap is not None
+        for view in self._views.all:
+            self._add_view(view, view.settled(), self._wall_ns())
         self._mcap.flush()
         os.fsync(self._file.fileno())
+        self._check_name()
         self.size_bytes = self._file.tell()
         self._synced_s = self._monotonic_s()
 
@@ -567,5 +678,7 @@ view/events: rcl_interfaces/msg/Log of rig/events.
 
 Attachments: catalogue.json (channel table with calibration), parameters.json, scene.json.
 Metadata "rig" opens the file; metadata "end" closes it with the end reason and the counts.
+Metadata "series": one of several files in a row; its number, the file before it, and the row due of each stream.
+Metadata "trigger": recorded around a trigger only. "cut", "recovered": what this file was made of.
 A file without "end" was cut off; what stands in it is good.
 """

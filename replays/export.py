@@ -6,7 +6,6 @@ Tables have one row a sample: `time [s]`, every signal of the model as `truth.NA
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from collections.abc import Callable
@@ -17,8 +16,9 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from replays.formats import columnar, delimited
+from replays.formats.export import check_output
 from rig import wire
-from rig.errors import InputError
 from rig.kernels.signals import ROW
 from rig.simulation import Frame, Simulation
 
@@ -39,28 +39,21 @@ class RunWriter(Protocol):
         ...
 
 
-def check_output(path: Path, *, force: bool) -> None:
+def check_run_output(path: Path, *, force: bool) -> None:
     """Refuse a file that cannot be written, before anything is simulated.
 
     Raises:
         InputError: Another suffix, a folder that is missing or read-only, or an existing file.
     """
-    if path.suffix not in SUFFIXES:
-        raise InputError("output", f"a file name that ends in {', '.join(SUFFIXES)}", str(path))
-    if not path.parent.is_dir():
-        raise InputError("output", "in a folder that exists", str(path))
-    if path.is_dir() or (path.exists() and not force):
-        raise InputError("output", "a new file (--force replaces one)", f"{path}, which exists")
-    if not os.access(path.parent, os.W_OK):
-        raise InputError("output", "in a folder that can be written", str(path))
+    check_output(path, force=force, suffixes=SUFFIXES)
 
 
 def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> RunWriter:
     """The writer that the suffix asks for."""
-    check_output(path, force=force)
+    check_run_output(path, force=force)
     if path.suffix == ".mcap":
         return _McapRun(path, simulation, force=force)
-    return _TableRun(path, simulation, _open_parquet if path.suffix == ".parquet" else _open_csv)
+    return _TableRun(path, simulation, columnar.Rows if path.suffix == ".parquet" else delimited.Rows)
 
 
 def table_columns(simulation: Simulation) -> list[str]:
@@ -115,8 +108,8 @@ class _TableRun:
         self._background = _Background()
 
     def __enter__(self) -> Self:
-        self._schema = _schema(self.simulation)
-        self._writer = self._open_table(self.part, self._schema)
+        schema = columnar.float_schema(table_columns(self.simulation))
+        self._writer = self._open_table(self.part, schema)
         return self
 
     def __exit__(
@@ -124,8 +117,10 @@ class _TableRun:
     ) -> None:
         whole = False
         try:
-            self._background.finish()
-            self._writer.close()
+            try:
+                self._background.finish()
+            finally:
+                self._writer.close()
             whole = kind is None
         finally:
             if whole:
@@ -138,32 +133,7 @@ class _TableRun:
         self._background.call(self._append, table_rows(self.simulation, frame))
 
     def _append(self, rows: np.ndarray) -> None:
-        self._writer.write_table(_table(rows, self._schema))
-
-
-def _open_csv(path: Path, schema: Any) -> Any:
-    from pyarrow import csv
-
-    return csv.CSVWriter(path, schema)
-
-
-def _open_parquet(path: Path, schema: Any) -> Any:
-    from pyarrow import parquet
-
-    # Dictionaries would be tried in vain on every column of a continuous quantity.
-    return parquet.ParquetWriter(path, schema, compression="lz4", use_dictionary=False)
-
-
-def _schema(simulation: Simulation) -> Any:
-    import pyarrow
-
-    return pyarrow.schema([(name, pyarrow.float64()) for name in table_columns(simulation)])
-
-
-def _table(rows: np.ndarray, schema: Any) -> Any:
-    import pyarrow
-
-    return pyarrow.Table.from_arrays([pyarrow.array(np.ascontiguousarray(column)) for column in rows.T], schema=schema)
+        self._writer.write(list(rows.T))
 
 
 class _McapRun:

@@ -14,8 +14,8 @@ from rig.scenes import COMMANDS, SensorChoice
 
 _DOCUMENTS = {
     wire.EVENTS: (
-        "published: `event` (start, command, hammer, speed, release, warning, end), `tick`, `time_s`, `wall_s` and the "
-        "event's own fields; `end` carries `reason` and is the last"
+        "published: `event` (start, command, hammer, speed, release, note, warning, end), `tick`, `time_s`, `wall_s` "
+        "and the event's own fields; `end` carries `reason` and is the last"
     ),
     wire.STATUS: (
         "published twice a second and on request: state, pace, lateness, overruns, real-time factor, queue, clients, "
@@ -25,9 +25,17 @@ _DOCUMENTS = {
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",
     wire.SCENE: "on request: the scene as it runs, with its seed, and as `taken` the commands sent to it so far",
     f"{wire.CLIENTS}/NAME": "sent by clients twice a second, and with `done` when they leave; shown in the status: "
-    "how far they have come",
+    "how far they have come; `room`: rows that one can hold, which a replay in a burst does not exceed",
 }
-_OTHER_COMMANDS = {"stop": "no fields; ends the run", "step": "`ticks`: how far to go; only at `--pace lockstep`"}
+_OTHER_COMMANDS = {
+    "stop": "no fields; ends the run",
+    "step": "`ticks`: how far to go; only at `--pace lockstep`, and for a replay that is paused (there also `blocks`)",
+    "pause": "no fields; only for a recording that is replayed, as are the next three",
+    "resume": "no fields",
+    "seek": "`time_s`: where to go on, in the recording's simulated time",
+    "rate": "`rate` from 0.01 to 1000: recorded seconds a second",
+    "note": "`text` and `tags` (a list of words); does nothing, but is published as an event, and so recorded",
+}
 
 
 def page() -> str:

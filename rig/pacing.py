@@ -128,10 +128,11 @@ class FreeRun:
         self._origin_tick = 0
         self._tick_rate_hz = 1
         self._factor = 0.0
+        self._last_tick = 0
 
     def start(self, tick: int, tick_rate_hz: int) -> None:
         """Take this tick as the origin; wall time runs from now on."""
-        self._origin_tick = tick
+        self._origin_tick = self._last_tick = tick
         self._tick_rate_hz = tick_rate_hz
         self._origin_ns = self._now_ns()
 
@@ -146,6 +147,10 @@ class FreeRun:
 
     def wake(self) -> None:
         """Nothing waits here."""
+
+    def position(self) -> int:
+        """The tick that it is now: here, the last that was released."""
+        return self._last_tick
 
     def statistics(self) -> dict[str, object]:
         """Real-time factor since the start, lateness of results [ms], and how many were not ready in time."""
@@ -163,6 +168,7 @@ class FreeRun:
         }
 
     def _measure(self, tick: int, now_ns: int) -> None:
+        self._last_tick = tick
         elapsed_ns = now_ns - self._origin_ns
         if elapsed_ns > 0:
             self._factor = (tick - self._origin_tick) * _NS / (self._tick_rate_hz * elapsed_ns)
@@ -199,6 +205,10 @@ class RealTime(FreeRun):
     def deadline_ns(self, tick: int) -> int:
         """When a tick is due, in the time of the time source [ns]."""
         return self._origin_ns + (tick - self._origin_tick) * _NS // self._tick_rate_hz
+
+    def position(self) -> int:
+        """The tick that it is now by the wall clock."""
+        return self._origin_tick + (self._now_ns() - self._origin_ns) * self._tick_rate_hz // _NS
 
     def wake(self) -> None:
         """Make a waiting `release` return False; from any thread."""

@@ -19,27 +19,25 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from rig import wire
-from rig.errors import InputError
+from rig.errors import InputError, RefusedError
 from rig.pacing import Clock, Lockstep, RealTime, StepTimeoutError, short_collections
 from rig.transport import Server
+from rig.transport.clients import Clients
 
 SIMULATION_COMMANDS = ("hammer", "speed", "release")
 """Commands that the simulation itself checks and carries out."""
-COMMANDS = (*SIMULATION_COMMANDS, "stop", "step")
+COMMANDS = (*SIMULATION_COMMANDS, "stop", "step", "note")
+REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
+"""Commands that only a replayed recording takes (`replays.player`)."""
 
 _PENDING_COMMANDS = 256
 _REQUEST_BYTES = 10_000
 _STEP_S = 3600
 """Longest single step [s of simulated time]."""
+_NOTE_CHARACTERS, _TAGS, _TAG_CHARACTERS = 1000, 10, 40
 _TAKEN = 10_000
 """Commands that are told to latecomers."""
-_CLIENTS = 64
-_CLIENT_FORGOTTEN_S = 600.0
-_CLIENT_GONE_S = 3.0
-"""A client that did not report for this long is not waited for at the end of a run; others report twice a second."""
 _FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
-_QUIET_S = 0.6
-"""At the end of a run: for how long nobody must be behind before the cache may go; two heartbeats of the transport."""
 
 
 class Frame(Protocol):
@@ -129,7 +127,7 @@ class Simulation(Protocol):
 
 
 @dataclass(slots=True)
-class _Pending:
+class Pending:
     """A command on its way from a transport thread to the simulation thread."""
 
     command: str
@@ -213,13 +211,6 @@ class _Queue:
         return self._closed and not self._entries
 
 
-@dataclass(slots=True)
-class _ClientReport:
-    received_index: int
-    lost: int
-    heard_s: float
-
-
 class Service:
     """Runs one simulation to its end and serves it.
 
@@ -270,7 +261,7 @@ class Service:
         self._known_warnings: set[str] = set()
         self._overflowing = False
 
-        self._pending: deque[_Pending] = deque()
+        self._pending: deque[Pending] = deque()
         self._pending_lock = threading.Lock()
         self._accepting = True
         self._accepted = 0
@@ -284,9 +275,7 @@ class Service:
         self._samples_published = 0
         self._congestion: dict[str, float] = {}
         self._publisher_error: BaseException | None = None
-        self._clients: dict[str, _ClientReport] = {}
-        self._clients_lock = threading.Lock()
-        self._bad_reports = 0
+        self._clients = Clients()
 
     # ---- from any thread ----
 
@@ -301,9 +290,9 @@ class Service:
         warnings = list(health.get("warnings", []))
         if self._queue.dropped:
             warnings.append(f"{self._queue.dropped} blocks dropped: the publisher did not keep up")
-        if self._bad_reports:
-            warnings.append(f"{self._bad_reports} client reports could not be read")
-        return _finite(
+        if self._clients.malformed:
+            warnings.append(f"{self._clients.malformed} client reports could not be read")
+        return finite(
             {
                 "scene": self._scene.get("name"),
                 "tick": self._tick,
@@ -321,7 +310,7 @@ class Service:
                     "dropped": self._queue.dropped,
                 },
                 "congestion": self._congestion,
-                "clients": self._client_rows(),
+                "clients": self._clients.rows(self._samples_published, self._samples_rate_hz),
                 "spin_hz": health.get("spin_hz"),
                 "energy": health.get("energy", {}),
                 "engine": health.get("engine", {}),
@@ -330,23 +319,6 @@ class Service:
                 "commands": self._accepted,
             }
         )
-
-    def _client_rows(self) -> dict[str, dict[str, Any]]:
-        now = time.monotonic()
-        with self._clients_lock:
-            rows = dict(self._clients)
-        return {
-            name: {
-                "received_index": row.received_index,
-                "lag_s": round(self._behind(row) / self._samples_rate_hz, 4) if self._samples_rate_hz else 0.0,
-                "last_heard_s": round(now - row.heard_s, 3),
-                "lost": row.lost,
-            }
-            for name, row in rows.items()
-        }
-
-    def _behind(self, row: _ClientReport) -> int:
-        return max(0, self._samples_published - row.received_index)
 
     # ---- on transport threads ----
 
@@ -361,12 +333,16 @@ class Service:
         self._server.answer(wire.STATUS, lambda _: wire.encode_document(self.status()))
         for name in COMMANDS:
             self._server.answer(wire.command_key(name), lambda payload, name=name: self._on_command(name, payload))
-        self._server.hear(f"{wire.CLIENTS}/*", self._on_report)
+        for name in REPLAY_COMMANDS:
+            line = f"{name} is for a recording that is replayed (rig replay); this is a simulator, which runs on"
+            refused = wire.encode_document(refusal(RefusedError(line)))
+            self._server.answer(wire.command_key(name), lambda _, refused=refused: refused)
+        self._server.hear(f"{wire.CLIENTS}/*", self._clients.take)
 
     def _on_command(self, name: str, payload: bytes) -> bytes:
         """Hand a command to the simulation thread and wait for its answer."""
         try:
-            pending = _parse_command(name, payload)
+            pending = parse_command(name, payload)
             with self._pending_lock:
                 if not self._accepting:
                     raise InputError(name, "sent while the rig runs", "a run that has ended")
@@ -374,26 +350,10 @@ class Service:
                     raise InputError("commands", f"at most {_PENDING_COMMANDS} at a time", len(self._pending) + 1)
                 self._pending.append(pending)
         except InputError as error:
-            return wire.encode_document(_refusal(error))
+            return wire.encode_document(refusal(error))
         self._clock.wake()
         # Answered at the next block boundary, or when the run ends; a step, when it is done.
         return wire.encode_document(pending.reply.result())
-
-    def _on_report(self, key: str, payload: bytes) -> None:
-        name = key.rpartition("/")[2]
-        try:
-            document = wire.decode_document(payload)
-            row = _ClientReport(int(document["received_index"]), int(document.get("lost", 0)), time.monotonic())
-        except (ValueError, KeyError, TypeError):
-            self._bad_reports += 1
-            return
-        with self._clients_lock:
-            for old in [key for key, old in self._clients.items() if row.heard_s - old.heard_s > _CLIENT_FORGOTTEN_S]:
-                del self._clients[old]
-            if document.get("done") is True:
-                self._clients.pop(name, None)
-            elif name in self._clients or len(self._clients) < _CLIENTS:
-                self._clients[name] = row
 
     # ---- on the simulation thread ----
 
@@ -433,7 +393,7 @@ class Service:
             reason = f"failed: {error}"
             raise
         except BaseException as error:
-            reason = f"failed: {type(error).__name__}: {_one_line(error)}"
+            reason = f"failed: {type(error).__name__}: {one_line(error)}"
             raise
         finally:
             wall_s = time.monotonic() - started
@@ -509,22 +469,24 @@ class Service:
             try:
                 event = self._carry_out(pending)
             except InputError as error:
-                pending.reply.set_result(_refusal(error))
+                pending.reply.set_result(refusal(error))
             except (ValueError, TypeError, KeyError) as error:
                 # A request that the simulation's own checks let through must not end the run.
-                pending.reply.set_result(_refusal(InputError(pending.command, "readable", _one_line(error))))
+                pending.reply.set_result(refusal(InputError(pending.command, "readable", one_line(error))))
             else:
                 events.append(event)
         return events
 
-    def _carry_out(self, pending: _Pending) -> dict[str, Any]:
+    def _carry_out(self, pending: Pending) -> dict[str, Any]:
         simulation = self._simulation
-        tick, done_tick = simulation.tick, None
+        tick, done_tick, note = simulation.tick, None, None
         if pending.command == "stop":
-            _only_fields(pending.request, ())
+            only_fields(pending.request, ())
             self._stop_requested = True
         elif pending.command == "step":
             done_tick = self._check_step(pending.request)
+        elif pending.command == "note":
+            note = _note(pending.request)
         else:
             tick = simulation.submit(pending.command, dict(pending.request))
             taken = {"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request}
@@ -536,6 +498,9 @@ class Service:
         else:
             reply |= {"tick": done_tick, "time_s": done_tick / self._rate}
             self._steps.append((done_tick, pending.reply, reply))
+        if note is not None:
+            # An event of its own: it does nothing to the rig, so whoever repeats the commands can pass over it.
+            return {**self._event("note", id=self._accepted), **note, "from": pending.sender}
         detail = {"id": self._accepted, "command": pending.command, "request": pending.request, "from": pending.sender}
         return self._event("command", tick=tick, **detail)
 
@@ -543,7 +508,7 @@ class Service:
         """Grant a step; returns the tick at which it is done."""
         if not isinstance(self._clock, Lockstep):
             raise InputError("step", "sent to a rig that runs with --pace lockstep", f"--pace {self._clock.pace}")
-        _only_fields(request, ("ticks",))
+        only_fields(request, ("ticks",))
         ticks, unit = request.get("ticks"), self._simulation.block_ticks
         most = _STEP_S * self._rate
         if not isinstance(ticks, int) or isinstance(ticks, bool) or not 0 < ticks <= most or ticks % unit:
@@ -595,24 +560,17 @@ class Service:
             self._pending.clear()
         waiting += [reply for _, reply, _ in self._steps]
         for reply in waiting:
-            reply.set_result(_refusal(InputError("command", "sent while the rig runs", f"a run that ended: {reason}")))
+            reply.set_result(refusal(InputError("command", "sent while the rig runs", f"a run that ended: {reason}")))
         self._queue.put(_Entry([self._event("end", reason=reason)]))
         self._queue.close()
 
     def _linger(self) -> None:
         """Keep the cache until everybody who is connected has everything."""
-        deadline = time.monotonic() + self._linger_s
-        quiet_since = time.monotonic()
-        while (now := time.monotonic()) < deadline:
-            self._congestion = self._server.congestion()
-            if not self._congestion.get("links", 0) or now - quiet_since >= _QUIET_S:
-                return
-            with self._clients_lock:
-                rows = list(self._clients.values())
-            behind = any(now - row.heard_s < _CLIENT_GONE_S and self._behind(row) for row in rows)
-            if behind or self._congestion.get("stalled_links", 0):
-                quiet_since = now
-            time.sleep(0.1)
+
+        def see(counts: dict[str, float]) -> None:
+            self._congestion = counts
+
+        self._clients.settle(self._server, self._samples_published, patience_s=self._linger_s, see=see)
 
     # ---- on the publisher thread ----
 
@@ -655,7 +613,7 @@ class Service:
         if event["event"] == "end":
             # Blocks and events travel apart: whoever has the end can tell from this what it still lacks.
             event = {**event, "rows": dict(self._rows)}
-        self._server.publish(wire.EVENTS, wire.encode_document(_finite(event)))
+        self._server.publish(wire.EVENTS, wire.encode_document(finite(event)))
 
     def _publish_status(self) -> None:
         self._congestion = self._server.congestion()
@@ -674,39 +632,65 @@ class Service:
             reply.set_result(document)
 
 
-def _parse_command(name: str, payload: bytes) -> _Pending:
+def parse_command(name: str, payload: bytes) -> Pending:
+    """A command out of its payload.
+
+    Raises:
+        InputError: It is none.
+    """
     if len(payload) > _REQUEST_BYTES:
         raise InputError(name, f"a request of at most {_REQUEST_BYTES} bytes", len(payload))
     try:
         request = wire.decode_document(payload)
     except (ValueError, RecursionError) as error:
-        raise InputError(name, "a JSON object", _one_line(error)) from None
+        raise InputError(name, "a JSON object", one_line(error)) from None
     sender = request.pop("from", "unknown")
     if not isinstance(sender, str) or not sender.isprintable() or not 1 <= len(sender) <= 100:
         raise InputError("from", "a name of 1 to 100 printable characters", sender)
-    return _Pending(name, request, sender)
+    return Pending(name, request, sender)
 
 
-def _only_fields(request: dict[str, Any], allowed: tuple[str, ...]) -> None:
+def only_fields(request: dict[str, Any], allowed: tuple[str, ...]) -> None:
+    """Refuse a request with other fields.
+
+    Raises:
+        InputError: It has one.
+    """
     for name in request:
         if name not in allowed:
             raise InputError("request", f"without fields other than {', '.join(allowed) or 'from'}", name)
 
 
-def _refusal(error: Exception) -> dict[str, Any]:
-    return {"accepted": False, "error": _one_line(error)}
+def _note(request: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a note, checked."""
+    only_fields(request, ("text", "tags"))
+    text, tags = request.get("text"), request.get("tags", [])
+    if not isinstance(text, str) or not text.isprintable() or not 1 <= len(text) <= _NOTE_CHARACTERS:
+        raise InputError("text", f"a line of 1 to {_NOTE_CHARACTERS} printable characters", text)
+    if not isinstance(tags, list) or len(tags) > _TAGS:
+        raise InputError("tags", f"a list of at most {_TAGS}", tags)
+    for tag in tags:
+        if not isinstance(tag, str) or not tag.isprintable() or not 1 <= len(tag) <= _TAG_CHARACTERS or " " in tag:
+            raise InputError("tag", f"a word of at most {_TAG_CHARACTERS} printable characters", tag)
+    return {"text": text, "tags": tags}
 
 
-def _one_line(error: BaseException) -> str:
+def refusal(error: Exception) -> dict[str, Any]:
+    """The reply to a command that was not taken."""
+    return {"accepted": False, "error": one_line(error)}
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, without line breaks."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """The same document with None for numbers that JSON cannot carry: a diverged run must still be able to say so."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
+        return {name: finite(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return value

@@ -42,6 +42,16 @@ class Source(Protocol):
         """
         ...
 
+    def taken(self, index: int, *, room: int, lost: int) -> None:
+        """Take note of what was read; must not wait, and may be of no use.
+
+        Args:
+            index: Number of the row after the last that was read.
+            room: How many rows find room beyond that.
+            lost: How many never came.
+        """
+        ...
+
     def close(self) -> None:
         """End; may be called again."""
         ...

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Callable, Sequence
+from itertools import count
 
 from drivers.samples import Samples
 from drivers.stream import RigStream, thin, whole_step
@@ -10,9 +13,12 @@ from rig import wire
 from rig.channels import Group
 from rig.transport import Client
 
+_REPORT_S = 0.4
+_numbers = count(1)
+
 
 class RigSource:
-    """Sensor groups of a running rig.
+    """Sensor groups of a running rig, which is told how far they have been read.
 
     Args:
         client: Transport to the rig.
@@ -21,8 +27,17 @@ class RigSource:
 
     def __init__(self, client: Client, *, close: Callable[[], None] | None = None) -> None:
         self._stream = RigStream(client)
+        self._client = client
         self._close = close
         self._leave: list[Callable[[], None]] = []
+        self._name = f"daq-{os.getpid()}-{next(_numbers)}"
+        self._scale = 1.0
+        """Rows of the stream that clients report on, for one of ours."""
+        self._read: tuple[int, int, int] | None = None
+        self._told = 0
+        self._due = threading.Event()
+        self._closed = False
+        self._reporter = threading.Thread(target=self._report_all, name="daq reports", daemon=True)
 
     def streams(self) -> dict[str, tuple[str, ...]]:
         """The groups of this rig's channel table."""
@@ -40,6 +55,9 @@ class RigSource:
         rate = float(rate_hz or min(group.rate_hz for group in groups))
         for group in groups:
             whole_step(group.rate_hz, rate)
+        all_groups = self._stream.table().groups
+        self._scale = all_groups.get("probes", next(iter(all_groups.values()))).rate_hz / rate
+        self._reporter.start()
         for group in groups:
             self._listen(group, rate, on_samples, on_end)
         return rate
@@ -73,10 +91,41 @@ class RigSource:
 
         self._leave.append(self._stream.listen(group.name, take, lambda reason: on_end(group.name, reason)))
 
+    def taken(self, index: int, *, room: int, lost: int) -> None:
+        """Tell the rig twice a second, and at once where much of the room has been used: a replay waits for it."""
+        self._read = (index, room, lost)
+        if abs(index - self._told) > room // 8:
+            self._due.set()
+
+    def _report_all(self) -> None:
+        while not self._closed:
+            self._due.wait(_REPORT_S)
+            self._due.clear()
+            if self._read is not None:
+                self._report()
+
+    def _report(self, *, done: bool = False) -> None:
+        self._told, room, lost = self._read or (0, 0, 0)
+        beat = {
+            "name": self._name,
+            "received_index": int(self._told * self._scale),
+            "room": int(room * self._scale),
+            "lost": lost,
+            "done": done,
+        }
+        self._client.report(f"{wire.CLIENTS}/{self._name}", wire.encode_document(beat))
+
     def close(self) -> None:
         """Listen no more."""
         while self._leave:
             self._leave.pop()()
+        self._closed = True
+        self._due.set()
+        if self._reporter.is_alive() and self._reporter is not threading.current_thread():
+            self._reporter.join(timeout=2.0)
+        if self._read is not None:
+            self._report(done=True)
+            self._read = None
         close, self._close = self._close, None
         if close is not None:
             close()

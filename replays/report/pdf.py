@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 from datetime import UTC, datetime
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from replays.report.document import Heading, Paragraph, Picture, Report, Row, Table
+from replays.report.document import Heading, Paragraph, Part, Picture, Report, Table
 
 if TYPE_CHECKING:
     from fpdf import FPDF
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 _INK, _SOFT = (26, 26, 26), (102, 102, 102)
 _MARKS = {"good": (0, 121, 79), "bad": (179, 38, 30), "open": (154, 103, 0), "plain": _INK}
 _FONT = "DejaVu"
+_CELL_SIZE = 7.5
 
 
 def render(report: Report) -> bytes:
@@ -50,10 +52,10 @@ def render(report: Report) -> bytes:
     write(report.title, size=16, bold=True)
     if report.lead:
         write(report.lead, size=10, colour=_SOFT)
-    for part in report.parts:
+    for number, part in enumerate(report.parts):
         if isinstance(part, Heading):
             pdf.ln(3)
-            if pdf.will_page_break(30):  # a heading does not stand alone at the foot of a page
+            if pdf.will_page_break(_room(pdf, report.parts[number:])):
                 pdf.add_page()
             write(part.text, size=13 if part.level == 1 else 11, bold=True)
         elif isinstance(part, Paragraph):
@@ -69,22 +71,23 @@ def render(report: Report) -> bytes:
     return bytes(pdf.output())
 
 
+def _room(pdf: FPDF, parts: list[Part]) -> float:
+    """Height of headings with the start of what follows them [mm]: none stands alone at the foot of a page."""
+    headings = list(takewhile(lambda part: isinstance(part, Heading), parts))
+    following = parts[len(headings)] if len(headings) < len(parts) else None
+    return 9.0 * len(headings) + (_size(pdf, following)[1] + 9.0 if isinstance(following, Picture) else 20.0)
+
+
 def _table(pdf: FPDF, table: Table) -> None:
     from fpdf.fonts import FontFace
 
-    pdf.set_font(_FONT, size=7.5)
+    pdf.set_font(_FONT, size=_CELL_SIZE)
     pdf.set_text_color(*_INK)
     pdf.set_draw_color(221, 221, 221)
-    # Wide enough for the text of a column, so far as there is room.
-    rows = [Row(table.headings), *table.rows]
-    widths = tuple(
-        min(60.0, max(8.0, *(pdf.get_string_width(row.cells[n]) + 3 for row in rows)))
-        for n in range(len(table.headings))
-    )
-    width = min(pdf.epw, sum(widths))
+    widths = _widths(pdf, table)
     with pdf.table(
         col_widths=widths,
-        width=width,
+        width=sum(widths),
         align="L",
         text_align="L",
         line_height=4,
@@ -100,13 +103,41 @@ def _table(pdf: FPDF, table: Table) -> None:
                 line.cell(cell, style=FontFace(color=_MARKS[row.mark] if last else _INK))
 
 
+def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:
+    """Widths of the columns [mm]: their texts in one line as far as there is room, else no narrower than any word."""
+    natural, least = [], []
+    for column, heading in enumerate(table.headings):
+        lines, words = 0.0, 0.0
+        # Bold is wider: measured by its own letters.
+        for style, texts in (("B", [heading]), ("", [row.cells[column] for row in table.rows])):
+            pdf.set_font(_FONT, style=style, size=_CELL_SIZE)
+            lines = max([lines, *map(pdf.get_string_width, texts)])
+            words = max([words, *(pdf.get_string_width(word) for text in texts for word in text.split())])
+        natural.append(lines + 3.0)
+        least.append(words + 3.0)
+    pdf.set_font(_FONT, size=_CELL_SIZE)
+    spare = pdf.epw - sum(least)
+    wanted = sum(natural) - sum(least)
+    if wanted <= spare:
+        return tuple(natural)
+    if spare <= 0.0:  # words are broken, there is no other way
+        return tuple(width * pdf.epw / sum(least) for width in least)
+    return tuple(a + (b - a) * spare / wanted for a, b in zip(least, natural, strict=True))
+
+
 def _picture(pdf: FPDF, picture: Picture) -> None:
+    width, height = _size(pdf, picture)
+    if pdf.will_page_break(height + 8):
+        pdf.add_page()
+    pdf.image(io.BytesIO(picture.png), w=width)
+    pdf.ln(1)
+
+
+def _size(pdf: FPDF, picture: Picture) -> tuple[float, float]:
+    """Width and height on the page [mm]: as wide as it has room for, with a heading above and a caption below."""
     from PIL import Image
 
     with Image.open(io.BytesIO(picture.png)) as image:
         share = image.height / image.width
-    width = min(pdf.epw, (pdf.eph - 15) / share)
-    if pdf.will_page_break(width * share + 8):
-        pdf.add_page()
-    pdf.image(io.BytesIO(picture.png), w=width)
-    pdf.ln(1)
+    width = min(pdf.epw, (pdf.eph - 30) / share)
+    return width, width * share

@@ -1,4 +1,4 @@
-"""`rig run --can`: the rig as a node of a CAN bus, beside its own transport."""
+"""`rig run --can` and `rig replay --can`: the rig as a node of a CAN bus, beside its own transport."""
 
 from __future__ import annotations
 
@@ -231,6 +231,39 @@ class CanOutput:
         ):
             self._open_more = partial(HubBus, hub)
             yield bus
+
+
+def can_output(
+    spec: str | None,
+    *,
+    classic: bool,
+    fd: bool,
+    rate_hz: int | None,
+    bitrate: str | None,
+    overload: bool,
+    socketcand: str | None,
+    slcan: bool,
+    expose: bool,
+) -> CanOutput | None:
+    """The bus that the --can options ask for, or None; as for `CanOutput`.
+
+    Raises:
+        InputError: They ask for none that there is, or only for how it should be.
+    """
+    settings: dict[str, Any] = {
+        "classic": classic,
+        "fd": fd,
+        "rate_hz": rate_hz,
+        "bitrate": bitrate,
+        "overload": overload,
+        "socketcand": socketcand,
+        "slcan": slcan,
+    }
+    if spec is not None:
+        return CanOutput(spec, **settings, expose=expose)
+    if any(setting is not None and setting is not False for setting in settings.values()):
+        raise InputError("--can", "given with the other --can options", None)
+    return None
 
 
 def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:

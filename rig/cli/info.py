@@ -1,65 +1,219 @@
-"""`rig info`: what a recording holds."""
+"""`rig info`: what a recording holds, and how sound it is."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.options import Json
 
-def info(file: Annotated[Path, typer.Argument(help="A recording, finished or cut off.")]) -> None:
-    """Show contents, calibration, gaps, events and end of a recording."""
+if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     from recorder.reader import Recording
-    from recorder.schemas import event_text
 
-    recording = Recording.open(file)
-    console = Console(highlight=False)
+_MOST_GAPS = 20
+
+
+def info(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="A recording, finished or not; or its parts.")],
+    *,
+    quick: Annotated[bool, typer.Option("--quick", help="Without reading the samples.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Show contents, calibration, gaps, health, events, notes and end of a recording; of several files as of one."""
+    from recorder.reader import join
+
+    recording = join(files)
+    document = describe(recording, quick=quick)
+    if as_json:
+        typer.echo(json.dumps(document, indent=1))
+    else:
+        _print(recording, document)
+
+
+def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
+    """Everything that the command shows, as a JSON document."""
+    from dataclasses import asdict
+
+    from recorder.health import examine
+
     about = recording.metadata["rig"]
-    streams = recording.streams
-    first_s = min((stream.first_time_s for stream in streams.values() if stream.rows), default=0.0)
-    last_s = max((stream.last_time_s for stream in streams.values() if stream.rows), default=0.0)
-    state = "complete" if recording.complete else "not complete"
-    for name, value in (
-        ("file", f"{file}, {file.stat().st_size / 1e6:.1f} MB, {state}"),
-        ("scene", f"{about['scene']}, seed {about['seed']}, parameters {about['parameter_set']}"),
-        ("recorded", about["created"]),
-        ("time", f"{first_s:.4f} s to {last_s:.4f} s ({last_s - first_s:.4f} s simulated)"),
-        ("ended", recording.end_reason),
-    ):
-        console.print(Text.assemble((f"{name:9}", "bold"), value), soft_wrap=True)
+    parts = [
+        {
+            "file": str(part.path),
+            "size_bytes": part.path.stat().st_size,
+            "complete": part.complete,
+            "ended": part.end_reason,
+            "damaged_chunks": part.damaged,
+            **{
+                name: part.metadata[name] for name in ("series", "trigger", "cut", "recovered") if name in part.metadata
+            },
+            "end": part.metadata.get("end", {}),
+        }
+        for part in recording.parts
+    ]
+    document: dict[str, Any] = {
+        "parts": parts,
+        "complete": recording.complete,
+        "ended": recording.end_reason,
+        **{name: about.get(name, "") for name in ("scene", "seed", "parameter_set", "created", "view_rate_hz")},
+        "messages": recording.messages,
+        "gaps": [asdict(gap) for gap in recording.gaps],
+        "events": recording.events,
+    }
+    if not quick:
+        document["streams"] = {key: asdict(stream) for key, stream in recording.streams.items()}
+        document["health"] = asdict(examine(recording))
+    return _without_nan(document)
+
+
+def _print(recording: Recording, document: dict[str, Any]) -> None:
+    from rich.text import Text
+
+    from recorder.schemas import event_text
+    from rig.cli.tables import table_console
+
+    console = table_console(highlight=False)
+    size_mb = sum(part["size_bytes"] for part in document["parts"]) / 1e6
+    state = "complete" if document["complete"] else "not complete"
+    file = document["parts"][0]["file"]
+    if len(document["parts"]) > 1:
+        file = f"{file} and {len(document['parts']) - 1} more"
+    rows: list[tuple[str, str]] = [
+        ("file", f"{file}, {size_mb:.1f} MB, {state}"),
+        ("scene", f"{document['scene']}, seed {document['seed']}, parameters {document['parameter_set']}"),
+        ("recorded", document["created"]),
+    ]
+    streams = document.get("streams", {})
+    if filled := [stream for stream in streams.values() if stream["rows"]]:
+        first_s = min(stream["first_time_s"] for stream in filled)
+        last_s = max(stream["last_time_s"] for stream in filled)
+        rows.append(("time", f"{first_s:.4f} s to {last_s:.4f} s ({last_s - first_s:.4f} s simulated)"))
+    for part in document["parts"]:
+        for name in ("trigger", "cut", "recovered"):
+            if name in part:
+                rows.append((name, ", ".join(f"{key} {value}" for key, value in part[name].items() if value)))
+    rows.append(("ended", document["ended"]))
+    for name, value in rows:
+        console.print(Text.assemble((f"{name:10}", "bold"), value), soft_wrap=True)
+    if len(document["parts"]) > 1:
+        _print_parts(console, document["parts"])
+    if streams:
+        _print_streams(console, streams)
+    else:
+        console.print("messages: " + ", ".join(f"{key} {count}" for key, count in document["messages"].items()))
+    _print_channels(console, recording, document.get("health"))
+    if "health" in document:
+        _print_health(console, document["health"])
+    for event in recording.events:
+        time_s = event.get("time_s")
+        stamp = f"{time_s:9.4f} s  " if isinstance(time_s, float | int) else " " * 13
+        style = "bold" if event.get("event") == "note" else ""
+        console.print(Text(stamp + event_text(event)[1], style=style), soft_wrap=True)
+    gaps = recording.gaps
+    console.print(f"gaps noted by the recorder: {len(gaps) or 'none'}")
+    for gap in gaps[:_MOST_GAPS]:
+        what = f"{gap.size} messages" if gap.index < 0 else f"{gap.size} rows from {gap.index} on"
+        console.print(f"  {gap.key}: {what}", soft_wrap=True)
+    if len(gaps) > _MOST_GAPS:
+        console.print(f"  and {len(gaps) - _MOST_GAPS} more")
+
+
+def _print_parts(console: Console, parts: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+
+    table = Table("part", "MB", "from, s", "to, s", "ended", box=None, header_style="bold")
+    for part in parts:
+        end = part["end"]
+        times = (f"{float(end[name]):.4f}" if name in end else "?" for name in ("first_time_s", "last_time_s"))
+        table.add_row(Path(part["file"]).name, f"{part['size_bytes'] / 1e6:.1f}", *times, part["ended"])
+    console.print(table)
+
+
+def _print_streams(console: Console, streams: dict[str, dict[str, Any]]) -> None:
+    from rich.table import Table
 
     table = Table("stream", box=None, header_style="bold")
     for heading in ("blocks", "rows", "from, s", "to, s", "lost"):
         table.add_column(heading, justify="right")
     for key, stream in streams.items():
-        numbers = (str(stream.messages), str(stream.rows), f"{stream.first_time_s:.4f}", f"{stream.last_time_s:.4f}")
-        table.add_row(key, *numbers, str(stream.lost), style="red" if stream.lost else None)
+        times = (f"{stream['first_time_s']:.4f}", f"{stream['last_time_s']:.4f}")
+        counts = (str(stream["messages"]), str(stream["rows"]))
+        table.add_row(key, *counts, *times, str(stream["lost"]), style="red" if stream["lost"] else None)
     console.print(table)
 
-    table = Table("channel", "unit", "range", "step", "rate", "label", box=None, header_style="bold")
+
+def _print_channels(console: Console, recording: Recording, health: dict[str, Any] | None) -> None:
+    from rich.table import Table
+
+    from rig.wire import sensor_key
+
+    found = {channel["name"]: channel for channel in (health or {}).get("channels", [])}
+    table = Table("channel", "unit", "range", "step", "rate", box=None, header_style="bold")
+    if found:
+        for heading in ("mean", "low", "high", "noise", "calibrated"):
+            table.add_column(heading, justify="right")
+        table.add_column("health")
+    else:
+        table.add_column("label")
     for group in recording.table.groups.values():
-        if f"rig/sensors/{group.name}" not in streams:
+        if sensor_key(group.name) not in recording.messages:
             continue
         for channel in group.channels:
             ends = sorted((volts - channel.bias_v) / channel.sensitivity_v for volts in channel.range_v)
-            reach = f"{ends[0]:.4g} to {ends[1]:.4g}"
-            step = f"{abs(channel.scale):.2g}"
-            table.add_row(channel.name, channel.unit, reach, step, f"{group.rate_hz} Hz", channel.label)
+            row = [
+                channel.name,
+                channel.unit,
+                f"{ends[0]:.4g} to {ends[1]:.4g}",
+                f"{abs(channel.scale):.2g}",
+                f"{group.rate_hz} Hz",
+            ]
+            seen = found.get(channel.name)
+            if seen is None:
+                table.add_row(*row, *([""] * 5 if found else []), "" if found else channel.label)
+                continue
+            names = ("mean", "low", "high", "noise", "noise_calibrated")
+            numbers = [f"{seen[name]:.3g}" if seen[name] is not None else "?" for name in names]
+            table.add_row(
+                *row, *numbers, "; ".join(seen["findings"]) or "good", style="yellow" if seen["findings"] else None
+            )
     console.print(table)
 
-    for event in recording.events:
-        time_s = event.get("time_s")
-        stamp = f"{time_s:9.4f} s  " if isinstance(time_s, float | int) else " " * 13
-        console.print(Text(stamp + event_text(event)[1]), soft_wrap=True)
-    gaps = recording.gaps
-    console.print(f"gaps noted by the recorder: {len(gaps) or 'none'}")
-    for gap in gaps[:20]:
-        what = f"{gap.size} messages" if gap.index < 0 else f"{gap.size} rows from {gap.index} on"
-        console.print(f"  {gap.key}: {what}", soft_wrap=True)
-    if len(gaps) > 20:
-        console.print(f"  and {len(gaps) - 20} more")
+
+def _print_health(console: Console, health: dict[str, Any]) -> None:
+    from rich.text import Text
+
+    lines = []
+    if health["pace"] is not None:
+        real_time = abs(health["pace_ppm"]) < 1e4
+        ppm = f"{health['pace_ppm']:+.1f} ppm (known to {health['pace_error_ppm']:.1f})"
+        pace = f"real time {ppm}" if real_time else f"x{health['pace']:.4g} real time"
+        strays = f", without {health['strays']:.1%} strays" if health["strays"] else ""
+        jitter = f"jitter {health['jitter_ms']:.2f} ms rms, {health['jitter_max_ms']:.2f} ms at most{strays}"
+        lines.append(f"{pace}, {jitter}")
+    status = health["status"]
+    late = status.get("lateness_ms") or {}
+    figures = [f"{name} {late[name]:.3f}" for name in ("p50", "p99", "max") if isinstance(late.get(name), float | int)]
+    if figures:
+        lines.append(f"the rig's lateness in ms: {', '.join(figures)}; overruns {status.get('overruns', '?')}")
+    for line in lines:
+        console.print(Text.assemble((f"{'clock':10}", "bold"), line), soft_wrap=True)
+    for text in [*health["findings"], *(f"the rig warned: {text}" for text in health["warnings"])]:
+        console.print(Text.assemble((f"{'doubt':10}", "bold yellow"), text), soft_wrap=True)
+
+
+def _without_nan(value: Any) -> Any:
+    """The same document with None for what was not measured: JSON has no nan."""
+    import math
+
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {name: _without_nan(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return value

@@ -35,6 +35,15 @@ class Reporter:
         if self.bar is not None or time.monotonic() - self._printed_s > _EVERY_S:
             self.say(text)
 
+    def part(self, done: float, text: str) -> None:
+        """So much of the whole is done, 0 to 1, of something without steps."""
+        percent = int(100.0 * done)
+        if self.total is None:
+            self.begin(100)
+        if percent > self.done:
+            self.done = percent - 1
+            self.step(text)
+
     def say(self, text: str) -> None:
         """This is being done."""
         if self.bar is not None:

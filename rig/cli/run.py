@@ -17,11 +17,11 @@ from rig.cli.can_output import (
     CanBus,
     CanClassic,
     CanFd,
-    CanOutput,
     CanOverload,
     CanRate,
     CanSlcan,
     CanSocketcand,
+    can_output,
 )
 from rig.cli.options import Changes, DurationS, Engine, Parameters, SceneName, Seed
 from rig.errors import InputError
@@ -80,24 +80,17 @@ def run(
         from rig.transport.zenoh import ZenohServer
 
         loaded = load_scene(scene, overrides)
-        bus = None
-        if can is not None:
-            bus = CanOutput(
-                can,
-                classic=can_classic,
-                fd=can_fd,
-                rate_hz=can_rate,
-                bitrate=can_bitrate,
-                overload=can_overload,
-                socketcand=can_socketcand,
-                slcan=can_slcan,
-                expose=expose,
-            )
-        elif any(
-            setting is not None and setting is not False
-            for setting in (can_rate, can_classic, can_fd, can_bitrate, can_overload, can_socketcand, can_slcan)
-        ):
-            raise InputError("--can", "given with the other --can options", None)
+        bus = can_output(
+            can,
+            classic=can_classic,
+            fd=can_fd,
+            rate_hz=can_rate,
+            bitrate=can_bitrate,
+            overload=can_overload,
+            socketcand=can_socketcand,
+            slcan=can_slcan,
+            expose=expose,
+        )
     paced = pace is Pace.REAL_TIME
     with ZenohServer(listen, expose=expose, wait=not paced) as server, ExitStack() as stack:
         if bus is not None:
@@ -116,7 +109,7 @@ def run(
                 bus.start(paced=paced)
                 typer.echo(f"rig: {bus}", err=True)
         typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
-        with _stopping_on_signals(service.stop), _showing(service):
+        with stopping_on_signals(service.stop), _showing(service):
             summary = service.run()
     _print_summary(summary)
     if bus is not None:
@@ -164,7 +157,7 @@ def _clock(pace: Pace) -> Clock:
 
 
 @contextmanager
-def _stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
+def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
     """SIGINT and SIGTERM end the run in good order; a second SIGINT interrupts at once."""
 
     def handle(number: int, _: object) -> None:

@@ -32,11 +32,11 @@ def simulate(
         from rich.console import Console
         from rich.progress import Progress
 
-        from replays.export import check_output, writer_for
+        from replays.export import check_run_output, writer_for
         from rig.cli.run import scene_overrides
         from rig.scenes import load_scene
 
-        check_output(output, force=force)
+        check_run_output(output, force=force)
         overrides = scene_overrides(
             changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed
         )

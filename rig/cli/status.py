@@ -84,15 +84,24 @@ def status_table(document: dict[str, Any]) -> Table:
     table = Table(title=f"rig: {document['scene']}, {document['state']}", show_header=False, title_justify="left")
     end = "" if document["end_s"] is None else f" of {document['end_s']:g} s"
     table.add_row("simulated time", f"{document['time_s']:.3f} s{end} (tick {document['tick']})")
+    if (play := document.get("replay")) is not None:
+        rate = "burst" if play["rate"] is None else f"x{play['rate']:g}"
+        if play["paused"]:
+            rate += ", paused"
+        passes = "endless" if play["passes"] is None else play["passes"]
+        table.add_row("replay of", ", ".join(play["files"]))
+        table.add_row("", f"{play['from_s']:g} to {play['to_s']:g} s, {rate}, pass {play['pass']} of {passes}")
     table.add_row("pace", f"{document['pace']}, blocks of {document['block_ms']:g} ms")
-    table.add_row("real-time factor", f"{document['real_time_factor']:.6f}")
+    table.add_row("real-time factor" if play is None else "achieved rate", f"{document['real_time_factor']:.6f}")
     table.add_row(
         "lateness", f"p50 {late['p50']:.3f}, p99 {late['p99']:.3f}, max {late['max']:.3f}, last {late['last']:.3f} ms"
     )
     table.add_row("overruns", str(document["overruns"]))
-    table.add_row(
-        "queue", f"{queue['depth']} of {queue['capacity']}, at most {queue['high_water']}, dropped {queue['dropped']}"
-    )
+    if play is None:
+        text = f"{queue['depth']} of {queue['capacity']}, at most {queue['high_water']}, dropped {queue['dropped']}"
+        table.add_row("queue", text)
+    else:
+        table.add_row("read ahead", f"{queue['depth']} instants")
     table.add_row("spin", _figure(document["spin_hz"], "Hz"))
     residual, dissipated = _figure(energy.get("residual_j"), "J"), _figure(energy.get("dissipated_j"), "J")
     table.add_row("energy", f"residual {residual}, dissipated {dissipated}")

@@ -1,4 +1,4 @@
-"""`rig step`: let a rig in lockstep run on."""
+"""`rig step`: let a rig in lockstep, or a replay that is paused, go on a little."""
 
 from __future__ import annotations
 
@@ -7,17 +7,22 @@ from typing import Annotated
 import typer
 
 from rig.cli.connection import Connect, console
+from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
 
 
 def step(
     ticks: Annotated[
-        int, typer.Argument(help="Microseconds of simulated time, a whole multiple of the scene's block.")
-    ],
+        int | None,
+        typer.Argument(help="Microseconds of simulated time; for a rig, a whole multiple of the scene's block."),
+    ] = None,
     *,
+    blocks: Annotated[int | None, typer.Option(help="A number of blocks instead; only for a replay.")] = None,
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Let a rig that runs with --pace lockstep simulate TICKS more; returns when they are done."""
+    """Let a rig that runs with --pace lockstep simulate TICKS more, or a paused replay play them; returns when done."""
+    if (ticks is None) == (blocks is None):
+        raise InputError("step", "given TICKS or --blocks", "neither" if ticks is None else "both")
     with console(connect, "step") as rig:
-        done = rig.step(ticks)
+        done = rig.step(ticks) if ticks is not None else rig.step_blocks(blocks or 0)
         typer.echo(f"stepped to {done.time_s:.6f} s (tick {done.tick})")

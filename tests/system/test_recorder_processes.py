@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from recorder.reader import Recording
+from recorder.reader import Recording, join
 from rig.transport.zenoh import ZenohServer
 from rig.wire import (
     CLIENTS,
@@ -118,9 +118,9 @@ def publisher(port: int) -> Iterator[Publisher]:
 
 
 @contextmanager
-def recorder(path: Path, port: int, options: str = "") -> Iterator[subprocess.Popen[str]]:
+def recorder(path: Path, port: int, options: str = "", *, before: str = "") -> Iterator[subprocess.Popen[str]]:
     """`rig record` in a process of its own, ended by its own id whatever happens."""
-    code = (
+    code = before + (
         "import sys; from pathlib import Path; from rig.cli.record import record; "
         f"record(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
     )
@@ -265,3 +265,83 @@ def test_without_a_rig_one_line_and_no_file(tmp_path):
     assert "no rig answers" in errors.splitlines()[-1]
     assert output == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_rotating_recorder_loses_nothing_at_its_seams(tmp_path):
+    port = free_port()
+    path = tmp_path / "run.mcap"
+    with publisher(port) as rig, recorder(path, port, "rotate_s=0.4") as process:
+        wait_for(lambda: received(rig) > 0)
+        begun = rig.blocks()
+        wait_for(lambda: rig.blocks() > begun + 200)
+        rig.end()
+        output, errors = process.communicate(timeout=20.0)
+        assert process.returncode == 0, errors
+        assert "lost: nothing" in output
+        files = sorted(tmp_path.iterdir())
+        assert len(files) >= 4
+        recording = join(files)
+        assert recording.complete
+        for key, sent in rig.sent.items():
+            payloads = [payload for _, payload in recording.payloads(key)]
+            assert payloads == sent[len(sent) - len(payloads) :], key
+            assert len(payloads) >= 200 or schema_of(key) is None, key
+
+
+def test_a_trigger_makes_a_file_of_its_own(tmp_path):
+    port = free_port()
+    options = "trigger=['hammer'], pre_s=0.2, post_s=0.3, trigger_count=1"
+    with publisher(port) as rig, recorder(tmp_path / "run.mcap", port, options) as process:
+        wait_for(lambda: received(rig) > 0)
+        begun = rig.blocks()
+        wait_for(lambda: rig.blocks() > begun + 60)  # longer than is kept before a trigger
+        tick = rig.blocks() * 10_000
+        rig.server.publish(EVENTS, encode_document({"event": "hammer", "tick": tick, "time_s": tick / 1e6}))
+        output, errors = process.communicate(timeout=20.0)
+    assert process.returncode == 0, errors
+    assert "ended: 1 captures made" in output
+    (path,) = tmp_path.iterdir()
+    stream_ = Recording.open(path).streams[PROBES]
+    assert stream_.first_time_s == pytest.approx(tick / 1e6 - 0.2, abs=0.011)
+    assert stream_.last_time_s == pytest.approx(tick / 1e6 + 0.3, abs=0.011)
+    assert stream_.lost == 0
+
+
+def test_a_second_recorder_to_the_same_file_is_refused_and_the_first_one_goes_on(tmp_path):
+    port = free_port()
+    path = tmp_path / "run.mcap"
+    with publisher(port) as rig, recorder(path, port) as first:
+        wait_for(lambda: received(rig) > 0)
+        with recorder(path, port, "force=True") as second, recorder(tmp_path / "other.mcap", port) as third:
+            _, errors = second.communicate(timeout=20.0)
+            assert second.returncode == 1
+            assert "no other recording is writing to" in errors
+            wait_for(lambda: (tmp_path / "other.mcap.part").exists())
+            rig.end()
+            for process in (first, third):
+                output, errors = process.communicate(timeout=20.0)
+                assert process.returncode == 0, errors
+                assert "lost: nothing" in output
+    assert Recording.open(path).complete
+    assert Recording.open(tmp_path / "other.mcap").complete
+
+
+def test_a_full_disk_ends_the_command_with_what_was_kept_and_recover_finishes_it(tmp_path):
+    from rig.cli.recover import recover
+
+    port = free_port()
+    path = tmp_path / "run.mcap"
+    # A limit on the size of a file stands for the disk.
+    code = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, -1)); "
+    with publisher(port) as rig, recorder(path, port, "keep_free_mb=0.0", before=code) as process:
+        output, errors = process.communicate(timeout=30.0)
+        assert process.returncode == 1
+        assert "ended: disk error" in output
+        assert "is kept in" in " ".join(errors.split())
+        part = path.with_name("run.mcap.part")
+        recover([part])
+        recording = Recording.open(tmp_path / "run.recovered.mcap")
+        payloads = [payload for _, payload in recording.payloads(PROBES)]
+        start = rig.sent[PROBES].index(payloads[0])
+        assert payloads == rig.sent[PROBES][start : start + len(payloads)]
+        assert all(stream_.lost == 0 for stream_ in recording.streams.values())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.export import SUFFIXES, check_output, table_columns, writer_for
+from replays.export import SUFFIXES, check_run_output, table_columns, writer_for
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.kernels.signals import ROW, TRUTH
@@ -139,15 +139,15 @@ def test_existing_file_is_replaced_only_by_force(suffix: str, tmp_path: Path) ->
 @pytest.mark.parametrize("name", ["run.txt", "run", "run.CSV", "run.csv.gz", ".csv"])
 def test_another_suffix_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^output must be a file name that ends in \.mcap, \.parquet, \.csv"):
-        check_output(tmp_path / name, force=False)
+        check_run_output(tmp_path / name, force=False)
 
 
 def test_folders_are_not_made_and_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^output must be in a folder that exists"):
-        check_output(tmp_path / "none" / "run.csv", force=True)
+        check_run_output(tmp_path / "none" / "run.csv", force=True)
     (tmp_path / "run.csv").mkdir()
     with pytest.raises(InputError, match=r"^output must be a new file"):
-        check_output(tmp_path / "run.csv", force=True)
+        check_run_output(tmp_path / "run.csv", force=True)
 
 
 class Stop(Exception):

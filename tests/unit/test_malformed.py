@@ -220,7 +220,7 @@ CASES = [
     change("sensors.groups=probes", "sensors.groups", "a list"),
     change("set=3", "set", "a valid dictionary"),
     # Options.
-    Case("no such scene", ("simulate", "nosuch", "-o", "out.csv"), "scene", "one of drop, hammer, run-up, stable-run"),
+    Case("no such scene", ("simulate", "nosuch", "-o", "out.csv"), "scene", "one of drop, hammer, partial-rub, run-up, stable-run"),
     Case("scene is a folder", ("simulate", ".", "-o", "out.csv"), "scene", "the path of a .toml file"),
     Case(
         "scene of another suffix",

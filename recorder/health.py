@@ -1,0 +1,328 @@
+"""How sound a recording is: each channel against its own calibration, time, and what the rig said of itself.
+
+Read off the recording alone, window by window, so that long ones fit into memory. What is found is a reason to look,
+not a proof: a rig whose houses ring at 50 Hz looks like one with mains hum.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from recorder.reader import Recording
+from rig.channels import Channel, Group
+from rig.wire import EDGES, schema_of, sensor_key
+
+WINDOW_S = 2.0
+"""Length of a window; its spectrum resolves 0.5 Hz."""
+_PIECE_ROWS = 2000
+"""Rows over which a noise level is taken; the quiet pieces count, as a signal adds to it."""
+_NOISE_RATIO = (0.5, 2.0)
+"""Measured noise against calibrated noise that raises no doubt."""
+_STUCK_S = 0.05
+_DC = 0.02
+"""Part of the range that the mean of an AC-coupled channel may have."""
+_MAINS_HZ = (50.0, 60.0)
+_HUM = 20.0
+"""Power of a line against its surroundings that raises doubt."""
+_STRAY = 30.0
+"""Multiple of the median deviation beyond which a clock pair is left out."""
+_DIFFERENCES = 6
+_GAIN = math.sqrt(math.comb(2 * _DIFFERENCES, _DIFFERENCES))
+"""Standard deviation of the sixth difference of white noise of deviation 1: root of the sum of squared binomials."""
+
+
+@dataclass
+class ChannelHealth:
+    """One channel.
+
+    Attributes:
+        name: Channel.
+        unit: Unit of the values below.
+        rows: Number of rows.
+        mean: Mean value.
+        low: Least value.
+        high: Greatest value.
+        noise: White noise, as it is in the quietest tenth of the recording, rms; nan where there are too few rows.
+        noise_calibrated: The same in the channel's calibration.
+        limited_rows: Rows at the conditioner's or the converter's limit.
+        stuck_s: Longest time without any change [s].
+        findings: What raises doubt.
+    """
+
+    name: str
+    unit: str
+    rows: int = 0
+    mean: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    noise: float = math.nan
+    noise_calibrated: float = math.nan
+    limited_rows: int = 0
+    stuck_s: float = 0.0
+    findings: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Health:
+    """A recording.
+
+    Attributes:
+        channels: Each channel that was recorded.
+        pace: Simulated seconds a wall-clock second, a line through the clock pairs; nan if there are too few.
+        pace_ppm: The same as a deviation from real time [1e-6].
+        pace_error_ppm: What the jitter lets it be known to: rms over the length of the recording [1e-6].
+        jitter_ms: Deviation of the clock pairs from that line, rms [ms].
+        jitter_max_ms: The largest one [ms].
+        strays: Part of the clock pairs that lie far from the line, and are left out: history, or a pause.
+        misplaced: Blocks whose time does not fit their row number, by key.
+        status: The rig's own figures at the end: lateness, overruns, real-time factor, queue.
+        warnings: The rig's warnings.
+        findings: What raises doubt, apart from the channels.
+    """
+
+    channels: list[ChannelHealth]
+    pace: float
+    pace_ppm: float
+    pace_error_ppm: float
+    jitter_ms: float
+    jitter_max_ms: float
+    strays: float
+    misplaced: dict[str, int]
+    status: dict[str, Any]
+    warnings: list[str]
+    findings: list[str]
+
+
+class _Watch:
+    """Follows one group."""
+
+    def __init__(self, group: Group, spin_hz: float, *, noisy: bool) -> None:
+        self._group = group
+        self._spin_hz = spin_hz
+        self._noisy = noisy
+        self._rows: list[np.ndarray] = []
+        self._held = 0
+        self._next: int | None = None
+        self._window = round(WINDOW_S * group.rate_hz)
+        count = len(group.channels)
+        self._total = np.zeros(count)
+        self._n = 0
+        self._low = np.full(count, np.inf)
+        self._high = np.full(count, -np.inf)
+        self._limited = np.zeros(count, dtype=np.int64)
+        self._levels: list[np.ndarray] = []
+        self._power: np.ndarray | None = None
+        self._windows = 0
+        self._last: np.ndarray | None = None
+        self._run = np.zeros(count, dtype=np.int64)
+        self._longest = np.zeros(count, dtype=np.int64)
+
+    def add(self, index: int, counts: np.ndarray) -> None:
+        if self._next is not None and index != self._next:
+            self.flush()
+        self._next = index + len(counts)
+        self._rows.append(counts)
+        self._held += len(counts)
+        if self._held >= self._window:
+            self.flush()
+
+    def flush(self) -> None:
+        """Take what is held as one window."""
+        if not self._held:
+            return
+        counts = np.concatenate(self._rows)
+        self._rows, self._held = [], 0
+        rows = len(counts)
+        self._n += rows
+        self._total += counts.sum(axis=0, dtype=np.float64)
+        self._low = np.minimum(self._low, counts.min(axis=0))
+        self._high = np.maximum(self._high, counts.max(axis=0))
+        for column, channel in enumerate(self._group.channels):
+            low, high = _limits(channel)
+            values = counts[:, column]
+            self._limited[column] += np.count_nonzero((values <= low) | (values >= high))
+            self._follow_runs(column, values)
+        self._last = counts[-1]
+        pieces = rows // _PIECE_ROWS
+        values = counts.astype(np.float64)
+        if pieces:
+            fast = np.diff(values, n=_DIFFERENCES, axis=0)[: pieces * _PIECE_ROWS - _DIFFERENCES]
+            whole = len(fast) // pieces
+            split = fast[: whole * pieces].reshape(pieces, whole, -1)
+            # The median holds for white noise however rare the jolts are; 0.6745 is that of a standard normal.
+            self._levels.append(np.median(np.abs(split), axis=1) / 0.6745 / _GAIN)
+        if rows >= self._window:
+            part = values[: self._window] - values[: self._window].mean(axis=0)
+            spectrum = np.abs(np.fft.rfft(part * np.hanning(self._window)[:, None], axis=0)) ** 2
+            reach = spectrum[: round(100.0 * WINDOW_S) + 1]
+            self._power = reach if self._power is None else self._power + reach
+            self._windows += 1
+
+    def _follow_runs(self, column: int, values: np.ndarray) -> None:
+        """Length of the longest run of one and the same count, over the windows' edges."""
+        changes = np.flatnonzero(np.diff(values)) + 1
+        goes_on = self._last is not None and values[0] == self._last[column]
+        head = int(self._run[column]) if goes_on else 0
+        edges = np.concatenate(([0], changes, [len(values)]))
+        lengths = np.diff(edges)
+        lengths[0] += head
+        self._longest[column] = max(self._longest[column], lengths.max())
+        self._run[column] = lengths[-1]
+
+    def results(self) -> list[ChannelHealth]:
+        self.flush()
+        levels = np.concatenate(self._levels) if self._levels else np.full((1, len(self._group.channels)), np.nan)
+        quiet = np.percentile(levels, 10.0, axis=0)
+        found = []
+        for column, channel in enumerate(self._group.channels):
+            scale, offset = channel.scale, channel.offset
+            ends = sorted((self._low[column] * scale + offset, self._high[column] * scale + offset))
+            health = ChannelHealth(
+                name=channel.name,
+                unit=channel.unit,
+                rows=self._n,
+                mean=self._total[column] / max(self._n, 1) * scale + offset,
+                low=float(ends[0]),
+                high=float(ends[1]),
+                noise=float(quiet[column] * abs(scale)),
+                noise_calibrated=math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0))
+                / abs(channel.sensitivity_v),
+                limited_rows=int(self._limited[column]),
+                stuck_s=float(self._longest[column] - 1) / self._group.rate_hz,
+            )
+            self._judge(health, channel, column)
+            found.append(health)
+        return found
+
+    def _judge(self, health: ChannelHealth, channel: Channel, column: int) -> None:
+        say = health.findings.append
+        if health.limited_rows:
+            limited_s = health.limited_rows / self._group.rate_hz
+            say(f"at its limit for {limited_s:.4g} s ({health.limited_rows} rows)")
+        if self._noisy and channel.noise_v > channel.lsb_v:
+            if health.stuck_s >= _STUCK_S:
+                say(f"stuck for {health.stuck_s:.3g} s")
+            ratio = health.noise / health.noise_calibrated
+            if ratio > _NOISE_RATIO[1] or ratio < _NOISE_RATIO[0]:
+                say(f"noise {ratio:.2g} times its calibration")
+        if channel.highpass_hz > 0.0:
+            volts = (health.mean - channel.offset) / channel.scale * channel.lsb_v - channel.bias_v
+            if abs(volts) > _DC * max(map(abs, channel.range_v)):
+                say(f"a mean of {volts:.3g} V though it is AC-coupled: a bias fault?")
+        for mains_hz in _MAINS_HZ:
+            amplitude = self._line(mains_hz, column) * abs(channel.scale)
+            if amplitude:
+                say(f"a line of {amplitude:.2g} {channel.unit} at {mains_hz:g} Hz: mains hum?")
+
+    def _line(self, mains_hz: float, column: int) -> float:
+        """Amplitude of a line that stands out [counts]; 0 if none does, or it may be a multiple of the spin."""
+        if self._power is None:
+            return 0.0
+        if self._spin_hz > 1.0 and abs(math.remainder(mains_hz, self._spin_hz)) < 1.0 / WINDOW_S:
+            return 0.0
+        power = self._power[:, column] / self._windows
+        middle, reach = round(mains_hz * WINDOW_S), round(10.0 * WINDOW_S)
+        around = power[middle - reach : middle + reach + 1]
+        near = np.abs(np.arange(-reach, reach + 1)) <= 2
+        if around.argmax() != reach or power[middle] < _HUM * np.median(around[~near]):
+            return 0.0
+        # The next highest beside it may be another narrow line: then it is the signal that has lines.
+        if power[middle] < _HUM * around[~near].max():
+            return 0.0
+        return 2.0 * math.sqrt(power[middle]) / (0.5 * self._window)
+
+
+def _limits(channel: Channel) -> tuple[float, float]:
+    """Counts at and beyond which a channel is at a limit, its noise allowed for."""
+    margin_v = 4.0 * channel.noise_v + 2.0 * channel.lsb_v
+    full = 2 ** (channel.adc_bits - 1)
+    low, high = channel.range_v
+    return max((low + margin_v) / channel.lsb_v, -full), min((high - margin_v) / channel.lsb_v, full - 1)
+
+
+def examine(recording: Recording) -> Health:
+    """Look at everything that a recording tells about its own soundness."""
+    edges = np.unique(recording.edges())
+    spin_hz = 1.0 / float(np.median(np.diff(edges))) if len(edges) > 2 else 0.0
+    noisy = _has_noise(recording.scene)
+    watches = {
+        sensor_key(name): _Watch(group, spin_hz, noisy=noisy)
+        for name, group in recording.table.groups.items()
+        if recording.messages.get(sensor_key(name))
+    }
+    misplaced: dict[str, int] = {}
+    starts: dict[str, tuple[int, int]] = {}
+    keys = {key for key in recording.messages if schema_of(key) is not None and key != EDGES}
+    for key, block in recording.blocks_of(keys):
+        if block.rate_hz > 0.0:
+            tick, index = starts.setdefault(key, (block.tick, block.index))
+            if abs(block.tick - tick - (block.index - index) * block.tick_rate_hz / block.rate_hz) > 0.5:
+                misplaced[key] = misplaced.get(key, 0) + 1
+        watch = watches.get(key)
+        if watch is not None and block.values.shape[1] == len(watch._group.channels):
+            watch.add(block.index, block.values)
+    channels = [health for watch in watches.values() for health in watch.results()]
+    return _with_findings(recording, channels, misplaced)
+
+
+def _with_findings(recording: Recording, channels: list[ChannelHealth], misplaced: dict[str, int]) -> Health:
+    clock = recording.clock
+    span_s = float(np.ptp(clock[:, 1])) if len(clock) else 0.0
+    pace, jitter_ms, jitter_max_ms, strays = _pace(clock)
+    last = recording.statuses[-1] if recording.statuses else {}
+    kept = ("pace", "real_time_factor", "lateness_ms", "overruns", "queue", "energy", "engine")
+    warnings = dict.fromkeys(
+        [str(event.get("text", "")) for event in recording.events if event.get("event") == "warning"]
+        + [str(text) for text in last.get("warnings", [])]
+    )
+    findings = [
+        f"{count} blocks of {key} have a time that does not fit their row number" for key, count in misplaced.items()
+    ]
+    dropped = last.get("queue", {}).get("dropped", 0)
+    if dropped:
+        findings.append(f"the rig dropped {dropped} blocks before they were published")
+    if recording.damaged:
+        findings.append(f"{recording.damaged} damaged chunks are passed over")
+    return Health(
+        channels=channels,
+        pace=pace,
+        pace_ppm=(pace - 1.0) * 1e6,
+        pace_error_ppm=1e3 * jitter_ms / span_s if span_s > 0.0 else math.nan,
+        jitter_ms=jitter_ms,
+        jitter_max_ms=jitter_max_ms,
+        strays=strays,
+        misplaced=misplaced,
+        status={name: last[name] for name in kept if name in last},
+        warnings=list(warnings),
+        findings=findings,
+    )
+
+
+def _has_noise(scene: dict[str, Any]) -> bool:
+    """Whether the scene's sensors have noise; a recording from elsewhere says nothing of it, and has."""
+    sensors = scene.get("scene", {}).get("sensors", {}) if isinstance(scene.get("scene"), dict) else {}
+    return sensors.get("noise", True) is not False and sensors.get("chain", "full") != "ideal"
+
+
+def _pace(clock: np.ndarray) -> tuple[float, float, float, float]:
+    """Slope of simulated over wall time, deviations from the line (rms and largest [ms]), part of strays.
+
+    The line is through medians: what a recorder fetched from the rig's cache arrived in one burst.
+    """
+    half = len(clock) // 2
+    if half < 2:
+        return math.nan, math.nan, math.nan, math.nan
+    simulated_s, wall_s = clock[:, 0] - clock[0, 0], clock[:, 1] - clock[0, 1]
+    steps_s = np.maximum(wall_s[half:] - wall_s[: len(wall_s) - half], 1e-9)
+    slope = float(np.median((simulated_s[half:] - simulated_s[: len(wall_s) - half]) / steps_s))
+    if not slope > 0.0:
+        return math.nan, math.nan, math.nan, math.nan
+    rest_ms = 1e3 * (simulated_s / slope - wall_s)
+    rest_ms -= np.median(rest_ms)
+    near = np.abs(rest_ms) <= max(_STRAY * float(np.median(np.abs(rest_ms))), 50.0)
+    kept_ms = rest_ms[near]
+    return slope, float(np.sqrt(np.mean(kept_ms**2))), float(np.abs(kept_ms).max()), 1.0 - float(near.mean())

@@ -1,0 +1,316 @@
+"""Recordings made of recordings: a finished file of what a kill left, and cuts of one or several files.
+
+Payloads are written as they came, through the same writer as in a recording, so that index, counts, gaps and the
+messages for plots are made anew and the file is like any other. Metadata `recovered` or `cut` says what it was made of.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from recorder import schemas
+from recorder.reader import Recording
+from recorder.series import Commands
+from recorder.writer import Counts, RecordingWriter, check_destination, part_of
+from rig.errors import InputError
+from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_block, decode_document, encode_block, schema_of
+
+_TELL_EVERY = 5000
+"""Messages between two reports of progress."""
+_HEAD = ("README.txt", "catalogue.json", "parameters.json", "scene.json")
+
+
+@dataclass(frozen=True)
+class Rewritten:
+    """What became of it.
+
+    Attributes:
+        path: The new file.
+        counts: What stands in it.
+        damaged: Chunks of the source that could not be read.
+    """
+
+    path: Path
+    counts: Counts
+    damaged: int
+
+
+def recovered_path(source: Path) -> Path:
+    """Where `recover` writes to unless told otherwise: beside NAME.mcap.part or NAME.mcap, to NAME.recovered.mcap."""
+    name = source.name.removesuffix(schemas.PART_SUFFIX).removesuffix(".mcap")
+    return source.with_name(f"{name}.recovered.mcap")
+
+
+def recover(
+    source: Path,
+    output: Path | None = None,
+    *,
+    force: bool = False,
+    on_progress: Callable[[float], None] | None = None,
+) -> Rewritten:
+    """Make a finished file of one that was cut off or damaged; the source stays as it is.
+
+    Args:
+        source: The file.
+        output: The new file; by default beside it, see `recovered_path`.
+        force: Replace an existing file.
+        on_progress: Called with the part done, 0 to 1.
+
+    Raises:
+        InputError: The file is being written, cannot be read, or has no whole calibration; or the new one cannot be
+            written.
+        RecordingError: The disk refused.
+    """
+    output = output or recovered_path(source)
+    _check_not_among([source], output)
+    with _unlocked(source):
+        recording = Recording(source, salvage=True)
+        about = {
+            "source": source.name,
+            "source_bytes": str(source.stat().st_size),
+            "damaged_chunks": str(recording.damaged),
+        }
+        counts = _write(
+            recording,
+            output,
+            scene=recording.scene,
+            catalogue=recording.catalogue,
+            metadata={"recovered": about},
+            reason="recovered",
+            force=force,
+            change=lambda _, payload: payload,
+            on_progress=on_progress,
+        )
+    return Rewritten(output, counts, recording.damaged)
+
+
+def cut(
+    recording: Recording,
+    output: Path,
+    *,
+    from_s: float = -math.inf,
+    to_s: float = math.inf,
+    only: Literal["sensors", "truth"] | None = None,
+    channels: tuple[str, ...] = (),
+    force: bool = False,
+    on_progress: Callable[[float], None] | None = None,
+) -> Rewritten:
+    """Write a part of a recording, or several files joined, to a new file.
+
+    Payloads are kept byte for byte, but for the blocks at the edges, which are trimmed to the rows from `from_s` up to
+    but not including `to_s`, and blocks that lose columns.
+
+    Args:
+        recording: What is cut; `join` opens several files as one.
+        output: The new file.
+        from_s: Begin [s of simulated time].
+        to_s: End [s of simulated time].
+        only: Sensors or truth alone; events and status stay.
+        channels: Keep only these channels.
+        force: Replace an existing file.
+        on_progress: Called with the part done, 0 to 1.
+
+    Raises:
+        InputError: Times or channels cannot be used, nothing lies between them, or the file cannot be written.
+        RecordingError: The disk refused.
+    """
+    if math.isnan(from_s) or math.isnan(to_s) or not from_s < to_s:
+        raise InputError("from and to", "times, one before the other", f"{from_s:g} and {to_s:g}")
+    if only not in (None, "sensors", "truth"):
+        raise InputError("only", "sensors or truth", only)
+    _check_not_among([part.path for part in recording.parts], output)
+    catalogue, columns = _narrowed(recording, channels, only)
+    tick_rate_hz = recording.catalogue["tick_rate_hz"]
+    from_tick, to_tick = (_tick(at_s, tick_rate_hz) for at_s in (from_s, to_s))
+    commands = Commands(recording.scene)
+    for event in recording.events:
+        if isinstance(event.get("tick"), int) and event["tick"] < from_tick:
+            commands.follow(EVENTS, event)
+
+    def change(key: str, payload: bytes) -> bytes | None:
+        schema = schema_of(key)
+        if schema is None:
+            tick = _tick_of(payload)
+            return payload if tick is None or from_tick <= tick < to_tick else None
+        if key not in columns:
+            return None
+        try:
+            block = decode_block(payload, schema)
+        except ValueError:
+            return payload
+        kept = _trimmed(key, block, from_tick, to_tick, columns[key])
+        return payload if kept is block else None if kept is None else encode_block(kept)
+
+    about = {
+        "sources": json.dumps([part.path.name for part in recording.parts]),
+        "source_ends": json.dumps([part.end_reason for part in recording.parts]),
+        "from_s": f"{from_s:g}",
+        "to_s": f"{to_s:g}",
+        "only": only or "",
+        "channels": json.dumps(channels),
+    }
+    if not any(_overlaps(recording, key, from_s, to_s) for key in columns):
+        raise InputError("from and to", "times that the recording holds", f"{from_s:g} to {to_s:g} s")
+    counts = _write(
+        recording,
+        output,
+        scene=commands.scene,
+        catalogue=catalogue,
+        metadata={"cut": about},
+        reason="cut",
+        force=force,
+        change=change,
+        on_progress=on_progress,
+    )
+    return Rewritten(output, counts, recording.damaged)
+
+
+def _write(
+    recording: Recording,
+    output: Path,
+    *,
+    scene: dict[str, Any],
+    catalogue: dict[str, Any],
+    metadata: dict[str, dict[str, str]],
+    reason: str,
+    force: bool,
+    change: Callable[[str, bytes], bytes | None],
+    on_progress: Callable[[float], None] | None,
+) -> Counts:
+    """Copy what was recorded, changed or left out (None), and derive the rest anew."""
+    check_destination(output, force=force)
+    about = recording.metadata["rig"]
+    left_out = {"rig", "end"} if "recovered" in metadata else {"rig", "end", "series"}  # a cut is no part of a series
+    kept = {name: entries for name, entries in recording.metadata.items() if name not in left_out}
+    metadata = {**kept, "rig": {"created": about["created"]}, **metadata}
+    with contextlib.ExitStack() as stack:
+        writer = RecordingWriter(
+            output,
+            catalogue=catalogue,
+            parameters=recording.parameters,
+            scene=scene,
+            view_rate_hz=float(about.get("view_rate_hz", 0.0)),
+            force=force,
+            metadata=metadata,
+            attachments={name: data for name, data in recording.attachments.items() if name not in _HEAD},
+            sync_every_s=2.0,
+        )
+        stack.callback(writer.abandon)  # nothing half-written stays; does nothing once it is finished
+        total = max(1, sum(recording.messages.values()))
+        for number, (key, _, wall_ns, payload) in enumerate(recording.everything()):
+            if on_progress is not None and number % _TELL_EVERY == 0:
+                on_progress(number / total)
+            if key.startswith(schemas.VIEW + "/") or key == schemas.CLOCK:
+                continue
+            if key == schemas.GAPS:
+                gap = decode_document(payload)
+                if gap.get("kind") == "messages":
+                    writer.write_missed(str(gap["key"]), int(gap["size"]), wall_ns)
+                continue
+            changed = change(key, payload)
+            if changed is not None:
+                writer.write(key, changed, wall_ns)
+        writer.finish(reason)
+    return writer.counts()
+
+
+def _check_not_among(sources: list[Path], output: Path) -> None:
+    taken = {output.absolute(), part_of(output).absolute()}  # while it is written, it is a .part
+    if any(source.absolute() in taken for source in sources):
+        raise InputError("output", "another name than that of what is read", str(output))
+
+
+@contextlib.contextmanager
+def _unlocked(path: Path) -> Iterator[None]:
+    """Hold a file that nobody is writing to, so that nobody begins to.
+
+    Raises:
+        InputError: A recorder is writing to it, or it cannot be read.
+    """
+    import fcntl
+
+    try:
+        with path.open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError("file", "one that no recorder is writing to", str(path)) from None
+            yield
+    except OSError as error:
+        if error.filename != str(path):
+            raise
+        raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
+
+
+def _tick(at_s: float, tick_rate_hz: float) -> float:
+    return at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz))
+
+
+def _tick_of(payload: bytes) -> int | None:
+    try:
+        tick = decode_document(payload).get("tick")
+    except ValueError:
+        return None
+    return tick if isinstance(tick, int) else None
+
+
+def _overlaps(recording: Recording, key: str, from_s: float, to_s: float) -> bool:
+    stream = recording.streams.get(key)
+    return stream is not None and stream.rows > 0 and stream.first_time_s < to_s and stream.last_time_s >= from_s
+
+
+def _narrowed(
+    recording: Recording, channels: tuple[str, ...], only: str | None
+) -> tuple[dict[str, Any], dict[str, list[int] | None]]:
+    """The catalogue of what is kept, and of each key that is kept the columns; None where all are."""
+    known = recording.table.channels
+    for name in channels:
+        if name not in known:
+            raise InputError("channels", f"among {', '.join(known)}", name)
+    keys = {key for key in recording.messages if schema_of(key) is not None}
+    if only is not None:
+        keys = {key for key in keys if key.startswith((SENSORS if only == "sensors" else TRUTH) + "/")}
+    columns: dict[str, list[int] | None] = dict.fromkeys(keys)
+    groups = dict(recording.catalogue["table"]["groups"])
+    for name, group in recording.table.groups.items():
+        key = f"{SENSORS}/{name}"
+        picked = [column for column, channel in enumerate(group.names) if not channels or channel in channels]
+        if key not in keys or not picked:
+            groups.pop(name)
+            columns.pop(key, None)
+        elif len(picked) < len(group.names):
+            groups[name] = {**groups[name], "channels": [groups[name]["channels"][column] for column in picked]}
+            columns[key] = picked
+    if channels and "keyphasor" not in channels:
+        columns.pop(EDGES, None)
+    truth = {name: table for name, table in recording.catalogue.get("truth", {}).items() if f"{TRUTH}/{name}" in keys}
+    return {**recording.catalogue, "table": {"groups": groups}, "truth": truth}, columns
+
+
+def _trimmed(key: str, block: Block, from_tick: float, to_tick: float, columns: list[int] | None) -> Block | None:
+    """The rows of a block between two ticks, with their own tick and number; the same block where it keeps all."""
+    rows = len(block.values)
+    if key == EDGES:
+        ticks = block.tick + block.values[:, 0]
+        a_row = 0.0
+    else:
+        a_row = block.tick_rate_hz / block.rate_hz
+        ticks = block.tick + a_row * np.arange(rows)
+    kept = np.flatnonzero((ticks >= from_tick) & (ticks < to_tick))
+    if not len(kept):
+        return None
+    first, last = int(kept[0]), int(kept[-1]) + 1
+    if (first, last) == (0, rows) and columns is None:
+        return block
+    values = block.values[first:last] if columns is None else block.values[first:last, columns]
+    # A row lies on a whole tick: rates divide the tick rate.
+    tick = block.tick + round(first * a_row)
+    return Block(tick, block.index + first, block.rate_hz, block.tick_rate_hz, values)

@@ -1,0 +1,273 @@
+"""Time axes: how even time stamps are, samples at other instants, edges, and the shift between two clocks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+
+from rig.errors import InputError
+
+EVEN = 0.05
+"""Part of a sample within which time stamps must lie on their straight line to be even."""
+_HALF_TAPS = 48
+"""Taps of the interpolation filter on each side, in samples of the slower rate."""
+_CUTOFF, _KAISER = 0.94, 9.0
+_FINEST = 512
+_LARGEST_UP = 20_000
+PASS_BAND = 0.88
+"""Part of the lower Nyquist rate up to which the filter is flat: for a Kaiser window of beta 9, A = 90 dB, the
+transition is (A - 8) / (2.285 N) wide (Kaiser; Oppenheim & Schafer, Discrete-Time Signal Processing, eq. 7.76)."""
+FILTER = (
+    f"band-limited polyphase: Kaiser-windowed sinc, {2 * _HALF_TAPS} taps, flat to {PASS_BAND:g} of the lower Nyquist "
+    "rate, 90 dB down above it, no delay"
+)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """When the samples of a signal were taken.
+
+    Attributes:
+        first_s: Time of the first [s].
+        rate_hz: Mean rate [Hz].
+        rows: Number of samples.
+        times_s: Their times where they are not even [s], shape (n,).
+        jitter_s: Residual of the stamps from their straight line, rms and largest [s].
+        note: Where the axis is from.
+        numbers: Number of each sample on the even axis where some are missing, int64, shape (samples that came,).
+    """
+
+    first_s: float
+    rate_hz: float
+    rows: int
+    times_s: np.ndarray | None = None
+    jitter_s: tuple[float, float] = (0.0, 0.0)
+    note: str = ""
+    numbers: np.ndarray | None = None
+
+    def placed(self, values: np.ndarray) -> np.ndarray:
+        """The samples that came, on the axis: nan where one is missing, shape (rows,)."""
+        if self.numbers is None:
+            return values
+        whole = np.full(self.rows, np.nan)
+        whole[self.numbers] = values
+        return whole
+
+    @property
+    def last_s(self) -> float:
+        """Time of the last sample [s]."""
+        return self.first_s + (self.rows - 1) / self.rate_hz if self.times_s is None else float(self.times_s[-1])
+
+    def instants(self) -> np.ndarray:
+        """Time of each sample [s], shape (n,)."""
+        return self.first_s + np.arange(self.rows) / self.rate_hz if self.times_s is None else self.times_s
+
+    def moved(self, offset_s: float, stretch: float = 1.0) -> Axis:
+        """On another clock, where t becomes offset + stretch t."""
+        times_s = None if self.times_s is None else offset_s + stretch * self.times_s
+        return replace(self, first_s=offset_s + stretch * self.first_s, rate_hz=self.rate_hz / stretch, times_s=times_s)
+
+
+def axis_of_stamps(times_s: np.ndarray, *, line: bool, what: str) -> Axis:
+    """The time axis that time stamps make.
+
+    Args:
+        times_s: Stamps [s], shape (n,).
+        line: Take the straight line through them for the axis, however they jitter.
+        what: Whose they are, for errors.
+
+    Raises:
+        InputError: There are fewer than two, or they do not ascend.
+    """
+    n = len(times_s)
+    if n < 2 or not np.isfinite(times_s).all():
+        raise InputError("time stamps", "two or more finite numbers", f"{what} with {n}")
+    steps = np.diff(times_s)
+    if not np.all(steps > 0.0) and not line:
+        at = int(np.argmax(steps <= 0.0)) + 1
+        must = 'ascending (or time.stamps = "line", or time.rate_hz given)'
+        raise InputError("time stamps", must, f"{what}, {times_s[at]:g} s after {times_s[at - 1]:g} s (row {at + 1})")
+    first_s, step, jitter = _line(times_s, np.arange(n))
+    even = line or jitter[1] < EVEN * step
+    if not even:
+        # Samples may be missing from an even axis, as where a network has lost some.
+        numbers = np.concatenate([[0], np.cumsum(np.rint(steps / np.median(steps)))]).astype(np.int64)
+        if np.all(np.diff(numbers) > 0) and n <= numbers[-1] < 4 * n:
+            started_s, spaced, spread = _line(times_s, numbers)
+            if spread[1] < EVEN * spaced:
+                rows = int(numbers[-1]) + 1
+                note = f"straight line through the time stamps, {rows - n} samples missing"
+                return Axis(started_s, 1.0 / spaced, rows, None, spread, note, numbers)
+        return Axis(float(times_s[0]), 1.0 / step, n, times_s, jitter, "time stamps as they are")
+    return Axis(first_s, 1.0 / step, n, None, jitter, "straight line through the time stamps")
+
+
+def _line(times_s: np.ndarray, numbers: np.ndarray) -> tuple[float, float, tuple[float, float]]:
+    """Straight line through times by number: time of number 0, step, residual rms and largest, all [s]."""
+    # About the middle, so that no digits are lost.
+    centre, middle = numbers.mean(), times_s.mean()
+    rows = numbers - centre
+    step = float(rows @ (times_s - middle)) / float(rows @ rows)
+    residual = times_s - middle - step * rows
+    jitter = (float(np.sqrt(np.mean(residual**2))), float(np.abs(residual).max()))
+    return float(middle - step * centre), step, jitter
+
+
+def linear(values: np.ndarray, axis: Axis, instants_s: np.ndarray) -> np.ndarray:
+    """Values on straight lines between samples; beyond the ends, the end values."""
+    return np.interp(instants_s, axis.instants(), values)
+
+
+def polyphase(values: np.ndarray, axis: Axis, first_s: float, rate_hz: float, rows: int) -> np.ndarray:
+    """Even samples at another rate and of another start, band-limited; scipy's upfirdn with a shifted filter.
+
+    Args:
+        values: Samples, shape (n,).
+        axis: When they were taken; must be even.
+        first_s: Time of the first wanted one [s].
+        rate_hz: Wanted rate [Hz].
+        rows: Number wanted.
+
+    Returns:
+        Shape (rows,); the ends are as if the signal had gone on at its end values.
+    """
+    from scipy.signal import firwin, upfirdn
+
+    ratio = Fraction(rate_hz / axis.rate_hz).limit_denominator(_LARGEST_UP)
+    # Interpolated instants lie on a grid of 1/up of a sample: fine enough for any start.
+    fine = max(1, math.ceil(_FINEST / max(1, ratio.numerator)))
+    up, down = ratio.numerator * fine, ratio.denominator * fine
+    half = _HALF_TAPS * max(up, down)
+    taps = firwin(2 * half + 1, _CUTOFF / max(up, down), window=("kaiser", _KAISER)) * up  # pyright: ignore[reportArgumentType]
+    pad = math.ceil(half / up) + 1
+    padded = np.concatenate([np.full(pad, values[0]), values, np.full(pad, values[-1])])
+    # Output m is wanted at `shift + m down` of the fine grid; of the convolution, multiples of `down` are computed.
+    shift = round((first_s - axis.first_s) * axis.rate_hz * up) + pad * up + half
+    lead = -shift % down
+    out = upfirdn(np.concatenate([np.zeros(lead), taps]), padded, up, down)
+    skip = (shift + lead) // down
+    return out[skip : skip + rows]
+
+
+def crossings(
+    values: np.ndarray, axis: Axis, *, threshold: float | None, hysteresis: float | None, falling: bool = False
+) -> tuple[np.ndarray, float]:
+    """Instants at which a signal passes a level, between samples by a straight line.
+
+    Args:
+        values: The signal, shape (n,).
+        axis: Its time axis.
+        threshold: The level; None: half way between the lowest and the highest value.
+        hysteresis: How far the signal must go back before the next one counts; None: a tenth of its extent.
+        falling: Downward instead of upward.
+
+    Returns:
+        Instants [s], shape (k,), and the level.
+    """
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    level = 0.5 * (low + high) if threshold is None else threshold
+    back = 0.1 * (high - low) if hysteresis is None else hysteresis
+    sign = -1.0 if falling else 1.0
+    signal = sign * (np.nan_to_num(values, nan=low) - level)
+    upward = np.flatnonzero((signal[:-1] < 0.0) & (signal[1:] >= 0.0))
+    if not len(upward):
+        return np.empty(0), level
+    # An edge counts if the signal has been below the band since the one before.
+    below = np.concatenate([[0], np.cumsum(signal < -back)])
+    kept, last = [], -1
+    for at in upward.tolist():
+        if last < 0 or below[at + 1] > below[last + 1]:
+            kept.append(at)
+            last = at
+    at = np.array(kept)
+    times_s = axis.instants()
+    part = -signal[at] / (signal[at + 1] - signal[at])
+    return times_s[at] + part * (times_s[at + 1] - times_s[at]), level
+
+
+@dataclass(frozen=True)
+class Shift:
+    """How a clock is brought to another: t becomes offset + stretch t.
+
+    Attributes:
+        offset_s: Added to its times [s].
+        stretch: Its seconds in those of the other.
+        note: How it was found, and how well.
+    """
+
+    offset_s: float
+    stretch: float
+    note: str
+
+
+def shift_by_edges(
+    reference: tuple[np.ndarray, Axis], moved: tuple[np.ndarray, Axis], *, threshold: float | None, within_s: float
+) -> Shift:
+    """The shift that lays the rising edges of a common trigger upon each other.
+
+    With two or more edges in both, that many, their straight line also tells how much faster one clock goes.
+
+    Raises:
+        InputError: One of them has no edge, or they lie too far apart.
+    """
+    found = [crossings(*signal, threshold=threshold, hysteresis=None)[0] for signal in (reference, moved)]
+    if not len(found[0]) or not len(found[1]):
+        must = "an edge through the threshold in both signals"
+        raise InputError("align", must, f"{len(found[0])} in the reference, {len(found[1])} in what is moved")
+    a, b = found
+    if len(a) == len(b) > 1:
+        middle = b.mean()
+        stretch, offset = np.polyfit(b - middle, a, 1)
+        residual = float(np.abs(a - offset - stretch * (b - middle)).max())
+        offset = float(offset - stretch * middle)
+        how = f"{len(a)} common edges, clock {1e6 * (stretch - 1.0):+.2f} ppm, worst edge {residual * 1e6:.2f} us off"
+    else:
+        stretch, offset = 1.0, float(a[0] - b[0])
+        how = f"first edges ({len(a)} and {len(b)} in all)"
+    moves = max(abs(offset + (stretch - 1.0) * t) for t in (b[0], b[-1]))
+    if moves > within_s:
+        raise InputError("align", f"within {within_s:g} s (align.within_s)", f"{moves:g} s")
+    return Shift(offset, float(stretch), f"by {how}")
+
+
+def shift_by_correlation(
+    reference: tuple[np.ndarray, Axis], moved: tuple[np.ndarray, Axis], *, within_s: float
+) -> Shift:
+    """The shift at which two signals are most alike, between samples by a parabola.
+
+    Raises:
+        InputError: They are alike nowhere.
+    """
+    from scipy.signal import correlate, correlation_lags
+
+    (x, ax), (y, ay) = reference, moved
+    rate = max(ax.rate_hz, ay.rate_hz)
+    first = min(ax.first_s, ay.first_s)
+
+    def even(values: np.ndarray, axis: Axis) -> tuple[np.ndarray, float]:
+        start = first + math.ceil((axis.first_s - first) * rate - 1e-9) / rate
+        instants = start + np.arange(math.floor((axis.last_s - start) * rate + 1e-9) + 1) / rate
+        even_values = linear(np.nan_to_num(values, nan=float(np.nanmean(values))), axis, instants)
+        return even_values - even_values.mean(), start
+
+    x, x_start = even(x, ax)
+    y, y_start = even(y, ay)
+    norm = math.sqrt(float(x @ x) * float(y @ y))
+    alike = correlate(x, y, method="fft") / max(norm, 1e-300)
+    lags = correlation_lags(len(x), len(y)) / rate + x_start - y_start
+    near = np.abs(lags) <= within_s
+    if norm == 0.0 or not near.any():
+        raise InputError("align", "two signals that vary, and overlap within align.within_s", f"{within_s:g} s")
+    best = int(np.flatnonzero(near)[np.argmax(alike[near])])
+    peak = float(alike[best])
+    if peak < 0.3:
+        raise InputError("align", "alike by a correlation of 0.3 or more", round(peak, 3))
+    offset = float(lags[best])
+    if 0 < best < len(alike) - 1:
+        left, centre, right = alike[best - 1 : best + 2]
+        bend = left - 2.0 * centre + right
+        offset += 0.5 * float((left - right) / bend) / rate if bend < 0.0 else 0.0
+    return Shift(offset, 1.0, f"by cross-correlation {peak:.3f}")

@@ -1,0 +1,242 @@
+"""The mapping file of `rig import`: which signal becomes which channel, and what is done to it. TOML, checked."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, ValidationError, field_validator
+
+from rig.errors import InputError
+from rig.parameters import input_error, read_toml
+
+_TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class FileOptions(_Table):
+    """How a file is read, where it does not say so itself."""
+
+    delimiter: str | None = None
+    """One character, or tab, comma, semicolon, space."""
+    decimal: Literal[".", ","] | None = None
+    header_line: Annotated[int, Field(ge=0)] | None = None
+    """Line of the names, from 1; 0: there is none, and the columns are called "column 1" and so on."""
+    units_line: Annotated[int, Field(ge=1)] | None = None
+    first_line: Annotated[int, Field(ge=1)] | None = None
+    """First line of data, from 1."""
+    encoding: str | None = None
+    missing: tuple[str, ...] = ()
+    """More texts that stand for no value."""
+    time_column: str | Annotated[int, Field(ge=1)] | None = None
+    """Column of times, by name or number from 1; "none": there is none."""
+    time_unit: str | None = None
+    """s, ms, us, ns, min, h, or datetime."""
+    time_format: str | None = None
+    """Format of times that are neither numbers nor ISO 8601, as for Python's strptime."""
+
+    @field_validator("delimiter")
+    @classmethod
+    def _one_character(cls, delimiter: str | None) -> str | None:
+        if delimiter is not None and len(delimiter) != 1 and delimiter not in ("tab", "comma", "semicolon", "space"):
+            raise ValueError("one character, or tab, comma, semicolon, space")
+        return delimiter
+
+    @field_validator("time_unit")
+    @classmethod
+    def _known_unit(cls, unit: str | None) -> str | None:
+        if unit not in (None, "datetime", *_TIME_UNITS):
+            raise ValueError(f"one of {', '.join(_TIME_UNITS)}, datetime")
+        return unit
+
+    def only_for_text(self, path: Path) -> None:
+        """Refuse options that mean nothing for a file's format.
+
+        Raises:
+            InputError: The first such option.
+        """
+        for name in ("delimiter", "decimal", "header_line", "units_line", "first_line", "encoding", "time_format"):
+            if getattr(self, name) is not None:
+                raise InputError(f"file.{name}", f"left out with {path.suffix} files", getattr(self, name))
+
+    def time_scale(self, told: str) -> float:
+        """One unit of a column of times [s]: as given here, else as the file tells, else seconds."""
+        return _TIME_UNITS.get(self.time_unit or told.strip(), 1.0)
+
+
+class TimeOptions(_Table):
+    """The time axis of the source."""
+
+    rate_hz: PositiveFloat | None = None
+    """Sample rate [Hz], where the file tells none or a rounded one; its time stamps are then not used."""
+    stamps: Literal["as-is", "line"] = "as-is"
+    """As they stand, or the straight line through them: samples came evenly, and only the stamps jitter."""
+    from_s: FiniteFloat | None = None
+    """Start of what is imported, in the time of the first file [s]."""
+    to_s: FiniteFloat | None = None
+    """End of it [s]."""
+    start: datetime | None = None
+    """When the source's time zero was."""
+
+
+class Resample(_Table):
+    """Another sample rate, or even samples out of uneven ones."""
+
+    method: Literal["none", "polyphase", "linear"] = "none"
+    rate_hz: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    """Rate of the recording [Hz]; left out: that of the source."""
+
+
+class SignalName(_Table):
+    """A signal of the source."""
+
+    source: str
+    """Its name in the file."""
+    group: str | None = None
+    """The file's group that it stands in, where the name is not enough."""
+    file: str | None = None
+    """Name of the file, where there are several."""
+
+
+class ChannelMapping(SignalName):
+    """How one signal becomes one channel: value = sign * factor * (source - bias), in the channel's unit."""
+
+    unit: str | None = None
+    """Unit of the source; left out: as the file tells."""
+    sensitivity: str | None = None
+    """For a source in volts, such as "7.87 V/mm" or "200 mV/mil"."""
+    sign: Literal[1, -1] = 1
+    factor: FiniteFloat = 1.0
+    """Anything else to multiply by."""
+    bias: FiniteFloat | Literal["mean"] = 0.0
+    """Source value at zero, in its unit, or the mean of what is imported."""
+    delay_us: FiniteFloat = 0.0
+    """How late the source shows what happened [us]: a filter, a multiplexer."""
+    full_scale: PositiveFloat | None = None
+    """Source value (its amount, in its unit) from which on a sample counts as overrange."""
+    missing: Literal["gap", "hold", "refuse"] = "gap"
+    """Values that are no numbers: their rows are left out, the last good value stands in, or the import is refused."""
+    to: str | None = None
+    """Sensor group of a channel that is none of the rig's own, ..."""
+    to_unit: str | None = None
+    """... and its unit."""
+    label: str | None = None
+
+    @field_validator("factor")
+    @classmethod
+    def _not_zero(cls, factor: float) -> float:
+        if factor == 0.0:
+            raise ValueError("another number than 0")
+        return factor
+
+
+class Rotate(_Table):
+    """Two probes at any two angles as horizontal and vertical."""
+
+    channels: tuple[str, str]
+    """The channels that the two probes are mapped to; they become x and y."""
+    angles_deg: tuple[FiniteFloat, FiniteFloat]
+    """Where each probe sits: direction of its positive values, from x (EAST) toward y (up) [degrees]."""
+
+
+class Align(_Table):
+    """Brings two clocks together by what both have recorded."""
+
+    reference: SignalName
+    moved: SignalName
+    """Everything in the file of this signal moves, or everything in its group with scope "group"."""
+    scope: Literal["file", "group"] = "file"
+    method: Literal["edge", "correlation"] = "edge"
+    threshold: FiniteFloat | None = None
+    """Level of the edge, in both signals' own unit; left out: half way between the lowest and the highest value."""
+    within_s: PositiveFloat = 10.0
+    """Largest shift to look for [s]."""
+
+
+class KeyphasorMapping(SignalName):
+    """The pulse train that becomes the exact edges."""
+
+    threshold: FiniteFloat | None = None
+    """Level of the edge in the signal's unit; left out: half way between the lowest and the highest value."""
+    edge: Literal["rising", "falling"] = "rising"
+    hysteresis: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
+    """How far the signal must fall back before the next edge counts; left out: a tenth of its extent."""
+    pulses_per_turn: Annotated[int, Field(ge=1)] = 1
+
+
+class HammerMapping(_Table):
+    """Blows of the hammer, found in the channel `hammer`."""
+
+    threshold_n: PositiveFloat = 10.0
+    """Force from which on it is a blow [N]."""
+    dead_s: PositiveFloat = 0.1
+    """Time after a blow in which there is no other one [s]."""
+    pre_s: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
+    """The recording begins so long before the first blow [s]."""
+    delay_us: FiniteFloat = 0.0
+    """How late the channel shows it [us], as by a filter; only the blow's time changes, no sample moves."""
+    direction: str | float = "x"
+    """Where it hits, as in a scene."""
+
+
+class ExperimentMapping(_Table):
+    """What was done, as a scene, so that it can be simulated."""
+
+    scene: str
+    """Name of a scene, or the path of a file."""
+    set: dict[str, Any] = {}
+    """Changes of the scene or its parameters, by dotted key."""
+    speed_hz: FiniteFloat | Literal["measured"] | None = None
+    """Speed of the drive [Hz]; measured: the mean of the channel `speed`, or of the edges, before the first command."""
+    commands: tuple[dict[str, Any], ...] | Literal["scene", "detected"] = "scene"
+    """Commands with at_s in the recording's time; those of the scene; or the blows that were found."""
+
+
+class Mapping(_Table):
+    """A mapping file."""
+
+    file: FileOptions = FileOptions()
+    time: TimeOptions = TimeOptions()
+    resample: Resample = Resample()
+    channels: dict[str, ChannelMapping] = Field(min_length=1)
+    rotate: tuple[Rotate, ...] = ()
+    align: tuple[Align, ...] = ()
+    keyphasor: KeyphasorMapping | None = None
+    hammer: HammerMapping | None = None
+    experiment: ExperimentMapping | None = None
+
+    def document(self) -> dict[str, Any]:
+        """As JSON, without what is left at its default."""
+        return json.loads(self.model_dump_json(exclude_defaults=True))
+
+
+def load_mapping(path: Path) -> Mapping:
+    """Read and check a mapping file.
+
+    Raises:
+        InputError: The first thing that is wrong, with file and field.
+    """
+    data = read_toml(path)
+    try:
+        mapping = Mapping(**data)
+    except ValidationError as error:
+        first = input_error(error, "")
+        raise InputError(f"{path.name}: {first.field}", first.must, first.received) from None
+    time = mapping.time
+    if time.from_s is not None and time.to_s is not None and time.to_s <= time.from_s:
+        raise InputError(f"{path.name}: time.to_s", f"after time.from_s = {time.from_s:g}", time.to_s)
+    for entry in mapping.rotate:
+        for name in entry.channels:
+            if name not in mapping.channels:
+                raise InputError(f"{path.name}: rotate.channels", "mapped under [channels]", name)
+    if mapping.hammer is not None and "hammer" not in mapping.channels:
+        raise InputError(f"{path.name}: hammer", "left out without a channel `hammer` under [channels]", "[hammer]")
+    experiment = mapping.experiment
+    if experiment is not None and experiment.commands == "detected" and mapping.hammer is None:
+        raise InputError(f"{path.name}: experiment.commands", "used with a table [hammer]", "detected")
+    return mapping

@@ -1,0 +1,403 @@
+"""What of a recording is exported: columns in tables of one rate each, read chunk by chunk."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from recorder.reader import Recording, Stream
+from replays.formats import unit as units
+from rig.channels import Channel
+from rig.errors import InputError
+from rig.wire import Block, sensor_key, truth_key
+
+Unit = Literal["engineering", "volts", "counts"]
+ROWS = 1 << 14
+"""Rows of a chunk."""
+NO_VOLTS = "imported in its own unit"
+"""Provenance of an imported channel of whose voltage nothing is known."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of an export.
+
+    Attributes:
+        name: Name of the channel; truth is named `truth.TABLE.COLUMN`.
+        unit: Unit of the exported values.
+        label: What it is.
+        source: Channel of the table, or None for truth.
+        linear: Exported value = a * count + b; None for values that are exported as they are (truth, counts).
+    """
+
+    name: str
+    unit: str
+    label: str
+    source: Channel | None = None
+    linear: tuple[float, float] | None = None
+
+    @property
+    def heading(self) -> str:
+        """Name with unit."""
+        return f"{self.name} [{self.unit}]"
+
+    @property
+    def full_scale(self) -> float:
+        """Exported value's distance from that of count 0 at the end of the converter's range; 1 for truth."""
+        if self.source is None:
+            return 1.0
+        half = 2.0 ** (self.source.adc_bits - 1)
+        return half if self.linear is None else self.linear[0] * half
+
+    @property
+    def metadata(self) -> dict[str, str | int | float]:
+        """Everything that is known of it."""
+        about: dict[str, str | int | float] = {"name": self.name, "unit": self.unit, "label": self.label}
+        about["full_scale"] = self.full_scale
+        about["offset_exported"] = 0.0 if self.linear is None else self.linear[1]
+        if self.source is not None:
+            channel = self.source
+            about |= {
+                "group": channel.group, "engineering_unit": channel.unit, "scale": channel.scale,
+                "offset": channel.offset, "volts_per_count": channel.lsb_v, "sensitivity_v": channel.sensitivity_v,
+                "bias_v": channel.bias_v, "bandwidth_hz": channel.bandwidth_hz, "highpass_hz": channel.highpass_hz,
+                "adc_v": channel.adc_v, "adc_bits": channel.adc_bits, "calibration": channel.kind,
+            }  # fmt: skip
+        return about
+
+    def about(self) -> str:
+        """The same in a line, for formats that have a comment only."""
+        return json.dumps(self.metadata, ensure_ascii=False)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One stream of a recording, as columns of a table."""
+
+    key: str
+    columns: tuple[int, ...]
+    """Its columns that are wanted."""
+    width: int
+    """Columns that it has."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Consecutive rows of a table.
+
+    Attributes:
+        index: Number of the first row in the table, from 0.
+        times_s: Simulated time of each row [s], shape (n,).
+        values: Counts, or values for truth, float64, nan where a stream has no such row, shape (n, columns).
+        present: Rows that any of the table's streams has, shape (n,).
+    """
+
+    index: int
+    times_s: np.ndarray
+    values: np.ndarray
+    present: np.ndarray
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns at one rate.
+
+    Attributes:
+        name: Name of the sensor group, or of the rate.
+        title: What it is.
+        columns: Its columns.
+        parts: The streams that they come from.
+        rate_hz: Rows per second [Hz].
+        first_s: Simulated time of its first row [s].
+        rows: Number of rows from the first to the last, missing ones included.
+        shift: Number of the stream's row that is its first.
+    """
+
+    name: str
+    title: str
+    columns: tuple[Column, ...]
+    parts: tuple[Part, ...]
+    rate_hz: float
+    first_s: float
+    rows: int
+    shift: int
+
+    def exported(self, c: int, chunk: Chunk) -> np.ndarray:
+        """Values of a column in the unit asked for, float64, shape (n,); nan where it has none."""
+        linear = self.columns[c].linear
+        values = chunk.values[:, c]
+        return values.copy() if linear is None else values * linear[0] + linear[1]
+
+    def raw(self, c: int, chunk: Chunk) -> np.ndarray:
+        """What the recording holds: int32 counts where none is missing, else float64, shape (n,)."""
+        values = chunk.values[:, c]
+        present = values[chunk.present]
+        if self.columns[c].source is not None and not np.isnan(present).any():
+            return np.where(chunk.present, values, 0).astype(np.int32)
+        return values.copy()
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is exported of a recording."""
+
+    recording: Recording
+    tables: tuple[Table, ...]
+    unit: Unit
+    notes: dict[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def start(self) -> datetime:
+        """Wall time of simulated time 0."""
+        pairs = self.recording.clock
+        if len(pairs):
+            return datetime.fromtimestamp(float(pairs[0, 1] - pairs[0, 0]), tz=UTC)
+        return datetime.fromisoformat(self.recording.metadata["rig"]["created"])
+
+    @cached_property
+    def metadata(self) -> dict[str, str]:
+        """What is known of the whole."""
+        about = self.recording.metadata["rig"]
+        return {
+            "recording": self.recording.path.name, "scene": about["scene"], "seed": about["seed"],
+            "parameter_set": about["parameter_set"], "start": self.start.isoformat(), "values": self.unit, **self.notes,
+        }  # fmt: skip
+
+    def summary(self) -> str:
+        """The same in a line."""
+        return json.dumps(self.metadata, ensure_ascii=False)
+
+    def sidecar(self) -> dict[str, Any]:
+        """All metadata as a document, for formats that have no place for it."""
+        tables = [
+            {"name": table.name, "rate_hz": table.rate_hz, "first_s": table.first_s, "rows": table.rows,
+             "columns": [column.metadata for column in table.columns]}
+            for table in self.tables
+        ]  # fmt: skip
+        return {**self.metadata, "tables": tables}
+
+    @cached_property
+    def missing(self) -> dict[str, int]:
+        """Rows that a stream of a table lacks, between the table's first and last, by the table's name."""
+        lacking = {}
+        for table in self.tables:
+            lacking[table.name] = 0
+            for part in table.parts:
+                present = np.zeros(table.rows, dtype=bool)
+                for block in self.recording.blocks(part.key):
+                    first = block.index - table.shift
+                    present[max(0, first) : max(0, first + len(block.values))] = True
+                lacking[table.name] += table.rows - int(present.sum())
+        return lacking
+
+    def whole(self, table: Table) -> bool:
+        """Whether every stream of a table has all its rows."""
+        return not self.missing[table.name]
+
+    def chunks(self, table: Table, rows: int = ROWS) -> Iterator[Chunk]:
+        """Rows of a table, in order; blocks that came later than a chunk are in it all the same."""
+        cursors = [_Cursor(self.recording, part, table) for part in table.parts]
+        for start in range(0, table.rows, rows):
+            n = min(rows, table.rows - start)
+            values = np.full((n, len(table.columns)), np.nan)
+            present = np.zeros(n, dtype=bool)
+            first = 0
+            for cursor in cursors:
+                width = len(cursor.part.columns)
+                present |= cursor.fill(start, values[:, first : first + width])
+                first += width
+            times_s = table.first_s + np.arange(start, start + n) / table.rate_hz
+            yield Chunk(index=start, times_s=times_s, values=values, present=present)
+
+
+class _Cursor:
+    """Goes once through the blocks of a stream."""
+
+    def __init__(self, recording: Recording, part: Part, table: Table) -> None:
+        self.part = part
+        self._shift = table.shift
+        self._columns = list(part.columns)
+        self._blocks = (b for b in recording.blocks(part.key) if b.values.shape[1] == part.width)
+        self._ahead: list[Block] = []
+        self._over = False
+
+    def fill(self, start: int, values: np.ndarray) -> np.ndarray:
+        """Put rows from `start` on into `values`; gives which were there."""
+        end = start + len(values)
+        present = np.zeros(len(values), dtype=bool)
+        waiting, self._ahead = self._ahead, []
+        for block in waiting:
+            self._put(block, start, end, values, present)
+        while not self._over:
+            block = next(self._blocks, None)
+            if block is None:
+                self._over = True
+                break
+            self._put(block, start, end, values, present)
+            # A recovered block may have been recorded late: look a little further than the chunk.
+            if block.index - self._shift >= end + ROWS // 4:
+                break
+        return present
+
+    def _put(self, block: Block, start: int, end: int, values: np.ndarray, present: np.ndarray) -> None:
+        first = block.index - self._shift
+        low, high = max(first, start), min(first + len(block.values), end)
+        if low < high:
+            values[low - start : high - start] = block.values[low - first : high - first][:, self._columns]
+            present[low - start : high - start] = True
+        if first + len(block.values) > end:
+            self._ahead.append(block)
+
+
+def select(
+    recording: Recording,
+    *,
+    channels: Sequence[str] = (),
+    truth: bool = False,
+    unit: Unit = "engineering",
+    from_s: float | None = None,
+    to_s: float | None = None,
+    merged: bool = False,
+) -> Selection:
+    """Choose what of a recording is exported.
+
+    Args:
+        recording: The recording.
+        channels: Names of channels, of groups, of truth (`truth.TABLE` or `truth.TABLE.COLUMN`); none: all sensors.
+        truth: All truth as well.
+        unit: What the sensors' values are given in.
+        from_s: Start, simulated time [s].
+        to_s: End, simulated time [s].
+        merged: One table a rate instead of one a group.
+
+    Raises:
+        InputError: No such channel, an empty range, or nothing in it.
+    """
+    if from_s is not None and to_s is not None and not to_s > from_s:
+        raise InputError("to_s", f"after from_s = {from_s:g}", to_s)
+    wanted = _wanted(recording, channels, truth=truth)
+    streams = recording.streams
+    tables: dict[tuple[str, float, int], list[Table]] = {}
+    for key, numbers in wanted.items():
+        stream = streams.get(key)
+        if stream is None or stream.rows == 0:
+            if channels and any(key.endswith(name.removeprefix("truth.")) for name in channels):
+                raise InputError("channel", "one with samples in the recording", key)
+            continue
+        table = _table(recording, key, numbers, stream, unit, from_s, to_s)
+        if table is not None:
+            offset = round((table.first_s - table.shift / table.rate_hz) * 1e9)
+            tables.setdefault(("" if merged else key, table.rate_hz, offset), []).append(table)
+    if not tables:
+        held = [s for s in streams.values() if s.rows]
+        low, high = min((s.first_time_s for s in held), default=0.0), max((s.last_time_s for s in held), default=0.0)
+        raise InputError("range", f"in the recording, {low:g} to {high:g} s", f"{from_s} to {to_s} s")
+    return Selection(recording=recording, tables=tuple(_merge(alike) for alike in tables.values()), unit=unit)
+
+
+def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> dict[str, list[int]]:
+    """Keys and numbers of their columns."""
+    groups = {name: list(group.names) for name, group in recording.table.groups.items()}
+    truths = {
+        name: [column["name"] for column in about["columns"]]
+        for name, about in recording.catalogue.get("truth", {}).items()
+    }
+    if not channels:
+        found = {sensor_key(name): list(range(len(names))) for name, names in groups.items()}
+        if truth:
+            found |= {truth_key(name): list(range(len(names))) for name, names in truths.items()}
+        return found
+    places: dict[str, list[tuple[str, int]]] = {}
+    for name, names in groups.items():
+        places[name] = [(sensor_key(name), c) for c in range(len(names))]
+    for name, names in groups.items():
+        # A channel wins over a group of its name (the group `hammer` has the one channel `hammer`).
+        places |= {channel: [(sensor_key(name), c)] for c, channel in enumerate(names)}
+    for name, names in truths.items():
+        places[f"truth.{name}"] = [(truth_key(name), c) for c in range(len(names))]
+        places |= {f"truth.{name}.{column}": [(truth_key(name), c)] for c, column in enumerate(names)}
+    places["truth"] = [place for name in truths for place in places[f"truth.{name}"]]
+    chosen: dict[str, set[int]] = {}
+    for channel in [*channels, *(["truth"] if truth else [])]:
+        if channel not in places:
+            near = [name for name in places if name.split(".")[0] == "truth" or name in groups]
+            names = [*(name for group in groups.values() for name in group), *near]
+            raise InputError("channel", f"one of {', '.join(dict.fromkeys(names))}", channel)
+        for key, c in places[channel]:
+            chosen.setdefault(key, set()).add(c)
+    order = [*(sensor_key(name) for name in groups), *(truth_key(name) for name in truths)]
+    return {key: sorted(chosen[key]) for key in order if key in chosen}
+
+
+def _table(
+    recording: Recording,
+    key: str,
+    numbers: list[int],
+    stream: Stream,
+    unit: Unit,
+    from_s: float | None,
+    to_s: float | None,
+) -> Table | None:
+    block = next(block for block in recording.blocks(key) if len(block.values))
+    rate = block.rate_hz
+    zero_s = block.tick / block.tick_rate_hz - block.index / rate  # of the stream's row 0
+    low, high = stream.first_time_s, stream.last_time_s
+    # A hair for the rounding of times.
+    first = math.ceil((max(low, -math.inf if from_s is None else from_s) - zero_s) * rate - 1e-6)
+    last = math.floor((min(high, math.inf if to_s is None else to_s) - zero_s) * rate + 1e-6)
+    if last < first:
+        return None
+    name = key.rsplit("/", 1)[-1]
+    if key == sensor_key(name):
+        group = recording.table.groups[name]
+        columns = tuple(sensor_column(group.channels[c], unit) for c in numbers)
+        title, width = group.title, len(group.channels)
+    else:
+        about = recording.catalogue["truth"][name]["columns"]
+        columns = tuple(
+            Column(name=f"truth.{name}.{about[c]['name']}", unit=about[c]["unit"], label=about[c].get("label", ""))
+            for c in numbers
+        )
+        name, title, width = f"truth.{name}", f"True state of the model: {name}", len(about)
+    part = Part(key=key, columns=tuple(numbers), width=width)
+    return Table(
+        name=name, title=title, columns=columns, parts=(part,), rate_hz=rate, first_s=zero_s + first / rate,
+        rows=last - first + 1, shift=first,
+    )  # fmt: skip
+
+
+def sensor_column(channel: Channel, unit: Unit) -> Column:
+    """A channel as an exported column."""
+    name, label = channel.name, channel.label
+    if unit == "volts" and channel.kind == NO_VOLTS:
+        raise InputError("unit", f"engineering or counts, as nothing is known of the voltage of {name}", unit)
+    if unit == "counts":
+        return Column(name=name, unit="counts", label=label, source=channel)
+    linear = (channel.lsb_v, 0.0) if unit == "volts" else (channel.scale, channel.offset)
+    return Column(name=name, unit="V" if unit == "volts" else channel.unit, label=label, source=channel, linear=linear)
+
+
+def _merge(tables: list[Table]) -> Table:
+    if len(tables) == 1:
+        return tables[0]
+    first = min(table.shift for table in tables)
+    last = max(table.shift + table.rows for table in tables)
+    start = min(tables, key=lambda table: table.shift)
+    return Table(
+        name="+".join(table.name for table in tables), title="; ".join(table.title for table in tables),
+        columns=tuple(column for table in tables for column in table.columns),
+        parts=tuple(part for table in tables for part in table.parts),
+        rate_hz=start.rate_hz, first_s=start.first_s, rows=last - first, shift=first,
+    )  # fmt: skip
+
+
+def ordinate(column: Column) -> str:
+    """What a column's unit measures, for formats that have numbers for it."""
+    return units.kind(column.unit)

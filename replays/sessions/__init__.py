@@ -1,0 +1,7 @@
+"""Reference sessions: short recordings that later versions are validated against, and what makes them anew."""
+
+from __future__ import annotations
+
+from replays.sessions.session import FOLDER, SESSIONS, Session, make
+
+__all__ = ["FOLDER", "SESSIONS", "Session", "make"]

@@ -1,0 +1,130 @@
+"""What the reference sessions are, and how one is made: the recording, and beside it its quantities as text.
+
+The recording is what a validation is made against; the text is the part of a diff that people read. Both come from one
+build: elsewhere the same command gives recordings that differ by rounding, and behind chaotic impacts by more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from recorder.reader import Recording
+from recorder.writer import RecordingWriter
+from replays.validation import validate
+from replays.validation.outcome import Validation
+from rig.offline import frames
+from rig.scenes import load_scene
+from rig.simulation import TICK_RATE_HZ, Simulation
+from rig.wire import EDGES, EVENTS, encode_block, encode_document, sensor_key, truth_key
+
+FOLDER = Path(__file__).parent
+COMMAND = "rig sessions -o replays/sessions --force"
+"""What makes the committed ones anew."""
+_EPOCH_NS = 1_800_000_000 * 1_000_000_000
+"""Wall time at which they begin, the same always: the same numbers give the same bytes."""
+_SMALL = {"sensors.truth_rate_hz": 100}
+
+
+@dataclass(frozen=True)
+class Session:
+    """One reference session: a scene, cut short and sampled slowly."""
+
+    name: str
+    scene: str
+    changes: dict[str, Any] = field(default_factory=dict)
+
+
+SESSIONS = {
+    session.name: session
+    for session in (
+        Session("drop", "drop", {"duration_s": 0.4, "sensors.rate_hz": 5000}),
+        Session("stable-run", "stable-run", {"duration_s": 0.6, "sensors.rate_hz": 2000}),
+        *(
+            Session(f"hammer-{hz}", "hammer", {"duration_s": 0.6, "sensors.rate_hz": 5000, "drive.speed_hz": hz})
+            for hz in (3.2, 4.2, 5.2, 6.2)
+        ),
+        Session("partial-rub", "partial-rub", {"duration_s": 0.9, "sensors.rate_hz": 5000}),
+    )
+}
+
+
+def make(session: Session, folder: Path, *, step: Callable[[str], None] = lambda _text: None) -> tuple[Path, Path]:
+    """Make one session: NAME.mcap and NAME.toml, each whole or not there; what stood there is replaced.
+
+    Args:
+        session: Which.
+        folder: Where.
+        step: Told what is being done.
+    """
+    recording, text = folder / f"{session.name}.mcap", folder / f"{session.name}.toml"
+    step(session.name)
+    _record(session, recording)
+    found = validate(Recording.open(recording), declared=True)
+    part = text.with_name(text.name + ".part")
+    try:
+        part.write_text(quantities_text(session, found), encoding="utf-8")
+        part.replace(text)
+    finally:
+        part.unlink(missing_ok=True)
+    return recording, text
+
+
+def _record(session: Session, path: Path) -> None:
+    simulation = Simulation(load_scene(session.scene, {**_SMALL, **session.changes}))
+    writer = RecordingWriter(
+        path, catalogue=simulation.catalogue(), parameters=simulation.parameters_document(),
+        scene=simulation.scene_document(), view_rate_hz=0.0, from_start=True, force=True, wall_ns=lambda: _EPOCH_NS,
+        monotonic_s=lambda: 0.0,
+    )  # fmt: skip
+    whole = False
+    try:
+        _write_event(writer, {"event": "start", "scene": session.scene, "seed": simulation.scene.seed, "tick": 0})
+        for frame in frames(simulation):
+            for event in frame.events:
+                _write_event(writer, event)
+            blocks = {sensor_key(name): block for name, block in frame.samples.items()}
+            blocks |= {truth_key(name): block for name, block in frame.truth.items()}
+            if frame.edges is not None:
+                blocks[EDGES] = frame.edges
+            for key, block in blocks.items():
+                writer.write(key, encode_block(block), _wall_ns(frame.tick))
+        _write_event(writer, {"event": "end", "reason": "completed", "tick": simulation.tick})
+        writer.finish("completed")
+        whole = True
+    finally:
+        if not whole:
+            writer.abandon()
+
+
+def _write_event(writer: RecordingWriter, event: dict[str, Any]) -> None:
+    tick = int(event["tick"])
+    writer.write(EVENTS, encode_document({"time_s": tick / TICK_RATE_HZ, **event}), _wall_ns(tick))
+
+
+def _wall_ns(tick: int) -> int:
+    return _EPOCH_NS + tick * (1_000_000_000 // TICK_RATE_HZ)
+
+
+def quantities_text(session: Session, found: Validation) -> str:
+    """The quantities of a session as TOML, phase by phase, as its sensors show them (energies: the truth)."""
+    lines = [
+        f"# Quantities of {session.name}.mcap, read off the recording; made with it by `{COMMAND}`.",
+        f"# Scene {session.scene} with {', '.join(f'{key} = {value}' for key, value in session.changes.items())}.",
+        "# Five digits are written: another machine may differ in the last ones, and more in a chaotic phase.",
+    ]
+    for number, phase in enumerate(found.phases):
+        lines += [
+            "",
+            "[[phases]]",
+            f'name = "{phase.name}"',
+            f"from_s = {phase.from_s:.5g}",
+            f"to_s = {phase.to_s:.5g}",
+        ]
+        for one in found.statistics:
+            if one.number == number and not one.quantity.startswith("spectrum"):
+                unit = f"  # {one.unit}" if one.unit else ""
+                lines.append(f"{one.quantity} = {one.recorded:.5g}{unit}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,134 @@
+"""Payload against payload: every recorded block beside the same rows of a re-simulation, encoded again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from recorder.reader import Recording
+from rig.simulation import TICK_RATE_HZ, Frame
+from rig.wire import EDGES, Block, encode_block, schema_of, sensor_key, truth_key
+
+
+@dataclass
+class StreamBits:
+    """How one stream compares.
+
+    Attributes:
+        rows: Rows compared.
+        different: Payloads that differ.
+        first_s: Simulated time of the first row that differs [s]; None where none does.
+        first_column: Its column.
+        largest: Largest difference, in counts or SI.
+        skipped: Rows that the recording lost.
+        beyond: Rows with nothing to hold them against.
+    """
+
+    rows: int = 0
+    different: int = 0
+    first_s: float | None = None
+    first_column: int = 0
+    largest: float = 0.0
+    skipped: int = 0
+    beyond: int = 0
+
+    @property
+    def equal(self) -> bool:
+        """Every payload is equal, byte for byte."""
+        return self.different == 0 and self.beyond == 0
+
+
+class Bits:
+    """Follows a re-simulation frame by frame; only rows that recorded blocks still wait for are kept."""
+
+    def __init__(self, recording: Recording) -> None:
+        keys = sorted(key for key in recording.messages if schema_of(key) is not None and key in recording.streams)
+        self.streams = {key: _Follower(key, recording.blocks(key)) for key in keys}
+
+    def follow(self, frame: Frame) -> None:
+        """Take the next frame."""
+        blocks = {sensor_key(name): block for name, block in frame.samples.items()}
+        blocks |= {truth_key(name): block for name, block in frame.truth.items()}
+        if frame.edges is not None:
+            blocks[EDGES] = frame.edges
+        for key, block in blocks.items():
+            if key in self.streams:
+                self.streams[key].take(block)
+
+    def finish(self) -> dict[str, StreamBits]:
+        """The outcome, by key."""
+        return {key: follower.finish() for key, follower in self.streams.items()}
+
+
+@dataclass
+class _Follower:
+    key: str
+    recorded: Iterator[Block]
+    found: StreamBits = field(default_factory=StreamBits)
+    _waiting: Block | None = None
+    _rows: list[np.ndarray] = field(default_factory=list)
+    _first: int = 0
+    """Number of the first kept row."""
+    _next: int | None = None
+
+    def take(self, block: Block) -> None:
+        values = block.values
+        if self.key == EDGES:  # ticks from the block's own tick: to the rig's tick zero, exactly
+            values = values + block.tick
+        if not self._rows:
+            self._first = block.index
+        self._rows.append(values.copy())
+        kept = np.concatenate(self._rows)
+        end = self._first + len(kept)
+        while (waiting := self._upcoming()) is not None and waiting.index + len(waiting.values) <= end:
+            self._compare(waiting, kept[max(0, waiting.index - self._first) :][: len(waiting.values)], block)
+            self._waiting = None
+        begin = end if waiting is None else min(end, max(self._first, waiting.index))
+        self._rows = [kept[begin - self._first :]] if begin < end else []
+        self._first = begin
+
+    def _upcoming(self) -> Block | None:
+        if self._waiting is None:
+            self._waiting = next(self.recorded, None)
+        return self._waiting
+
+    def _compare(self, recorded: Block, values: np.ndarray, like: Block) -> None:
+        found, n = self.found, len(recorded.values)
+        if self._next is not None:
+            found.skipped += max(0, recorded.index - self._next)
+        self._next = recorded.index + n
+        if recorded.index < self._first and len(values) and self._first > recorded.index:
+            found.beyond += n  # an older block again: its rows are gone
+            return
+        if n == 0:
+            return
+        found.rows += n
+        if self.key == EDGES:
+            tick, values = recorded.tick, values - recorded.tick
+        else:
+            tick = round(recorded.index * TICK_RATE_HZ / like.rate_hz)
+        again = Block(
+            tick=tick, index=recorded.index, rate_hz=like.rate_hz, tick_rate_hz=like.tick_rate_hz, values=values
+        )
+        if encode_block(again) == encode_block(recorded):
+            return
+        found.different += 1
+        if values.shape != recorded.values.shape:
+            row, column = 0, 0
+        else:
+            off = np.abs(values.astype(float) - recorded.values)
+            found.largest = max(found.largest, float(off.max()))
+            row, column = (int(k) for k in np.argwhere(values != recorded.values)[0]) if off.any() else (0, 0)
+        if found.first_s is None:
+            rate = recorded.rate_hz
+            offset = recorded.values[row, 0] if self.key == EDGES else row * TICK_RATE_HZ / rate if rate else 0.0
+            found.first_s, found.first_column = float(recorded.tick + offset) / TICK_RATE_HZ, column
+
+    def finish(self) -> StreamBits:
+        """Count what nothing came for."""
+        while (waiting := self._upcoming()) is not None:
+            self.found.beyond += len(waiting.values)
+            self._waiting = None
+        return self.found

@@ -1,0 +1,438 @@
+"""A validation: a recording held against its own experiment, and everything that comes out of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recorder.reader import Recording
+from replays.experiment import Experiment
+from replays.sensitivity import value_of, with_values
+from replays.validation.attribution import Explained, attribute
+from replays.validation.bits import Bits, StreamBits
+from replays.validation.criteria import Criteria, load_criteria
+from replays.validation.phases import QUANTITIES, SPECTRA, Phase, View, find_phases, quantities, spectra, view_of
+from replays.validation.prediction import Measured, Prediction, bare, measured, predict
+from replays.validation.trajectory import ChannelResidual, foreseeable_s, residuals
+from rig.channels import default_table
+from rig.kernels.signals import COLUMN, TRUTH
+from rig.model import build_model
+from rig.simulation import DISSIPATED
+from rig.wire import TRUTH as TRUTH_KEY
+
+_CENTRE = 0.99
+"""Contact truth is compared where the gap is below this part of the clearance."""
+_TRUTH = {"dissipated": DISSIPATED, "drive_work": ("drive_work",)}
+
+
+@dataclass(frozen=True)
+class StatisticResult:
+    """One quantity of one phase.
+
+    Attributes:
+        number: Place of the phase among the phases found.
+        phase: The phase's name.
+        quantity: The quantity's name.
+        unit: Its unit.
+        recorded: Read off the recording.
+        foretold: Median over the ensemble.
+        spread: Standard deviation over the ensemble.
+        limit: Largest difference allowed; None where there is no criterion.
+        reason: The criterion's.
+    """
+
+    number: int
+    phase: str
+    quantity: str
+    unit: str
+    recorded: float
+    foretold: float
+    spread: float
+    limit: float | None
+    reason: str
+
+    @property
+    def good(self) -> bool | None:
+        """Within the criterion; None where there is none."""
+        if self.limit is None:
+            return None
+        off = self.recorded - self.foretold
+        # Spectra cannot be too much alike.
+        return bool((off if self.quantity in SPECTRA else abs(off)) <= self.limit)
+
+
+@dataclass(frozen=True)
+class TruthResult:
+    """One truth table inside the window: largest difference as a part of each column's largest value."""
+
+    table: str
+    column: str
+    relative: float
+    limit: float
+
+    @property
+    def good(self) -> bool:
+        """Within the criterion."""
+        return self.relative <= self.limit
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What a validation came to.
+
+    Attributes:
+        path: The recording.
+        scene: Name of its scene.
+        criteria: Title of the criteria.
+        changes: What was changed against the recording.
+        bits: By key; empty where bits were not compared.
+        bit_exact: Every payload is equal.
+        declared: Judged by the declared comparison even so.
+        window_s: The trajectory is judged from the first to the second of these times [s].
+        window_reason: How its end was found.
+        residuals: Of every channel in the window.
+        truth: Of every truth table in the window.
+        phases: The phases found.
+        statistics: Of every phase.
+        calibration: How the recording's channels differ from the rig's own table, in words.
+        skipped: Rows that the recording lost.
+        explained: Where something failed, what it may come from.
+        parts: What was recorded.
+        nominal: What was foretold.
+    """
+
+    path: Path
+    scene: str
+    criteria: str
+    changes: dict[str, Any]
+    bits: dict[str, StreamBits]
+    bit_exact: bool
+    declared: bool
+    window_s: tuple[float, float]
+    window_reason: str
+    residuals: tuple[ChannelResidual, ...]
+    truth: tuple[TruthResult, ...]
+    phases: tuple[Phase, ...]
+    statistics: tuple[StatisticResult, ...]
+    calibration: tuple[str, ...]
+    skipped: int
+    explained: Explained | None
+    parts: dict[str, Measured] = field(repr=False, default_factory=dict)
+    nominal: Prediction | None = field(repr=False, default=None)
+
+    @property
+    def good(self) -> bool:
+        """Bit-exact, or within every criterion."""
+        return (self.bit_exact and not self.declared) or not self.failures
+
+    @property
+    def failures(self) -> list[str]:
+        """Every criterion that is not met, in words."""
+        found = [
+            f"{one.channel}: residual {one.rms:.3g} floors RMS, {one.peak:.3g} at most, drift {one.drift:.3g}"
+            for one in self.residuals
+            if one.good is False
+        ]
+        found += [f"truth {one.table}.{one.column}: off by {one.relative:.2g}" for one in self.truth if not one.good]
+        found += [
+            f"{one.phase}, {one.quantity}: {one.recorded:.5g} against {one.foretold:.5g} {one.unit}".rstrip()
+            for one in self.statistics
+            if one.good is False
+        ]
+        return found
+
+    @property
+    def bits_line(self) -> str:
+        """How the payloads compare, in one line."""
+        rows = sum(one.rows for one in self.bits.values())
+        lost = f"; {self.skipped} rows that the recording lost are passed over" if self.skipped else ""
+        if self.bit_exact:
+            return f"bit-exact: all payloads of {len(self.bits)} streams, {rows} rows{lost}"
+        off = [(key, one) for key, one in self.bits.items() if not one.equal]
+        if not off:
+            return f"bits: nothing to compare{lost}"
+        timed = [(one.first_s, key) for key, one in off if one.first_s is not None]
+        first = f", first {min(timed)[1]} at {min(timed)[0]:.6f} s" if timed else ""
+        truth = [key for key, _ in off if key.startswith(TRUTH_KEY)]
+        held = any(key.startswith(TRUTH_KEY) for key in self.bits)
+        motion = "; truth is equal to the bit: another noise, calibration or sensor" if held and not truth else ""
+        return f"not bit-exact: {len(off)} of {len(self.bits)} streams differ{first}{motion}{lost}"
+
+    @property
+    def verdict_line(self) -> str:
+        """The outcome in one line."""
+        if self.good:
+            basis = "bit by bit" if self.bit_exact and not self.declared else f"by the criteria: {self.criteria}"
+            return f"good, {basis}"
+        failures = self.failures
+        return f"FAILS {len(failures)} criteria: " + "; ".join(failures[:3]) + ("; ..." if failures[3:] else "")
+
+    def document(self) -> dict[str, Any]:
+        """All of it but the samples, as a JSON document."""
+        return _plain(
+            {
+                "file": str(self.path),
+                "scene": self.scene,
+                "criteria": self.criteria,
+                "changes": self.changes,
+                "good": self.good,
+                "bit_exact": self.bit_exact,
+                "bits": {key: {**asdict(one), "equal": one.equal} for key, one in self.bits.items()},
+                "rows_lost": self.skipped,
+                "calibration": list(self.calibration),
+                "window": {"from_s": self.window_s[0], "to_s": self.window_s[1], "reason": self.window_reason},
+                "trajectory": [asdict(one) for one in self.residuals],
+                "truth": [{**asdict(one), "good": one.good} for one in self.truth],
+                "phases": [asdict(one) for one in self.phases],
+                "statistics": [{**asdict(one), "good": one.good} for one in self.statistics],
+                "failures": self.failures,
+                "explained": None if self.explained is None else asdict(self.explained),
+            }
+        )
+
+
+def validate(
+    recording: Recording,
+    *,
+    criteria: Criteria | None = None,
+    changes: dict[str, Any] | None = None,
+    declared: bool = False,
+    step: Callable[[str], None] = lambda _text: None,
+) -> Validation:
+    """Hold a recording against its own experiment.
+
+    Args:
+        recording: The recording.
+        criteria: What is asked; None for the rig's own.
+        changes: Other values of scene or parameters than the recorded ones, by dotted key.
+        declared: Judge by the declared comparison even where every bit is equal: what another build, on which it is
+            not, would be judged by.
+        step: Told what is being done.
+
+    Raises:
+        InputError: The recording is none that can be done again, or a change is none.
+    """
+    criteria = load_criteria() if criteria is None else criteria
+    experiment = Experiment.of(recording)
+    if changes:
+        experiment = experiment.changed(changes)
+    parts = measured(recording, experiment.scene.sensors, longest_s=criteria.window.longest_s)
+    bits = Bits(recording)
+    step("re-simulated, payload by payload")
+    nominal = predict(experiment, parts, follow=bits.follow)
+    streams = bits.finish()
+    quick = bare(experiment)
+    bit_exact = bool(streams) and all(stream.equal for stream in streams.values())
+
+    step("perturbed, to see how far it can be foretold")
+    rules = criteria.window
+    perturbed = predict(_perturbed(quick, rules.parameters, rules.perturbation), parts)
+    begin = min(float(part.times_s[0]) for part in parts.values())
+    end = max(float(part.times_s[-1]) for part in parts.values()) + 1e-9
+    parted = foreseeable_s(parts, nominal, perturbed, share=rules.share)
+    if parted is None:
+        reason = f"to the end: a change of {rules.perturbation:g} stays below {rules.share:g} of every channel's noise"
+    else:
+        end = parted
+        reason = f"a change of {rules.perturbation:g} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
+    trajectory = residuals(parts, nominal, perturbed, criteria, end_s=end)
+    tables = _recorded_truth(recording, longest_s=begin + rules.longest_s)
+    truth = _judge_truth(tables, nominal, perturbed, criteria, end_s=end)
+
+    step("statistics by phase, and their spread")
+    phases, statistics = _statistics(quick, parts, nominal, tables, criteria)
+    validation = Validation(
+        path=recording.path, scene=experiment.scene.name, criteria=criteria.title, changes=dict(changes or {}),
+        bits=streams, bit_exact=bit_exact, declared=declared, window_s=(begin, end), window_reason=reason,
+        residuals=tuple(trajectory), truth=tuple(truth), phases=tuple(phases), statistics=tuple(statistics),
+        calibration=tuple(_calibration(recording)), skipped=sum(stream.lost for stream in recording.streams.values()),
+        explained=None, parts=parts, nominal=nominal,
+    )  # fmt: skip
+    if validation.good:
+        return validation
+    firsts = [one.first_s for one in trajectory if one.first_s is not None]
+    explained = None
+    if firsts:
+        step("what explains the difference")
+        explained = attribute(quick, parts, nominal, criteria.attribution, from_s=min(firsts), step=step)
+    return replace(validation, explained=explained)
+
+
+def _perturbed(experiment: Experiment, keys: tuple[str, ...], part: float) -> Experiment:
+    return with_values(experiment, {key: value_of(experiment, key) * (1.0 + part) for key in keys})
+
+
+# Truth.
+
+
+def _recorded_truth(recording: Recording, *, longest_s: float) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Row numbers and values of the truth tables that are as this version makes them."""
+    found = {}
+    for name, columns in TRUTH.items():
+        if name not in recording.catalogue.get("truth", {}):
+            continue
+        samples = recording.truth(name)
+        if samples.names == columns and len(samples.index):
+            kept = samples.times_s < longest_s
+            found[name] = (samples.index[kept], samples.values[kept])
+    return found
+
+
+def _judge_truth(
+    tables: dict[str, tuple[np.ndarray, np.ndarray]],
+    nominal: Prediction,
+    perturbed: Prediction,
+    criteria: Criteria,
+    *,
+    end_s: float,
+) -> list[TruthResult]:
+    found = []
+    for name, (index, values) in tables.items():
+        here, there = nominal.truth[name], perturbed.truth[name]
+        kept = (index < min(len(here), len(there))) & (index < end_s * nominal.truth_rate_hz)
+        if name == "contact":  # at the very centre it has no direction, nor a speed along it
+            kept &= np.append(here[:, 0], 0.0)[np.minimum(index, len(here))] > _CENTRE * here[:, 0].min()
+        rows, recorded = index[kept], values[kept]
+        if not len(rows):
+            continue
+        scale = np.abs(here).max(axis=0)
+        scale[scale == 0.0] = 1.0
+        off = np.abs(recorded - here[rows]).max(axis=0) / scale
+        allowed = criteria.truth.relative + 10.0 * np.abs(there[rows] - here[rows]).max(axis=0) / scale
+        worst = int(np.argmax(off / allowed))
+        found.append(TruthResult(name, TRUTH[name][worst], float(off[worst]), float(allowed[worst])))
+    return found
+
+
+# Statistics.
+
+
+def _whole(parts: dict[str, Measured]) -> Phase:
+    begin = min(float(part.times_s[0]) for part in parts.values())
+    return Phase("", begin, max(float(part.times_s[-1]) for part in parts.values()) + 1e-9)
+
+
+def _statistics(
+    experiment: Experiment,
+    parts: dict[str, Measured],
+    nominal: Prediction,
+    tables: dict[str, tuple[np.ndarray, np.ndarray]],
+    criteria: Criteria,
+) -> tuple[list[Phase], list[StatisticResult]]:
+    recorded = {name: part.values for name, part in parts.items()}
+    channels = {channel.name: (name, c) for name, part in parts.items() for c, channel in enumerate(part.channels)}
+    model = build_model(experiment.scene.load_parameters(), experiment.scene.model)
+    row = experiment.simulation().first_row
+    base = {name: float(row[COLUMN[parts[g].channels[c].signal]] / parts[g].channels[c].si)
+            for name, (g, c) in channels.items() if name.startswith("P_")}  # fmt: skip
+
+    def floor(names: tuple[str, ...]) -> float:
+        return math.hypot(*(parts[channels[n][0]].floor[channels[n][1]] for n in names if n in channels))
+
+    touches = model.constants.contact.clearance * 1e3 + 6.0 * floor(("ring_x",))
+    if "ring_x" not in channels:
+        touches = math.nan
+
+    floors = {name: floor(names) for name, names in SPECTRA.items()}
+
+    def view(values: dict[str, np.ndarray], phase: Phase) -> View:
+        return view_of(parts, values, phase, base=base, touches=touches)
+
+    phases = find_phases(view(recorded, _whole(parts)), floor_n=floor(("P_N", "P_S", "P_E", "P_W")))
+    generator = np.random.default_rng(0)  # of the ensemble's noise and perturbations: the same in every validation
+    members = []
+    for _ in range(criteria.ensemble.members):
+        part = criteria.ensemble.perturbation * generator.uniform(-1.0, 1.0)
+        prediction = predict(_perturbed(experiment, criteria.window.parameters, part), parts)
+        loud = {
+            name: values + parts[name].floor * parts[name].random * generator.standard_normal(values.shape)
+            for name, values in prediction.values.items()
+        }
+        members.append((loud, prediction))
+
+    results = []
+    for number, phase in enumerate(phases):
+        there = view(nominal.values, phase)
+        read = quantities(view(recorded, phase), phase.name)
+        others = [quantities(view(loud, phase), phase.name) for loud, _ in members]
+        distances = spectra(view(recorded, phase), there, floors)
+        spread = [spectra(view(loud, phase), there, floors) for loud, _ in members]
+        energy = {}
+        if "energy" in tables:
+            energy = {name: _energy(tables["energy"], columns, phase, nominal) for name, columns in _TRUTH.items()}
+        for name, value in {**read, **distances, **{k: v[0] for k, v in energy.items()}}.items():
+            if name in distances:
+                sample = [one.get(name, 1.0) for one in spread]
+            elif name in energy:
+                sample = [_energy(tables["energy"], _TRUTH[name], phase, prediction)[1] for _, prediction in members]
+            else:
+                sample = [one[name] for one in others]
+            foretold, deviation = float(np.median(sample)), float(np.std(sample, ddof=1))
+            criterion = criteria.statistic_of(phase.name, name)
+            limit = None
+            if criterion is not None:
+                limit = criterion.relative * abs(foretold) + criterion.absolute + criterion.spread * deviation
+            results.append(
+                StatisticResult(
+                    number,
+                    phase.name, name, QUANTITIES[name].unit, value, foretold, deviation, limit,
+                    criterion.reason if criterion else "",
+                )
+            )  # fmt: skip
+    return phases, results
+
+
+def _energy(
+    table: tuple[np.ndarray, np.ndarray], columns: tuple[str, ...], phase: Phase, prediction: Prediction
+) -> tuple[float, float]:
+    """Recorded and foretold change of a sum of integrals over a phase [J]."""
+    index, values = table
+    picked = [TRUTH["energy"].index(column) for column in columns]
+    rate = prediction.truth_rate_hz
+    rows = np.flatnonzero((index >= phase.from_s * rate) & (index < phase.to_s * rate))
+    rows = rows[index[rows] < len(prediction.truth["energy"])]
+    if len(rows) < 2:
+        return 0.0, 0.0
+    ends = [rows[0], rows[-1]]
+    recorded = values[np.ix_(ends, picked)].sum(axis=1)
+    foretold = prediction.truth["energy"][np.ix_(index[ends], picked)].sum(axis=1)
+    return float(recorded[1] - recorded[0]), float(foretold[1] - foretold[0])
+
+
+# What the recording says of its own sensors.
+
+
+def _calibration(recording: Recording) -> list[str]:
+    """How the recording's channels differ from the rig's own table."""
+    own = default_table().channels
+    found = []
+    for name, channel in recording.table.channels.items():
+        if name not in own:
+            found.append(f"{name}: not in the rig's own channel table")
+            continue
+        like = default_table().only((own[name].group,), channel.rate_hz).channels[name]
+        fields = ("signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "highpass_hz", "noise_v",
+                  "adc_v", "adc_bits")  # fmt: skip
+        off = [f"{key} {getattr(channel, key)} instead of {getattr(like, key)}" for key in fields
+               if getattr(channel, key) != getattr(like, key)]  # fmt: skip
+        if off:
+            found.append(f"{name}: {', '.join(off)}")
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """Without numpy's types and numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

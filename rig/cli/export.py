@@ -1,0 +1,64 @@
+"""`rig export`: a recording in other tools' formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.errors import InputError
+
+
+def export(
+    file: Annotated[Path, typer.Argument(help="A recording (.mcap).")],
+    *,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="File to write: .mf4, .tdms, .uff, .csv, .parquet or .wav.")
+    ],
+    channels: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--channel", "-c", metavar="NAME", help="A channel, a group, or truth.TABLE[.COLUMN]; repeatable."
+        ),
+    ] = None,
+    truth: Annotated[bool, typer.Option("--truth", help="The model's true state as well.")] = False,
+    unit: Annotated[str, typer.Option(help="engineering, volts or counts.")] = "engineering",
+    from_s: Annotated[float | None, typer.Option(help="Start, in s of simulated time.")] = None,
+    to_s: Annotated[float | None, typer.Option(help="End, in s of simulated time.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(help="Bring all channels to this rate, in Hz.")] = None,
+    method: Annotated[str, typer.Option(help="How: polyphase (band-limited) or linear.")] = "polyphase",
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration where they have a place.
+
+    CSV and WAV have none: FILE.json stands beside them. CSV, Parquet and WAV hold one rate: channels of several make as
+    many files, or --rate-hz brings them to one.
+    """
+    from recorder.reader import Recording
+    from replays.formats.export import check_output, merged
+    from replays.formats.export import export as write
+    from replays.formats.selection import select
+    from rig.cli.progress import reporting
+
+    if unit not in ("engineering", "volts", "counts"):
+        raise InputError("--unit", "engineering, volts or counts", unit)
+    if method not in ("polyphase", "linear"):
+        raise InputError("--method", "polyphase or linear", method)
+    check_output(output, force=force)
+    recording = Recording.open(file)
+    selection = select(
+        recording, channels=channels or [], truth=truth, unit=unit, from_s=from_s, to_s=to_s, merged=merged(output)
+    )
+    with reporting() as reporter:
+
+        def tell(part: float) -> None:
+            reporter.part(part, f"exporting {file.name}")
+
+        written = write(selection, output, rate_hz=rate_hz, method=method, force=force, progress=tell)
+    for made in written:
+        size = made.path.stat().st_size / 1e6
+        typer.echo(f"{made.path}: {made.columns} columns, {size:.1f} MB, {unit}")
+        for name, rate, rows, missing in made.tables:
+            lost = f", {missing} missing" if missing else ""
+            typer.echo(f"  {name}: {rows} rows at {rate:g} Hz{lost}")

@@ -1,0 +1,173 @@
+"""`rig identify`: numbers of the rig from a recording, with intervals, and with what cannot be told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.options import Engine, Json, Parameters
+from rig.cli.progress import reporting
+from rig.cli.tables import new_table, table_console
+
+if TYPE_CHECKING:
+    from recorder.reader import Recording
+    from replays.experiment import Experiment
+    from replays.identification import Identification
+
+
+def identify(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")],
+    *,
+    fit: Annotated[
+        list[str],
+        typer.Option(
+            metavar="KEY[,KEY]",
+            help="What is asked for: a parameter, a number of the scene, or of a blow (hammer.1.force_n).",
+        ),
+    ],
+    start: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=VALUE", help="Where the search begins; else as recorded.")
+    ] = None,
+    bounds: Annotated[list[str] | None, typer.Option(metavar="KEY=LOW:HIGH", help="Least and largest value.")] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY=VALUE+-SIGMA", help="What is known from elsewhere: mean and standard deviation."),
+    ] = None,
+    window: Annotated[
+        str | None, typer.Option(metavar="FROM:TO", help="Use samples between these simulated times only, in s.")
+    ] = None,
+    channels: Annotated[str | None, typer.Option(metavar="NAME[,NAME]", help="Use these channels only.")] = None,
+    parameters: Parameters = None,
+    scene: Annotated[
+        str | None, typer.Option(metavar="SCENE", help="What was done, where the recording does not tell.")
+    ] = None,
+    engine: Engine = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.toml", help="Write the fitted parameter set.")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a report with pictures, .html or .pdf.")
+    ] = None,
+    precision: Annotated[
+        float, typer.Option(min=1e-9, help="Relative half width of the intervals that is fine enough.")
+    ] = 1e-4,
+    spread: Annotated[float, typer.Option(min=1e-6, max=1.0, help="How far off the start may be, relatively.")] = 0.1,
+    robust: Annotated[bool, typer.Option("--robust", help="Let single samples that are far off count less.")] = False,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Go on as far as the model stays linear, even if it no longer fits.")
+    ] = False,
+    json_output: Json = False,
+    force: Annotated[bool, typer.Option(help="Replace existing files.")] = False,
+) -> None:
+    """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell."""
+    import json
+
+    from recorder.reader import Recording
+    from replays.identification import ask
+    from replays.identification import identify as run
+    from replays.identification.document import check_set, fitted_set, identification_document, write_set
+    from replays.identification.summary import report_of
+    from replays.report import check_report
+    from rig.kernels import COMPILE_NOTICE, compiled_before
+
+    if output is not None:
+        check_set(output, force=force)
+    if report is not None:
+        check_report(report, force=force)
+    keys = [key.strip() for part in fit for key in part.split(",") if key.strip()]
+    recording = Recording.open(file)
+    question = ask(
+        recording,
+        _experiment(recording, parameters=parameters, scene=scene, engine=engine),
+        keys,
+        start={key: _number("start", text) for key, text in _pairs("start", start)},
+        bounds={key: _two("bounds", text, ":") for key, text in _pairs("bounds", bounds)},
+        priors={key: _two("prior", text, "+-") for key, text in _pairs("prior", prior)},
+        channels=[name.strip() for name in channels.split(",")] if channels else None,
+        window=_two("window", window, ":") if window else None,
+    )
+    if not compiled_before():
+        typer.echo(COMPILE_NOTICE, err=True)
+    with reporting() as reporter:
+        found = run(question, precision=precision, spread=spread, robust=robust, whole=whole, progress=reporter.step)
+    if output is not None:
+        write_set(fitted_set(found, recording=file.name), output)
+    if report is not None:
+        report_of(found, recording=file.name).write(report)
+    if json_output:
+        typer.echo(json.dumps(identification_document(found, recording=file.name), indent=2, allow_nan=False))
+        return
+    _show(found, file.name)
+    if output is not None:
+        typer.echo(f"written  {output}: a parameter set, as in `rig run hammer --parameters {output}`")
+    if report is not None:
+        typer.echo(f"written  {report}")
+
+
+def _experiment(recording: Recording, *, parameters: str | None, scene: str | None, engine: str | None) -> Experiment:
+    from replays.experiment import Experiment
+    from rig.scenes import load_scene
+
+    experiment = Experiment(scene=load_scene(scene)) if scene is not None else Experiment.of(recording)
+    if parameters is not None:
+        experiment = experiment.changed({"parameters": parameters, "set": {}})
+    return experiment.changed({"engine.name": engine}) if engine is not None else experiment
+
+
+def _pairs(option: str, given: list[str] | None) -> list[tuple[str, str]]:
+    from rig.errors import InputError
+
+    pairs = []
+    for text in given or []:
+        key, sign, value = text.partition("=")
+        if not sign:
+            raise InputError(option, "of the form KEY=...", text)
+        pairs.append((key.strip(), value.strip()))
+    return pairs
+
+
+def _number(option: str, text: str) -> float:
+    from rig.errors import InputError
+
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(option, "a number", text) from None
+
+
+def _two(option: str, text: str, between: str) -> tuple[float, float]:
+    from rig.errors import InputError
+
+    first, sign, second = text.partition(between)
+    if not sign:
+        raise InputError(option, f"two numbers with {between} between them", text)
+    return _number(option, first), _number(option, second)
+
+
+def _show(found: Identification, name: str) -> None:
+    from rich.text import Text
+
+    from replays.identification.summary import HEADINGS, cells, fit_line, window_line
+
+    console = table_console(width=200, highlight=False)
+    table = new_table(f"{name}: what it tells")
+    for heading in HEADINGS:
+        table.add_column(Text(heading), justify="right" if heading in ("start", "result", "95 % interval") else "left")
+    for finding in found.judgement.findings:
+        good = finding.standing == "identified"
+        table.add_row(*(Text(cell) for cell in cells(finding)), style=None if good else "yellow")
+    console.print(table)
+    keys = found.question.keys
+    if len(keys) > 1:
+        table = new_table("correlation")
+        for key in ("", *keys):
+            table.add_column(key, justify="right" if key else "left")
+        for key, row in zip(keys, found.judgement.correlation, strict=True):
+            table.add_row(key, *("-" if value != value else f"{value:+.4f}" for value in row))
+        console.print()
+        console.print(table)
+    console.print()
+    console.print(Text(window_line(found)))
+    console.print(Text(fit_line(found)))

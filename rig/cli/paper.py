@@ -1,0 +1,91 @@
+"""`rig paper`: the paper's figures, tables and conclusion, made again and judged, in one report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.options import Json
+from rig.cli.progress import reporting
+from rig.cli.tables import new_table, table_console
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    from replays.paper.document import Findings
+
+
+def paper(
+    *,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Write the report, .html or .pdf.")
+    ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option("--pictures", metavar="FOLDER", help="Write the main pictures as PNG files as well.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick/--full", help="Few, short runs (some seconds), or all of them (about a minute).")
+    ] = False,
+    processes: Annotated[int, typer.Option(min=1, max=64, help="Processes at a time.")] = 2,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    json_output: Json = False,
+) -> None:
+    """Make the paper's figures, tables and claims again, as printed and corrected, each with a verdict."""
+    import json
+
+    from replays.paper.document import draw_pictures, find, steps, write_up
+    from replays.report import check_report
+    from rig.kernels import COMPILE_NOTICE, compiled_before
+
+    if output is not None:
+        check_report(output, force=force)
+    if pictures is not None and not pictures.is_dir():
+        raise InputError("--pictures", "a folder that exists", str(pictures))
+    if not compiled_before():
+        typer.echo(COMPILE_NOTICE, err=True)
+    with reporting() as reporter:
+        reporter.begin(steps(quick=quick))
+        findings = find(quick=quick, processes=processes, progress=reporter.step)
+        if output is not None:
+            reporter.say("report")
+            write_up(findings, quick=quick).write(output)
+        drawn = draw_pictures(findings, pictures) if pictures is not None else []
+    if json_output:
+        typer.echo(json.dumps(summary(findings), indent=2, allow_nan=False))
+        return
+    _show(findings)
+    for path in drawn:
+        typer.echo(f"picture  {path}")
+    if output is not None:
+        typer.echo(f"\nreport  {output}")
+
+
+def summary(findings: Findings) -> dict[str, object]:
+    """The summary as a JSON document; null where a number does not exist."""
+    import math
+
+    return {
+        "statements": [
+            {
+                **line.statement.model_dump(exclude={"low", "high"}),
+                "values": {name: value if math.isfinite(value) else None for name, value in line.values.items()},
+                "verdicts": line.verdicts,
+            }
+            for line in [*findings.lines, *findings.claims]
+        ]
+    }
+
+
+def _show(findings: Findings) -> None:
+    from rich.text import Text
+
+    table = new_table("the paper's statements, and ours")
+    for heading in ("statement", "the paper", "as-printed", "corrected", "verdict"):
+        table.add_column(heading, justify="right" if heading in ("as-printed", "corrected") else "left")
+    colours = {"good": "green", "bad": "bold red", "open": "yellow", "plain": ""}
+    for line in [*findings.lines, *findings.claims]:
+        row = line.row()
+        says, _, paper_says, printed, corrected, verdict = row.cells
+        table.add_row(Text(says), paper_says, printed, corrected, Text(verdict, style=colours[row.mark]))
+    table_console().print(table)

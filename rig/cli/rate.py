@@ -1,0 +1,20 @@
+"""`rig rate`: how fast a replay goes."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rig.cli.connection import Connect, console, show
+from rig.transport import DEFAULT_ENDPOINT
+
+
+def rate(
+    x: Annotated[float, typer.Argument(metavar="X", help="Recorded seconds a second, 0.01 to 1000.")],
+    *,
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Set how fast the replay of a recording goes."""
+    with console(connect, "rate") as rig:
+        show(rig.rate(x), "rate")

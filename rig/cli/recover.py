@@ -1,0 +1,50 @@
+"""`rig recover`: finished recordings of what a kill or a full disk left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rig.cli.progress import reporting
+from rig.errors import InputError
+
+
+def recover(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE.mcap.part...", help="Files that were not finished.")],
+    *,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The new file; without it FILE.recovered.mcap, beside the other."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Make finished recordings of files that were cut off or damaged; these stay as they are."""
+    from recorder.rewrite import recovered_path
+    from recorder.writer import check_destination
+
+    if output is not None and len(files) > 1:
+        raise InputError("--output", "used with one FILE", f"{len(files)} files")
+    outputs = [output or recovered_path(file) for file in files]
+    for file, new in zip(files, outputs, strict=True):
+        if not file.is_file():
+            raise InputError("file", "a file that can be read", str(file))
+        check_destination(new, force=force)
+    for file, new in zip(files, outputs, strict=True):
+        _recover(file, new, force=force)
+
+
+def _recover(file: Path, new: Path, *, force: bool) -> None:
+    from recorder.rewrite import recover as recover_file
+
+    with reporting() as report:
+        made = recover_file(file, new, force=force, on_progress=lambda done: report.part(done, f"recovering {file}"))
+    counts = made.counts
+    lost = sum(counts.lost.values())
+    typer.echo(
+        f"{new}: {(counts.first_time_ns or 0) / 1e9:.3f} s to {counts.last_time_ns / 1e9:.3f} s, "
+        f"{sum(counts.rows.values())} rows, {new.stat().st_size / 1e6:.1f} MB"
+        + (f"; {made.damaged} damaged chunks passed over" if made.damaged else "")
+        + (f"; {lost} rows are missing in it" if lost else "")
+    )

@@ -1,0 +1,147 @@
+"""`rig validate`: a recording against the model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.options import Changes, Engine, Json
+from rig.cli.progress import reporting
+from rig.cli.tables import new_table, table_console
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from replays.validation import Validation
+
+_SAID = {True: "good", False: "FAILS", None: ""}
+
+
+def validate(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap).")],
+    *,
+    criteria: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Criteria of your own; start from replays/validation/default.toml."),
+    ] = None,
+    changes: Changes = None,
+    engine: Engine = None,
+    declared: Annotated[
+        bool, typer.Option("--declared", help="Judge by the declared comparison even where every bit is equal.")
+    ] = False,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write a report with pictures, .html or .pdf.")
+    ] = None,
+    force: Annotated[bool, typer.Option(help="Replace an existing report.")] = False,
+    json_output: Json = False,
+) -> None:
+    """Do a recording again and hold it against the model: bit by bit, then by declared criteria.
+
+    Where a criterion fails, it says what explains the difference: a sensor, the time, or which number of the model.
+    """
+    import json
+
+    from recorder.reader import Recording
+    from replays.report import check_report
+    from replays.validation import load_criteria
+    from replays.validation import validate as hold
+    from rig.cli.run import scene_overrides
+    from rig.kernels import COMPILE_NOTICE, compiled_before
+    from rig.scenes import read_value
+
+    if report is not None:
+        check_report(report, force=force)
+    rules = load_criteria(criteria)
+    overrides = {key: read_value(value) for key, value in scene_overrides(changes or [], engine=engine).items()}
+    recording = Recording.open(file)
+    if not compiled_before():
+        typer.echo(COMPILE_NOTICE, err=True)
+    with reporting() as reporter:
+        found = hold(recording, criteria=rules, changes=overrides, declared=declared, step=reporter.step)
+        if report is not None:
+            from replays.validation.report import make_report
+
+            reporter.step("report")
+            make_report(found).write(report)
+    if json_output:
+        typer.echo(json.dumps(found.document(), indent=2, allow_nan=False))
+    else:
+        _show(found)
+        if report is not None:
+            typer.echo(f"report  {report}")
+    if not found.good:
+        raise typer.Exit(1)
+
+
+def _show(found: Validation) -> None:
+    console = table_console(width=160, highlight=False)
+    changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
+    console.print(f"{found.path.name}, scene {found.scene}" + (f", validated with {changed}" if changed else ""))
+    console.print(found.bits_line)
+    for line in found.calibration:
+        console.print(f"calibration: {line}")
+    if not found.bit_exact or found.declared:
+        begin, end = found.window_s
+        console.print(f"trajectory from {begin:.4f} to {end:.4f} s: {found.window_reason}\n")
+        console.print(_trajectory(found))
+        console.print()
+        if found.truth:
+            console.print(_truth(found))
+            console.print()
+        console.print(_statistics(found))
+    console.print()
+    if found.explained is not None:
+        one = found.explained
+        console.print(_explanations(found))
+        console.print(f"\nfirst difference at {one.from_s:.4f} s; {one.conclusion}")
+    console.print(found.verdict_line)
+
+
+def _trajectory(found: Validation) -> Table:
+    table = new_table("Trajectory: residual over the channel's own noise")
+    for header in ("channel", "noise", "RMS", "limit", "largest", "drift", "", "first at"):
+        table.add_column(header, justify="left" if header in ("channel", "") else "right")
+    for one in found.residuals:
+        first = "" if one.first_s is None else f"{one.first_s:.4f} s"
+        cells = (
+            f"{one.floor:.3g} {one.unit}",
+            f"{one.rms:.3f}",
+            f"{one.limit:.3f}",
+            f"{one.peak:.2f}",
+            f"{one.drift:.2f}",
+        )
+        table.add_row(one.channel, *cells, _SAID[one.good], first)
+    return table
+
+
+def _truth(found: Validation) -> Table:
+    table = new_table("Truth: largest difference as a part of the column's largest value")
+    for header in ("table", "column that is off most", "off by", "limit", ""):
+        table.add_column(header, justify="right" if header in ("off by", "limit") else "left")
+    for one in found.truth:
+        table.add_row(one.table, one.column, f"{one.relative:.1e}", f"{one.limit:.1e}", _SAID[one.good])
+    return table
+
+
+def _statistics(found: Validation) -> Table:
+    table = new_table("Phases")
+    for header in ("phase", "quantity", "recorded", "foretold", "limit", "", "unit"):
+        table.add_column(header, justify="left" if header in ("phase", "quantity", "", "unit") else "right")
+    for one in found.statistics:
+        limit = "" if one.limit is None else f"{one.limit:.2g}"
+        table.add_row(
+            one.phase, one.quantity, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good], one.unit
+        )
+    return table
+
+
+def _explanations(found: Validation) -> Table:
+    assert found.explained is not None
+    table = new_table("What explains the difference")
+    for header in ("kind", "what", "change", "explains", "left", "seen to"):
+        table.add_column(header, justify="left" if header in ("kind", "what", "change") else "right")
+    for one in found.explained.ranked[:12]:
+        table.add_row(one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s")
+    return table

@@ -1,0 +1,123 @@
+"""What clients report about how far they have come: for the status, for the end of a run, and for a free pace."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rig import wire
+from rig.transport import Server
+
+_MOST = 64
+_FORGOTTEN_S = 600.0
+_GONE_S = 3.0
+"""A client that did not report for this long is not waited for; others report twice a second."""
+_QUIET_S = 0.6
+"""At the end of a run: for how long nobody must be behind before the cache may go; two heartbeats of the transport."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Report:
+    received_index: int
+    lost: int
+    heard_s: float
+    room: int | None
+
+
+class Clients:
+    """The clients of one rig, by the names that they give themselves.
+
+    Args:
+        now_s: Clock [s], monotonic.
+    """
+
+    def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._lock = threading.Lock()
+        self._reports: dict[str, _Report] = {}
+        self.malformed = 0
+        """Reports that could not be read."""
+
+    def take(self, key: str, payload: bytes) -> None:
+        """Take a report; on a thread of the transport."""
+        name = key.rpartition("/")[2]
+        try:
+            document = wire.decode_document(payload)
+            room = None if document.get("room") is None else int(document["room"])
+            row = _Report(int(document["received_index"]), int(document.get("lost", 0)), self._now_s(), room)
+        except (ValueError, KeyError, TypeError):
+            self.malformed += 1
+            return
+        with self._lock:
+            for old in [key for key, old in self._reports.items() if row.heard_s - old.heard_s > _FORGOTTEN_S]:
+                del self._reports[old]
+            if document.get("done") is True:
+                self._reports.pop(name, None)
+            elif name in self._reports or len(self._reports) < _MOST:
+                self._reports[name] = row
+
+    def rows(self, published: int, rate_hz: float) -> dict[str, dict[str, Any]]:
+        """Each client for the status.
+
+        Args:
+            published: Number of the row after the last one published of the stream that clients report on.
+            rate_hz: Rate of that stream [Hz]; 0 where nothing was published yet.
+        """
+        now_s = self._now_s()
+        with self._lock:
+            reports = dict(self._reports)
+        return {
+            name: {
+                "received_index": report.received_index,
+                "lag_s": round(max(0, published - report.received_index) / rate_hz, 4) if rate_hz else 0.0,
+                "last_heard_s": round(now_s - report.heard_s, 3),
+                "lost": report.lost,
+            }
+            for name, report in reports.items()
+        }
+
+    def behind(self, published: int) -> int:
+        """Rows that the slowest client still lacks, of those that are there; 0 where nobody reports."""
+        return max((max(0, published - report.received_index) for report in self._live()), default=0)
+
+    def crowded(self, published: int, most: int) -> bool:
+        """Whether a client that is there has more on its way than so many rows, or than half of its own room."""
+        return any(
+            published - report.received_index > (most if report.room is None else min(most, report.room // 2))
+            for report in self._live()
+        )
+
+    def _live(self) -> list[_Report]:
+        now_s = self._now_s()
+        with self._lock:
+            return [report for report in self._reports.values() if now_s - report.heard_s < _GONE_S]
+
+    def settle(
+        self,
+        server: Server,
+        published: int,
+        *,
+        patience_s: float,
+        see: Callable[[dict[str, float]], None] = lambda counts: None,
+    ) -> None:
+        """Wait until everybody who is connected has everything, so that the cache may go.
+
+        Args:
+            server: Whose links are looked at.
+            published: Number of the row after the last one published.
+            patience_s: Longest wait [s].
+            see: Takes each count of the links.
+        """
+        deadline = time.monotonic() + patience_s
+        quiet_since = time.monotonic()
+        while (now := time.monotonic()) < deadline:
+            counts = server.congestion()
+            see(counts)
+            if not counts.get("links", 0) or now - quiet_since >= _QUIET_S:
+                return
+            if self.behind(published) or counts.get("stalled_links", 0):
+                quiet_since = now
+            time.sleep(0.1)

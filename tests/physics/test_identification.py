@@ -1,0 +1,127 @@
+"""Identification: the truth comes back out of noise, and what cannot be told is not told.
+
+| what | must agree with | why |
+|---|---|---|
+| fitted values, noisy recording, start 5 to 10 % off | the values it was made with | what the tool is for |
+| intervals of a run without contact | the scatter of fits to other noise | an interval is a claim about that scatter |
+| how two moduli make up for each other | dE_B/dE_S = -(E_B/E_S)^2 | only 1/E* = sum (1 - nu^2)/E enters |
+| friction, magnets in a drop without them | nothing | no sliding, no magnets: no information |
+| a recording of another engine | the values it was made with | both solve the same equations |
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording
+from replays.experiment import Experiment
+from replays.export import writer_for
+from replays.identification import Identification, ask, identify
+from replays.sensitivity import value_of
+from rig.offline import frames
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+
+KEYS = ("magnet.stiffness", "contact.friction", "contact.stiffness", "ring.offset_x", "ring.offset_y")
+
+
+def recorded(path: Path, scene: str, **changes: Any) -> Recording:
+    simulation = Simulation(load_scene(scene, {key.replace("__", "."): value for key, value in changes.items()}))
+    with writer_for(path, simulation, force=True) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+    return Recording.open(path)
+
+
+def off(identification: Identification, truth: dict[str, float]) -> dict[str, float]:
+    """Errors in half widths of the reported intervals."""
+    return {
+        finding.unknown.key: (finding.value - truth[finding.unknown.key]) / finding.half_width
+        for finding in identification.judgement.findings
+        if finding.standing == "identified"
+    }
+
+
+@pytest.fixture(scope="module")
+def truth() -> dict[str, float]:
+    usual = Experiment(scene=load_scene("hammer"))
+    parts = {"magnet.stiffness": 1.04, "contact.friction": 0.95, "contact.stiffness": 1.05, "ring.offset_y": 0.97}
+    return {key: value_of(usual, key) * part for key, part in parts.items()} | {"ring.offset_x": 0.03}
+
+
+@pytest.mark.parametrize("engine", ["split", "taylor"])
+def test_truth_comes_back_from_a_hammer_recording(tmp_path: Path, truth: dict[str, float], engine: str) -> None:
+    changes = {key.replace(".", "__"): value for key, value in truth.items()}
+    recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.1, engine__name=engine, seed=11, **changes)
+    experiment = Experiment.of(recording).changed({"parameters": "corrected", "set": {}, "engine.name": "split"})
+    found = identify(ask(recording, experiment, KEYS))
+    errors = off(found, truth)
+    assert set(errors) == set(KEYS)
+    assert max(map(abs, errors.values())) < (2.0 if engine == "split" else 3.0)
+    for finding in found.judgement.findings:
+        # Orders of magnitude finer than the 5 % that the start was off.
+        assert finding.half_width < 2e-3 * finding.unknown.scale
+    if engine == "split":
+        assert found.judgement.fits
+        assert found.judgement.white
+
+
+def test_start_ten_per_cent_off_gets_there(tmp_path: Path) -> None:
+    recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.06, seed=5)
+    experiment = Experiment.of(recording)
+    right = {key: value_of(experiment, key) for key in ("contact.friction", "contact.restitution", "contact.stiffness")}
+    start = {
+        "contact.friction": 0.275,
+        "contact.restitution": 0.81,
+        "contact.stiffness": 1.1 * right["contact.stiffness"],
+    }
+    found = identify(ask(recording, experiment, tuple(right), start=start))
+    errors = off(found, right)
+    assert set(errors) == set(right)
+    assert max(map(abs, errors.values())) < 2.0
+
+
+def test_intervals_are_the_scatter_of_fits_to_other_noise(tmp_path: Path) -> None:
+    keys = ("magnet.stiffness", "shaft.unbalance_eccentricity", "shaft.unbalance_phase")
+    values, widths = [], []
+    for seed in range(8):
+        recording = recorded(tmp_path / "s.mcap", "stable-run", duration_s=0.05, seed=seed, sensors__rate_hz=2000)
+        found = identify(ask(recording, Experiment.of(recording), keys, channels=("ring_x", "ring_y")))
+        values.append([finding.value for finding in found.judgement.findings])
+        widths.append([finding.half_width for finding in found.judgement.findings])
+    scatter = np.std(values, axis=0, ddof=1)
+    claimed = np.mean(widths, axis=0) / 1.96
+    # Root of chi2 over its 7 degrees of freedom: 0.1 % to 99.9 %.
+    assert (scatter / claimed > 0.29).all()
+    assert (scatter / claimed < 1.86).all()
+
+
+def test_moduli_act_only_together(tmp_path: Path) -> None:
+    recording = recorded(tmp_path / "h.mcap", "hammer", duration_s=0.04, seed=3)
+    found = identify(
+        ask(recording, Experiment.of(recording), ("shaft.young_modulus", "ring.young_modulus", "contact.friction"))
+    )
+    shaft, ring, friction = found.judgement.findings
+    assert shaft.standing == ring.standing == "only together"
+    assert friction.standing == "identified"
+    told = re.search(r"a change by \+(\S+) Pa is made up for by ring.young_modulus by (\S+) Pa", shaft.words)
+    assert told is not None
+    parameters = Experiment.of(recording).scene.load_parameters()
+    ratio = (parameters["ring.young_modulus"] / parameters["shaft.young_modulus"]) ** 2
+    assert float(told[2]) / float(told[1]) == pytest.approx(-ratio, rel=0.02)
+
+
+def test_a_drop_tells_neither_friction_nor_magnets(tmp_path: Path) -> None:
+    recording = recorded(tmp_path / "d.mcap", "drop", duration_s=0.06, seed=3, shaft__damping_ratio_x=0.0,
+                         shaft__damping_ratio_y=0.0, ring__offset_y=-1.56)  # fmt: skip
+    keys = ("contact.friction", "magnet.stiffness", "contact.restitution")
+    found = identify(ask(recording, Experiment.of(recording), keys))
+    friction, magnet, restitution = found.judgement.findings
+    assert friction.standing == magnet.standing == "not seen"
+    assert restitution.standing == "identified"
+    assert abs(restitution.value - 0.9) < 2.0 * restitution.half_width

@@ -1,0 +1,212 @@
+"""A recording played to real clients: a recorder and a DAQ over zenoh, python-can over CAN; and the command."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can  # noqa: TID253 - the subject
+import numpy as np
+import pytest
+
+from drivers.console import Console
+from drivers.daq import Daq
+from recorder.reader import Recording
+from recorder.session import RecordingSession
+from replays.player.player import Player
+from replays.player.tape import Tape
+from rig import wire
+from rig.cli.can_output import CanOutput
+from rig.errors import RefusedError
+from rig.pacing import FreeRun, RealTime
+from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.system.test_can_run import check_against_recording
+from tests.unit.player_recording import BLOCKS, by_key, write_recording
+from tests.unit.recorder_stream import stream
+from tests.unit.test_transport_zenoh import free_endpoint, until
+
+pytestmark = pytest.mark.wallclock
+ROOT = Path(__file__).parents[2]
+_channels = itertools.count()
+
+
+def payloads() -> Iterator[tuple[str, bytes]]:
+    """A short run with an end as a rig tells it: with the number of rows."""
+    rows: dict[str, int] = {}
+    for key, payload in stream(BLOCKS):
+        schema = wire.schema_of(key)
+        if schema is not None:
+            block = wire.decode_block(payload, schema)
+            rows[key] = block.index + len(block.values)
+        elif (document := wire.decode_document(payload)).get("event") == "end":
+            payload = wire.encode_document({**document, "rows": rows})
+        yield key, payload
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_recording(tmp_path_factory.mktemp("replay") / "first.mcap", payloads())
+
+
+@contextmanager
+def playing(path: Path, clock: RealTime | FreeRun) -> Iterator[tuple[Player, str]]:
+    """A player that waits to be resumed, at an endpoint of its own."""
+    endpoint = free_endpoint()
+    with ZenohServer(endpoint, wait=not isinstance(clock, RealTime)) as server:
+        player = Player(Tape([path]), server, clock, paused=True)
+        player.prepare()
+        thread = threading.Thread(target=player.run)
+        thread.start()
+        try:
+            yield player, endpoint
+        finally:
+            player.stop()
+            thread.join(30.0)
+
+
+@pytest.mark.parametrize("clock", [RealTime, FreeRun])
+def test_recorded_again_it_is_the_same_byte_for_byte(path: Path, tmp_path: Path, clock: type[FreeRun]) -> None:
+    again = tmp_path / "again.mcap"
+    with playing(path, clock()) as (player, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
+        session = RecordingSession(client, again, name="recorder")
+        recorder = threading.Thread(target=session.run)
+        recorder.start()
+        until(lambda: "recorder" in player.status()["clients"])
+        Console(client).resume()
+        recorder.join(60.0)
+    assert by_key(_payloads(again)) == by_key(payloads())
+    first, second = Recording.open(path), Recording.open(again)
+    assert (second.catalogue, second.parameters, second.scene) == (first.catalogue, first.parameters, first.scene)
+    assert second.gaps == []
+    assert second.end_reason == "completed"
+
+
+def _payloads(path: Path) -> Iterator[tuple[str, bytes]]:
+    recording = Recording.open(path)
+    for key in recording.messages:
+        if key.startswith(f"{wire.ROOT}/"):
+            for _, payload in recording.payloads(key):
+                yield key, payload
+
+
+def test_a_daq_gets_every_row_of_a_burst(path: Path) -> None:
+    with playing(path, FreeRun()) as (player, endpoint), Daq.open(f"zenoh:{endpoint}", wait_s=10.0) as daq:
+        with ZenohClient(endpoint, wait_s=10.0) as client:
+            console = Console(client)
+            # A subscription takes effect a little after it was made: a DAQ that is there says how far it is.
+            while not any(name.startswith("daq") for name in player.status()["clients"]):
+                console.step_blocks(1)
+            console.resume()
+        got = list(daq.blocks(1000))
+        first = got[0].index
+        assert first % 200 == 0
+        assert first + sum(map(len, got)) == 200 * BLOCKS
+        assert (daq.dropped, daq.unmatched, sum(daq.lost.values())) == (0, 0, 0)
+        force = np.concatenate([samples["P_N"] for samples in got])
+    assert np.allclose(force, Recording.open(path).samples("forces").column("P_N")[first:], rtol=1e-12)
+
+
+def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
+    channel = f"replay-{next(_channels)}"
+    frames: dict[int, list[bytes]] = {}
+    with can.Bus(channel, interface="virtual", ignore_config=True) as bus:
+        with (
+            ZenohServer(free_endpoint()) as server,
+            # What a bus of this speed could carry does not matter to the virtual one.
+            CanOutput(f"virtual:{channel}", classic=True, fd=True, overload=True) as output,
+        ):
+            player = Player(Tape([path]), output.beside(server), FreeRun())
+            player.prepare()
+            output.start(paced=False)
+            player.run()
+        while (message := bus.recv(0.2)) is not None:
+            frames.setdefault(message.arbitration_id, []).append(bytes(message.data))
+    compared = check_against_recording(frames, path, rates={True: 10_000, False: 1000})
+    # Whole frames only: of a message with many rows a frame the last instants may never be sent.
+    assert 0.95 < compared / (15 * 11 * 10 * BLOCKS) <= 1.0
+
+
+@contextmanager
+def command(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, "-m", "rig.cli.main", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:
+    endpoint = free_endpoint()
+    with (
+        command("replay", str(path), "--pause", "--listen", endpoint) as child,
+        ZenohClient(endpoint, wait_s=30.0) as client,
+    ):
+        console = Console(client)
+        until(lambda: console.status()["replay"]["paused"])
+        assert console.step(20_000).time_s == pytest.approx(0.02)
+        assert console.seek(0.5).time_s == pytest.approx(0.5)
+        with pytest.raises(RefusedError, match="takes no hammer"):
+            console.hammer()
+        console.rate(0.01)
+        console.resume()
+        console.stop()
+        output, _ = child.communicate(timeout=30.0)
+    assert child.returncode == 0
+    assert output.startswith("replay: stopped at 0.5")
+
+
+def test_ctrl_c_ends_the_stream_and_says_so(path: Path) -> None:
+    endpoint = free_endpoint()
+    events: list[dict] = []
+    with (
+        command("replay", str(path), "--rate", "0.01", "--listen", endpoint) as child,
+        ZenohClient(endpoint, wait_s=30.0) as client,
+    ):
+        client.subscribe(wire.EVENTS, lambda _, payload: events.append(json.loads(payload)))
+        until(lambda: Console(client).status()["state"] == "running")
+        child.send_signal(signal.SIGINT)
+        output, errors = child.communicate(timeout=30.0)
+        until(lambda: bool(events))
+    assert child.returncode == 130
+    assert "replay: stopped" in output
+    assert errors.endswith("rig: interrupted\n")
+    assert (events[-1]["event"], events[-1]["reason"]) == ("end", "stopped")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("nothing.mcap",), "file must be a file that can be read"),
+        (("FILE", "--rate", "0"), "rate must be a number of 0.01 to 1000"),
+        (("FILE", "--rate", "2", "--burst"), "rate must be left out with --burst"),
+        (("FILE", "--from", "9"), "from must be within the recording, 0 to 0.6 s"),
+        (("FILE", "--remap", "a"), "--remap must be OLD=NEW"),
+        (("FILE", "--can-rate", "1000"), "--can must be given with the other --can options"),
+    ],
+)
+def test_wrong_input_is_one_line(
+    path: Path, arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rig.cli.main import main
+
+    files = [str(path) if text == "FILE" else text for text in arguments]
+    with pytest.raises(SystemExit) as end:
+        main(["replay", *files, "--listen", free_endpoint()])
+    assert end.value.code == 2
+    assert message in (line := capsys.readouterr().err)
+    assert line.count("\n") == 1

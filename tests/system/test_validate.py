@@ -1,0 +1,82 @@
+"""`rig validate` and `rig sessions` as commands: exit status, one line for wrong input, reports."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rig.cli.main import main
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as end:
+        main(list(arguments))
+    captured = capsys.readouterr()
+    return int(end.value.code or 0), captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("validate") / "hammer.mcap"
+    arguments = ["simulate", "hammer", "-o", str(path), "--duration-s", "0.1", "--set", "sensors.rate_hz=5000"]
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert not end.value.code
+    return path
+
+
+def test_a_fresh_recording_is_bit_exact(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "validate", str(recording))
+    assert code == 0
+    assert "bit-exact" in out
+    assert "good, bit by bit" in out
+
+
+def test_a_failure_ends_in_1_and_a_report_names_the_cause(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "r.html"
+    code, out, _ = run(capsys, "validate", str(recording), "--set", "contact.restitution=0.88", "--report", str(report))
+    assert code == 1
+    assert "contact.restitution +2.27 %" in out
+    page = report.read_text(encoding="utf-8")
+    assert "Contact.restitution" in page or "contact.restitution +2.27 %" in page
+    assert page.count("data:image/png") == 6  # five groups, orbits and spectra
+    assert 'src="http' not in page
+
+
+def test_json_and_another_engine(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "validate", str(recording), "--engine", "rk8", "--json")
+    document = json.loads(out)
+    assert document["good"] is (code == 0)
+    assert not document["bit_exact"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "contact.frction=1"], "contact.frction must be"),
+        (["--criteria", "missing.toml"], "missing.toml must be a readable file"),
+        (["--report", "r.txt"], "report must be a file name that ends in"),
+        (["--engine", "euler"], "engine.name must be"),
+    ],
+)
+def test_wrong_input_ends_in_2(
+    recording: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, error = run(capsys, "validate", str(recording), *arguments)
+    assert code == 2
+    assert error.startswith(f"rig: {message}")
+    assert error.count("\n") == 1
+    assert out == ""
+
+
+def test_sessions_are_written_only_where_they_may(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, "sessions", "drop", "-o", str(tmp_path))[0] == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"drop.mcap", "drop.toml"}
+    code, _, error = run(capsys, "sessions", "drop", "-o", str(tmp_path))
+    assert code == 2
+    assert "--force" in error
+    assert run(capsys, "sessions", "hammer", "-o", str(tmp_path))[0] == 2

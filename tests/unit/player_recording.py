@@ -1,0 +1,52 @@
+"""A small recording for the player's tests, without physics: known payloads, in many chunks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import count
+from pathlib import Path
+
+from recorder.writer import RecordingWriter
+from rig.wire import CATALOGUE, PARAMETERS, SCENE
+from tests.unit.recorder_stream import documents, stream
+
+BLOCKS = 60
+BLOCK_NS = 10_000_000
+DURATION_NS = BLOCKS * BLOCK_NS
+Payloads = dict[str, list[bytes]]
+
+
+def write_recording(
+    path: Path, payloads: Iterable[tuple[str, bytes]] | None = None, *, chunk_messages: int = 37
+) -> Path:
+    """Write payloads as the recorder does."""
+    ticks = count()
+    written = documents()
+    writer = RecordingWriter(
+        path,
+        catalogue=written[CATALOGUE],
+        parameters=written[PARAMETERS],
+        scene=written[SCENE],
+        # A clock that counts its readings: the file is flushed, and so a chunk closed, after so many messages.
+        sync_every_s=float(chunk_messages),
+        monotonic_s=lambda: float(next(ticks)),
+    )
+    for number, (key, payload) in enumerate(stream(BLOCKS) if payloads is None else payloads):
+        writer.write(key, payload, 1_700_000_000_000_000_000 + 1_000_000 * number)
+    writer.finish("completed")
+    return path
+
+
+def by_key(payloads: Iterable[tuple[str, bytes]]) -> Payloads:
+    """Payloads of each key, in order."""
+    found: Payloads = {}
+    for key, payload in payloads:
+        found.setdefault(key, []).append(payload)
+    return found
+
+
+def key_by_key() -> Iterator[tuple[str, bytes]]:
+    """The same payloads, as a recorder that fetches history gets them."""
+    for key, payloads in by_key(stream(BLOCKS)).items():
+        for payload in payloads:
+            yield key, payload

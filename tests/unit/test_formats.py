@@ -1,0 +1,330 @@
+"""Exports, read back by other people's readers: they are the recording, to the last bit where the format can."""
+
+from __future__ import annotations
+
+import csv
+import json
+import wave
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording
+from recorder.writer import RecordingWriter
+from replays.export import writer_for
+from replays.formats import clock
+from replays.formats.export import SUFFIXES, Written, export
+from replays.formats.selection import Selection, Unit, select
+from rig.cli.main import main
+from rig.errors import InputError
+from rig.offline import frames
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+from rig.wire import Block, encode_block, sensor_key
+
+DURATION_S = 0.12
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    path = tmp_path_factory.mktemp("formats") / "run.mcap"
+    simulation = Simulation(load_scene("hammer", {"duration_s": DURATION_S, "seed": 7, "sensors.truth_rate_hz": 2000}))
+    with writer_for(path, simulation) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+    return Recording.open(path)
+
+
+@pytest.fixture(scope="module")
+def gappy(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The same without a block of the probes, and with two others the wrong way round."""
+    path = tmp_path_factory.mktemp("gaps") / "gaps.mcap"
+    with RecordingWriter(
+        path, catalogue=recording.catalogue, parameters=recording.parameters, scene=recording.scene
+    ) as writer:
+        for name in recording.table.groups:
+            key = sensor_key(name)
+            blocks = [
+                Block(
+                    b.tick + at * 50,
+                    b.index + at,
+                    b.rate_hz,
+                    b.tick_rate_hz,
+                    np.ascontiguousarray(b.values[at : at + 200]),
+                )
+                for b in recording.blocks(key)
+                for at in range(0, len(b.values), 200)
+            ]
+            if name == "probes":
+                del blocks[3]
+                blocks[5], blocks[6] = blocks[6], blocks[5]
+            for block in blocks:
+                writer.write(key, encode_block(block), 0)
+    return Recording.open(path)
+
+
+def written(
+    recording: Recording, path: Path, *channels: str, unit: Unit = "engineering", truth: bool = False
+) -> tuple[Selection, list[Written]]:
+    merged = path.suffix in (".csv", ".parquet", ".wav")
+    selection = select(recording, channels=channels, unit=unit, truth=truth, merged=merged)
+    return selection, export(selection, path)
+
+
+def counts_of(recording: Recording, group: str) -> np.ndarray:
+    return np.concatenate([block.values for block in recording.blocks(sensor_key(group))])
+
+
+def test_mdf_by_asammdf(recording: Recording, tmp_path: Path) -> None:
+    from asammdf import MDF
+
+    path = tmp_path / "x.mf4"
+    written(recording, path, truth=True)
+    with MDF(path) as mdf:
+        names = [group.channel_group.acq_name for group in mdf.groups]
+        assert names[:5] == list(recording.table.groups)
+        assert mdf.header.start_time.timestamp() == pytest.approx(recording.clock[0, 1], abs=1e-3)
+        assert json.loads(mdf.header.description)["seed"] == "7"
+        for number, group in enumerate(recording.table.groups.values()):
+            samples, counts = recording.samples(group.name), counts_of(recording, group.name)
+            for c, channel in enumerate(group.channels):
+                found = mdf.get(channel.name, group=number)
+                raw = mdf.get(channel.name, group=number, raw=True)
+                assert found.unit == channel.unit
+                assert channel.label in found.comment
+                np.testing.assert_array_equal(raw.samples, counts[:, c])
+                np.testing.assert_allclose(found.samples, samples.values[:, c], rtol=1e-15, atol=0)
+                np.testing.assert_allclose(found.timestamps, samples.times_s, rtol=0, atol=1e-12)
+        force = mdf.get("truth.contact.normal_force")
+        np.testing.assert_array_equal(force.samples, recording.truth("contact").column("normal_force"))
+        assert (force.unit, len(force.timestamps)) == ("N", round(DURATION_S * 2000))
+
+
+def test_tdms_by_nptdms(recording: Recording, tmp_path: Path) -> None:
+    from nptdms import TdmsFile
+
+    path = tmp_path / "x.tdms"
+    written(recording, path)
+    with TdmsFile.open(path) as file:
+        assert file.properties["parameter_set"] == "corrected"
+        for name, group in recording.table.groups.items():
+            samples, counts = recording.samples(name), counts_of(recording, name)
+            for c, channel in enumerate(group.channels):
+                found = file[name][channel.name]
+                assert found.properties["unit_string"] == channel.unit
+                assert found.properties["rig_sensitivity_v"] == channel.sensitivity_v
+                np.testing.assert_array_equal(found.read_data(scaled=False), counts[:, c])
+                np.testing.assert_allclose(found[:], samples.values[:, c], rtol=1e-15, atol=0)
+                np.testing.assert_allclose(found.time_track(), samples.times_s, rtol=0, atol=1e-9)
+
+
+def test_uff_by_the_columns_of_its_specification(recording: Recording, tmp_path: Path) -> None:
+    """Read by field positions, as the documentation of dataset 58 gives them, not by a library."""
+    path = tmp_path / "x.uff"
+    written(recording, path, "disk_x", "P_E")
+    data = path.read_bytes()
+    for name, group, kind in (("disk_x", "probes", (8, 1, 0)), ("P_E", "forces", (9, 0, 1))):
+        head, rest = [], data
+        for _ in range(13):
+            line, rest = rest.split(b"\n", 1)
+            head.append(line.decode("ascii"))
+        assert head[0] == "    -1"
+        assert head[1][:6] == "    58"
+        assert head[1][6] == "b"
+        little, ieee, lines, size = (int(head[1][a:b]) for a, b in ((7, 13), (13, 19), (19, 31), (31, 43)))
+        assert (little, ieee, lines) == (1, 2, 11)
+        assert head[2].strip() == name
+        assert (int(head[7][:5]), head[7][31:41].strip()) == (1, name)
+        precision, rows, even = (int(head[8][a:b]) for a, b in ((0, 10), (10, 20), (20, 30)))
+        assert (precision, even, float(head[8][43:56])) == (4, 1, 5e-5)
+        assert (int(head[9][:10]), head[9][26:46].strip(), head[9][47:67].strip()) == (17, "Time", "s")
+        assert tuple(int(head[10][a:b]) for a, b in ((0, 10), (10, 15), (15, 20))) == kind
+        assert head[10][47:67].strip() == recording.table.channels[name].unit
+        assert size == 8 * rows
+        values = np.frombuffer(rest[:size], "<f8")
+        np.testing.assert_array_equal(values, recording.samples(group).column(name))
+        assert rest[size : size + 8] == b"\n    -1\n"
+        data = rest[size + 8 :]
+    assert data == b""
+
+
+def test_uff_by_pyuff(recording: Recording, tmp_path: Path) -> None:
+    import pyuff
+
+    path = tmp_path / "x.uff"
+    written(recording, path)
+    file = pyuff.UFF(str(path))
+    channels = list(recording.table.channels.values())
+    assert list(file.get_set_types()) == [58] * len(channels)
+    for n, channel in enumerate(channels):
+        found = file.read_sets(n)
+        assert (found["id1"], found["ordinate_axis_units_lab"]) == (channel.name, channel.unit)
+        np.testing.assert_array_equal(found["data"], recording.samples(channel.group).column(channel.name))
+
+
+def test_csv_by_the_csv_module(recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    written(recording, path)
+    with path.open(newline="") as file:
+        names, *rows = csv.reader(file)
+    assert names == ["time [s]", *(f"{c.name} [{c.unit}]" for c in recording.table.channels.values())]
+    values = np.array(rows, dtype=float)
+    expected = np.column_stack([recording.samples(name).values for name in recording.table.groups])
+    np.testing.assert_array_equal(values[:, 1:], expected)
+    beside = json.loads((tmp_path / "x.csv.json").read_text())
+    assert beside["tables"][0]["columns"][0]["sensitivity_v"] == recording.table.channels["disk_x"].sensitivity_v
+
+
+def test_parquet_by_pyarrow(recording: Recording, tmp_path: Path) -> None:
+    from pyarrow import parquet
+
+    path = tmp_path / "x.parquet"
+    written(recording, path, "forces", unit="counts")
+    table = parquet.read_table(path)
+    np.testing.assert_array_equal(
+        np.column_stack([c.to_numpy() for c in table.columns[1:]]), counts_of(recording, "forces")
+    )
+    metadata = table.schema.field("P_N [counts]").metadata
+    channel = recording.table.channels["P_N"]
+    assert float(metadata[b"scale"]) == channel.scale
+    assert json.loads(table.schema.metadata[b"rig"])["scene"] == "hammer"
+
+
+# libsndfile adds a chunk of peaks to floating point, which scipy reads past with a warning.
+@pytest.mark.filterwarnings("ignore:Chunk .non-data. not understood")
+def test_wav_by_scipy_and_the_wave_module(recording: Recording, tmp_path: Path) -> None:
+    from scipy.io import wavfile
+
+    written(recording, tmp_path / "f.wav", "probes")
+    rate, samples = wavfile.read(tmp_path / "f.wav")
+    assert (rate, samples.dtype) == (20_000, np.float32)
+    beside = json.loads((tmp_path / "f.wav.json").read_text())["tables"][0]["columns"]
+    for c, column in enumerate(beside):
+        channel = recording.table.channels[column["name"]]
+        values = samples[:, c].astype(float) * column["full_scale"] + column["offset_exported"]
+        expected = recording.samples("probes").column(column["name"])
+        np.testing.assert_allclose(values, expected, rtol=0, atol=1e-12)
+        assert column["full_scale"] == pytest.approx(channel.adc_v / channel.sensitivity_v)
+
+    written(recording, tmp_path / "i.wav", "forces", unit="counts")
+    with wave.open(str(tmp_path / "i.wav")) as file:
+        assert (file.getsampwidth(), file.getnchannels(), file.getframerate()) == (4, 4, 20_000)
+        integers = np.frombuffer(file.readframes(file.getnframes()), "<i4").reshape(-1, 4)
+    np.testing.assert_array_equal(integers, counts_of(recording, "forces") << 8)
+
+
+def test_volts_are_what_the_converter_saw(recording: Recording, tmp_path: Path) -> None:
+    selection, _ = written(recording, tmp_path / "x.parquet", "disk_x", unit="volts")
+    table = selection.tables[0]
+    volts = np.concatenate([table.exported(0, chunk) for chunk in selection.chunks(table)])
+    channel = recording.table.channels["disk_x"]
+    mm = recording.samples("probes").column("disk_x")
+    np.testing.assert_allclose(volts, channel.bias_v + channel.sensitivity_v * mm, rtol=0, atol=1e-12)
+
+
+def test_a_range_holds_its_ends_and_several_rates_make_several_tables(recording: Recording, tmp_path: Path) -> None:
+    selection = select(recording, channels=["disk_x", "truth.contact"], from_s=0.01, to_s=0.05, merged=True)
+    made = export(selection, tmp_path / "x.csv")
+    assert [entry.path.name for entry in made] == ["x-20000Hz.csv", "x-2000Hz.csv"]
+    times = np.loadtxt(made[1].path, delimiter=",", skiprows=1)[:, 0]
+    np.testing.assert_allclose(times, np.arange(20, 101) / 2000, rtol=0, atol=1e-12)
+    assert made[0].tables[0][2] == 801
+
+
+def test_one_rate_by_a_declared_method(recording: Recording, tmp_path: Path) -> None:
+    selection = select(recording, channels=["ring_x", "truth.contact.normal_force"], merged=True)
+    made = export(selection, tmp_path / "x.parquet", rate_hz=5000, method="linear")
+    assert made[0].tables[0][1:3] == (5000, int((DURATION_S - 1 / 2000) * 5000 + 1e-6) + 1)
+    with pytest.raises(InputError, match=r"^unit must be engineering or volts"):
+        export(select(recording, unit="counts"), tmp_path / "y.tdms", rate_hz=1000)
+
+
+def test_rows_that_are_missing_are_left_out_or_nan_never_made_up(gappy: Recording, tmp_path: Path) -> None:
+    from nptdms import TdmsFile
+
+    assert gappy.streams["rig/sensors/probes"].rows == round(DURATION_S * 20_000) - 200
+    written(gappy, tmp_path / "x.csv", "probes")
+    values = np.loadtxt(tmp_path / "x.csv", delimiter=",", skiprows=1)
+    samples = gappy.samples("probes")
+    order = np.argsort(samples.index)
+    np.testing.assert_allclose(values[:, 0], samples.times_s[order], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(values[:, 1:], samples.values[order])
+    written(gappy, tmp_path / "x.tdms", "disk_x")
+    found = TdmsFile.read(tmp_path / "x.tdms")["probes"]["disk_x"][:]
+    assert np.flatnonzero(np.isnan(found)).tolist() == list(range(600, 800))
+    np.testing.assert_array_equal(found[~np.isnan(found)], samples.column("disk_x")[order])
+    with pytest.raises(InputError, match=r"^range must be free of missing rows for a WAV file"):
+        written(gappy, tmp_path / "x.wav", "disk_x")
+    _, made = written(gappy, tmp_path / "x.mf4")
+    assert made[0].tables[0][3] == 200
+    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".json", ".tdms", ".mf4"}
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / f"x{suffix}"
+    path.write_text("precious")
+    selection = select(recording, merged=True)
+
+    def stop(part: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        export(selection, path, force=True, progress=stop)
+    assert path.read_text() == "precious"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-o", "x.xls"], "output must be a file name that ends in .mf4, .tdms, .uff"),
+        (["-o", "no/x.csv"], "output must be in a folder that exists"),
+        (["-o", "x.csv", "-c", "disk_z"], "channel must be one of disk_x"),
+        (["-o", "x.csv", "-c", "truth.nothing"], "channel must be one of"),
+        (["-o", "x.csv", "--unit", "mils"], "--unit must be engineering, volts or counts"),
+        (["-o", "x.csv", "--method", "magic"], "--method must be polyphase or linear"),
+        (["-o", "x.csv", "--from-s", "5"], "range must be in the recording, 0 to 0.11995 s"),
+        (["-o", "x.csv", "--from-s", "0.1", "--to-s", "0.05"], "to_s must be after from_s"),
+        (["-o", "x.csv", "--rate-hz", "0"], "rate_hz must be between 1 and 1e6"),
+        (["-o", "x.tdms", "--rate-hz", "1000", "--unit", "counts"], "unit must be engineering or volts"),
+    ],
+)
+def test_wrong_exports_are_one_line(
+    arguments: list[str],
+    message: str,
+    recording: Recording,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["export", str(recording.path), *arguments])
+    printed = capsys.readouterr()
+    assert end.value.code == 2
+    assert printed.out == ""
+    assert printed.err.startswith(f"rig: {message}")
+    assert printed.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("rate_hz", "target_hz"), [(51_200.0, 20_000.0), (10_000.0, 20_000.0), (19_998.7, 20_000.0)])
+def test_polyphase_gives_a_tone_back(rate_hz: float, target_hz: float) -> None:
+    """Against the closed form: a tone in the pass band, at instants between samples, within 90 dB."""
+    tone_hz = 0.8 * clock.PASS_BAND * min(rate_hz, target_hz) / 2
+    axis = clock.Axis(0.0131, rate_hz, round(rate_hz * 0.4))
+    values = 3.0 + np.sin(2 * np.pi * tone_hz * axis.instants())
+    first_s, rows = 0.0131 + 0.1234567, 3000
+    found = clock.polyphase(values, axis, first_s, target_hz, rows)
+    wanted = 3.0 + np.sin(2 * np.pi * tone_hz * (first_s + np.arange(rows) / target_hz))
+    assert np.abs(found - wanted).max() < 2 * np.pi * tone_hz / rate_hz / 512 + 1e-4  # its grid of instants is 1/512
+
+
+def test_polyphase_keeps_out_what_would_fold() -> None:
+    axis = clock.Axis(0.0, 20_000.0, 20_000)
+    tone = np.sin(2 * np.pi * 2_600.0 * axis.instants())
+    found = clock.polyphase(tone, axis, 0.1, 5_000.0, 4_000)
+    assert np.abs(found).max() < 1e-4
+    assert np.abs(clock.linear(tone, axis, 0.1 + np.arange(4_000) / 5_000.0)).max() > 0.9, "as straight lines do not"

@@ -1,0 +1,201 @@
+"""`rig identify`: what it reads, writes and refuses; judging a fit; how far ahead is looked."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording
+from replays.experiment import Experiment
+from replays.export import writer_for
+from replays.identification import ask, identify
+from replays.identification.horizon import horizon
+from replays.identification.question import measured_noise
+from replays.identification.window import Window
+from rig.cli.main import main
+from rig.errors import InputError
+from rig.offline import frames
+from rig.parameters import load_parameters
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "h.mcap"
+    simulation = Simulation(load_scene("hammer", {"duration_s": 0.035, "contact.friction": 0.24}))
+    with writer_for(path, simulation) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+    return path
+
+
+def run(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(["identify", *map(str, arguments)])
+    assert isinstance(end.value.code, int)
+    return end.value.code
+
+
+def test_writes_a_set_that_a_run_takes_and_a_report(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted, page = tmp_path / "fitted.toml", tmp_path / "page.html"
+    keys = "contact.friction,contact.stiffness,contact.smoothing_speed,hammer.1.force_n"
+    window = ("--window", "0.015:0.03")
+    status = run(file, "--fit", keys, "--parameters", "corrected", *window, "-o", fitted, "--report", page)
+    told = capsys.readouterr().out
+    assert status == 0
+    assert "contact.smoothing_speed" in told
+    assert "not seen" in told
+    document = tomllib.loads(fitted.read_text(encoding="utf-8"))
+    assert document["base"] == "corrected"
+    assert set(document["contact"]) == {"friction", "stiffness"}  # what is not seen stays as it was
+    parameters = load_parameters(str(fitted))
+    friction = parameters.entries["contact.friction"]
+    assert friction.kind == "fitted"
+    assert "h.mcap, 0.0150 to" in friction.source
+    assert friction.value == pytest.approx(0.24, rel=1e-3)
+    assert "# hammer.1.force_n = " in fitted.read_text(encoding="utf-8")
+    assert (
+        Simulation(load_scene("hammer", {"parameters": str(fitted)})).model.constants.contact.friction == friction.value
+    )
+    assert page.read_bytes().count(b"data:image/png") == 2
+    assert run(file, "--fit", "contact.friction", "-o", fitted) == 2
+    assert "--force replaces one" in capsys.readouterr().err
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["fitted.toml", "page.html"]
+
+
+def test_json_has_a_number_only_where_there_is_one(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(file, "--fit", "contact.friction,magnet.stiffness", "--window", "0:0.018", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    friction, magnet = document["values"]["contact.friction"], document["values"]["magnet.stiffness"]
+    assert friction["standing"] == "not seen"
+    assert friction["value"] is None
+    assert friction["half_width_95"] is None
+    assert magnet["value"] == pytest.approx(1.7, abs=0.05)
+    assert magnet["half_width_95"] > 0.0
+
+
+def test_bounds_decide_what_counts_as_seen(file: Path) -> None:
+    recording = Recording.open(file)
+
+    def half_width(given: dict[str, tuple[float, float]]) -> tuple[str, float]:
+        question = ask(recording, Experiment.of(recording), ["magnet.stiffness"], window=(0.0, 0.015), bounds=given)
+        finding = identify(question).judgement.findings[0]
+        return finding.standing, finding.half_width
+
+    standing, wide = half_width({})
+    assert standing == "identified"
+    assert half_width({"magnet.stiffness": (1.7 - wide / 2, 1.7 + wide / 2)})[0] == "not seen"
+
+
+def test_a_prior_narrows_the_interval_as_two_measurements_do(file: Path) -> None:
+    recording = Recording.open(file)
+    experiment = Experiment.of(recording)
+    ask_for = {"keys": ["magnet.stiffness"], "window": (0.0, 0.01), "channels": ["disk_x"]}
+    alone = identify(ask(recording, experiment, **ask_for)).judgement.findings[0].half_width
+    prior = {"magnet.stiffness": (1.7, alone / 1.96)}
+    both = identify(ask(recording, experiment, **ask_for, priors=prior)).judgement.findings[0]
+    assert both.half_width == pytest.approx(alone / np.sqrt(2.0), rel=0.05)
+
+
+def test_lost_samples_are_left_out(file: Path) -> None:
+    recording = Recording.open(file)
+    question = ask(recording, Experiment.of(recording), ["contact.friction"])
+    whole = Window(question, 0.03)
+    question.observation.values[100:120, 3] = np.nan
+    window = Window(question, 0.03)
+    residuals = window.residuals(np.zeros(1))
+    assert np.isfinite(residuals).all()
+    assert not residuals[100:120, 3].any()
+    assert whole.rows == window.rows
+
+
+def test_the_horizon_is_nearer_where_less_is_known(file: Path) -> None:
+    recording = Recording.open(file)
+    question = ask(recording, Experiment.of(recording), ["magnet.stiffness", "contact.restitution"])
+    window = Window(question, 0.035)
+    vague, sharp = (horizon(window, np.zeros(2), np.diag([size, size]) ** 2) for size in (0.1, 1e-5))
+    assert not vague.whole
+    assert vague.time_s < 0.034
+    assert sharp.whole
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--fit", "contact.frictionn"], "a parameter, a number of the scene"),
+        (["--fit", "contact.friction,contact.friction"], "different keys"),
+        (["--fit", "contact.friction", "--bounds", "contact.friction=0.3:0.2"], "ascending"),
+        (["--fit", "contact.friction", "--bounds", "contact.friction"], "KEY="),
+        (["--fit", "contact.friction", "--prior", "contact.friction=0.25"], "+- between them"),
+        (["--fit", "contact.friction", "--start", "magnet.stiffness=1"], "of a key that is fitted"),
+        (["--fit", "contact.friction", "--start", "contact.friction=much"], "a number"),
+        (["--fit", "contact.friction", "--channels", "truth_x"], "some that the recording has"),
+        (["--fit", "contact.friction", "--window", "5:6"], "a window with samples in it"),
+        (["--fit", "hammer.2.force_n"], "which has 1 of hammer"),
+        (["--fit", "contact.friction", "-o", "fitted.json"], "ends in .toml"),
+    ],
+)
+def test_wrong_input_is_one_line(
+    file: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert run(file, *arguments) == 2
+    told = capsys.readouterr().err
+    assert message in told
+    assert told.count("\n") == 1
+
+
+def test_no_truth_is_read(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("truth was read")
+
+    monkeypatch.setattr(Recording, "truth", refuse)
+    recording = Recording.open(file)
+    ask(recording, Experiment.of(recording), ["contact.friction"])
+    with pytest.raises(InputError, match="different keys"):
+        ask(recording, Experiment.of(recording), [])
+
+
+def test_single_samples_that_are_far_off_count_less(file: Path) -> None:
+    recording = Recording.open(file)
+    errors = []
+    for robust in (False, True):
+        question = ask(recording, Experiment.of(recording), ["magnet.stiffness"], window=(0.0, 0.02))
+        question.observation.values[50:400:35, 3] += 200.0 * question.observation.noise[3]
+        finding = identify(question, robust=robust).judgement.findings[0]
+        errors.append(abs(finding.value - 1.7))
+    assert errors[1] < 0.2 * errors[0]
+
+
+def test_a_log_without_a_scene_takes_one_from_elsewhere(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ("--fit", "magnet.stiffness", "--window", "0:0.02", "--channels", "ring_x,ring_y", "--json")
+    assert run(file, *arguments) == 0
+    own = json.loads(capsys.readouterr().out)
+    assert run(file, *arguments, "--scene", "hammer") == 0
+    given = json.loads(capsys.readouterr().out)
+    assert given["values"] == own["values"]
+    assert [channel["name"] for channel in given["channels"]] == ["ring_x", "ring_y"]
+
+
+def test_noise_is_measured_where_the_table_tells_none() -> None:
+    noise = np.random.default_rng(1).normal(0.0, 0.02, 4000)
+    smooth = np.sin(np.linspace(0.0, 30.0, 4000))
+    assert measured_noise(smooth + noise) == pytest.approx(0.02, rel=0.1)
+
+
+def test_samples_that_begin_after_the_impacts_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "late.mcap"
+    simulation = Simulation(load_scene("hammer", {"duration_s": 0.3}))
+    with writer_for(path, simulation) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+    recording = Recording.open(path)
+    question = ask(recording, Experiment.of(recording), ["contact.friction", "magnet.stiffness"], window=(0.25, 0.3))
+    with pytest.raises(InputError, match="before the first contacts"):
+        identify(question)

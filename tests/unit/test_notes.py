@@ -1,0 +1,65 @@
+"""Notes: through the rig into its events, and so into every recording."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from drivers.console import Console
+from recorder.reader import Recording
+from recorder.schemas import event_text
+from recorder.session import RecordingSession
+from rig import wire
+from rig.errors import RefusedError
+from rig.pacing import Lockstep
+from rig.service import Service
+from rig.transport.memory import MemoryClient, MemoryServer
+from tests.unit.recorder_stream import documents
+from tests.unit.service_fake import FakeSimulation
+
+pytestmark = pytest.mark.wallclock
+
+
+class Simulation(FakeSimulation):
+    """The fake one, with a catalogue that a recorder can use."""
+
+    def catalogue(self) -> dict:
+        return documents()[wire.CATALOGUE]
+
+
+def test_a_note_is_recorded_with_its_time_and_is_no_command(tmp_path: Path) -> None:
+    server = MemoryServer()
+    service = Service(Simulation(duration_s=1.0), server, Lockstep(timeout_s=20.0), block_ticks=10_000)
+    service.prepare()
+    run = threading.Thread(target=service.run)
+    session = RecordingSession(MemoryClient(server), tmp_path / "run.mcap", history=True)
+    recording = threading.Thread(target=session.run)
+    run.start()
+    recording.start()
+    console = Console(MemoryClient(server), name="a test")
+    console.step(300_000)
+    accepted = console.note("bearing is warm", tags=["bearing", "look"])
+    for text, tags, must in (
+        ("", [], "text must be a line"),
+        ("two\nlines", [], "text must be a line"),
+        ("x" * 1001, [], "text must be a line"),
+        ("x", ["two words"], "tag must be a word"),
+        ("x", ["t"] * 11, "tags must be a list of at most 10"),
+    ):
+        with pytest.raises(RefusedError, match=must):
+            console.note(text, tags=tags)
+    console.stop()
+    run.join(20.0)
+    recording.join(20.0)
+    events = [event for event in Recording.open(tmp_path / "run.mcap").events if event["event"] == "note"]
+    assert len(events) == 1
+    (note,) = events
+    assert accepted.tick == note["tick"] == 300_000
+    assert (note["text"], note["tags"], note["from"]) == ("bearing is warm", ["bearing", "look"], "a test")
+    assert note["wall_s"] > 1e9
+    assert event_text(note)[1] == "note: bearing is warm #bearing #look"
+    # It does nothing to the rig: it is not among the commands that have to be sent again.
+    scene = wire.decode_document(MemoryClient(server).request(wire.SCENE))
+    assert all(entry["command"] != "note" for entry in scene["taken"])

@@ -1,0 +1,218 @@
+"""`rig paper`: its data files, its verdicts, its quick variant, and what the command refuses."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from replays.paper.blow import BLOW_AT, Blow, Outcome, outcome, outcomes
+from replays.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
+from replays.paper.document import Findings, all_questions, find, planned_groups, steps, write_up
+from replays.paper.spread import (
+    assumed_values,
+    changes,
+    free_values,
+    hypercube,
+    one_at_a_time,
+    phases,
+    rank_correlation,
+)
+from replays.paper.statement import SETS, Statement, claims, number, printed_values, statements
+from replays.report.document import Heading, Picture, Table
+from rig.cli.main import main
+from rig.parameters import load_parameters
+
+BESIDE = {"hammer.duration", "hammer.at", "transducer.bandwidth"}
+"""What the report assumes beside the parameters."""
+
+
+@pytest.fixture(scope="module")
+def told() -> list[str]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def findings(told: list[str]) -> Findings:
+    return find(quick=True, processes=1, progress=told.append)
+
+
+def statement(**fields: object) -> Statement:
+    given = {"quantity": "q", "place": "p", "says": "s", "kind": "claim", "paper": "", "unit": "N"}
+    return Statement.model_validate({**given, **fields})
+
+
+def test_every_assumed_value_has_a_range():
+    for name in SETS:
+        entries = load_parameters(name).entries
+        assumed = {key for key, entry in entries.items() if entry.kind == "assumed"}
+        assert {entry.key for entry in assumed_values()} == assumed | BESIDE
+
+
+def test_ranges_hold_what_is_taken_and_what_the_model_accepts():
+    entries = load_parameters().entries
+    for entry in free_values():
+        assert entry.low < entry.high
+        assert entry.why
+        value = entries[entry.key].value if entry.key in entries else entry.value
+        if isinstance(value, float):
+            assert entry.low <= value <= entry.high, entry.key
+        if entry.key in entries and not entry.name:
+            least, most = entries[entry.key].range
+            assert least <= entry.low
+            assert entry.high <= most
+
+
+def test_tied_value_follows():
+    assert changes({"shaft.radius": 27.0}) == {"shaft.radius": 27.0, "ring.clearance": 2.0}
+
+
+def test_hypercube_is_one_in_each_layer_and_the_same_again():
+    parts, blows = hypercube(8)
+    assert np.array_equal(parts, hypercube(8)[0])
+    assert len(blows) == 8
+    for column in parts.T:
+        assert sorted(np.floor(column * 8).astype(int)) == list(range(8))
+
+
+def test_statements_say_where_and_what_agrees():
+    names = [entry.quantity for entry in (*statements(), *claims())]
+    assert len(set(names)) == len(names)
+    for entry in (*statements(), *claims()):
+        assert entry.place
+        assert entry.says
+        judged = math.isfinite(entry.low) and math.isfinite(entry.high)
+        assert judged != bool(entry.why), entry.quantity
+        if judged:
+            assert entry.low <= entry.high
+    keys = load_parameters().entries
+    assert all(printed.key in keys for printed in printed_values())
+
+
+@pytest.mark.parametrize(
+    ("value", "verdict"), [(1.0, "agrees"), (2.0, "agrees"), (2.1, "differs"), (0.9, "differs"), (math.nan, "differs")]
+)
+def test_verdict_comes_of_the_number(value, verdict):
+    assert statement(low=1.0, high=2.0).verdict(value) == verdict
+
+
+def test_nothing_to_judge_by():
+    assert statement(why="no axis").verdict(1.0) == "cannot be judged"
+
+
+def test_printed_values_against_the_sets():
+    printed = {entry.key: entry for entry in printed_values()}
+    verdicts = {key: entry.verdict(load_parameters("as-printed")) for key, entry in printed.items()}
+    differs = {key for key, verdict in verdicts.items() if verdict == "differs"}
+    # M_oh stands for the sum in eqs. 24 and 25, K_ft for one transducer of a pair.
+    assert differs == {"house.outer_mass", "house.pair_stiffness_vertical"}
+
+
+def test_a_blow_that_dies_out_and_one_that_cannot_be_built():
+    weak = outcome(Blow(force_n=5.0, duration_s=0.3))
+    assert not weak.whirls
+    assert math.isnan(weak.whirl_hz)
+    assert outcome(Blow(changes={"magnet.count": 20})).outcome == "cannot be built"
+
+
+def test_bandwidth_lowers_the_peak_and_not_the_contact():
+    plain, slow = (outcome(Blow(changes=change)) for change in ({}, {"transducer.bandwidth": 200.0}))
+    assert slow.peak_x_n < 0.6 * plain.peak_x_n
+    assert slow.normal_n == plain.normal_n
+    # Butterworth of order 2 at 82 Hz.
+    share = 1.0 / math.sqrt(1.0 + (abs(plain.whirl_hz) / 200.0) ** 4)
+    assert slow.reaction_x_n / plain.reaction_x_n == pytest.approx(share, rel=5e-3)
+
+
+def test_corrections_are_where_the_sets_differ():
+    assert set(correction_keys()) == {
+        "contact.damping_factor",
+        "house.outer_mass",
+        "house.pair_stiffness_vertical",
+        "house.pair_stiffness_horizontal",
+        "house.gap_counts_outer",
+    }
+
+
+def test_tornado_is_widest_first_and_tells_what_reaches_the_measured():
+    blank = Outcome("backward whirl", reaction_x_n=540.0)
+    results = {name: [blank] for name in claim_groups(ensemble=1)}
+    results["low shaft.radius"] = [Outcome("backward whirl", reaction_x_n=350.0)]
+    found = bars(results, "reaction_x_n")
+    assert found[0] == Bar("shaft.radius", "assumed value", (350.0, 540.0, 540.0))
+    assert toward_measured(found) == found[:1]
+    assert {entry.key for entry in free_values()} <= {bar.name for bar in found}
+    assert {entry.key for entry, _, _ in one_at_a_time()} == {entry.key for entry in free_values()}
+
+
+def test_phases_cover_one_turn_of_the_shaft():
+    at = [blow.changes[BLOW_AT] for blow in phases(Blow(), 4)]
+    assert np.diff(at) == pytest.approx([1 / 6.2 / 4] * 3, abs=2e-4)
+
+
+def test_rank_correlation():
+    parts = np.array([[0.1, 0.9], [0.4, 0.2], [0.6, 0.7], [0.9, 0.1], [0.5, 0.5]])
+    values = np.array([1.0, 8.0, 27.0, 64.0, math.nan])
+    assert rank_correlation(parts, values) == pytest.approx([1.0, -0.8])
+
+
+def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list[str]):
+    assert len(told) == steps(quick=True)
+    for line in findings.lines:
+        assert set(line.values) == set(SETS)
+    for line in [*findings.lines, *findings.claims]:
+        assert all(math.isfinite(value) for value in line.values.values()), line.statement.quantity
+        assert re.search(r"\d", line.row().cells[4])
+        assert line.row().cells[5]
+    assert all(len(findings.results[name]) == len(group) for name, group in planned_groups(quick=True).items())
+
+
+def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: Path):
+    report = write_up(findings, quick=True)
+    headings = [part.text for part in report.parts if isinstance(part, Heading) and part.level == 1]
+    assert headings == [
+        "Summary",
+        "Figure by figure",
+        "Open questions",
+        "The conclusion as a claim: what moves the force toward the measured one?",
+        "When it whirls, and how fast",
+        "What is assumed here",
+    ]
+    assert sum(isinstance(part, Picture) for part in report.parts) == 12
+    for before, after in zip(report.parts, report.parts[1:], strict=False):
+        if isinstance(before, Picture):
+            assert isinstance(after, Table), before.caption
+    for table in (part for part in report.parts if isinstance(part, Table)):
+        assert table.rows, table.caption
+        assert any(re.search(r"\d", cell) for row in table.rows for cell in row.cells[1:])
+    for question in all_questions(findings):
+        assert re.search(r"\d", question.answer)
+    target = tmp_path / "report.html"
+    report.write(target)
+    text = target.read_text(encoding="utf-8")
+    assert "nan" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+@pytest.mark.wallclock
+def test_two_processes_give_what_one_gives():
+    blows = [Blow(label=str(force), force_n=force, duration_s=0.3) for force in (20.0, 80.0, 100.0, 120.0)]
+    told: list[str] = []
+    assert str(list(outcomes(blows, processes=2, progress=told.append))) == str(list(outcomes(blows, processes=1)))
+    assert told == [blow.label for blow in blows]
+
+
+@pytest.mark.parametrize("name", ["report.txt", "missing/report.html"])
+def test_command_refuses_a_file_before_it_runs(name, tmp_path, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["paper", "--quick", "-o", str(tmp_path / name)])
+    assert end.value.code == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_number():
+    assert [number(x) for x in (math.nan, 0.0, 1234.5, 538.61, 1e-4, 1.28)] == [
+        "none", "0", "1234", "538.6", "0.0001", "1.28",
+    ]  # fmt: skip

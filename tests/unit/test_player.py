@@ -1,0 +1,552 @@
+"""The player: payload for payload, on time, from any position, and changed only as asked for."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.console import Console
+from recorder.reader import Recording
+from replays.player import player as player_module
+from replays.player.edit import Edit
+from replays.player.player import Part, Player
+from replays.player.tape import Tape
+from replays.player.timeline import By, Timeline
+from rig import wire
+from rig.channels import ChannelTable
+from rig.errors import InputError, RefusedError
+from rig.pacing import FreeRun, RealTime
+from rig.service import REPLAY_COMMANDS, Service
+from rig.transport.clients import Clients
+from rig.transport.memory import MemoryClient, MemoryServer
+from tests.unit.player_recording import BLOCK_NS, BLOCKS, DURATION_NS, Payloads, by_key, key_by_key, write_recording
+from tests.unit.recorder_stream import documents, stream
+from tests.unit.service_fake import FakeSimulation
+from tests.unit.test_pacing import FakeTime
+from tests.unit.test_transport_zenoh import until
+
+PROBES = wire.sensor_key("probes")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("player")
+
+
+@pytest.fixture(scope="module")
+def path(folder: Path) -> Path:
+    return write_recording(folder / "whole.mcap")
+
+
+@pytest.fixture(scope="module")
+def tape(path: Path) -> Tape:
+    return Tape([path])
+
+
+class Heard:
+    """Everything that was published, with the time at which it was."""
+
+    def __init__(self, server: MemoryServer, time: FakeTime | None = None) -> None:
+        self.all: list[tuple[str, bytes]] = []
+        self.at_ns: list[int] = []
+        self.summary: dict[str, Any] = {}
+        self._time = time
+        self.client = MemoryClient(server)
+        self.client.subscribe("rig/**", self._take)
+
+    def _take(self, key: str, payload: bytes) -> None:
+        self.all.append((key, payload))
+        self.at_ns.append(self._time.ns if self._time is not None else 0)
+
+    @property
+    def payloads(self) -> Payloads:
+        return by_key(self.all)
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        return [wire.decode_document(payload) for payload in self.payloads.get(wire.EVENTS, [])]
+
+    def blocks(self, key: str = PROBES) -> list[wire.Block]:
+        schema = wire.schema_of(key)
+        assert schema is not None
+        return [wire.decode_block(payload, schema) for payload in self.payloads.get(key, [])]
+
+
+def play(tape: Tape, **options: Any) -> tuple[Heard, dict[str, Any]]:
+    """Play to the end with a clock of our own; returns what was heard and the summary."""
+    time = FakeTime(oversleep_ns=700_000)
+    server = MemoryServer()
+    heard = Heard(server, time)
+    clock = RealTime(now_ns=time.now_ns, sleep=time.sleep)
+    heard.begin_ns = time.ns  # type: ignore[attr-defined]
+    summary = Player(tape, server, clock, **options).run()
+    return heard, summary
+
+
+# Order and deadlines.
+
+
+@pytest.mark.parametrize("by", By)
+def test_every_payload_comes_once_and_in_the_order_of_its_key(tape: Tape, by: By) -> None:
+    played = [(item.key, item.payload) for batch in Timeline(tape, by).play(0) for item in batch]
+    assert by_key(played) == by_key(stream(BLOCKS))
+
+
+def test_a_block_is_due_at_its_end_and_a_document_at_its_own_time(tape: Tape) -> None:
+    for batch in Timeline(tape).play(0):
+        for item in batch:
+            if item.block is None:
+                assert item.due_ns == wire.decode_document(item.payload)["tick"] * 1000
+            else:
+                assert item.due_ns == item.block.tick * 1000 + BLOCK_NS
+
+
+def test_deadlines_by_arrival_are_those_of_the_recorder(tape: Tape) -> None:
+    due = [batch[0].due_ns for batch in Timeline(tape, By.ARRIVAL).play(0)]
+    assert np.all(np.diff(due) == 1_000_000)
+
+
+def test_what_was_recorded_key_by_key_is_played_by_its_time(folder: Path) -> None:
+    history = Tape([write_recording(folder / "history.mcap", key_by_key())])
+    due: list[int] = []
+    played: list[tuple[str, bytes]] = []
+    for batch in Timeline(history).play(0):
+        due.append(batch[0].due_ns)
+        played += [(item.key, item.payload) for item in batch]
+    assert due == sorted(set(due))
+    assert by_key(played) == by_key(stream(BLOCKS))
+
+
+@pytest.mark.parametrize("from_ms", [0, 5, 10, 333])
+def test_a_range_has_the_whole_blocks_inside_it(tape: Tape, from_ms: int) -> None:
+    to_ms = from_ms + 100
+    played = [item for batch in Timeline(tape).play(from_ms * 1_000_000, to_ms * 1_000_000) for item in batch]
+    ticks = [item.block.tick for item in played if item.key == PROBES and item.block is not None]
+    first = -(-from_ms // 10)
+    assert ticks == [10_000 * number for number in range(first, to_ms // 10)]
+
+
+# A whole play.
+
+
+def test_a_replay_is_the_recording_byte_for_byte(tape: Tape) -> None:
+    heard, summary = play(tape)
+    assert heard.payloads == by_key(stream(BLOCKS))
+    assert summary["reason"] == "completed"
+    assert summary["left_out"] == 0
+    assert heard.all[-1][0] == wire.EVENTS, "the end comes last"
+
+
+@pytest.mark.parametrize("rate", [0.01, 1.0, 1000.0])
+def test_nothing_adds_up_though_every_sleep_is_late(tape: Tape, rate: float) -> None:
+    heard, summary = play(tape, rate=rate)
+    begin_ns = heard.begin_ns  # type: ignore[attr-defined]
+    for (key, payload), at_ns in zip(heard.all, heard.at_ns, strict=True):
+        schema = wire.schema_of(key)
+        if schema is not None:
+            due_ns = begin_ns + (wire.decode_block(payload, schema).tick * 1000 + BLOCK_NS) / rate
+            assert -1 <= at_ns - due_ns <= 700_001
+    assert heard.at_ns[-1] - begin_ns - DURATION_NS / rate <= 700_001
+    assert summary["lateness_ms"]["max"] <= 0.701
+
+
+def test_documents_are_answered_from_the_file_and_the_status_says_what_it_is(tape: Tape) -> None:
+    server = MemoryServer()
+    player = Player(tape, server, FreeRun(), paused=True)
+    player.prepare()
+    client = MemoryClient(server)
+    for key in (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE):
+        assert client.request(key) == wire.encode_document(documents()[key])
+    status = wire.decode_document(client.request(wire.STATUS))
+    assert status["pace"] == "replay"
+    assert status["replay"]["paused"] is True
+    assert status["replay"]["files"] == [str(tape.paths[0])]
+    assert "replayed" in status["warnings"][0]
+    player.stop()
+    player.run()
+
+
+@pytest.mark.parametrize("cut", [0.35, 0.7, 0.97])
+def test_a_cut_off_file_is_played_as_far_as_it_goes_and_then_ended(folder: Path, path: Path, cut: float) -> None:
+    short = folder / f"cut-{cut}.mcap"
+    data = path.read_bytes()
+    short.write_bytes(data[: int(cut * len(data))])
+    heard, summary = play(Tape([short]))
+    recording, whole = Recording.open(short), by_key(stream(BLOCKS))
+    assert 0 < recording.messages[PROBES] < BLOCKS
+    for key, payloads in heard.payloads.items():
+        expected = whole[key][: recording.messages[key]]
+        assert payloads[: len(expected)] == expected
+        assert len(payloads) == len(expected) + (key == wire.EVENTS)
+    assert heard.events[-1]["event"] == "end"
+    assert heard.events[-1]["rows"][PROBES] == 200 * recording.messages[PROBES]
+    assert summary["reason"] == "completed"
+
+
+def test_parts_are_one_recording(folder: Path) -> None:
+    payloads = list(stream(BLOCKS))
+    half = next(n for n, (key, _) in enumerate(payloads) if n > len(payloads) / 2 and key == PROBES)
+    parts = [write_recording(folder / "a.mcap", payloads[:half]), write_recording(folder / "b.mcap", payloads[half:])]
+    for order in (parts, parts[::-1]):
+        heard, _ = play(Tape(order))
+        assert heard.payloads == by_key(payloads)
+
+
+def test_a_cut_off_file_can_be_sought_in(folder: Path, path: Path) -> None:
+    short = folder / "killed.mcap"
+    data = path.read_bytes()
+    short.write_bytes(data[: int(0.97 * len(data))])
+    with running(Tape([short]), paused=True) as (_, heard, console):
+        for position_s in (0.4, 0.1, 0.5):
+            console.seek(position_s)
+            console.step_blocks(1)
+    assert [block.index for block in heard.blocks()] == [200 * number for number in (40, 10, 50)]
+
+
+# Parts, passes, numbers.
+
+
+def test_a_range_begins_and_ends_with_events_of_its_own(tape: Tape) -> None:
+    heard, summary = play(tape, part=Part(from_s=0.2, to_s=0.4))
+    assert [event["event"] for event in heard.events] == ["start", "end"]
+    assert heard.events[0]["time_s"] == 0.2
+    assert heard.events[0]["pace"] == "replay"
+    assert heard.events[-1]["rows"][PROBES] == 8000
+    assert [block.index for block in heard.blocks()] == [200 * number for number in range(20, 40)]
+    assert summary["played_s"] == pytest.approx(0.2)
+
+
+def test_passes_with_original_numbers_step_back(tape: Tape) -> None:
+    heard, summary = play(tape, part=Part(from_s=0.1, to_s=0.3, loops=3))
+    assert [block.index for block in heard.blocks()] == 3 * [200 * number for number in range(10, 30)]
+    assert [event["event"] for event in heard.events] == ["start", "end"]
+    assert summary["replay"]["pass"] == 3
+    assert summary["played_s"] == pytest.approx(0.6)
+
+
+def test_whole_passes_keep_every_payload_but_the_ends_between(tape: Tape) -> None:
+    heard, summary = play(tape, part=Part(loops=2))
+    once = by_key(stream(BLOCKS))
+    for key, payloads in once.items():
+        if key != wire.EVENTS:
+            assert heard.payloads[key] == 2 * payloads
+    assert [event["event"] for event in heard.events] == ["start", "start", "end"]
+    assert summary["left_out"] == 1
+
+
+def test_new_numbers_run_on_through_passes_and_belong_together(tape: Tape) -> None:
+    heard, _ = play(tape, part=Part(from_s=0.1, to_s=0.3, start_s=0.2, loops=3), renumber=True)
+    continuity = wire.Continuity()
+    keys = [key for key in heard.payloads if wire.schema_of(key) is not None]
+    for key in keys:
+        for block in heard.blocks(key):
+            assert continuity.follow(key, block.index, len(block.values)) is None
+            if key != wire.EDGES:
+                assert block.tick * block.rate_hz == block.index * block.tick_rate_hz
+    probes = heard.blocks()
+    assert (probes[0].index, probes[0].tick) == (0, 0)
+    assert len(probes) == 10 + 20 + 20
+    recorded = [wire.decode_block(payload, wire.SAMPLE_SCHEMA) for payload in by_key(stream(BLOCKS))[PROBES]]
+    numbers = [*range(20, 30), *range(10, 30), *range(10, 30)]
+    for block, number in zip(probes, numbers, strict=True):
+        assert np.array_equal(block.values, recorded[number].values)
+    assert [event["event"] for event in heard.events] == ["start", "end"]
+    assert heard.events[0]["tick"] == 0
+    assert heard.events[-1]["rows"][PROBES] == 50 * 200
+    assert heard.events[-1]["tick"] == 50 * 10_000
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        (Part(from_s=-1.0), "from must be within the recording, 0 to 0.6 s"),
+        (Part(to_s=9.0), "to must be within"),
+        (Part(from_s=0.3, to_s=0.2), "to must be later than from"),
+        (Part(from_s=0.3, start_s=0.2), "start must be within from and to"),
+        (Part(from_s=0.301, to_s=0.302), "late enough for a whole block"),
+        (Part(loops=0), "loop must be at least 1"),
+    ],
+)
+def test_parts_that_there_are_not_are_refused(tape: Tape, part: Part, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Player(tape, MemoryServer(), FreeRun(), part=part)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.009, 1001.0, float("nan"), True, "1"])
+def test_rates_that_there_are_not_are_refused(tape: Tape, rate: Any) -> None:
+    with pytest.raises(InputError, match=r"rate must be a number of 0\.01 to 1000"):
+        Player(tape, MemoryServer(), FreeRun(), rate=rate)
+
+
+# Changes.
+
+
+def edit(tape: Tape, **options: Any) -> Edit:
+    return Edit(tape.documents[wire.CATALOGUE], **options)
+
+
+def test_a_key_goes_elsewhere_with_the_same_payloads(tape: Tape) -> None:
+    new = wire.sensor_key("probes2")
+    heard, _ = play(tape, edit=edit(tape, keys={PROBES: new}))
+    assert PROBES not in heard.payloads
+    assert heard.payloads[new] == by_key(stream(BLOCKS))[PROBES]
+    assert heard.events[-1]["rows"][new] == 200 * BLOCKS
+
+
+def test_channels_change_with_their_calibration(tape: Tape) -> None:
+    table = ChannelTable.model_validate(tape.documents[wire.CATALOGUE]["table"])
+    first, second = table.groups["probes"].names[:2]
+    force = table.groups["forces"].names[1]
+    changed = edit(tape, channels=[second, first, force], names={first: second, second: first})
+    heard, summary = play(tape, edit=changed)
+    now = ChannelTable.model_validate(changed.catalogue["table"])
+    assert {name: group.names for name, group in now.groups.items()} == {"probes": (first, second), "forces": (force,)}
+    assert now.channels[first].sensitivity_v == table.channels[second].sensitivity_v
+    recorded = [wire.decode_block(payload, wire.SAMPLE_SCHEMA) for payload in by_key(stream(BLOCKS))[PROBES]]
+    for block, before in zip(heard.blocks(), recorded, strict=True):
+        assert np.array_equal(block.values, before.values[:, [1, 0]])
+        assert (block.index, block.tick) == (before.index, before.tick)
+    assert wire.sensor_key("drive") not in heard.payloads
+    assert summary["left_out"] == (len(table.groups) - 2) * BLOCKS
+
+
+def test_the_truth_can_stay_out(tape: Tape) -> None:
+    heard, _ = play(tape, edit=edit(tape, truth=False))
+    whole = by_key(stream(BLOCKS))
+    assert {key for key in whole if key not in heard.payloads} == {key for key in whole if key.startswith(wire.TRUTH)}
+    assert edit(tape, truth=False).catalogue["truth"] == {}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"keys": {"rig/sensors/nothing": "rig/sensors/a"}}, "remap must be from one of"),
+        ({"keys": {PROBES: wire.truth_key("a")}}, "remap must be to a key for the same kind"),
+        ({"keys": {PROBES: "elsewhere"}}, "remap must be to a key for the same kind"),
+        ({"keys": {PROBES: wire.sensor_key("forces")}}, "remap must be to a key that nothing else has"),
+        ({"channels": ["nothing"]}, "channel must be one of"),
+        ({"channels": ["disk_x", "disk_x"]}, "channels must be at least one, each once"),
+        ({"names": {"disk_x": "disk_y"}}, "rename must be to names that no other channel has"),
+    ],
+)
+def test_changes_that_make_no_sense_are_refused(tape: Tape, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        edit(tape, **options)
+
+
+def test_swapped_keys_are_no_clash(tape: Tape) -> None:
+    forces = wire.sensor_key("forces")
+    heard, _ = play(tape, edit=edit(tape, keys={PROBES: forces, forces: PROBES}))
+    assert heard.payloads[forces] == by_key(stream(BLOCKS))[PROBES]
+
+
+# Commands.
+
+
+@contextmanager
+def running(tape: Tape, **options: Any) -> Iterator[tuple[Player, Heard, Console]]:
+    server = MemoryServer()
+    heard = Heard(server)
+    clock = options.pop("clock", None) or RealTime()
+    player = Player(tape, server, clock, **options)
+    player.prepare()
+    thread = threading.Thread(target=lambda: heard.summary.update(player.run()))
+    thread.start()
+    try:
+        yield player, heard, Console(MemoryClient(server), name="a test")
+    finally:
+        player.stop()
+        thread.join(20.0)
+    assert not thread.is_alive()
+
+
+def test_commands_of_a_rig_are_refused(tape: Tape) -> None:
+    with running(tape, paused=True) as (_, heard, console):
+        for command in (console.hammer, console.release, lambda: console.speed(5.0)):
+            with pytest.raises(RefusedError, match="this is a recording that is replayed, which takes no"):
+                command()
+        assert heard.all == []
+
+
+def test_a_simulator_refuses_the_commands_of_a_replay() -> None:
+    server = MemoryServer()
+    service = Service(FakeSimulation(), server, FreeRun(), block_ticks=10_000)
+    service.prepare()
+    for name in REPLAY_COMMANDS:
+        reply = wire.decode_document(MemoryClient(server).request(wire.command_key(name), b"{}"))
+        assert reply["accepted"] is False
+        assert f"{name} is for a recording that is replayed" in reply["error"]
+
+
+def test_steps_while_paused(tape: Tape) -> None:
+    with running(tape, paused=True) as (player, heard, console):
+        assert console.step_blocks(2).time_s == pytest.approx(0.02)
+        assert len(heard.blocks()) == 2
+        assert console.step(25_000).time_s == pytest.approx(0.04), "the last whole block"
+        assert len(heard.blocks()) == 4
+        console.step(5_000)
+        assert len(heard.blocks()) == 5
+        assert player.status()["replay"]["paused"] is True
+        for fields in ({"ticks": 0}, {"ticks": 1.5}, {"blocks": True}, {}, {"ticks": 1, "blocks": 1}, {"x": 1}):
+            request = json.dumps(fields).encode()
+            assert b'"accepted":false' in heard.client.request(wire.command_key("step"), request)
+
+
+def test_a_seek_goes_on_from_there(tape: Tape) -> None:
+    with running(tape, paused=True) as (_, heard, console):
+        console.step_blocks(1)
+        assert console.seek(0.4).time_s == pytest.approx(0.4)
+        console.step_blocks(1)
+        assert console.seek(0.1).time_s == pytest.approx(0.1)
+        console.step_blocks(1)
+        assert [block.index for block in heard.blocks()] == [0, 40 * 200, 10 * 200]
+        for wrong in (-0.1, 0.6, 7.0):
+            with pytest.raises(RefusedError, match=r"time_s must be a position from 0 to below 0\.6 s"):
+                console.seek(wrong)
+    assert heard.summary["played_s"] == pytest.approx(0.03), "what was jumped over was not played"
+
+
+def test_a_seek_with_new_numbers_leaves_no_gap(tape: Tape) -> None:
+    with running(tape, paused=True, renumber=True) as (_, heard, console):
+        for position_s in (0.4, 0.1, 0.5):
+            console.step_blocks(3)
+            console.seek(position_s)
+        console.step_blocks(1)
+        blocks = heard.blocks()
+        assert [block.index for block in blocks] == [200 * number for number in range(10)]
+        assert [block.tick for block in blocks] == [10_000 * number for number in range(10)]
+
+
+def test_pause_resume_rate_and_the_end(tape: Tape) -> None:
+    with running(tape, rate=0.01) as (player, heard, console):
+        console.pause()
+        assert console.pause().command == "pause", "twice is no error"
+        held = len(heard.all)
+        assert player.status()["replay"]["paused"] is True
+        console.resume()
+        with pytest.raises(RefusedError, match="step must be sent to a replay that is paused"):
+            console.step(1000)
+        with pytest.raises(RefusedError, match=r"rate must be a number of 0\.01 to 1000"):
+            console.rate(0.0)
+        console.rate(1000.0)
+        until(lambda: bool(heard.events) and heard.events[-1]["event"] == "end")
+        assert len(heard.all) > held
+        assert heard.payloads == by_key(stream(BLOCKS))
+
+
+def test_a_stop_ends_the_stream_well(tape: Tape) -> None:
+    with running(tape, paused=True) as (_, heard, console):
+        console.step_blocks(3)
+        console.stop()
+        until(lambda: heard.events[-1]["event"] == "end")
+    assert heard.events[-1]["reason"] == "stopped"
+    assert heard.events[-1]["rows"][PROBES] == 600
+
+
+def test_a_burst_waits_for_what_clients_report(tape: Tape, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(player_module, "_AHEAD_BLOCKS", 10)
+    with running(tape, clock=FreeRun(), paused=True) as (_, heard, console):
+        client = heard.client
+        client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 0}')
+        console.resume()
+        until(lambda: len(heard.blocks()) >= 11)
+        client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 1000}')
+        assert len(heard.blocks()) == 11, "ten blocks ahead, and the one that made it so"
+        until(lambda: len(heard.blocks()) >= 16)
+        assert len(heard.blocks()) == 16
+        client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 1000, "done": true}')
+        until(lambda: len(heard.blocks()) == BLOCKS)
+
+
+def test_the_scene_tells_latecomers_the_commands_so_far(folder: Path) -> None:
+    command = {"event": "command", "id": 1, "tick": 200_000, "time_s": 0.2, "command": "hammer", "request": {}}
+    payloads = list(stream(BLOCKS))
+    payloads.insert(len(payloads) // 2, (wire.EVENTS, wire.encode_document(command)))
+    tape = Tape([write_recording(folder / "command.mcap", payloads)])
+    with running(tape, paused=True) as (_, heard, console):
+        for position_s, taken in ((0.1, []), (0.3, [{name: command[name] for name in tape.commands[0]}])):
+            console.seek(position_s)
+            scene = wire.decode_document(heard.client.request(wire.SCENE))
+            assert scene.get("taken", []) == taken
+
+
+# What it stands on.
+
+
+def test_an_end_that_was_none_stays_where_it_was(folder: Path) -> None:
+    late = {"event": "warning", "tick": 600_000, "time_s": 0.6, "text": "went on"}
+    payloads = [*stream(BLOCKS), (wire.EVENTS, wire.encode_document(late))]
+    heard, _ = play(Tape([write_recording(folder / "on.mcap", payloads)]))
+    assert [event["event"] for event in heard.events] == ["start", "end", "warning", "end"]
+    assert heard.payloads[wire.EVENTS][:3] == by_key(payloads)[wire.EVENTS]
+
+
+def test_what_is_told_late_of_an_earlier_time_keeps_its_place(folder: Path) -> None:
+    told = [{"event": "command", "id": 1, "tick": tick, "time_s": tick / 1e6} for tick in (300_000, 295_000, 301_000)]
+    payloads = list(stream(BLOCKS))
+    for number, event in enumerate(told):
+        payloads.insert(len(payloads) // 2 + number, (wire.EVENTS, wire.encode_document(event)))
+    heard, _ = play(Tape([write_recording(folder / "late.mcap", payloads)]))
+    assert [event.get("tick") for event in heard.events] == [0, 300_000, 295_000, 301_000, 600_000]
+
+
+def test_a_status_that_the_run_has_ended_comes_after_the_end(folder: Path) -> None:
+    ended = wire.encode_document({"tick": 600_000, "time_s": 0.6, "state": "ended"})
+    payloads = list(stream(BLOCKS))
+    payloads.insert(len(payloads) - 1, (wire.STATUS, ended))
+    heard, _ = play(Tape([write_recording(folder / "status.mcap", payloads)]))
+    assert [key for key, _ in heard.all[-2:]] == [wire.EVENTS, wire.STATUS]
+    assert heard.payloads == by_key(payloads)
+
+
+def test_a_damaged_file_ends_the_stream_and_says_so(folder: Path, path: Path) -> None:
+    damaged = folder / "damaged.mcap"
+    data = bytearray(path.read_bytes())
+    chunk = Tape([path]).chunks[10]
+    data[chunk.offset + chunk.length // 2] ^= 0xFF
+    damaged.write_bytes(data)
+    server = MemoryServer()
+    heard = Heard(server)
+    player = Player(Tape([damaged]), server, FreeRun())
+    with pytest.raises(InputError, match="file must be an intact recording"):
+        player.run()
+    assert heard.events[-1]["event"] == "end"
+    assert heard.events[-1]["reason"].startswith("failed: InputError: file must be an intact recording")
+    assert heard.blocks(), "what came before went out"
+
+
+def test_a_clock_tells_where_it_is() -> None:
+    time = FakeTime()
+    clock = RealTime(now_ns=time.now_ns, sleep=time.sleep)
+    clock.start(500, 2_000_000_000)
+    time.work(0.25)
+    assert clock.position() == 500 + 500_000_000
+    free = FreeRun(now_ns=time.now_ns)
+    free.start(7, 1000)
+    assert free.position() == 7
+    free.release(9)
+    assert free.position() == 9
+
+
+def test_a_client_with_little_room_is_not_overrun() -> None:
+    now = [0.0]
+    clients = Clients(now_s=lambda: now[0])
+    assert not clients.crowded(10**9, 10)
+    clients.take(f"{wire.CLIENTS}/a", b'{"received_index": 1000}')
+    assert clients.crowded(1101, 100)
+    assert not clients.crowded(1100, 100)
+    clients.take(f"{wire.CLIENTS}/b", b'{"received_index": 1000, "room": 60}')
+    assert clients.crowded(1031, 100)
+    assert not clients.crowded(1030, 100)
+    assert clients.behind(1030) == 30
+    now[0] = 10.0
+    assert not clients.crowded(10**6, 100), "who is not heard any more is not waited for"
+    clients.take(f"{wire.CLIENTS}/c", b'{"received_index": 0, "room": "much"}')
+    assert clients.malformed == 1

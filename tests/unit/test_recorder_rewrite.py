@@ -1,0 +1,263 @@
+"""Recordings made of recordings: recovered and cut."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording, join
+from recorder.rewrite import cut, recover, recovered_path
+from recorder.writer import RecordingWriter
+from rig.errors import InputError
+from rig.wire import CATALOGUE, EDGES, EVENTS, PARAMETERS, SCENE, STATUS, encode_document, sensor_key, truth_key
+
+from .recorder_stream import documents, stream
+
+PROBES = sensor_key("probes")
+HEAD = 9
+"""Bytes of an opcode and a length."""
+
+
+def writer(path: Path, **options: Any) -> RecordingWriter:
+    about = documents()
+    return RecordingWriter(
+        path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE], **options
+    )
+
+
+def write(path: Path, items: list[tuple[str, bytes]]) -> Path:
+    """A recording whose chunks are as large as they become."""
+    with writer(path, sync_every_s=1e9) as file:
+        for number, (key, payload) in enumerate(items):
+            file.write(key, payload, 1_700_000_000_000_000_000 + number * 1_250_000)
+        file.finish("completed")
+    return path
+
+
+def of(items: list[tuple[str, bytes]]) -> dict[str, list[bytes]]:
+    found = defaultdict(list)
+    for key, payload in items:
+        found[key].append(payload)
+    return dict(found)
+
+
+@pytest.fixture(scope="module")
+def items() -> list[tuple[str, bytes]]:
+    return list(stream(100))
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory, items) -> Path:
+    return write(tmp_path_factory.mktemp("rewrite") / "run.mcap", items)
+
+
+@pytest.fixture(scope="module")
+def chunks(path) -> list[tuple[int, int]]:
+    """Start and end of each chunk, from the library's own reader."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return [(row.chunk_start_offset, row.chunk_start_offset + row.chunk_length) for row in summary.chunk_indexes]
+
+
+def test_a_file_cut_in_a_chunk_gives_whole_messages_of_that_chunk_too(path, chunks, items, tmp_path):
+    data = path.read_bytes()
+    sent = of(items)
+    part = tmp_path / "run.mcap.part"
+    start, end = chunks[1]
+    before = Recording.open(_part(part, data[:start])).messages[PROBES]
+    after = Recording.open(_part(part, data[:end])).messages[PROBES]
+    found = []
+    for at in np.linspace(start, end - 1, 12).astype(int).tolist():
+        recording = Recording.open(_part(part, data[:at]))
+        for key, payloads in sent.items():
+            got = [payload for _, payload in recording.payloads(key)]
+            assert got == payloads[: len(got)], (at, key)
+        found.append(recording.messages[PROBES])
+    assert found[0] == before
+    assert found == sorted(found)
+    assert before < found[6] < after
+
+
+def _part(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    return path
+
+
+def test_a_recovered_file_is_finished_and_holds_what_the_source_did(path, chunks, tmp_path):
+    part = _part(tmp_path / "run.mcap.part", path.read_bytes()[: chunks[-1][1] - 1000])
+    source = Recording.open(part)
+    raw = part.read_bytes()
+    made = recover(part)
+    assert made.path == tmp_path / "run.recovered.mcap"
+    assert part.read_bytes() == raw
+    recording = Recording.open(made.path)
+    assert recording.complete
+    assert recording.end_reason == "recovered"
+    assert recording.metadata["recovered"]["source"] == "run.mcap.part"
+    assert recording.metadata["rig"] == source.metadata["rig"]
+    assert recording.streams == source.streams
+    for topic in (topic for topic in source.messages if topic.startswith("rig/")):
+        assert list(recording._stamped({topic})) == list(source._stamped({topic})), topic
+    # Derived anew: the messages for plots of the last rows too.
+    views = [topic for topic in recording.messages if topic.startswith("view/")]
+    for topic in views:
+        again = [payload for _, payload in recording.payloads(topic)]
+        assert [payload for _, payload in source.payloads(topic)] == again[: source.messages.get(topic, 0)], topic
+    np.testing.assert_array_equal(recording.clock[: len(source.clock)], source.clock)
+
+
+def test_a_damaged_chunk_is_passed_over_and_its_rows_are_a_gap(path, chunks, items, tmp_path):
+    data = bytearray(path.read_bytes())
+    start, end = chunks[1]
+    data[(start + end) // 2] ^= 0xFF
+    damaged = tmp_path / "run.mcap"
+    damaged.write_bytes(data)
+    made = recover(damaged)
+    assert made.damaged == 1
+    recording = Recording.open(made.path)
+    assert [payload for _, payload in recording.payloads(PROBES)] != of(items)[PROBES]
+    rows = recording.streams[PROBES].rows
+    assert 0 < rows < 20_000
+    (gap,) = [gap for gap in recording.gaps if gap.key == PROBES]
+    assert rows + gap.size == 20_000
+
+
+def test_what_the_transport_gave_up_stays_on_record(tmp_path, items):
+    with writer(tmp_path / "run.mcap") as file:
+        for key, payload in items[:30]:
+            file.write(key, payload, 0)
+        file.write_missed(STATUS, 2, 0)
+        file.finish("completed")
+    recover(tmp_path / "run.mcap")
+    assert [(gap.key, gap.size) for gap in Recording.open(tmp_path / "run.recovered.mcap").gaps] == [(STATUS, 2)]
+
+
+def test_a_file_in_the_making_is_not_recovered(tmp_path, items):
+    with writer(tmp_path / "run.mcap", sync_every_s=0.0) as file:
+        for key, payload in items[:30]:
+            file.write(key, payload, 0)
+        with pytest.raises(InputError, match="one that no recorder is writing to"):
+            recover(file.part)
+        file.finish("completed")
+    assert list(tmp_path.iterdir()) == [tmp_path / "run.mcap"]
+
+
+@pytest.mark.parametrize("output", ["run.mcap", "run.mcap.part"])
+def test_the_source_is_never_the_place_to_write_to(path, tmp_path, output):
+    part = _part(tmp_path / "run.mcap.part", path.read_bytes()[:-100])
+    raw = part.read_bytes()
+    with pytest.raises(InputError, match="output must be"):
+        recover(part, tmp_path / output, force=True)
+    assert part.read_bytes() == raw
+
+
+def test_a_file_cut_in_its_calibration_is_refused_and_nothing_is_left(path, tmp_path):
+    part = _part(tmp_path / "run.mcap.part", path.read_bytes()[:5000])
+    with pytest.raises(InputError, match="cut off in it"):
+        recover(part)
+    assert list(tmp_path.iterdir()) == [part]
+
+
+def test_the_name_of_a_recovered_file():
+    assert recovered_path(Path("a/x.mcap.part")) == recovered_path(Path("a/x.mcap")) == Path("a/x.recovered.mcap")
+
+
+def test_a_cut_keeps_the_rows_between_two_times_and_whole_payloads(path, items, tmp_path):
+    made = cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.2034, to_s=0.75)
+    recording = Recording.open(made.path)
+    assert recording.complete
+    whole = Recording.open(path)
+    for group in whole.table.groups:
+        old, new = whole.samples(group), recording.samples(group)
+        rows = slice(4068, 15_000)
+        np.testing.assert_array_equal(new.values, old.values[rows])
+        np.testing.assert_array_equal(new.index, old.index[rows])
+        np.testing.assert_allclose(new.times_s, old.times_s[rows], atol=1e-12)
+    # Rows lie at each 0.5 ms: the first one not before 0.2034 s is number 407.
+    np.testing.assert_array_equal(recording.truth("state").index, np.arange(407, 1500))
+    edges = whole.edges()
+    np.testing.assert_array_equal(recording.edges(), edges[(edges >= 0.2034) & (edges < 0.75)])
+    inside = [payload for _, payload in recording.payloads(PROBES)][1:]
+    assert inside == of(items)[PROBES][21:75]
+    about = recording.metadata["cut"]
+    assert json.loads(about["sources"]) == ["run.mcap"]
+    assert (about["from_s"], about["to_s"]) == ("0.2034", "0.75")
+    assert recording.gaps == []
+
+
+def test_cuts_behind_each_other_join_to_the_whole(path, tmp_path):
+    whole = Recording.open(path)
+    pieces = []
+    for number, (start, end) in enumerate([(0.0, 0.31234), (0.31234, 0.6), (0.6, 9.0)]):
+        pieces.append(cut(whole, tmp_path / f"{number}.mcap", from_s=start, to_s=end).path)
+    made = cut(join(pieces[::-1]), tmp_path / "joined.mcap")
+    again = Recording.open(made.path)
+    for group in whole.table.groups:
+        np.testing.assert_array_equal(again.samples(group).values, whole.samples(group).values)
+        np.testing.assert_array_equal(again.samples(group).index, whole.samples(group).index)
+    np.testing.assert_array_equal(again.truth("state").values, whole.truth("state").values)
+    np.testing.assert_array_equal(again.edges(), whole.edges())
+
+
+def test_channels_and_kinds_are_left_out_with_their_calibration(path, tmp_path):
+    whole = Recording.open(path)
+    recording = Recording.open(cut(whole, tmp_path / "a.mcap", only="sensors", channels=("P_W", "disk_y")).path)
+    assert {key for key in recording.messages if key.startswith("rig/s")} == {PROBES, sensor_key("forces"), STATUS}
+    assert recording.table.groups["forces"].names == ("P_W",)
+    assert recording.catalogue["truth"] == {}
+    for group, name in (("forces", "P_W"), ("probes", "disk_y")):
+        np.testing.assert_array_equal(recording.samples(group).column(name), whole.samples(group).column(name))
+    truth = Recording.open(cut(whole, tmp_path / "b.mcap", only="truth").path)
+    assert not truth.table.groups
+    np.testing.assert_array_equal(truth.truth("state").values, whole.truth("state").values)
+    assert EDGES not in truth.messages
+    assert truth_key("contact") in truth.messages
+
+
+def test_a_cut_knows_the_commands_before_it(tmp_path, items):
+    def command(number: int, tick: int) -> tuple[str, bytes]:
+        about = {"event": "command", "tick": tick, "id": number, "command": "speed", "request": {"speed_hz": 2.0}}
+        return EVENTS, encode_document(about)
+
+    path = write(tmp_path / "run.mcap", [*items[:200], command(1, 100_000), command(2, 500_000), *items[200:]])
+    recording = Recording.open(cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.3).path)
+    assert [entry["id"] for entry in recording.scene["taken"]] == [1]
+    assert [event["id"] for event in recording.events if event["event"] == "command"] == [2]
+
+
+@pytest.mark.parametrize(
+    ("options", "must"),
+    [
+        ({"from_s": 2.0, "to_s": 1.0}, "from and to must be times, one before the other"),
+        ({"from_s": float("nan")}, "from and to must be times"),
+        ({"from_s": 50.0}, "from and to must be times that the recording holds"),
+        ({"channels": ("disk_z",)}, "channels must be among disk_x"),
+    ],
+)
+def test_impossible_cuts_are_refused_and_leave_nothing(path, tmp_path, options, must):
+    with pytest.raises(InputError, match=must):
+        cut(Recording.open(path), tmp_path / "cut.mcap", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_foreign_reader_reads_them(path, chunks, tmp_path):
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    part = _part(tmp_path / "run.mcap.part", path.read_bytes()[: chunks[1][1] - 500])
+    for made in (recover(part), cut(Recording.open(path), tmp_path / "cut.mcap", from_s=0.1, to_s=0.2)):
+        with made.path.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            rows = sum(
+                len(row.decoded_message.values) // row.decoded_message.columns
+                for row in reader.iter_decoded_messages(topics=[PROBES])
+            )
+        assert rows == made.counts.rows[PROBES] > 0

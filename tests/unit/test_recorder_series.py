@@ -1,0 +1,265 @@
+"""Recordings in several files, and what they may take of the disk."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import defaultdict
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording, join
+from recorder.rewrite import cut, recover
+from recorder.series import Limits, Series, part_path
+from recorder.writer import RecordingError, RecordingWriter
+from rig.errors import InputError
+from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Gap, encode_block, encode_document, sensor_key
+
+from .recorder_stream import block_of, documents, stream
+
+PROBES = sensor_key("probes")
+
+
+def series(path: Path, *, force: bool = False, **limits: Any) -> Series:
+    about = documents()
+    calls = count()
+
+    def open_writer(name: Path, *, from_start: bool, **options: Any) -> RecordingWriter:
+        return RecordingWriter(
+            name,
+            catalogue=about[CATALOGUE],
+            parameters=about[PARAMETERS],
+            force=force,
+            monotonic_s=lambda: 0.01 * next(calls),  # a flush each 25 payloads
+            **options,
+        )
+
+    return Series(path, scene=about[SCENE], limits=Limits(**limits), open_writer=open_writer, force=force)
+
+
+def write(file: Series, items: list[tuple[str, bytes]]) -> None:
+    for number, (key, payload) in enumerate(items):
+        if file.ended:
+            break
+        file.write(key, payload, 1_700_000_000_000_000_000 + number)
+    file.finish("completed")
+
+
+@pytest.fixture(scope="module")
+def items() -> list[tuple[str, bytes]]:
+    return list(stream(100))
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory, items) -> list[Path]:
+    file = series(tmp_path_factory.mktemp("series") / "run.mcap", rotate_s=0.3)
+    write(file, items)
+    return file.files
+
+
+def test_every_payload_stands_in_one_part_and_the_parts_in_order_are_the_stream(parts, items):
+    assert [part.name for part in parts] == [f"run.{number:04d}.mcap" for number in range(4)]
+    assert sorted(parts) == parts
+    sent = defaultdict(list)
+    for key, payload in items:
+        sent[key].append(payload)
+    recordings = [Recording.open(part) for part in parts]
+    for key, payloads in sent.items():
+        assert [p for part in recordings for _, p in part.payloads(key)] == payloads, key
+    joined = join(list(reversed(parts)))
+    assert joined.streams == _streams_of(items, parts[0].parent)
+    np.testing.assert_array_equal(joined.samples("probes").index, np.arange(20_000))
+
+
+def _streams_of(items: list[tuple[str, bytes]], folder: Path) -> dict[str, Any]:
+    file = series(folder / "whole.mcap")
+    write(file, items)
+    return Recording.open(folder / "whole.mcap").streams
+
+
+def test_a_seam_lies_at_one_instant_for_all_streams(parts):
+    for number, part in enumerate(parts):
+        streams = Recording.open(part).streams
+        firsts = [stream.first_time_s for key, stream in streams.items() if "edges" not in key]
+        assert firsts == pytest.approx([0.3 * number] * len(firsts))
+
+
+def test_each_part_is_complete_and_names_its_neighbours(parts):
+    from mcap.reader import make_reader
+
+    for number, part in enumerate(parts):
+        recording = Recording.open(part)
+        assert recording.complete
+        about = recording.metadata["series"]
+        assert about["number"] == str(number)
+        assert about["previous"] == (parts[number - 1].name if number else "")
+        following = parts[number + 1].name if number + 1 < len(parts) else None
+        assert recording.metadata["end"].get("next") == following
+        due = json.loads(about["due"])
+        assert due == ({} if not number else {key: due[key] for key in recording.streams})
+        if number:
+            assert due[PROBES] == recording.samples("probes").index[0]
+        with part.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == sum(recording.messages.values())
+
+
+def test_a_part_knows_the_commands_before_it(tmp_path, items):
+    command = {
+        "event": "command",
+        "tick": 100_000,
+        "time_s": 0.1,
+        "id": 3,
+        "command": "hammer",
+        "request": {"force_n": 50.0},
+        "from": "test",
+    }
+    file = series(tmp_path / "run.mcap", rotate_s=0.3)
+    write(file, [*items[:100], (EVENTS, encode_document(command)), *items[100:]])
+    taken = {"id": 3, "tick": 100_000, "command": "hammer", "request": {"force_n": 50.0}}
+    scenes = [Recording.open(part).scene for part in file.files]
+    assert "taken" not in scenes[0]
+    assert [scene["taken"] for scene in scenes[1:]] == [[taken]] * 3
+
+
+def test_rows_lost_at_a_seam_are_a_gap(tmp_path):
+    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(60) if number not in (29, 30, 31)]
+    file = series(tmp_path / "run.mcap", rotate_s=0.3)
+    write(file, blocks)
+    assert [Recording.open(part).gaps for part in file.files] == [[], [Gap(PROBES, 5800, 600)]]
+    assert file.counts().lost == {PROBES: 600}
+    assert join(file.files).streams[PROBES].lost == 600
+
+
+def test_rotation_by_size(tmp_path):
+    file = series(tmp_path / "run.mcap", rotate_mb=1.0)
+    write(file, list(stream(200)))
+    sizes = [part.stat().st_size for part in file.files]
+    assert len(sizes) >= 3
+    assert all(1_000_000 < size < 1_300_000 for size in sizes[:-1])
+
+
+def test_the_budget_ends_a_recording_that_is_closed_well(tmp_path):
+    file = series(tmp_path / "run.mcap", budget_mb=5.0)
+    write(file, list(stream(400)))
+    assert file.ended == "the budget of 5 MB is used up"
+    assert file.out_of_room
+    assert 2_500_000 < (tmp_path / "run.mcap").stat().st_size <= 5_000_000
+    assert Recording.open(tmp_path / "run.mcap").complete
+
+
+def test_the_oldest_files_make_room_where_that_was_asked_for(tmp_path):
+    file = series(tmp_path / "run.mcap", rotate_mb=1.0, budget_mb=5.0, when_full="remove-oldest")
+    write(file, list(stream(500)))
+    assert file.ended == ""
+    assert file.removed > 0
+    assert file.files == sorted(tmp_path.iterdir())
+    assert sum(part.stat().st_size for part in file.files) <= 5_000_000
+    assert join(file.files).streams[PROBES].last_time_s == pytest.approx(5.0 - 50e-6)
+    assert int(Recording.open(file.files[0]).metadata["series"]["number"]) == file.removed
+
+
+def test_room_is_left_on_the_disk(tmp_path, monkeypatch):
+    free = [100]
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=free[0], f_frsize=1_000_000))
+    file = series(tmp_path / "run.mcap", keep_free_mb=50.0)
+    items = list(stream(40))
+    for key, payload in items[:160]:
+        file.write(key, payload, 0)
+    assert file.ended == ""
+    free[0] = 51
+    file._checked_s = -1e9
+    file.write(*items[160], 0)
+    assert file.ended == "less than 50 MB are free on the disk"
+    file.finish(file.ended)
+    assert Recording.open(tmp_path / "run.mcap").end_reason == file.ended
+
+
+@pytest.mark.parametrize(
+    ("limits", "must"),
+    [
+        ({"rotate_mb": 0.5}, "rotate_mb must be from 1"),
+        ({"rotate_s": 0.0}, "rotate_s must be from 0.1"),
+        ({"rotate_s": float("nan")}, "rotate_s must be from 0.1"),
+        ({"budget_mb": 1.0}, "budget_mb must be from 5"),
+        ({"keep_free_mb": -1.0}, "keep_free_mb must be from 0"),
+        ({"when_full": "remove-oldest"}, "stop for a recording in one file"),
+    ],
+)
+def test_impossible_limits_are_refused(limits, must):
+    with pytest.raises(InputError, match=must):
+        Limits(**limits)
+
+
+def test_parts_of_an_earlier_recording_are_not_mixed_with_new_ones(tmp_path, items):
+    old = part_path(tmp_path / "run.mcap", 7)
+    old.write_text("precious")
+    other = tmp_path / "run.other.mcap"
+    other.write_text("somebody else's")
+    with pytest.raises(InputError, match=r"run\.0007\.mcap, which exists"):
+        series(tmp_path / "run.mcap", rotate_s=0.3)
+    file = series(tmp_path / "run.mcap", rotate_s=0.3, force=True)
+    write(file, items)
+    assert not old.exists()
+    assert other.read_text() == "somebody else's"
+    assert len(file.files) == 4
+
+
+def test_a_removed_folder_leaves_a_copy_in_the_nearest_one(tmp_path, items):
+    folder = tmp_path / "day"
+    folder.mkdir()
+    file = series(folder / "run.mcap")
+    for key, payload in items[:200]:
+        file.write(key, payload, 0)
+    for each in folder.iterdir():
+        each.unlink()
+    folder.rmdir()
+    with pytest.raises(RecordingError, match=r"was removed while it was written.*is kept in .*run\.mcap\.part"):
+        write(file, items[200:])
+    copy = tmp_path / "run.mcap.part"
+    assert file.part == copy
+    payloads = [payload for _, payload in Recording.open(copy).payloads(PROBES)]
+    assert payloads == [payload for key, payload in items if key == PROBES][: len(payloads)]
+    assert len(payloads) >= 24
+
+
+def test_a_recovered_part_joins_the_others_and_cuts_of_them_join_too(parts, tmp_path):
+    torn = tmp_path / "run.0003.mcap.part"
+    torn.write_bytes(parts[3].read_bytes()[:-300])
+    whole = join([*parts[:3], recover(torn).path])
+    assert whole.streams[PROBES].rows == 20_000
+    pieces = [
+        cut(whole, tmp_path / "a.mcap", from_s=0.1, to_s=0.45).path,
+        cut(whole, tmp_path / "b.mcap", from_s=0.45).path,
+    ]
+    np.testing.assert_array_equal(join(pieces).samples("probes").index, np.arange(2000, 20_000))
+    assert "series" not in Recording.open(pieces[0]).metadata
+
+
+def test_files_of_different_runs_are_not_joined(tmp_path, items):
+    about = documents()
+    for name, seed in (("a", 1), ("b", 2)):
+        with RecordingWriter(
+            tmp_path / f"{name}.mcap",
+            catalogue=about[CATALOGUE],
+            parameters=about[PARAMETERS],
+            scene={**about[SCENE], "seed": seed},
+        ) as file:
+            for key, payload in items[:50]:
+                file.write(key, payload, 0)
+    with pytest.raises(InputError, match="recordings of one run"):
+        join([tmp_path / "a.mcap", tmp_path / "b.mcap"])
+
+
+def test_the_same_rows_twice_are_not_joined(tmp_path, items):
+    for name in ("a", "b"):
+        write(series(tmp_path / f"{name}.mcap"), items[:100])
+    with pytest.raises(InputError, match="recordings behind each other"):
+        join([tmp_path / "a.mcap", tmp_path / "b.mcap"])

@@ -1,0 +1,274 @@
+"""Parts of a validation: criteria, phases, spectra, bits, and what explains a difference."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording
+from recorder.writer import RecordingWriter
+from replays.experiment import Experiment
+from replays.validation import load_criteria, outcome, validate
+from replays.validation.attribution import Explained, attribute
+from replays.validation.criteria import DEFAULT
+from replays.validation.phases import View, find_phases, quantities, spectrum_distance
+from replays.validation.prediction import Measured, Prediction, bare, measured, predict
+from rig.errors import InputError
+from rig.offline import frames
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+from rig.wire import EDGES, EVENTS, encode_block, encode_document, sensor_key, truth_key
+
+SMALL = {"sensors.rate_hz": 2000, "sensors.truth_rate_hz": 100, "duration_s": 0.06}
+
+
+def record(
+    path: Path, scene: str = "hammer", *, truth: bool = True, leave_out: tuple[int, ...] = (), **changes: object
+) -> Recording:
+    """A recording of a scene; of some frames of 0.01 s nothing arrives."""
+    simulation = Simulation(load_scene(scene, {**SMALL, **{key.replace("__", "."): v for key, v in changes.items()}}))
+    with RecordingWriter(
+        path, catalogue=simulation.catalogue(), parameters=simulation.parameters_document(),
+        scene=simulation.scene_document(), view_rate_hz=0.0, force=True,
+    ) as writer:  # fmt: skip
+        for number, frame in enumerate(frames(simulation, chunk_s=0.01)):
+            for event in frame.events:
+                writer.write(EVENTS, encode_document(event), 0)
+            blocks = {sensor_key(name): block for name, block in frame.samples.items()}
+            blocks |= {truth_key(name): block for name, block in frame.truth.items()} if truth else {}
+            if frame.edges is not None:
+                blocks[EDGES] = frame.edges
+            for key, block in blocks.items():
+                if number not in leave_out:
+                    writer.write(key, encode_block(block), frame.tick * 1000)
+        writer.finish("completed")
+    return Recording.open(path)
+
+
+@pytest.fixture(scope="module")
+def hammer(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return record(tmp_path_factory.mktemp("validation") / "hammer.mcap")
+
+
+# Criteria.
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("longest_s = 30.0", "longest_s = 0.0", "window.longest_s"),
+        ("longest_s = 30.0", "", "window.longest_s"),
+        ('"ring.clearance", "shaft.mass"', '"ring.clearence"', "ring.clearence"),
+        ('quantities = ["contact_fraction"]', 'quantities = ["contact_part"]', "contact_fraction"),
+        ("rms = 1.01", "rms = 1.01\nrsm = 2.0", "rsm"),
+        ('reason = "Truth has no noise: only rounding may part the two."', 'reason = ""', "truth.reason"),
+        ("title =", "title", "a TOML file"),
+    ],
+)
+def test_wrong_criteria_are_refused_with_their_field(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = DEFAULT.read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / "own.toml"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        load_criteria(path)
+
+
+def test_the_first_criterion_that_fits_holds() -> None:
+    criteria = load_criteria()
+    keyphasor, probe = criteria.trajectory_of("keyphasor"), criteria.trajectory_of("disk_x")
+    assert keyphasor is not None
+    assert probe is not None
+    assert keyphasor.peak > probe.peak
+    spin, force = criteria.statistic_of("whirl", "spin"), criteria.statistic_of("impacts", "spin")
+    assert spin is not None
+    assert force is not None
+    assert spin.relative < force.relative
+
+
+# Spectra and phases, against closed forms.
+
+
+def test_distance_of_spectra() -> None:
+    turn = np.exp(2j * np.pi * 50.0 * np.arange(4096) / 4096.0)
+    assert spectrum_distance(turn, turn) == 0.0
+    assert spectrum_distance(turn, turn * np.exp(0.7j)) == pytest.approx(0.0, abs=1e-12)  # phase does not count
+    assert spectrum_distance(turn, turn.conj()) == pytest.approx(1.0, abs=1e-6)  # the other way round
+    assert spectrum_distance(turn, 1.1 * turn) == pytest.approx(0.1 / math.sqrt(1.0 + 1.1**2))
+
+
+def test_phases_are_found_where_they_are() -> None:
+    times = np.arange(0.0, 2.0, 1e-3)
+    radius = np.select([times < 0.3, times < 0.6, times < 1.5], [0.1, 0.5 + 0.6 * (np.sin(40 * times) > 0), 1.01], 0.1)
+    angle = np.where(times >= 0.6, -2 * np.pi * 30.0 * times, 0.3)
+    values = {"ring_x": radius * np.cos(angle), "ring_y": radius * np.sin(angle)}
+    view = View(times_s=dict.fromkeys(values, times), values=values, base={}, touches=1.0)
+    phases = find_phases(view, floor_n=1.0)
+    assert [phase.name for phase in phases] == ["free run", "impacts", "whirl", "decay"]
+    starts = [phase.from_s for phase in phases]
+    assert starts[1] == pytest.approx(0.3, abs=0.1)
+    assert starts[2] == pytest.approx(0.6, abs=0.051)
+    assert starts[3] == pytest.approx(1.5, abs=0.051)
+    kept = (times >= 0.7) & (times < 1.4)
+    whirl = View(
+        times_s=dict.fromkeys(values, times[kept]), values={k: v[kept] for k, v in values.items()}, base={}, touches=1.0
+    )
+    read = quantities(whirl, "whirl")
+    assert read["whirl_frequency"] == pytest.approx(-30.0, rel=1e-6)
+    assert read["sense"] == -1.0
+    assert read["contact_fraction"] == 1.0
+
+
+# Bits.
+
+
+def test_the_same_build_gives_the_same_bits(hammer: Recording) -> None:
+    found = validate(hammer)
+    assert found.bit_exact
+    assert found.good
+    assert len(found.bits) == 9  # five groups, four truth tables; no edge in so short a time
+    assert sum(stream.rows for stream in found.bits.values()) == 5 * 120 + 4 * 6
+
+
+def test_one_count_is_found_with_its_time(hammer: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = Recording.blocks
+
+    def off(self: Recording, key: str):
+        for block in blocks(self, key):
+            if key.endswith("/probes") and block.index == 80:
+                values = block.values.copy()
+                values[3, 1] += 1
+                block = replace(block, values=values)
+            yield block
+
+    monkeypatch.setattr(Recording, "blocks", off)
+    found = validate(hammer)
+    assert not found.bit_exact
+    (stream,) = [one for one in found.bits.values() if not one.equal]
+    assert (stream.first_s, stream.first_column, stream.largest) == (83 / 2000, 1, 1.0)
+
+
+def test_gaps_and_a_late_begin_are_passed_over(tmp_path: Path) -> None:
+    found = validate(record(tmp_path / "gap.mcap", leave_out=(0, 3)), declared=True)
+    assert found.bit_exact
+    assert found.good
+    assert found.bits[sensor_key("probes")].rows == 80
+    assert found.bits[sensor_key("probes")].skipped == 20
+    assert found.skipped == 5 * 20 + 4
+
+
+def test_another_seed_changes_sensors_and_not_the_motion(hammer: Recording) -> None:
+    found = validate(hammer, changes={"seed": 9})
+    assert {key.split("/")[1] for key, one in found.bits.items() if not one.equal} == {"sensors"}
+    assert found.good
+    assert "truth is equal to the bit" in found.bits_line
+
+
+def test_few_channels_and_no_truth_are_enough(tmp_path: Path) -> None:
+    recording = record(tmp_path / "few.mcap", truth=False, sensors__groups=["accelerations"])
+    found = validate(recording, declared=True)
+    assert found.good
+    assert [phase.name for phase in found.phases] == ["free run"]
+    assert not found.truth
+    wrong = validate(recording, changes={"contact.friction": 0.2})
+    assert not wrong.good
+    assert wrong.explained is not None
+    assert wrong.explained.best == ("contact.friction",)
+
+
+def test_rows_of_another_clock_lie_between_the_models_own(
+    hammer: Recording, heard: tuple[dict[str, Measured], Prediction]
+) -> None:
+    """A recorder at 1/3 of a millisecond past every row: nothing of the model falls there."""
+    from scipy.interpolate import CubicSpline
+
+    parts, nominal = heard
+    part = parts["probes"]
+    late = replace(part, times_s=part.times_s[:40] + 1e-3 / 3.0, index=part.index[:40], values=part.values[:40])
+    between = predict(bare(Experiment.of(hammer)), {"probes": late}).values["probes"]
+    assert between == pytest.approx(CubicSpline(part.times_s, nominal.values["probes"])(late.times_s), abs=2e-5)
+
+
+# What explains a difference: faults put into the channels themselves.
+
+
+def explained(recording: Recording, parts: dict[str, Measured], nominal: Prediction) -> Explained:
+    experiment = bare(Experiment.of(recording))
+    rules = load_criteria().attribution
+    few = [one for one in rules.candidates if one.name in ("contact.friction", "house.preload", "magnet.stiffness")]
+    return attribute(experiment, parts, nominal, rules.model_copy(update={"candidates": tuple(few)}), from_s=0.0)
+
+
+@pytest.fixture(scope="module")
+def heard(hammer: Recording) -> tuple[dict[str, Measured], Prediction]:
+    experiment = Experiment.of(hammer)
+    parts = measured(hammer, experiment.scene.sensors, longest_s=1.0)
+    return parts, predict(bare(experiment), parts)
+
+
+def with_fault(parts: dict[str, Measured], group: str, matrix: np.ndarray, shift: float = 0.0) -> dict[str, Measured]:
+    values = parts[group].values @ matrix
+    values[:, 0] += shift
+    return {**parts, group: replace(parts[group], values=values)}
+
+
+@pytest.mark.parametrize(
+    ("matrix", "shift", "name", "change"),
+    [
+        (np.diag([1.01, 1.0, 1.0, 1.0]), 0.0, "disk_x gain", "+1 %"),
+        (np.diag([-1.0, 1.0, 1.0, 1.0]), 0.0, "disk_x polarity", "turned round"),
+        (np.eye(4), 0.002, "disk_x offset", "+0.002 mm"),
+        (np.eye(4)[[1, 0, 2, 3]], 0.0, "disk_x and disk_y", "swapped"),
+    ],
+)
+def test_a_sensor_fault_is_called_one(
+    hammer: Recording,
+    heard: tuple[dict[str, Measured], Prediction],
+    matrix: np.ndarray,
+    shift: float,
+    name: str,
+    change: str,
+) -> None:
+    parts, nominal = heard
+    found = explained(hammer, with_fault(parts, "probes", matrix, shift), nominal)
+    assert found.best == (name,)
+    assert found.conclusion.startswith("sensor: ")
+    one = next(one for one in found.ranked if one.name == name)
+    assert one.change.replace("+0.99", "+1").startswith(change[:5]) or one.change == change
+
+
+def test_a_late_clock_is_called_time(hammer: Recording, heard: tuple[dict[str, Measured], Prediction]) -> None:
+    from scipy.interpolate import CubicSpline
+
+    parts, nominal = heard
+    late = {}
+    for name, part in parts.items():
+        noise = part.values - nominal.values[name]
+        late[name] = replace(part, values=CubicSpline(part.times_s, nominal.values[name])(part.times_s - 2e-4) + noise)
+    found = explained(hammer, late, nominal)
+    assert found.best == ("time offset",)
+    assert found.ranked[0].value == pytest.approx(2e-4, abs=2e-6)
+
+
+def test_two_that_explain_it_alike_are_both_named(tmp_path: Path) -> None:
+    """Transducers at rest show the preload alone: so does an offset of theirs."""
+    recording = record(tmp_path / "rest.mcap", "stable-run", sensors__groups=["forces"])
+    found = validate(recording, changes={"house.preload": 2990.0})
+    assert not found.good
+    assert found.explained is not None
+    assert "house.preload" in found.explained.best
+    assert any(name.startswith("P_") for name in [one.name for one in found.explained.ranked])
+
+
+def test_a_document_is_json_throughout(hammer: Recording) -> None:
+    import json
+
+    found = validate(hammer, changes={"contact.restitution": 0.85}, declared=True)
+    document = json.loads(json.dumps(found.document(), allow_nan=False))
+    assert document["good"] is False
+    assert document["explained"]["best"] == ["contact.restitution"]
+    assert outcome.Validation is type(found)
