@@ -180,6 +180,8 @@ class Daq:
         with self._changed:
             self._aligner = Aligner(columns, order, self._room)
             self._pile = Pile(self._room)
+            # It listens now: a replay may wait for that.
+            source.taken(None, room=self._room, lost=0)
             early, self._early = self._early or [], None
             for name, samples in early:
                 self._feed(name, samples)

@@ -16,6 +16,8 @@ from rig.channels import ChannelTable, Group
 from rig.errors import InputError
 from rig.transport import Client
 
+GRACE_S = 1.0
+"""After an end that does not tell the number of rows, the last blocks have this time to come [s]."""
 RIG_GONE = "the rig has gone"
 
 
@@ -165,9 +167,16 @@ class RigStream:
             event = wire.decode_document(payload)
             if event["event"] != "end":
                 return
-            rows, reason = dict(event["rows"]), f"the rig's run has ended: {event['reason']}"
+            rows, reason = event.get("rows"), f"the rig's run has ended: {event['reason']}"
+            rows = rows if rows is None else dict(rows)
         except (ValueError, KeyError, TypeError):
             self.malformed += 1
+            return
+        if rows is None:
+            # A recording that does not tell what there was: whatever may still come has its time.
+            timer = threading.Timer(GRACE_S, lambda: self._end(list(self._subscribed), reason))
+            timer.daemon = True
+            timer.start()
             return
         done = []
         with self._lock:

@@ -47,7 +47,7 @@ class ChannelHealth:
         low: Least value.
         high: Greatest value.
         noise: White noise, as it is in the quietest tenth of the recording, rms; nan where there are too few rows.
-        noise_calibrated: The same in the channel's calibration.
+        noise_calibrated: The same in the channel's calibration; nan where the recording has none.
         limited_rows: Rows at the conditioner's or the converter's limit.
         stuck_s: Longest time without any change [s].
         findings: What raises doubt.
@@ -189,8 +189,7 @@ class _Watch:
                 low=float(ends[0]),
                 high=float(ends[1]),
                 noise=float(quiet[column] * abs(scale)),
-                noise_calibrated=math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0))
-                / abs(channel.sensitivity_v),
+                noise_calibrated=_noise_of(channel) if self._noisy else math.nan,
                 limited_rows=int(self._limited[column]),
                 stuck_s=float(self._longest[column] - 1) / self._group.rate_hz,
             )
@@ -236,6 +235,11 @@ class _Watch:
         return 2.0 * math.sqrt(power[middle]) / (0.5 * self._window)
 
 
+def _noise_of(channel: Channel) -> float:
+    """White noise by calibration, that of the converter's steps included [unit of the channel]."""
+    return math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0)) / abs(channel.sensitivity_v)
+
+
 def _limits(channel: Channel) -> tuple[float, float]:
     """Counts at and beyond which a channel is at a limit, its noise allowed for."""
     margin_v = 4.0 * channel.noise_v + 2.0 * channel.lsb_v
@@ -270,7 +274,7 @@ def examine(recording: Recording) -> Health:
 
 
 def _with_findings(recording: Recording, channels: list[ChannelHealth], misplaced: dict[str, int]) -> Health:
-    clock = recording.clock
+    clock = recording.clock if _has_clock(recording) else np.empty((0, 2))
     span_s = float(np.ptp(clock[:, 1])) if len(clock) else 0.0
     pace, jitter_ms, jitter_max_ms, strays = _pace(clock)
     last = recording.statuses[-1] if recording.statuses else {}
@@ -303,26 +307,39 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth], misplace
 
 
 def _has_noise(scene: dict[str, Any]) -> bool:
-    """Whether the scene's sensors have noise; a recording from elsewhere says nothing of it, and has."""
+    """Whether the sensors have the noise of their calibration: not where a scene turns it off, nor in an import."""
+    if "import" in scene:
+        return False
     sensors = scene.get("scene", {}).get("sensors", {}) if isinstance(scene.get("scene"), dict) else {}
     return sensors.get("noise", True) is not False and sensors.get("chain", "full") != "ideal"
+
+
+def _has_clock(recording: Recording) -> bool:
+    """Whether the wall times are those of a clock; a simulation without one, and an import, derive them."""
+    without = {("start", "none"), ("import", None)}
+    return not any((event.get("event"), event.get("pace")) in without for event in recording.events)
 
 
 def _pace(clock: np.ndarray) -> tuple[float, float, float, float]:
     """Slope of simulated over wall time, deviations from the line (rms and largest [ms]), part of strays.
 
-    The line is through medians: what a recorder fetched from the rig's cache arrived in one burst.
+    The line is through medians: what a recorder fetched from the rig's cache arrived in one burst. A first one, through
+    neighbours, tells which pairs belong together; a second one, through those far apart, is the result.
     """
-    half = len(clock) // 2
-    if half < 2:
-        return math.nan, math.nan, math.nan, math.nan
-    simulated_s, wall_s = clock[:, 0] - clock[0, 0], clock[:, 1] - clock[0, 1]
-    steps_s = np.maximum(wall_s[half:] - wall_s[: len(wall_s) - half], 1e-9)
-    slope = float(np.median((simulated_s[half:] - simulated_s[: len(wall_s) - half]) / steps_s))
-    if not slope > 0.0:
-        return math.nan, math.nan, math.nan, math.nan
-    rest_ms = 1e3 * (simulated_s / slope - wall_s)
-    rest_ms -= np.median(rest_ms)
-    near = np.abs(rest_ms) <= max(_STRAY * float(np.median(np.abs(rest_ms))), 50.0)
+    unknown = math.nan, math.nan, math.nan, math.nan
+    simulated_s, wall_s = (clock - clock[:1]).T
+    near = np.ones(len(clock), dtype=bool)
+    slope, rest_ms = math.nan, np.zeros(len(clock))
+    for neighbours in (True, False):
+        apart = 1 if neighbours else int(near.sum()) // 2
+        if near.sum() < 4:
+            return unknown
+        steps = (values[near][apart:] - values[near][:-apart] for values in (simulated_s, wall_s))
+        slope = float(np.median(np.divide(next(steps), np.maximum(next(steps), 1e-9))))
+        if not slope > 0.0:
+            return unknown
+        rest_ms = 1e3 * (simulated_s / slope - wall_s)
+        rest_ms -= np.median(rest_ms[near])
+        near = np.abs(rest_ms) <= max(_STRAY * float(np.median(np.abs(rest_ms))), 50.0)
     kept_ms = rest_ms[near]
     return slope, float(np.sqrt(np.mean(kept_ms**2))), float(np.abs(kept_ms).max()), 1.0 - float(near.mean())

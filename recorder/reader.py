@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from io import BytesIO
 from itertools import pairwise
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self
 import numpy as np
 
 from recorder import schemas
+from recorder.payload import block_in
 from rig.channels import ChannelTable
 from rig.errors import InputError
 from rig.wire import (
@@ -24,7 +25,6 @@ from rig.wire import (
     Block,
     Continuity,
     Gap,
-    decode_block,
     decode_document,
     schema_of,
     sensor_key,
@@ -96,13 +96,26 @@ class Stream:
 
 
 @dataclass(frozen=True)
-class _Chunk:
+class Chunk:
+    """Messages in a row that were packed together; see `Recording.chunks`.
+
+    Attributes:
+        offset: Where its record begins in its file [bytes].
+        length: Length of the record's body [bytes].
+        begin_ns: Least simulated time of its messages [ns].
+        end_ns: Greatest simulated time of its messages [ns].
+        channels: Channels with messages in it, where the file says so.
+        cut: The file ends in it.
+        part: Number of the file that it is in, of `Recording.parts`.
+    """
+
     offset: int
     length: int
-    channels: frozenset[int] | None
-    """Channels with messages in it, where the file says so."""
+    begin_ns: int = 0
+    end_ns: int = 0
+    channels: frozenset[int] | None = None
     cut: bool = False
-    """The file ends in it."""
+    part: int = 0
 
 
 class Recording:
@@ -134,13 +147,13 @@ class Recording:
         self.metadata: dict[str, dict[str, str]] = {}
         self.messages: dict[str, int] = {}
         self._attachments: dict[str, bytes] = {}
-        self._chunks: list[_Chunk] = []
+        self._chunks: list[Chunk] = []
         self._channels: dict[int, Channel] = {}
         try:
             with path.open("rb") as file, self._intact():
                 self._scan(file, salvage=salvage)
         except OSError as error:
-            raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
+            raise _unreadable(path, error) from None
         about = self.metadata.get("rig", {})
         if about.get("format") != schemas.FORMAT:
             raise InputError("file", _OURS, str(path))
@@ -178,6 +191,11 @@ class Recording:
     def parts(self) -> tuple[Recording, ...]:
         """The files that it is read from."""
         return (self,)
+
+    @property
+    def chunks(self) -> tuple[Chunk, ...]:
+        """Where its messages are, in file order, for who reads from somewhere in the middle; see `read`."""
+        return tuple(self._chunks)
 
     @property
     def end_reason(self) -> str:
@@ -303,6 +321,15 @@ class Recording:
         """Every message in file order: topic, simulated time [ns], wall time of arrival [unix ns] and payload."""
         yield from self._stamped(set(self.messages))
 
+    def read(self, chunk: Chunk) -> Iterator[tuple[str, int, int, bytes]]:
+        """The messages of one of its chunks, as `everything` gives them.
+
+        Raises:
+            InputError: The file has changed, or cannot be read any more.
+        """
+        part = self.parts[chunk.part]
+        yield from part._read([chunk], {number: channel.topic for number, channel in part._channels.items()})
+
     def payloads(self, key: str) -> Iterator[tuple[int, bytes]]:
         """The payloads of one key, byte for byte as they came: pairs of simulated time [ns] and bytes."""
         for _, log_time, payload in self._messages({key}):
@@ -350,11 +377,10 @@ class Recording:
         return block.times_s
 
     def _block(self, key: str, payload: bytes) -> Block | None:
-        schema = schema_of(key)
-        if schema is None:
+        if schema_of(key) is None:
             raise InputError("key", "a key of blocks (sensors or truth)", key)
         try:
-            return decode_block(payload, schema)
+            return block_in(key, payload)
         except ValueError:
             return None
 
@@ -386,6 +412,7 @@ class Recording:
         A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through.
         """
         from mcap.data_stream import ReadDataStream
+        from mcap.exceptions import McapError
         from mcap.opcode import Opcode
         from mcap.records import Attachment, Channel, MessageIndex, Metadata, Statistics
 
@@ -402,14 +429,14 @@ class Recording:
             opcode, length = _RECORD.unpack(file.read(_RECORD.size))
             end = position + _RECORD.size + length
             if end > size and opcode == Opcode.CHUNK:
-                self._chunks.append(
-                    _Chunk(offset=position, length=size - position - _RECORD.size, channels=None, cut=True)
-                )
+                self._chunks.append(Chunk(offset=position, length=size - position - _RECORD.size, cut=True))
             if end > size or opcode == 0:  # cut off, or zeros where a power cut left unwritten pages
                 break
             if opcode == Opcode.CHUNK:
                 last_chunk = position
-                self._chunks.append(_Chunk(offset=position, length=length, channels=None))
+                head = file.read(_CHUNK.size) if length >= _CHUNK.size else bytes(_CHUNK.size)
+                begin_ns, end_ns, *_ = _CHUNK.unpack(head)
+                self._chunks.append(Chunk(offset=position, length=length, begin_ns=begin_ns, end_ns=end_ns))
             elif opcode in (
                 Opcode.METADATA,
                 Opcode.ATTACHMENT,
@@ -417,20 +444,25 @@ class Recording:
                 Opcode.STATISTICS,
                 Opcode.MESSAGE_INDEX,
             ):
-                stream = ReadDataStream(BytesIO(file.read(length)))
-                if opcode == Opcode.METADATA:
-                    metadata = Metadata.read(stream)
-                    self.metadata[metadata.name] = metadata.metadata
-                elif opcode == Opcode.ATTACHMENT:
-                    attachment = Attachment.read(stream)
-                    self._attachments[attachment.name] = attachment.data
-                elif opcode == Opcode.CHANNEL:
-                    channel = Channel.read(stream)
-                    self._channels[channel.id] = channel
-                elif opcode == Opcode.STATISTICS:
-                    counts = dict(Statistics.read(stream).channel_message_counts)
-                else:
-                    indexed.setdefault(last_chunk, set()).add(MessageIndex.read(stream).channel_id)
+                try:
+                    stream = ReadDataStream(BytesIO(file.read(length)))
+                    if opcode == Opcode.METADATA:
+                        metadata = Metadata.read(stream)
+                        self.metadata[metadata.name] = metadata.metadata
+                    elif opcode == Opcode.ATTACHMENT:
+                        attachment = Attachment.read(stream)
+                        self._attachments[attachment.name] = attachment.data
+                    elif opcode == Opcode.CHANNEL:
+                        channel = Channel.read(stream)
+                        self._channels[channel.id] = channel
+                    elif opcode == Opcode.STATISTICS:
+                        counts = dict(Statistics.read(stream).channel_message_counts)
+                    else:
+                        indexed.setdefault(last_chunk, set()).add(MessageIndex.read(stream).channel_id)
+                except (McapError, struct.error, ValueError):
+                    # Indexes and counts can be made anew, and if it is the calibration it will be missed.
+                    if not salvage:
+                        raise
             elif opcode == Opcode.FOOTER:
                 footer = True
             position = end
@@ -438,10 +470,9 @@ class Recording:
             file.seek(position)
             self.complete = file.read(len(_MAGIC)) == _MAGIC and not salvage
         if self.complete:
-            self._chunks = [
-                _Chunk(offset=chunk.offset, length=chunk.length, channels=frozenset(indexed.get(chunk.offset, ())))
-                for chunk in self._chunks
-            ]
+            # One without an index has no messages.
+            chunks = [replace(chunk, channels=frozenset(indexed.get(chunk.offset, ()))) for chunk in self._chunks]
+            self._chunks = [chunk for chunk in chunks if chunk.channels]
         else:
             counts = self._scan_chunks(file)
         self.messages = {self._channels[number].topic: count for number, count in sorted(counts.items())}
@@ -462,14 +493,17 @@ class Recording:
             except (McapError, struct.error, zstandard.ZstdError, ValueError):
                 self.damaged += 1
                 continue
-            good.append(chunk)
+            times_ns = []
             for opcode, start, end in _records(data):
                 if opcode == Opcode.MESSAGE:
-                    number = _MESSAGE.unpack_from(data, start)[0]
+                    number, _, time_ns, _ = _MESSAGE.unpack_from(data, start)
                     counts[number] = counts.get(number, 0) + 1
+                    times_ns.append(time_ns)
                 elif opcode == Opcode.CHANNEL:
                     channel = Channel.read(ReadDataStream(BytesIO(data[start:end])))
                     self._channels[channel.id] = channel
+            if times_ns:
+                good.append(replace(chunk, begin_ns=min(times_ns), end_ns=max(times_ns)))
         self._chunks = good
         return {number: count for number, count in counts.items() if number in self._channels}
 
@@ -480,13 +514,20 @@ class Recording:
 
     def _stamped(self, topics: set[str]) -> Iterator[tuple[str, int, int, bytes]]:
         """Topic, log time, publish time and payload of every message on some topics, in file order."""
+        wanted = {number: channel.topic for number, channel in self._channels.items() if channel.topic in topics}
+        if wanted:
+            yield from self._read(self._chunks, wanted)
+
+    def _read(self, chunks: list[Chunk], wanted: dict[int, str]) -> Iterator[tuple[str, int, int, bytes]]:
+        """The messages on some channels, of some chunks of this file."""
         from mcap.opcode import Opcode
 
-        wanted = {number: channel.topic for number, channel in self._channels.items() if channel.topic in topics}
-        if not wanted:
-            return
-        with self.path.open("rb") as file, self._intact():
-            for chunk in self._chunks:
+        try:
+            file = self.path.open("rb")
+        except OSError as error:
+            raise _unreadable(self.path, error) from None
+        with file, self._intact():
+            for chunk in chunks:
                 if chunk.channels is not None and chunk.channels.isdisjoint(wanted):
                     continue
                 data = _unpack(file, chunk)
@@ -508,7 +549,11 @@ def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
             yield opcode, start, position
 
 
-def _unpack(file: BinaryIO, chunk: _Chunk) -> bytes:
+def _unreadable(path: Path, error: OSError) -> InputError:
+    return InputError("file", "a file that can be read", f"{path} ({error.strerror})")
+
+
+def _unpack(file: BinaryIO, chunk: Chunk) -> bytes:
     """Records of a chunk, unpacked and checked against their sum."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Chunk
@@ -567,6 +612,11 @@ class Joined(Recording):
     def parts(self) -> tuple[Recording, ...]:
         """The files that it is read from."""
         return self._parts
+
+    @property
+    def chunks(self) -> tuple[Chunk, ...]:
+        """Where its messages are, part after part."""
+        return tuple(replace(chunk, part=number) for number, part in enumerate(self._parts) for chunk in part.chunks)
 
     @property
     def end_reason(self) -> str:

@@ -17,11 +17,12 @@ from typing import Any, Literal
 import numpy as np
 
 from recorder import schemas
+from recorder.payload import block_in, tick_in
 from recorder.reader import Recording
 from recorder.series import Commands
 from recorder.writer import Counts, RecordingWriter, check_destination, part_of
 from rig.errors import InputError
-from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_block, decode_document, encode_block, schema_of
+from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_document, encode_block, schema_of
 
 _TELL_EVERY = 5000
 """Messages between two reports of progress."""
@@ -132,18 +133,18 @@ def cut(
     from_tick, to_tick = (_tick(at_s, tick_rate_hz) for at_s in (from_s, to_s))
     commands = Commands(recording.scene)
     for event in recording.events:
-        if isinstance(event.get("tick"), int) and event["tick"] < from_tick:
+        tick = tick_in(event)
+        if tick is not None and tick < from_tick:
             commands.follow(EVENTS, event)
 
     def change(key: str, payload: bytes) -> bytes | None:
-        schema = schema_of(key)
-        if schema is None:
+        if schema_of(key) is None:
             tick = _tick_of(payload)
             return payload if tick is None or from_tick <= tick < to_tick else None
         if key not in columns:
             return None
         try:
-            block = decode_block(payload, schema)
+            block = block_in(key, payload)
         except ValueError:
             return payload
         kept = _trimmed(key, block, from_tick, to_tick, columns[key])
@@ -256,10 +257,9 @@ def _tick(at_s: float, tick_rate_hz: float) -> float:
 
 def _tick_of(payload: bytes) -> int | None:
     try:
-        tick = decode_document(payload).get("tick")
+        return tick_in(decode_document(payload))
     except ValueError:
         return None
-    return tick if isinstance(tick, int) else None
 
 
 def _overlaps(recording: Recording, key: str, from_s: float, to_s: float) -> bool:

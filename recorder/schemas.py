@@ -74,7 +74,7 @@ class _Cdr:
         self.body += struct.pack("<I", value)
 
     def string(self, text: str) -> None:
-        data = text.encode() + b"\0"
+        data = text.encode(errors="replace") + b"\0"  # JSON can hold half a character
         self.u32(len(data))
         self.body += data
 
@@ -149,7 +149,8 @@ class JointStateRows:
 def encode_log(time_ns: int, level: int, name: str, text: str) -> bytes:
     """One `rcl_interfaces/msg/Log` message at a simulated time [ns]."""
     cdr = _Cdr()
-    cdr.body += struct.pack("<iIB", time_ns // 1_000_000_000, time_ns % 1_000_000_000, level)
+    seconds, rest = divmod(time_ns, 1_000_000_000)
+    cdr.body += struct.pack("<iIB", min(seconds, 2**31 - 1), rest, level)
     for field in (name, text, "", ""):
         cdr.string(field)
     cdr.u32(0)
@@ -166,8 +167,11 @@ def event_text(event: dict[str, Any]) -> tuple[int, str]:
     if kind == "warning":
         return LOG_WARN, str(event.get("text", "warning"))
     level = LOG_ERROR if kind == "end" and reason.startswith("failed") else LOG_INFO
-    hidden = {"event", "tick", "time_s", "wall_s", "rows"}
-    details = ", ".join(f"{name} {_brief(value)}" for name, value in event.items() if name not in hidden)
+    hidden = {"event", "tick", "time_s", "wall_s", "rows", "request"}
+    request = event.get("request")
+    shown = {name: value for name, value in event.items() if name not in hidden}
+    shown |= request if isinstance(request, dict) else {}
+    details = ", ".join(f"{name} {_brief(value)}" for name, value in shown.items())
     return level, f"{kind}: {details}" if details else kind
 
 

@@ -3,7 +3,7 @@
 NAME.mcap becomes NAME.0000.mcap, NAME.0001.mcap, ...: four digits, so that they sort. Each is complete in itself:
 calibration, parameters, and the scene with the commands sent up to its beginning. A part ends between two blocks of
 simulated time, for all streams at once, and the next one knows which row is due, so that a row lost at a seam is
-recorded like any other.
+recorded like any other. History, which comes stream by stream, stands in the first part, however long it is.
 """
 
 from __future__ import annotations
@@ -11,24 +11,27 @@ from __future__ import annotations
 import json
 import os
 import re
-import struct
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from recorder.payload import place_of
 from recorder.schemas import PART_SUFFIX
-from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination
+from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination, remove
 from rig.errors import InputError
 from rig.wire import EDGES, EVENTS, schema_of
 
 MB = 1_000_000
-MOST_PARTS = 10_000
+MOST_PARTS = 1_000_000
 _PENDING_BYTES = 2 * MB
-"""What may still come to a file at its end: a chunk that is not yet on the disk, and the index."""
+"""What may still come to a file at its end, but for its index: a chunk that is not yet on the disk."""
 _CHECK_S = 0.25
-_TICK = struct.Struct("<q")
+_BEHIND_NS = NS
+"""Simulated time by which streams may be apart at a seam: more, and one of them is still catching up [ns]."""
+_CATCH_UP_S = 5.0
+"""Longest wait with a full file for a stream that may never come [s]."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,9 @@ class Limits:
             raise InputError("when_full", "stop or remove-oldest", self.when_full)
         if self.when_full == "remove-oldest" and not self.rotates:
             raise InputError("when_full", "stop for a recording in one file (--rotate-mb, --rotate-s)", self.when_full)
+        least = 2.0 * (self.rotate_mb or 0.0)
+        if self.when_full == "remove-oldest" and self.budget_mb is not None and self.budget_mb < least:
+            raise InputError("budget_mb", f"at least two files, {least:g}, where the oldest makes room", self.budget_mb)
 
     @property
     def rotates(self) -> bool:
@@ -97,11 +103,11 @@ def check_room(path: Path, limits: Limits) -> None:
 
 def _parts_of(path: Path) -> list[Path]:
     """Files that look like parts of a recording of that name."""
-    name = re.compile(rf"{re.escape(path.stem)}\.\d{{4}}{re.escape(path.suffix)}({re.escape(PART_SUFFIX)})?")
+    name = re.compile(rf"{re.escape(path.stem)}\.\d{{4,}}{re.escape(path.suffix)}({re.escape(PART_SUFFIX)})?")
     return sorted(each for each in path.parent.iterdir() if name.fullmatch(each.name))
 
 
-def lack_of_room(folder: Path, keep_free_mb: float) -> str:
+def lack_of_room(folder: Path, keep_free_mb: float, *, index_bytes: int = 0) -> str:
     """What is wrong if a disk has less room than is to be left on it [MB]; empty if nothing is."""
     if not keep_free_mb:
         return ""
@@ -109,7 +115,7 @@ def lack_of_room(folder: Path, keep_free_mb: float) -> str:
         disk = os.statvfs(folder)
     except OSError:
         return ""  # the next write says what is wrong
-    if disk.f_bavail * disk.f_frsize >= keep_free_mb * MB + _PENDING_BYTES:
+    if disk.f_bavail * disk.f_frsize >= keep_free_mb * MB + _PENDING_BYTES + index_bytes:
         return ""
     return f"less than {keep_free_mb:g} MB are free on the disk"
 
@@ -184,13 +190,14 @@ class Series:
         self._number = 0
         self._checked_s = -1e9
         self._unchecked_bytes = 0
+        self._reached_ns: dict[str, int] = {}
+        self._expected: set[str] = set()
+        self._full_s: float | None = None
         self._series = f"{path.stem} {time.time_ns():x}"
         if force and limits.rotates:
-            first = part_path(path, 0)
-            for old in _parts_of(path):
-                if old.name not in (first.name, first.name + PART_SUFFIX):
-                    old.unlink()
+            remove(_parts_of(path))
         self._writer = self._open(path if not limits.rotates else part_path(path, 0), previous="", from_start=True)
+        self._expected = set(self._writer.streams)
 
     @property
     def part(self) -> Path:
@@ -261,13 +268,29 @@ class Series:
     def _is_seam(self, key: str, payload: bytes) -> bool:
         """Whether the file is full and this is the first block of a later time than all that it holds."""
         writer, limits = self._writer, self._limits
-        if writer.first_time_ns is None or key == EDGES or schema_of(key) is None or len(payload) < 12:
+        place = None if key == EDGES or schema_of(key) is None else place_of(payload)
+        if place is None:
+            return False
+        block_ns = self._reached_ns[key] = place[0] * NS // writer.tick_rate_hz
+        if writer.first_time_ns is None or block_ns <= writer.last_time_ns:
             return False
         full = limits.rotate_mb is not None and writer.size_bytes >= limits.rotate_mb * MB
-        block_ns = _TICK.unpack_from(payload, 4)[0] * NS // writer.tick_rate_hz
         if limits.rotate_s is not None and block_ns - writer.first_time_ns >= limits.rotate_s * NS:
             full = True
-        return full and block_ns > writer.last_time_ns
+        return full and not self._await_others(block_ns)
+
+    def _await_others(self, block_ns: int) -> bool:
+        """Whether streams are still catching up with a block that would begin the next file."""
+        behind = {key for key in self._expected if self._reached_ns.get(key, -_BEHIND_NS) < block_ns - _BEHIND_NS}
+        now_s = self._monotonic_s()
+        if not behind:
+            self._full_s = None
+        elif self._full_s is None:
+            self._full_s = now_s
+        elif now_s - self._full_s > _CATCH_UP_S:
+            self._expected -= behind
+            self._full_s = None
+        return self._full_s is not None
 
     def _rotate(self) -> None:
         if self._number + 1 >= MOST_PARTS:
@@ -293,16 +316,20 @@ class Series:
             if self._limits.when_full == "stop" or not self.files:
                 self.ended, self.out_of_room = why, True
                 return
-            oldest = self.files.pop(0)
+            try:
+                self.files[0].unlink(missing_ok=True)
+            except OSError as error:
+                self.ended, self.out_of_room = f"{why}, and {self.files[0]} stays ({error.strerror})", True
+                return
+            self.files.pop(0)
             self._sizes.pop(0)
-            oldest.unlink(missing_ok=True)
             self.removed += 1
 
     def _lack(self) -> str:
         """What there is no more room for."""
         limits = self._limits
         if limits.budget_mb is not None:
-            used = sum(self._sizes) + self._writer.size_bytes + _PENDING_BYTES
+            used = sum(self._sizes) + self._writer.size_bytes + self._writer.index_bytes + _PENDING_BYTES
             if used > limits.budget_mb * MB:
                 return f"the budget of {limits.budget_mb:g} MB is used up"
-        return lack_of_room(self.path.parent, limits.keep_free_mb)
+        return lack_of_room(self.path.parent, limits.keep_free_mb, index_bytes=self._writer.index_bytes)

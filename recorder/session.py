@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from recorder.payload import block_in, place_of
 from recorder.series import Limits, Series, check_room, check_series
 from recorder.trigger import Capture, Captures, check_captures
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_view_rate
@@ -21,6 +22,7 @@ from rig.wire import (
     ALIVE,
     CATALOGUE,
     CLIENTS,
+    EDGES,
     EVENTS,
     PARAMETERS,
     SCENE,
@@ -31,17 +33,23 @@ from rig.wire import (
     encode_document,
     schema_of,
     sensor_key,
+    truth_key,
 )
 
 RIG_LOST = "rig lost"
 """End reason of a session whose rig vanished without an end event."""
 INBOX_BYTES = 256 << 20
 """About a minute and a half of the default streams: longer than any stall of a disk that still works."""
+_PORTION = 1000
+"""Payloads that are taken out of the inbox at a time: only when all of them are written does their room come free."""
+_ROUND_NS = NS // 5
+"""Streams that begin within this time of each other begin together, each with its first block [ns]."""
 HEARTBEAT_S = 0.5
 QUIET_S = 0.3
 """After the end of the stream, with all streams whole: silence after which nothing more is expected [s]."""
 RECOVERY_S = 2.0
-"""After the end of the stream, with blocks still missing: silence after which they are given up [s]."""
+"""After the end of the stream, or of the time to record, with blocks still missing: silence after which they are given
+up [s]."""
 PATIENCE_S = 30.0
 """After the end of the stream: longest wait [s]."""
 
@@ -78,7 +86,7 @@ class Summary:
     Attributes:
         path: The last file; the .part file if it could not be finished.
         reason: Why the session ended.
-        error: What went wrong at the disk, or that there was no more room; empty if nothing did.
+        error: What went wrong at the disk or in the recorder, or that there was no more room; empty if nothing did.
         first_time_s: Simulated time of the first row [s].
         duration_s: Simulated time from the first to the last row [s].
         rows: Rows received by key.
@@ -173,6 +181,7 @@ class _Inbox:
         self._capacity = capacity_bytes
         self._items: deque[tuple[str, bytes, int]] = deque()
         self._bytes = 0
+        self._taken_bytes = 0
         self._closed = False
         self._ready = threading.Condition()
         self.dropped = 0
@@ -198,13 +207,14 @@ class _Inbox:
         return self._bytes
 
     def take(self, timeout_s: float) -> list[tuple[str, bytes, int]] | None:
-        """Everything that waits, oldest first; None when it is closed and empty."""
+        """What waits, oldest first, when all that was taken before is done with; None when closed and empty."""
         with self._ready:
+            self._bytes -= self._taken_bytes
+            self._taken_bytes = 0
             if not self._items and not self._closed:
                 self._ready.wait(timeout_s)
-            items = list(self._items)
-            self._items.clear()
-            self._bytes = 0
+            items = [self._items.popleft() for _ in range(min(_PORTION, len(self._items)))]
+            self._taken_bytes = sum(len(payload) for _, payload, _ in items)
             return None if self._closed and not items else items
 
     def close(self) -> None:
@@ -242,7 +252,7 @@ class RecordingSession:
             client: Connection to the rig; remains the caller's to close.
             path: File to write, ends in .mcap.
             name: Name in the rig's list of clients.
-            duration_s: Simulated time to record [s]; None until something else ends the session.
+            duration_s: Simulated time to record [s], to the block; None until something else ends the session.
             view_rate_hz: Rate of the plottable messages [Hz]; 0 writes none.
             history: Also record what the rig's cache still holds from before; rows since the start of the run that it
                 no longer holds count as lost.
@@ -285,7 +295,14 @@ class RecordingSession:
         self._end_rows: dict[str, int] | None = None
         """Number of the row after the last one published, by key, as the end event tells it."""
         self._rig_lost = False
+        self._replaced = False
+        self._arrived: dict[str, int] = {}
         self._heard_s = 0.0
+        self._streams: set[str] = set()
+        self._beyond: set[str] = set()
+        """Streams that have come to the end of the time to record."""
+        self._begin_ns: dict[str, int] = {}
+        self._within_s = 0.0
         self._failure: BaseException | None = None
 
     def stop(self, reason: str = "stopped") -> None:
@@ -310,6 +327,9 @@ class RecordingSession:
             decode_document(self._client.request(key)) for key in (CATALOGUE, PARAMETERS, SCENE)
         )
         writer = self._open_sink(catalogue, parameters, scene)
+        self._tick_rate_hz = round(catalogue["tick_rate_hz"])
+        self._streams = {sensor_key(group) for group in writer.table.groups}
+        self._streams |= {truth_key(table) for table in catalogue.get("truth", {})}
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
         thread.start()
         reason = "failed"
@@ -366,9 +386,14 @@ class RecordingSession:
     # On the transport's threads.
 
     def _on_message(self, key: str, payload: bytes) -> None:
-        self._inbox.put(key, payload, self._wall_ns())
-        if schema_of(key) is not None:
+        if schema_of(key) is not None and (place := place_of(payload)) is not None:
+            index = place[1]
+            # Whoever goes on after the rig was lost and counts from the start again is another one in its place.
+            self._replaced = self._replaced or (self._rig_lost and index < self._arrived.get(key, 0))
+            self._arrived[key] = index
             self._heard_s = self._monotonic_s()
+        if not self._replaced:
+            self._inbox.put(key, payload, self._wall_ns())
 
     def _on_miss(self, key: str, messages: int) -> None:
         self._misses.append((key, messages, self._wall_ns()))
@@ -377,6 +402,8 @@ class RecordingSession:
         if not alive:
             self._rig_lost = True
             self._wake.set()
+        elif self._rig_lost:
+            self._replaced = True
 
     # On the writer thread.
 
@@ -384,6 +411,8 @@ class RecordingSession:
         try:
             while (items := self._inbox.take(0.1)) is not None:
                 for key, payload, wall_ns in items:
+                    if not self._is_in_time(key, payload):
+                        continue
                     document = writer.write(key, payload, wall_ns)
                     if document is not None:
                         self._follow(key, document)
@@ -398,6 +427,24 @@ class RecordingSession:
             self._failure = error
             self._inbox.close()
             self._wake.set()
+
+    def _is_in_time(self, key: str, payload: bytes) -> bool:
+        """Whether a payload is of the time to record; only what is a block can be of a later one."""
+        if math.isinf(self._duration_ns) or schema_of(key) is None:
+            return True
+        try:
+            start_ns = block_in(key, payload).tick * NS // self._tick_rate_hz
+        except ValueError:
+            return True
+        begin_ns = self._begin_ns.setdefault(key, start_ns)
+        first_ns = min(self._begin_ns.values())
+        if key == EDGES or begin_ns - first_ns > _ROUND_NS:
+            begin_ns = first_ns
+        if start_ns < begin_ns + self._duration_ns:
+            self._within_s = self._monotonic_s()
+            return True
+        self._beyond.add(key)
+        return False
 
     def _follow(self, key: str, document: dict) -> None:
         if key == EVENTS and document.get("event") == "end":
@@ -423,8 +470,7 @@ class RecordingSession:
                 return self._stop_reason
             if writer.ended:
                 return writer.ended
-            counts = writer.counts()
-            if counts.first_time_ns is not None and counts.last_time_ns - counts.first_time_ns >= self._duration_ns:
+            if self._beyond and (self._beyond >= self._streams or now_s - self._within_s > RECOVERY_S):
                 return "duration reached"
             if ended_s is None and (self._end_reason or self._rig_lost):
                 ended_s = now_s
@@ -440,7 +486,7 @@ class RecordingSession:
 
     def _nothing_left(self, writer: Sink, now_s: float, ended_s: float) -> bool:
         """After the end: whatever may still come has had its time."""
-        if now_s - ended_s > PATIENCE_S:
+        if now_s - ended_s > PATIENCE_S or self._replaced:
             return True
         # The `end` event can overtake blocks that are being recovered: while a stream is short of it, wait longer.
         whole = self._end_rows is not None and not len(self._inbox) and not writer.short_of(self._end_rows)
@@ -488,6 +534,8 @@ class RecordingSession:
             writer.finish(reason, notes=notes)
         except RecordingError as error:
             return str(error)
+        if self._failure is not None:
+            return f"recording stopped by {type(self._failure).__name__}: {self._failure}; what came before it is kept"
         return ""
 
     def _summary(self, writer: Sink, reason: str, trouble: str) -> Summary:

@@ -18,12 +18,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from recorder.payload import block_in, tick_in
 from recorder.schemas import PART_SUFFIX
 from recorder.series import Commands, lack_of_room
-from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination
+from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination, remove
 from rig.channels import ChannelTable
 from rig.errors import InputError
-from rig.wire import EDGES, EVENTS, SENSORS, Block, Continuity, Gap, decode_block, decode_document, schema_of
+from rig.wire import EDGES, EVENTS, SENSORS, Block, Continuity, Gap, decode_document, schema_of
 
 EVENT_NAMES = ("hammer", "speed", "release", "note", "warning")
 """Events of the stream that can be waited for."""
@@ -32,6 +33,8 @@ _LATE_NS = NS // 2
 """For so long after its end a capture waits for streams that are behind the others, and the ring keeps more than it
 need for an event that comes after its blocks [ns of simulated time]."""
 MOST_CAPTURES = 1000
+_MOST_FIRED = 1000
+"""Triggers that a file lists; more are only counted."""
 _MOST_PRE_S = 120.0
 
 
@@ -144,13 +147,14 @@ def _captures_of(path: Path) -> list[Path]:
 
 @dataclass
 class _Item:
-    """A payload in the ring, with the simulated time that it covers [ns]."""
+    """A payload in the ring, with the simulated time that it covers, and at which it came [ns]."""
 
     key: str
     payload: bytes
     wall_ns: int
     start_ns: int
     end_ns: int
+    came_ns: int
 
 
 @dataclass
@@ -160,6 +164,7 @@ class _Open:
     writer: RecordingWriter
     end_ns: int
     fired: list[dict[str, Any]] = field(default_factory=list)
+    count: int = 1
 
 
 class Captures:
@@ -204,8 +209,7 @@ class Captures:
         check_captures(path, capture, force=force)
         capture.check(table)
         if force:
-            for old in _captures_of(path):
-                old.unlink()
+            remove(_captures_of(path))
         self.path = self.part = path
         self.table = table
         self.files: list[Path] = []
@@ -253,19 +257,20 @@ class Captures:
             if schema is None:
                 document = decode_document(payload)
             else:
-                block = decode_block(payload, schema)
+                block = block_in(key, payload)
         except ValueError:
             self._malformed += 1
         if block is not None:
             start_ns, end_ns = self._follow(key, block)
         else:
             start_ns = end_ns = self._time_of(document)
-        item = _Item(key, payload, wall_ns, start_ns, end_ns)
+        item = _Item(key, payload, wall_ns, start_ns, end_ns, self._latest_ns)
         self._ring.append(item)
         if self._open is not None and start_ns <= self._open.end_ns:
             self._open.writer.write(key, payload, wall_ns)
-        # The ring's own scene: what was sent before the first thing that it still holds.
-        while self._ring and self._ring[0].end_ns < self._latest_ns - self._pre_ns - _LATE_NS:
+        # The ring's own scene: what was sent before the first thing that it still holds. It is emptied by the time at
+        # which things came, as an event can name a tick that is far off.
+        while self._ring and self._ring[0].came_ns < self._latest_ns - self._pre_ns - _LATE_NS:
             gone = self._ring.popleft()
             if gone.key == EVENTS:
                 self._commands.follow(EVENTS, _document(gone.payload))
@@ -316,8 +321,8 @@ class Captures:
         return start_ns, end_ns
 
     def _time_of(self, document: dict[str, Any] | None) -> int:
-        tick = document.get("tick") if document is not None else None
-        return max(0, tick * NS // self._tick_rate_hz) if isinstance(tick, int) else self._latest_ns
+        tick = tick_in(document)
+        return self._latest_ns if tick is None else max(0, tick * NS // self._tick_rate_hz)
 
     def _fired_by(self, key: str, document: dict[str, Any] | None, block: Block | None) -> list[tuple[Trigger, int]]:
         """Triggers that this payload sets off, with their simulated times [ns]."""
@@ -338,9 +343,11 @@ class Captures:
             # What is beyond its level from the first row on has not crossed it.
             before = np.concatenate(([self._beyond.get(trigger, True)], beyond[:-1]))
             self._beyond[trigger] = bool(beyond[-1])
+            rows = np.flatnonzero(beyond & ~before).tolist()
+            # The first starts a capture, the last makes it longer.
             found += [
-                (trigger, block.tick * NS // self._tick_rate_hz + round(int(row) * NS / block.rate_hz))
-                for row in np.flatnonzero(beyond & ~before)[:1]
+                (trigger, block.tick * NS // self._tick_rate_hz + round(row * NS / block.rate_hz))
+                for row in dict.fromkeys((*rows[:1], *rows[-1:]))
             ]
         return found
 
@@ -348,7 +355,9 @@ class Captures:
         self.fired += 1
         about = {"trigger": trigger.text, "time_s": time_ns / NS}
         if self._open is not None and time_ns <= self._open.end_ns:
-            self._open.fired.append(about)
+            self._open.count += 1
+            if len(self._open.fired) < _MOST_FIRED:
+                self._open.fired.append(about)
             if self._capture.again == "extend":
                 self._open.end_ns = max(self._open.end_ns, time_ns + self._post_ns)
             return
@@ -404,7 +413,8 @@ class Captures:
         assert writing is not None
         if writing.writer.closed:
             return
-        writing.writer.finish(reason, notes={**(notes or {}), "triggers": json.dumps(writing.fired)})
+        fired = {"triggers": json.dumps(writing.fired), "trigger_count": str(writing.count)}
+        writing.writer.finish(reason, notes={**(notes or {}), **fired})
         self.files.append(writing.writer.path)
         self._size_bytes += writing.writer.size_bytes
         if self._capture.count is not None and self._number >= self._capture.count:

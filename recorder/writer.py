@@ -7,17 +7,17 @@ import errno
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 from recorder import schemas
-from recorder.container import Container
+from recorder.payload import block_in, tick_in
 from recorder.views import Messages, View, Views
 from rig.channels import ChannelTable, Group
-from rig.errors import InputError
+from rig.errors import DiskError, InputError, check_new_file
 from rig.wire import (
     EDGES,
     EVENTS,
@@ -27,7 +27,6 @@ from rig.wire import (
     Block,
     Continuity,
     Gap,
-    decode_block,
     decode_document,
     encode_document,
     schema_of,
@@ -35,10 +34,16 @@ from rig.wire import (
     truth_key,
 )
 
+if TYPE_CHECKING:
+    from mcap.writer import Writer
+
 NS = 1_000_000_000
+_CHUNK_BYTES = 1 << 20
+_SET_BACK_NS = 60 * NS
+"""Step back of the wall clock after which clock pairs begin anew; smaller ones are of streams that came in turn."""
 
 
-class RecordingError(RuntimeError):
+class RecordingError(DiskError):
     """The disk ended the recording; everything written before is kept."""
 
 
@@ -94,17 +99,9 @@ def check_destination(path: Path, *, force: bool = False) -> None:
     Raises:
         InputError: The name does not end in .mcap, the folder is missing or read-only, or the file exists.
     """
-    if path.suffix != ".mcap":
-        raise InputError("output", "a file name that ends in .mcap", str(path))
-    if not path.parent.is_dir():
-        raise InputError("output", "in a folder that exists", str(path))
-    if path.is_dir():
-        raise InputError("output", "a file, not a folder", str(path))
-    for taken in (path, part_of(path)):
-        if taken.exists() and not force:
-            raise InputError("output", "a new file (--force replaces one)", f"{taken}, which exists")
-    if not os.access(path.parent, os.W_OK):
-        raise InputError("output", "in a folder that can be written", str(path))
+    check_new_file(path, field="output", suffixes=(".mcap",), force=force)
+    if (part := part_of(path)).exists() and not force:
+        raise InputError("output", "a new file (--force replaces one)", f"{part}, which exists")
 
 
 def _open_part(part: Path, *, replace: bool) -> BinaryIO:
@@ -121,16 +118,43 @@ def _open_part(part: Path, *, replace: bool) -> BinaryIO:
     import fcntl
 
     if replace and part.exists():
-        with part.open("rb+") as old:
-            try:
-                fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError("output", "a file that no other recording is writing to", str(part)) from None
-            # A new file under the name, not the old one emptied: nobody else can have it open.
-            part.unlink()
+        # A new file under the name, not the old one emptied: nobody else can have it open.
+        remove([part])
     file = part.open("x+b")  # readable, to save it if somebody removes it
     fcntl.flock(file, fcntl.LOCK_EX)
     return file
+
+
+def remove(files: Iterable[Path]) -> None:
+    """Remove files of an earlier recording, all or none of them.
+
+    Raises:
+        InputError: Another recording is writing to one, or one cannot be removed.
+    """
+    import fcntl
+
+    files = list(files)
+    for file in files:
+        with contextlib.suppress(FileNotFoundError), file.open("rb") as old:
+            try:
+                fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError("output", "files that no other recording is writing to", str(file)) from None
+    for file in files:
+        try:
+            file.unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError("output", "files that can be replaced", f"{file} ({error.strerror})") from None
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring names of files to the disk as well; not every file system can."""
+    with contextlib.suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
 
 
 def check_view_rate(view_rate_hz: float) -> None:
@@ -166,6 +190,7 @@ class RecordingWriter:
     `recorder/clock` repeats two a second in plain JSON.
 
     The file is FILE.mcap.part until `finish`, and is flushed to the disk so often that a kill loses less than 0.5 s.
+    The index of a file stays in memory until then, about 30 MB an hour: a reason to rotate long recordings.
     """
 
     def __init__(
@@ -212,6 +237,8 @@ class RecordingWriter:
         try:
             self.table = ChannelTable.model_validate(catalogue["table"])
             self.tick_rate_hz = round(catalogue["tick_rate_hz"])
+            if self.tick_rate_hz < 1:
+                raise ValueError(f"tick rate {self.tick_rate_hz}")
         except (KeyError, TypeError, ValueError) as error:
             raise InputError("catalogue", "a document with a channel table and a tick rate", str(error)) from None
         self.view_rate_hz = view_rate_hz
@@ -225,7 +252,7 @@ class RecordingWriter:
         self.malformed = 0
         self.first_time_ns: int | None = None
         self.last_time_ns = 0
-        """Simulated time of the latest block's last row, or of the latest document [ns]."""
+        """Simulated time of the latest row [ns]."""
         self.messages = 0
         self.size_bytes = 0
         """Size of the file at the last flush."""
@@ -237,6 +264,8 @@ class RecordingWriter:
         self._monotonic_s = monotonic_s
         self._synced_s = monotonic_s()
         self._clock_ns = 0
+        self._chunks = 0
+        self._chunk_bytes = 0
         self._begun = False
         self._topics: dict[str, _Topic] = {}
         self._schema_ids: dict[str, int] = {}
@@ -247,8 +276,10 @@ class RecordingWriter:
             self._file = _open_part(self.part, replace=force)
         except OSError as error:
             raise InputError("output", "a file that can be written", f"{self.part} ({error.strerror})") from None
-        mcap = Container(self._file)
-        self._mcap: Container | None = mcap
+        from mcap.writer import Writer as McapWriter
+
+        mcap = McapWriter(self._file, chunk_size=_CHUNK_BYTES)
+        self._mcap: Writer | None = mcap
         with self._guard():
             mcap.start(profile="ros2", library="rotor-stator-rig recorder")
             self._write_head(catalogue, parameters, scene, metadata or {}, attachments or {})
@@ -270,6 +301,7 @@ class RecordingWriter:
             if view_rate_hz:
                 self._view_events = self._channel(schemas.VIEW_EVENTS, schemas.LOG_SCHEMA, {"source": EVENTS})
             self._sync()
+            _sync_folder(self.part.parent)
             self._begun = True
 
     def __enter__(self) -> Self:
@@ -278,6 +310,16 @@ class RecordingWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         if self._mcap is not None:
             self.finish("closed" if kind is None else f"failed: {error or kind.__name__}")
+
+    @property
+    def index_bytes(self) -> int:
+        """About what the index at the end of the file will take: it names each chunk, and each topic in it [bytes]."""
+        return (60 + 10 * len(self._topics)) * self._chunks
+
+    @property
+    def streams(self) -> set[str]:
+        """Keys of the streams that the catalogue promises."""
+        return {sensor_key(group) for group in self.table.groups} | {truth_key(table) for table in self._truth}
 
     @property
     def closed(self) -> bool:
@@ -305,7 +347,7 @@ class RecordingWriter:
                 if topic.schema is None:
                     document = decode_document(payload)
                 else:
-                    block = decode_block(payload, topic.schema)
+                    block = block_in(key, payload)
             except ValueError:
                 # Not what the key promises: kept as it came, counted, and left to the reader to judge.
                 self.malformed += 1
@@ -409,12 +451,7 @@ class RecordingWriter:
                 raise FileExistsError(errno.EEXIST, f"{self.path} was created by someone else meanwhile")
             self.part.replace(self.path)
             self._mcap = None
-        with contextlib.suppress(OSError):  # the new name on the disk as well; not every file system can
-            folder = os.open(self.path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        _sync_folder(self.path.parent)
 
     @contextlib.contextmanager
     def _guard(self) -> Iterator[None]:
@@ -557,6 +594,10 @@ class RecordingWriter:
         self._mcap.add_message(topic.channel, time_ns, payload, wall_ns, topic.sequence)
         topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
         self.messages += 1
+        self._chunk_bytes += len(payload)
+        if self._chunk_bytes >= _CHUNK_BYTES:
+            self._chunks += 1
+            self._chunk_bytes = 0
 
     def _write_block(self, topic: _Topic, key: str, payload: bytes, block: Block, wall_ns: int) -> None:
         time_ns = max(0, block.tick * NS // self.tick_rate_hz)
@@ -573,7 +614,8 @@ class RecordingWriter:
             self.last_time_ns = max(self.last_time_ns, time_ns + round((rows - 1) * NS / block.rate_hz))
         if topic.group is None:
             return
-        if wall_ns - self._clock_ns >= NS // 2:
+        since_ns = wall_ns - self._clock_ns
+        if since_ns >= NS // 2 or since_ns < -_SET_BACK_NS:
             self._clock_ns = wall_ns
             pair = {"tick": block.tick, "time_s": time_ns / NS, "wall_s": wall_ns / NS}
             self._add(self._topics[schemas.CLOCK], encode_document(pair), time_ns, wall_ns)
@@ -586,13 +628,13 @@ class RecordingWriter:
         if not len(messages):
             return
         topic = self._topics[view.topic]
-        self._mcap.add_rows(topic.channel, messages.times_ns, messages.data, wall_ns, topic.sequence)
-        topic.sequence = (topic.sequence + len(messages)) & 0xFFFFFFFF
-        self.messages += len(messages)
+        data, size = messages.data.tobytes(), messages.data.shape[1]
+        for number, time_ns in enumerate(messages.times_ns.tolist()):
+            self._add(topic, data[number * size : (number + 1) * size], time_ns, wall_ns)
 
     def _write_document(self, topic: _Topic, key: str, payload: bytes, document: dict[str, Any], wall_ns: int) -> None:
-        tick = document.get("tick")
-        time_ns = max(0, tick * NS // self.tick_rate_hz) if isinstance(tick, int) else self.last_time_ns
+        tick = tick_in(document)
+        time_ns = self.last_time_ns if tick is None else max(0, tick * NS // self.tick_rate_hz)
         self._add(topic, payload, time_ns, wall_ns)
         if key == EVENTS and self.view_rate_hz:
             level, text = schemas.event_text(document)
@@ -617,6 +659,7 @@ class RecordingWriter:
         for view in self._views.all:
             self._add_view(view, view.settled(), self._wall_ns())
         self._mcap.flush()
+        self._chunks += 1
         os.fsync(self._file.fileno())
         self._check_name()
         self.size_bytes = self._file.tell()

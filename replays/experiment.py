@@ -43,6 +43,9 @@ class Experiment:
         """
         document = recording.scene.get("scene")
         streams = [stream for stream in recording.streams.values() if stream.rows]
+        if "import" in recording.scene and not isinstance(document, dict):
+            must = "a recording with the scene it ran: add [experiment] to the mapping, and import it again"
+            raise InputError("file", must, f"{recording.path}, imported without one")
         if not isinstance(document, dict) or not streams:
             raise InputError("file", "a recording of this rig, with the scene it ran and samples", str(recording.path))
         duration_s = max(_end_s(recording), 1.0 / TICK_RATE_HZ)

@@ -20,6 +20,7 @@ from replays.formats import columnar, delimited
 from replays.formats.export import check_output
 from rig import wire
 from rig.kernels.signals import ROW
+from rig.service import blocks_of
 from rig.simulation import Frame, Simulation
 
 SUFFIXES = (".mcap", ".parquet", ".csv")
@@ -155,6 +156,7 @@ class _McapRun:
             scene=simulation.scene_document(),
             force=self._force,
         )
+        self._rows = wire.RowCount()
         self._event({"event": "start", "scene": simulation.scene.name, "seed": simulation.scene.seed, "pace": "none"})
         return self
 
@@ -179,17 +181,15 @@ class _McapRun:
     def _write(self, frame: Frame) -> None:
         for event in frame.events:
             self._event(event)
-        blocks = {wire.sensor_key(group): block for group, block in frame.samples.items()}
-        blocks |= {wire.truth_key(table): block for table, block in frame.truth.items()}
-        if frame.edges is not None:
-            blocks[wire.EDGES] = frame.edges
-        for key, block in blocks.items():
+        for key, block in blocks_of(frame):
             self._writer.write(key, wire.encode_block(block), self._wall(frame.tick))
+            self._rows.follow(key, block)
 
     def _event(self, event: dict[str, Any]) -> None:
         tick = self.simulation.tick
         stamp = {"tick": tick, "time_s": tick / self.simulation.tick_rate_hz}
-        self._writer.write(wire.EVENTS, wire.encode_document({**stamp, **event}), self._wall(stamp["tick"]))
+        payload = wire.encode_document(self._rows.tell({**stamp, **event}))
+        self._writer.write(wire.EVENTS, payload, self._wall(stamp["tick"]))
 
     def _wall(self, tick: int) -> int:
         return self._wall_ns + tick * 1_000_000_000 // self.simulation.tick_rate_hz

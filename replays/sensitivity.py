@@ -1,8 +1,9 @@
 """What the sensors would show without noise, and how that changes with any number of the experiment.
 
 A value goes by its dotted key: a parameter (`contact.friction`, in its own unit), a number of the scene
-(`drive.speed_hz`), or one of a command (`hammer.1.force_n`: of the first blow; `at_s`, `duration_ms` and `direction`
-[degrees from x toward y] likewise).
+(`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first blow; `at_s`, `duration_ms` and `direction`
+[degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its clock,
+`shaft.angle_rad` where it begins).
 """
 
 from __future__ import annotations
@@ -17,45 +18,33 @@ from typing import Any
 import numpy as np
 
 from replays.experiment import Experiment
-from rig.channels import Channel, default_table
+from replays.prediction import Measured, Prediction, bare, lagrange, predict
 from rig.errors import InputError, SimulationError
-from rig.kernels.signals import COLUMN
 from rig.model import build_model
 from rig.parameters import load_parameters
 from rig.scenes import Scene, TimedCommand, change_scene, parse_command, parse_scene
-from rig.sensors.conditioning import channel_filter
 from rig.simulation import ROW_TICKS, TICK_RATE_HZ
 
+CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
+"""How late the recording's clock is where its samples begin, and how much faster it goes: unit, change of size 1."""
+ANGLE = "shaft.angle_rad"
+"""Angle of the shaft where the samples begin, on what the experiment has [rad]: whatever the speed before was."""
 SAME_SLOPE = 0.05
 """Two step sizes may differ by this part before a derivative is called doubtful."""
 _STEP = 1e-5
 """Step of a difference quotient, as a part of the value's scale, ..."""
 _LEAST_STEP = 1e-8
 """... and this is as far as it is shortened where the contacts are not the same ones on both sides."""
-_ONE_GROUP = "hammer"
-"""The least group of channels."""
+_KEPT = 8
+"""Predictions that are kept."""
+_MARGIN_S = 1e-4
+"""The model is followed so far behind the last row, which may lie between two of its own."""
+_ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
 _COMMAND_KEY = re.compile(r"(hammer|speed|release)\.([1-9][0-9]*)\.(\w+)")
 _GRIDS = {"at_s": ROW_TICKS / TICK_RATE_HZ, "duration_ms": ROW_TICKS / TICK_RATE_HZ * 1e3}
 """A simulation rounds these to its rows, by field of a command, in the field's unit."""
 _SCALES = {"at_s": 1e-3, "direction": 10.0}
 """What counts as a change of size 1 where the value itself may be 0 [s], [degrees]."""
-
-
-@dataclass(frozen=True)
-class Signals:
-    """Channels without noise over a window.
-
-    Attributes:
-        times_s: Simulated time of the rows [s], shape (n,).
-        names: The channels.
-        values: In each channel's unit, shape (n, channels).
-        contacts: Contacts begun from the start of the experiment to the end of the window.
-    """
-
-    times_s: np.ndarray
-    names: tuple[str, ...]
-    values: np.ndarray
-    contacts: int
 
 
 @dataclass(frozen=True)
@@ -65,16 +54,16 @@ class Derivatives:
     Attributes:
         base: The channels at the values themselves.
         keys: The values' keys.
-        values: d channel / d value, in their units, shape (keys, n, channels).
+        slopes: d channel / d value, in their units, by group, each shape (rows, channels); one a key.
         steps: Step of each difference quotient, in the value's unit, shape (keys,).
         differences: By how large a part quotients of this step and of half of it differ (root mean square over the
             window, channels weighted by their noise), shape (keys,).
         smooth: Whether the contacts were the same ones on both sides, shape (keys,).
     """
 
-    base: Signals
+    base: Prediction
     keys: tuple[str, ...]
-    values: np.ndarray
+    slopes: tuple[dict[str, np.ndarray], ...]
     steps: np.ndarray
     differences: np.ndarray
     smooth: np.ndarray
@@ -91,6 +80,8 @@ def value_of(experiment: Experiment, key: str) -> float:
     Raises:
         InputError: No such number.
     """
+    if key in CLOCK or key == ANGLE:
+        return 0.0
     match = _COMMAND_KEY.fullmatch(key)
     if match is not None:
         command = _commands(experiment)[_place(experiment, key)]
@@ -116,11 +107,18 @@ def value_of(experiment: Experiment, key: str) -> float:
 
 
 def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experiment:
-    """The experiment with other numbers; a rule gives way to the number.
+    """The experiment with other numbers; a rule gives way to the number. Those of the clock are none of the experiment.
 
     Raises:
         InputError: An unknown key, or a value that it must not have.
     """
+    values = {key: value for key, value in values.items() if key not in CLOCK}
+    if ANGLE in values:
+        ahead = values.get("drive.speed_hz", experiment.scene.drive.speed_hz) - experiment.scene.drive.speed_hz
+        phase = value_of(experiment, "shaft.unbalance_phase") + values[ANGLE]
+        phase -= 2.0 * math.pi * ahead * experiment.first_s
+        values = {key: value for key, value in values.items() if key != ANGLE}
+        values["shaft.unbalance_phase"] = math.remainder(phase, 2.0 * math.pi)
     changes = {key: value for key, value in values.items() if _COMMAND_KEY.fullmatch(key) is None}
     scene = change_scene(experiment.scene, changes) if changes else experiment.scene
     changed = replace(experiment, scene=scene)
@@ -148,67 +146,22 @@ def scale_of(experiment: Experiment, key: str) -> float:
     """What counts as a change of size 1 in a value, in its unit: the value itself, or a length or time like it."""
     if key in ("ring.offset_x", "ring.offset_y"):
         return value_of(experiment, "ring.clearance")
-    if key == "shaft.unbalance_phase":
+    if key in ("shaft.unbalance_phase", ANGLE):
         return 1.0
+    if key in CLOCK:
+        return CLOCK[key][1]
     value = abs(value_of(experiment, key))
     return _SCALES.get(key.split(".")[-1], value if value > 0.0 else 1.0)
 
 
-def signals(
-    experiment: Experiment,
-    *,
-    channels: Sequence[str],
-    start_s: float = 0.0,
-    end_s: float | None = None,
-    rate_hz: int | None = None,
-) -> Signals:
-    """What channels show without noise, by the sensors' own chain.
-
-    Args:
-        experiment: What is done.
-        channels: Names of channels.
-        start_s: Start of the window, simulated [s].
-        end_s: End of the window [s]; None for the experiment's.
-        rate_hz: Rows a second, of which the sensors' rate is a whole multiple; None for that rate.
-    """
-    return Predictor(experiment, (), channels=channels, start_s=start_s, end_s=end_s, rate_hz=rate_hz).signals(())
-
-
-def derivatives(
-    experiment: Experiment,
-    keys: Sequence[str],
-    *,
-    channels: Sequence[str],
-    start_s: float = 0.0,
-    end_s: float | None = None,
-    rate_hz: int | None = None,
-    steps: Mapping[str, float] | None = None,
-) -> Derivatives:
-    """How channels change with values of the experiment, at the values that it has.
-
-    Args:
-        experiment: What is done.
-        keys: Keys of the values.
-        channels: Names of channels.
-        start_s: Start of the window, simulated [s].
-        end_s: End of the window [s]; None for the experiment's.
-        rate_hz: As for `signals`.
-        steps: Steps by key, in the value's unit, where others than the usual ones are wanted.
-    """
-    predictor = Predictor(experiment, keys, channels=channels, start_s=start_s, end_s=end_s, rate_hz=rate_hz)
-    return predictor.derivatives(predictor.start, steps=steps)
-
-
 class Predictor:
-    """The channels of an experiment as a function of some of its values.
+    """The channels of a recording as a function of some values of its experiment.
 
     Attributes:
         keys: Keys of the values.
         start: The values as the experiment has them, shape (keys,).
         scales: What counts as a change of size 1, shape (keys,).
-        names: The channels.
-        noise: Noise of each channel by the channel table, quantisation included, in its unit, shape (channels,).
-        rate_hz: Rows a second.
+        parts: The channels and the rows wanted, by group.
         runs: How many simulations there have been.
     """
 
@@ -216,42 +169,25 @@ class Predictor:
         self,
         experiment: Experiment,
         keys: Sequence[str],
+        parts: Mapping[str, Measured],
         *,
-        channels: Sequence[str],
-        start_s: float = 0.0,
-        end_s: float | None = None,
-        rate_hz: int | None = None,
+        about_s: float | None = None,
     ) -> None:
-        known = default_table().channels
-        unknown = [name for name in channels if name not in known]
-        if unknown or not channels:
-            raise InputError("channels", f"some of {', '.join(known)}", ", ".join(unknown))
-        scene = experiment.scene
-        rate_hz = rate_hz or scene.sensors.rate_hz
-        if scene.sensors.rate_hz % rate_hz:
-            raise InputError("rate_hz", f"a divisor of the sensors' {scene.sensors.rate_hz} Hz", rate_hz)
-        end_s = scene.duration_s if end_s is None else end_s
-        if not 0.0 <= start_s < end_s:
-            raise InputError("window", "of times that rise from 0", [start_s, end_s])
-        # The rows behind the samples are those of the recorded run; the samples themselves are made here.
-        short = {"sensors.noise": False, "sensors.groups": [_ONE_GROUP], "duration_s": end_s, "fidelity": "given"}
-        self._experiment = replace(experiment, scene=change_scene(scene, short))
-        table = default_table().only(tuple(default_table().groups), scene.sensors.rate_hz).channels
-        self._channels = [table[name] for name in channels]
-        self.rate_hz = rate_hz
-        self._window = (start_s, end_s)
         self.keys = tuple(keys)
-        self.names = tuple(channels)
+        self.parts = dict(parts)
         self.start = np.array([value_of(experiment, key) for key in self.keys])
         self.scales = np.array([scale_of(experiment, key) for key in self.keys])
-        self.noise = np.array([channel_noise(channel) for channel in self._channels])
         self.runs = 0
-        self._cache: dict[tuple[float, ...], Signals] = {}
+        first_s = min(float(part.times_s[0]) for part in self.parts.values())
+        self._about_s = first_s if about_s is None else about_s
+        self._last_s = max(float(part.times_s[-1]) for part in self.parts.values())
+        self._experiment = bare(experiment)
+        self._cache: dict[tuple[float, ...], Prediction] = {}
 
-    def signals(self, values: Sequence[float] | np.ndarray) -> Signals:
+    def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
         """The channels at some values, shape (keys,).
 
-        What a simulation rounds to its rows (times and durations of blows) is interpolated between two simulations.
+        What a simulation rounds to its rows (times and durations of blows) is interpolated between simulations.
 
         Raises:
             InputError: A value that the model does not take.
@@ -259,18 +195,15 @@ class Predictor:
         """
         values = tuple(float(value) for value in values)
         for place, (key, value) in enumerate(zip(self.keys, values, strict=True)):
-            grid = _GRIDS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
-            below = math.floor(value / grid + 1e-6) * grid if grid else value
-            if grid and value - below > 1e-6 * grid:
-                # Rounded, so that both find what was simulated before.
-                ends = [round(below, 9), round(below + grid, 9)]
-                low, high = (self.signals((*values[:place], end, *values[place + 1 :])) for end in ends)
-                weight = (value - below) / grid
-                return replace(low, values=(1.0 - weight) * low.values + weight * high.values)
+            grid = _grid(key)
+            if grid and not self._later(key):
+                below = math.floor(value / grid + 1e-6)
+                if value - below * grid > 1e-6 * grid:
+                    return self._between(values, place, below, grid)
         if values not in self._cache:
-            if len(self._cache) > 4:
+            if len(self._cache) > _KEPT:
                 self._cache.pop(next(iter(self._cache)))
-            self._cache[values] = self._run(with_values(self._experiment, dict(zip(self.keys, values, strict=True))))
+            self._cache[values] = self._run(dict(zip(self.keys, values, strict=True)))
         return self._cache[values]
 
     def derivatives(
@@ -290,115 +223,104 @@ class Predictor:
             check: Also try half the step and tell the difference; else the differences are 0.
         """
         values = np.asarray(values, dtype=float)
-        base = self.signals(values)
+        base = self.predict(values)
         chosen = np.array([self._step(place, steps) for place in range(len(self.keys))])
-        found = np.zeros((len(self.keys), *base.values.shape))
+        found: list[dict[str, np.ndarray]] = []
         differences, smooth = np.zeros(len(self.keys)), np.zeros(len(self.keys), dtype=bool)
-        for place in range(len(self.keys)):
-            grid = self._grid(place)
+        for place, key in enumerate(self.keys):
+            grid = _grid(key)
             for step in _shorter(chosen[place], grid or _LEAST_STEP * self.scales[place]):
-                found[place], smooth[place] = self._quotient(values, place, step, base)
+                slope, smooth[place] = self._quotient(values, place, step, base)
                 chosen[place] = step
                 if check and grid is None:
                     half, same = self._quotient(values, place, step / 2.0, base)
-                    differences[place] = self._difference(half, found[place])
+                    differences[place] = self._difference(half, slope)
                     if same:  # Richardson: the error of both goes with the square of the step
-                        found[place] = half + (half - found[place]) / 3.0
+                        slope = {name: half[name] + (half[name] - slope[name]) / 3.0 for name in half}
                 if smooth[place] and differences[place] < SAME_SLOPE:
                     break
-        return Derivatives(base, self.keys, found, chosen, differences, smooth)
+            found.append(slope)  # pyright: ignore[reportPossiblyUnboundVariable]
+        return Derivatives(base, self.keys, tuple(found), chosen, differences, smooth)
 
-    def _difference(self, quotient: np.ndarray, other: np.ndarray) -> float:
-        size = float(np.linalg.norm(quotient / self.noise))
-        return float(np.linalg.norm((quotient - other) / self.noise)) / size if size > 0.0 else 0.0
+    def _later(self, key: str) -> bool:
+        """Whether a command comes only behind the last row: nothing of it is seen."""
+        kind, number, _ = key.split(".")
+        return value_of(self._experiment, f"{kind}.{number}.at_s") > self._last_s + _MARGIN_S
 
-    def _grid(self, place: int) -> float | None:
-        key = self.keys[place]
-        return _GRIDS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
+    def _between(self, values: tuple[float, ...], place: int, below: int, grid: float) -> Prediction:
+        """The channels where one value lies between what can be simulated, by the cubic through four neighbours."""
+        for nodes in (np.arange(-1, 3), np.arange(2)):
+            try:
+                # Rounded, so that what was simulated before is found.
+                ends = [round((below + node) * grid, 9) for node in nodes]
+                found = [self.predict((*values[:place], end, *values[place + 1 :])) for end in ends]
+            except InputError:
+                continue  # at the edge of what it may be: a straight line
+            weights = lagrange(np.array([values[place] / grid - below]), nodes)[:, 0]
+            both = {
+                name: sum(weight * one.values[name] for weight, one in zip(weights, found, strict=True))
+                for name in found[0].values
+            }
+            return replace(found[0], values=both)  # pyright: ignore[reportArgumentType]
+        raise InputError(self.keys[place], "a value that can be simulated, with its neighbours", values[place])
+
+    def _difference(self, quotient: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> float:
+        def size(slopes: dict[str, np.ndarray]) -> float:
+            return math.hypot(*(float(np.linalg.norm(v / self.parts[name].floor)) for name, v in slopes.items()))
+
+        whole = size(quotient)
+        return size({name: quotient[name] - other[name] for name in quotient}) / whole if whole > 0.0 else 0.0
 
     def _step(self, place: int, steps: Mapping[str, float] | None) -> float:
         own = (steps or {}).get(self.keys[place])
-        return own or self._grid(place) or _STEP * self.scales[place]
+        return own or _grid(self.keys[place]) or _STEP * self.scales[place]
 
-    def _quotient(self, values: np.ndarray, place: int, step: float, base: Signals) -> tuple[np.ndarray, bool]:
+    def _quotient(
+        self, values: np.ndarray, place: int, step: float, base: Prediction
+    ) -> tuple[dict[str, np.ndarray], bool]:
         """A difference quotient, and whether the contacts were the same ones on both sides."""
-        sides: list[tuple[float, Signals]] = []
+        sides: list[tuple[float, Prediction]] = []
         for sign in (1.0, -1.0):
             moved = values.copy()
             moved[place] += sign * step
             try:
-                sides.append((moved[place], self.signals(moved)))
+                sides.append((moved[place], self.predict(moved)))
             except (InputError, SimulationError):
                 sides.append((values[place], base))
         (above, up), (below, down) = sides
         if above == below:
             raise InputError(self.keys[place], "a value with room for a change on one side", float(values[place]))
         same = up.contacts == down.contacts == base.contacts
-        return (up.values - down.values) / (above - below), same
+        return {name: (up.values[name] - down.values[name]) / (above - below) for name in up.values}, same
 
-    def _run(self, experiment: Experiment) -> Signals:
-        simulation = experiment.simulation()
-        columns = [COLUMN[channel.signal] for channel in self._channels]
-        rows = [frame.rows[:, columns].copy() for frame in experiment.frames(simulation, chunk_s=1.0)]
+    def _run(self, values: dict[str, float]) -> Prediction:
         self.runs += 1
-        row_rate_hz = simulation.tick_rate_hz // simulation.row_ticks
-        ideal = simulation.scene.sensors.chain == "ideal"
-        values = _conditioned(np.concatenate(rows), self._channels, row_rate_hz=row_rate_hz, ideal=ideal)
-        every = row_rate_hz // self.rate_hz
-        first, last = (math.ceil(round(time * self.rate_hz, 6)) for time in self._window)
-        values = values[first * every : last * every : every]
-        times_s = (first + np.arange(len(values))) / self.rate_hz
-        return Signals(times_s, self.names, values, simulation.health()["contacts"])
+        parts = on_the_models_clock(self.parts, values, about_s=self._about_s)
+        last_s = max(float(part.times_s[-1]) for part in parts.values())
+        changed = with_values(self._experiment, values)
+        # Nothing behind the window: contacts that begin there are none of it.
+        end_s = math.ceil(round((last_s + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
+        return predict(replace(changed, scene=change_scene(changed.scene, {"duration_s": end_s})), parts)
 
 
-def _conditioned(rows: np.ndarray, channels: Sequence[Channel], *, row_rate_hz: int, ideal: bool) -> np.ndarray:
-    """What the sensors' chain makes of its signals, but for noise and the converter's rounding.
-
-    Rounding would hide how a signal changes with a value, and make values look different that act alike.
+def on_the_models_clock(
+    parts: Mapping[str, Measured], values: Mapping[str, float], *, about_s: float
+) -> dict[str, Measured]:
+    """Channels of a recording whose own clock is off by `clock.offset_s` and `clock.rate_ppm`.
 
     Args:
-        rows: Signal of each channel at every row from the start of the experiment, SI, shape (n, channels).
-        channels: The channels.
-        row_rate_hz: Rows a second.
-        ideal: Range only, no filters.
-
-    Returns:
-        In each channel's unit, shape (n, channels).
+        parts: The channels.
+        values: Values, of which only these two count.
+        about_s: Where both clocks differ by the offset alone [s].
     """
-    from scipy.signal import sosfilt
-
-    bias, sensitivity, si, adc = (
-        np.array([getattr(channel, field) for channel in channels])
-        for field in ("bias_v", "sensitivity_v", "si", "adc_v")
-    )
-    volts = np.clip(bias + rows * (sensitivity / si), *np.array([channel.range_v for channel in channels]).T)
-    if not ideal:
-        alike: dict[tuple[float, float], list[int]] = {}
-        for column, channel in enumerate(channels):
-            alike.setdefault((channel.bandwidth_hz, channel.highpass_hz), []).append(column)
-        for (bandwidth_hz, highpass_hz), columns in alike.items():
-            sections, settled = _filter(bandwidth_hz, highpass_hz, row_rate_hz)
-            # The instruments have been on for long: filters start in the steady state of the first row.
-            volts[:, columns], _ = sosfilt(
-                sections, volts[:, columns], axis=0, zi=settled[:, :, None] * volts[0, columns]
-            )
-    return (np.clip(volts, -adc, adc) - bias) / sensitivity
+    shift, rate = values.get("clock.offset_s", 0.0), values.get("clock.rate_ppm", 0.0) * 1e-6
+    if shift == rate == 0.0:
+        return dict(parts)
+    return {name: part.later(shift, rate, about_s=about_s) for name, part in parts.items()}
 
 
-@cache
-def _filter(bandwidth_hz: float, highpass_hz: float, row_rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
-    """The chain's filter, and its memory in the steady state of 1."""
-    from scipy.signal import sosfilt_zi
-
-    channel = next(iter(default_table().channels.values()))
-    channel = channel.model_copy(update={"bandwidth_hz": bandwidth_hz, "highpass_hz": highpass_hz})
-    sections = channel_filter(channel, float(row_rate_hz))
-    return sections, sosfilt_zi(sections)
-
-
-def channel_noise(channel: Channel) -> float:
-    """Noise of a channel of the table, with what rounding in the converter adds, in its unit."""
-    return math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0)) / abs(channel.sensitivity_v)
+def _grid(key: str) -> float | None:
+    return _GRIDS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
 
 
 def _shorter(step: float, least: float) -> Iterator[float]:

@@ -1,6 +1,9 @@
-"""Errors that a user meets: wrong input, a refusal by the rig, a run that failed."""
+"""Errors that a user meets: wrong input, a refusal by the rig, a run that failed, a file that cannot be written."""
 
 from __future__ import annotations
+
+import tempfile
+from pathlib import Path
 
 
 class InputError(ValueError):
@@ -29,3 +32,36 @@ class RefusedError(InputError):
 
 class SimulationError(RuntimeError):
     """The numbers have gone wrong: the state is no longer finite, and the run ends."""
+
+
+class DiskError(RuntimeError):
+    """The disk refused in the middle of writing; the message says what is kept of it."""
+
+
+def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: bool) -> None:
+    """Refuse a file that cannot be written, before anything is worked out.
+
+    Args:
+        path: The file.
+        field: What the user knows it by.
+        suffixes: Endings that it may have.
+        force: An existing file may be replaced.
+
+    Raises:
+        InputError: Another ending, a folder that is missing or read-only, or an existing file.
+    """
+    if path.suffix not in suffixes:
+        *others, last = suffixes
+        endings = f"{', '.join(others)} or {last}" if others else last
+        raise InputError(field, f"a file name that ends in {endings}", str(path))
+    if not path.parent.is_dir():
+        raise InputError(field, "in a folder that exists", str(path))
+    if path.is_dir():
+        raise InputError(field, "a file, not a folder", str(path))
+    if path.exists() and not force:
+        raise InputError(field, "a new file (--force replaces one)", f"{path}, which exists")
+    try:
+        # Asked of the system by trying: permissions alone do not tell.
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise InputError(field, "in a folder that can be written", f"{path} ({error.strerror})") from None

@@ -25,7 +25,8 @@ _DOCUMENTS = {
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",
     wire.SCENE: "on request: the scene as it runs, with its seed, and as `taken` the commands sent to it so far",
     f"{wire.CLIENTS}/NAME": "sent by clients twice a second, and with `done` when they leave; shown in the status: "
-    "how far they have come; `room`: rows that one can hold, which a replay in a burst does not exceed",
+    "how far they have come, null where nothing came yet; `room`: rows that one can hold, which a replay in a burst "
+    "does not exceed",
 }
 _OTHER_COMMANDS = {
     "stop": "no fields; ends the run",

@@ -152,6 +152,11 @@ class FreeRun:
         """The tick that it is now: here, the last that was released."""
         return self._last_tick
 
+    @property
+    def last_late_s(self) -> float:
+        """Lateness of the last result [s]."""
+        return self._last_s
+
     def statistics(self) -> dict[str, object]:
         """Real-time factor since the start, lateness of results [ms], and how many were not ready in time."""
         # Read without a lock: a value that is one block old does no harm, and the simulation thread never waits.

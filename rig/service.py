@@ -13,7 +13,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -270,7 +270,7 @@ class Service:
         self._steps: list[tuple[int, Future[dict[str, Any]], dict[str, Any]]] = []
         self._step_target: int | None = None
 
-        self._rows: dict[str, int] = {}
+        self._rows = wire.RowCount()
         self._samples_rate_hz = 0.0
         self._samples_published = 0
         self._congestion: dict[str, float] = {}
@@ -413,7 +413,7 @@ class Service:
             **{name: status[name] for name in kept},
             "samples_published": self._samples_published,
             "commands": self._accepted,
-            "rows": dict(self._rows),
+            "rows": dict(self._rows.next),
         }
 
     def _advance_all(self) -> str:
@@ -594,26 +594,16 @@ class Service:
         for event in entry.before:
             self._publish_event(event)
         if entry.frame is not None:
-            for group, block in entry.frame.samples.items():
-                self._publish_block(wire.sensor_key(group), block)
-            if entry.frame.edges is not None:
-                self._publish_block(wire.EDGES, entry.frame.edges)
-            for table, block in entry.frame.truth.items():
-                self._publish_block(wire.truth_key(table), block)
+            for key, block in blocks_of(entry.frame):
+                self._server.publish(key, wire.encode_block(block))
+                self._rows.follow(key, block)
             self._count_samples(entry.frame)
         for event in entry.after:
             self._publish_event(event)
         self._answer(entry)
 
-    def _publish_block(self, key: str, block: wire.Block) -> None:
-        self._server.publish(key, wire.encode_block(block))
-        self._rows[key] = block.index + len(block.values)
-
     def _publish_event(self, event: dict[str, Any]) -> None:
-        if event["event"] == "end":
-            # Blocks and events travel apart: whoever has the end can tell from this what it still lacks.
-            event = {**event, "rows": dict(self._rows)}
-        self._server.publish(wire.EVENTS, wire.encode_document(finite(event)))
+        self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
 
     def _publish_status(self) -> None:
         self._congestion = self._server.congestion()
@@ -624,12 +614,22 @@ class Service:
         group = "probes" if "probes" in frame.samples else next(iter(frame.samples), None)
         if group is not None:
             self._samples_rate_hz = frame.samples[group].rate_hz
-            self._samples_published = self._rows[wire.sensor_key(group)]
+            self._samples_published = self._rows.next[wire.sensor_key(group)]
 
     @staticmethod
     def _answer(entry: _Entry) -> None:
         for reply, document in entry.replies:
             reply.set_result(document)
+
+
+def blocks_of(frame: Frame) -> Iterator[tuple[str, wire.Block]]:
+    """Keys and blocks of a frame, in the order in which they are published."""
+    for group, block in frame.samples.items():
+        yield wire.sensor_key(group), block
+    if frame.edges is not None:
+        yield wire.EDGES, frame.edges
+    for table, block in frame.truth.items():
+        yield wire.truth_key(table), block
 
 
 def parse_command(name: str, payload: bytes) -> Pending:

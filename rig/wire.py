@@ -155,6 +155,25 @@ class Gap:
     size: int
 
 
+class RowCount:
+    """Counts what is published, for the event that ends a run.
+
+    Blocks and events travel apart: whoever has the end can tell from its `rows` what it still lacks.
+    """
+
+    def __init__(self) -> None:
+        self.next: dict[str, int] = {}
+        """Number of the row after the last one, by key."""
+
+    def follow(self, key: str, block: Block) -> None:
+        """Count a block."""
+        self.next[key] = block.index + len(block.values)
+
+    def tell(self, event: dict[str, Any]) -> dict[str, Any]:
+        """The event as it is published: with the counts where it is the end."""
+        return {**event, "rows": dict(self.next)} if event.get("event") == "end" else event
+
+
 class Continuity:
     """Follows the row numbers of any number of streams and reports each gap with its size."""
 

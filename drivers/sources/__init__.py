@@ -42,11 +42,11 @@ class Source(Protocol):
         """
         ...
 
-    def taken(self, index: int, *, room: int, lost: int) -> None:
+    def taken(self, index: int | None, *, room: int, lost: int) -> None:
         """Take note of what was read; must not wait, and may be of no use.
 
         Args:
-            index: Number of the row after the last that was read.
+            index: Number of the row after the last that was read; None where nothing has come yet.
             room: How many rows find room beyond that.
             lost: How many never came.
         """

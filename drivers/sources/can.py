@@ -273,7 +273,7 @@ class CanSource:
         """Frames that were no samples though their identifier says so."""
         return {"malformed": 0 if self._layout is None else self._layout.malformed}
 
-    def taken(self, index: int, *, room: int, lost: int) -> None:
+    def taken(self, index: int | None, *, room: int, lost: int) -> None:
         """A bus does not ask how far its nodes are."""
 
     def close(self) -> None:

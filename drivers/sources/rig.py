@@ -33,8 +33,8 @@ class RigSource:
         self._name = f"daq-{os.getpid()}-{next(_numbers)}"
         self._scale = 1.0
         """Rows of the stream that clients report on, for one of ours."""
-        self._read: tuple[int, int, int] | None = None
-        self._told = 0
+        self._read: tuple[int | None, int, int] | None = None
+        self._told: int | None = None
         self._due = threading.Event()
         self._closed = False
         self._reporter = threading.Thread(target=self._report_all, name="daq reports", daemon=True)
@@ -91,10 +91,10 @@ class RigSource:
 
         self._leave.append(self._stream.listen(group.name, take, lambda reason: on_end(group.name, reason)))
 
-    def taken(self, index: int, *, room: int, lost: int) -> None:
+    def taken(self, index: int | None, *, room: int, lost: int) -> None:
         """Tell the rig twice a second, and at once where much of the room has been used: a replay waits for it."""
         self._read = (index, room, lost)
-        if abs(index - self._told) > room // 8:
+        if index is None or self._told is None or abs(index - self._told) > room // 8:
             self._due.set()
 
     def _report_all(self) -> None:
@@ -105,10 +105,10 @@ class RigSource:
                 self._report()
 
     def _report(self, *, done: bool = False) -> None:
-        self._told, room, lost = self._read or (0, 0, 0)
+        self._told, room, lost = self._read or (None, 0, 0)
         beat = {
             "name": self._name,
-            "received_index": int(self._told * self._scale),
+            "received_index": None if self._told is None else int(self._told * self._scale),
             "room": int(room * self._scale),
             "lost": lost,
             "done": done,

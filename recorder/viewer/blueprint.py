@@ -25,35 +25,27 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Bluepr
 
     curves = _curve_views(table, geometry, live=live)
     small = [curves.pop(name) for name in _SMALL if name in curves]
-    motion = rrb.Vertical(
-        rrb.Horizontal(*(_orbit_view(plane, geometry) for plane in orbit.PLANES)),
-        _scene_view(),
-        *([rrb.Horizontal(*small)] if small else []),
-        row_shares=[5.2, 5, 2.6][: 3 if small else 2],
-    )
-    frequency = rrb.Vertical(
-        rrb.BarChartView(
-            origin=f"{spectrum.ROOT}/now",
-            name="Full spectrum of x + jy at the ring [mm] over [Hz]: backward < 0 < forward",
-            plot_legend=rrb.PlotLegend(visible=False),
-        ),
-        rrb.Spatial2DView(
-            origin=spectrum.WATERFALL,
-            name="Waterfall of the full spectrum [dB re 1 um]",
-            visual_bounds=rrb.VisualBounds2D(x_range=[-26, 220], y_range=[-16, spectrum.HEIGHT + 20]),
-            background=_BACKGROUND,
-        ),
-        _contact_view(live=live),
-        rrb.TextLogView(
-            origin=painter.EVENTS,
-            name="Events",
-            columns=rrb.TextLogColumns(timeline_columns=[canvas.SIMULATED], text_log_columns=["loglevel", "body"]),
-        ),
-        row_shares=[3.6, 5, 2.0, 3],
-    )
+    planes = [plane for plane in orbit.PLANES if plane in painter.planes_in(table)]
+    # Views with their heights; of channels that are not a rig's, as of an imported log, only what they can fill.
+    motion: list[tuple[rrb.View | rrb.Container, float]] = []
+    frequency: list[tuple[rrb.View | rrb.Container, float]] = []
+    if planes:
+        motion.append((rrb.Horizontal(*(_orbit_view(plane, geometry) for plane in planes)), 5.2))
+        frequency += [(_spectrum_view(), 3.6), (_waterfall_view(), 5.0), (_contact_view(live=live), 2.0)]
+    if planes or "speed" in table.channels:
+        motion.append((_scene_view(), 5.0))
+    if small:
+        motion.append((rrb.Horizontal(*small), 2.6))
+    frequency.append((_events_view(), 3.0))
+    columns = [(motion, 5.2), ([(view, 1.0) for view in curves.values()], 5.0), (frequency, 4.6)]
+    columns = [(views, share) for views, share in columns if views]
     return rrb.Blueprint(
         rrb.Horizontal(
-            motion, rrb.Vertical(*curves.values(), name="Time series"), frequency, column_shares=[5.2, 5, 4.6]
+            *(
+                rrb.Vertical(*(view for view, _ in views), row_shares=[height for _, height in views])
+                for views, _ in columns
+            ),
+            column_shares=[share for _, share in columns],
         ),
         rrb.TimePanel(
             timeline=canvas.SIMULATED,
@@ -65,6 +57,37 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Bluepr
         rrb.SelectionPanel(state="hidden"),
         auto_layout=False,
         auto_views=False,
+    )
+
+
+def _spectrum_view() -> rrb.BarChartView:
+    import rerun.blueprint as rrb
+
+    return rrb.BarChartView(
+        origin=f"{spectrum.ROOT}/now",
+        name="Full spectrum of x + jy at the ring [mm] over [Hz]: backward < 0 < forward",
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+
+
+def _waterfall_view() -> rrb.Spatial2DView:
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial2DView(
+        origin=spectrum.WATERFALL,
+        name="Waterfall of the full spectrum [dB re 1 um]",
+        visual_bounds=rrb.VisualBounds2D(x_range=[-26, 220], y_range=[-16, spectrum.HEIGHT + 20]),
+        background=_BACKGROUND,
+    )
+
+
+def _events_view() -> rrb.TextLogView:
+    import rerun.blueprint as rrb
+
+    return rrb.TextLogView(
+        origin=painter.EVENTS,
+        name="Events",
+        columns=rrb.TextLogColumns(timeline_columns=[canvas.SIMULATED], text_log_columns=["loglevel", "body"]),
     )
 
 

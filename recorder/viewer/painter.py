@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from recorder import schemas
 from recorder.viewer import contact, orbit
 from recorder.viewer.canvas import Canvas
 from recorder.viewer.contact import ContactPlot, Touch
 from recorder.viewer.geometry import Geometry
 from recorder.viewer.orbit import OrbitPlot
 from recorder.viewer.scene3d import Scene3D
-from recorder.viewer.series import SeriesPlot, Window, reaction_of
+from recorder.viewer.series import REACTIONS, SeriesPlot, Window, reaction_of
 from recorder.viewer.spectrum import SpectrumPlot
 from rig.channels import ChannelTable, Group
 
@@ -27,8 +28,7 @@ AROUND_HAMMER_S = 0.05
 HELD_S = AROUND_HAMMER_S + 0.02
 """Live curves lag by this much, so that a hammer blow still finds the rows before it at full rate."""
 
-_LEVELS = {"warning": "WARN", "hammer": "INFO", "end": "INFO"}
-_HIDDEN_FIELDS = {"event", "tick", "time_s", "wall_s", "scene", "rows"}
+_LEVELS = {schemas.LOG_INFO: "INFO", schemas.LOG_WARN: "WARN", schemas.LOG_ERROR: "ERROR"}
 _SLOW_ROWS_PER_S = 200.0
 
 
@@ -58,6 +58,24 @@ def planes_of(group: Group) -> list[_Plane]:
         for plane in orbit.PLANES
         if {f"{plane}_x", f"{plane}_y"} <= set(group.names)
     ]
+
+
+def planes_in(table: ChannelTable) -> set[str]:
+    """Names of the measuring planes that some channels have."""
+    return {plane.name for group in table.groups.values() for plane in planes_of(group)}
+
+
+def not_drawn(table: ChannelTable) -> list[str]:
+    """What of a rig cannot be drawn of other channels, such as those of an imported log, and why."""
+    lacking = []
+    if not planes_in(table):
+        pairs = " or ".join(f"{plane}_x and {plane}_y" for plane in orbit.PLANES)
+        lacking.append(f"orbit, spectrum, contact (no channels {pairs})")
+    if not any(set(group.names) >= REACTIONS for group in table.groups.values()):
+        lacking.append("reaction (no channels P_N, P_S, P_E and P_W in one group)")
+    if "speed" not in table.channels:
+        lacking.append("turning of the rotor (no channel speed)")
+    return lacking
 
 
 class Painter:
@@ -104,7 +122,7 @@ class Painter:
         }
         self._groups = table.groups
         self._truth = ContactPlot(canvas, path=contact.TRUTH, touch=Touch(enter=1e-9, leave=1e-9))
-        if geometry.assumed:
+        if geometry.assumed and planes_in(table):
             names = ", ".join(geometry.assumed)
             self.note(0.0, f"the stream does not give {names}: usual values are drawn", level="WARN")
 
@@ -157,12 +175,8 @@ class Painter:
         time_s = float(event.get("time_s", 0.0))
         if name == "hammer":
             self._windows.append((time_s - AROUND_HAMMER_S, time_s + AROUND_HAMMER_S))
-        level = (
-            "ERROR"
-            if name == "end" and str(event.get("reason", "")).startswith("failed")
-            else _LEVELS.get(name, "INFO")
-        )
-        self.note(time_s, text_of(event), level=level)
+        level, text = schemas.event_text(dict(event))
+        self.note(time_s, text, level=_LEVELS[level])
 
     def note(self, time_s: float, text: str, *, level: str = "INFO") -> None:
         """Write a line into the log of events."""
@@ -198,16 +212,6 @@ class Painter:
         struck = times_s[np.abs(values[:, 0]) > threshold]
         if len(struck):
             self._windows.append((float(struck[0]) - AROUND_HAMMER_S, float(struck[-1]) + AROUND_HAMMER_S))
-
-
-def text_of(event: Mapping[str, Any]) -> str:
-    """An event as one line: its name, then its fields."""
-    fields = {key: value for key, value in event.items() if key not in _HIDDEN_FIELDS}
-    fields.update(fields.pop("request", None) or {})
-    words = [f"{key} {value:g}" if isinstance(value, float) else f"{key} {value}" for key, value in fields.items()]
-    if event.get("event") == "start" and isinstance(event.get("scene"), str):
-        words.insert(0, f"scene {event['scene']}")
-    return f"{event.get('event', 'event')}: {', '.join(words)}" if words else str(event.get("event", "event"))
 
 
 def _is_fast(group: Group) -> bool:
@@ -330,7 +334,7 @@ def _parts_of(group: Group, canvas: Canvas, scene: Scene3D, geometry: Geometry, 
     parts: list[_Part] = []
     if planes := planes_of(group):
         parts.append(_Probes(canvas, scene, group, planes, geometry, whole=whole))
-    if {"P_N", "P_S", "P_E", "P_W"} <= set(group.names):
+    if set(group.names) >= REACTIONS:
         parts.append(_Reaction(scene, reaction_of(group)))
     if "speed" in group.names:
         parts.append(_Spin(scene, group))

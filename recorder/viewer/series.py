@@ -12,6 +12,8 @@ from rig.channels import ChannelTable, Group
 
 ROOT = "/sensors"
 REACTION = "/derived/reaction"
+REACTIONS = {"P_N", "P_S", "P_E", "P_W"}
+"""Channels that together give the reaction."""
 _NOT_DRAWN = {"keyphasor"}
 """A pulse of a fraction of a millisecond, once per turn, is a row of meaningless spikes at a viewing rate."""
 
@@ -62,7 +64,7 @@ def series_of(group: Group) -> list[Series]:
         )
         for plane, columns in planes.items()
     ]
-    if {"P_N", "P_S", "P_E", "P_W"} <= set(group.names):
+    if set(group.names) >= REACTIONS:
         found.append(
             Series(
                 path=REACTION,

@@ -3,53 +3,19 @@
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from replays.formats.dialect import parse_heading, time_column
 from replays.formats.source import Entry, Signal, Source, damaged, even_rate_hz
 
 if TYPE_CHECKING:
     from replays.formats.mapping import FileOptions
     from replays.formats.selection import Chunk, Column, Selection, Table
-
-_HEADING = re.compile(r"\s*(.*?)\s*[\[(]([^\])]*)[\])]\s*")
-_TIMES = re.compile(r"(time|zeit|timestamp|timestamps|t|x_value|seconds|datetime|date.?time)([ _].*)?", re.IGNORECASE)
-
-
-def parse_heading(text: str) -> tuple[str, str]:
-    """Name and unit in a heading such as `disk_x [mm]` or `P_N (N)`."""
-    match = _HEADING.fullmatch(text)
-    return (match[1], match[2]) if match and match[1] else (text.strip(), "")
-
-
-def is_time(name: str) -> bool:
-    """Whether a heading names a column of times."""
-    return _TIMES.fullmatch(name.strip()) is not None
-
-
-def time_column(names: Sequence[str], wanted: str | int | None, *, path: Path) -> int | None:
-    """Number of the column of times: the one asked for, else the first that is named so.
-
-    Raises:
-        InputError: There is no such column.
-    """
-    from rig.errors import InputError
-
-    if wanted is None:
-        return next((c for c, name in enumerate(names) if is_time(name)), None)
-    if wanted == "none":
-        return None
-    if isinstance(wanted, int) and 1 <= wanted <= len(names):
-        return wanted - 1
-    if wanted in names:
-        return names.index(str(wanted))
-    must = f'a column of {path.name} ({", ".join(names)}), its number from 1, or "none"'
-    raise InputError("file.time_column", must, wanted)
 
 
 def open_file(path: Path, options: FileOptions) -> Source:
@@ -68,6 +34,8 @@ def open_file(path: Path, options: FileOptions) -> Source:
     headings = [parse_heading(field.name) for field in schema]
     names = [name for name, _ in headings]
     stamps = time_column(names, options.time_column, path=path)
+    if stamps is None and options.time_column is None:  # as pandas names an index of instants
+        stamps = next((c for c in range(len(names)) if _is_clock(schema.field(c).type)), None)
 
     def column(c: int) -> np.ndarray:
         try:
@@ -103,16 +71,27 @@ def _numeric(kind: Any) -> bool:
     return types.is_integer(kind) or types.is_floating(kind)
 
 
+def _is_clock(kind: Any) -> bool:
+    import pyarrow.types as types
+
+    return types.is_timestamp(kind) or types.is_duration(kind)
+
+
 def numbers(column: Any) -> np.ndarray:
     """A column of pyarrow as numbers, integers where they are and none is missing; times in seconds, missing: nan."""
     import pyarrow
     import pyarrow.compute as compute
     import pyarrow.types as types
 
-    if types.is_timestamp(column.type):
-        ns = column.cast(pyarrow.timestamp("ns", tz=column.type.tz)).cast(pyarrow.int64())
-        whole = ns.to_numpy()
-        return (whole - whole[0]) / 1e9 + (whole[0] % 1_000_000_000) / 1e9
+    if _is_clock(column.type):
+        zoned = types.is_timestamp(column.type)
+        ns = column.cast(pyarrow.timestamp("ns", tz=column.type.tz) if zoned else pyarrow.duration("ns"))
+        whole = ns.cast(pyarrow.int64()).to_numpy()
+        if column.null_count:
+            return np.asarray(whole, dtype=float) / 1e9
+        # Instants count from the second of the first, which `first_instant` tells; durations from their own zero.
+        base = whole[0] - whole[0] % 1_000_000_000 if zoned else 0
+        return (whole - base) / 1e9
     if column.null_count or not types.is_integer(column.type):
         return np.array(compute.cast(column, pyarrow.float64()).to_numpy(), dtype=float)
     return np.array(column.to_numpy())
@@ -127,6 +106,18 @@ def first_instant(column: Any) -> datetime | None:
         return None
     told = column[0].cast(pyarrow.timestamp("us", tz=column.type.tz)).as_py()
     return None if told is None else told.replace(microsecond=0)
+
+
+class RowsFile(Protocol):
+    """A file that grows by rows."""
+
+    def write(self, columns: Sequence[np.ndarray]) -> None:
+        """Take rows, column by column, each shape (n,)."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left."""
+        ...
 
 
 class Rows:
@@ -174,6 +165,8 @@ class Writer:
     """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata."""
 
     merged = True
+    rows: Callable[[Path, Any], RowsFile] = Rows
+    """What takes the rows."""
 
     def __init__(self, path: Path, selection: Selection) -> None:
         import pyarrow
@@ -185,7 +178,7 @@ class Writer:
             told = {key: str(value) for key, value in column.metadata.items()}
             fields.append(pyarrow.field(column.heading, _type(column, kind), metadata=told))
         whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz})}
-        self._rows = Rows(path, pyarrow.schema(fields, metadata=whole))
+        self._rows = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
 
     def write(self, table: Table, chunk: Chunk) -> None:
         """Take rows; those that no stream has are left out."""

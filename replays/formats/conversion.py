@@ -33,6 +33,8 @@ from rig.errors import InputError
 
 TICK_RATE_HZ = 1_000_000
 NO_SCENE = "none (imported)"
+_EPOCH_S = (946_684_800.0, 4_102_444_800.0)
+"""Times from 2000 to 2100 in seconds since 1970: none that a measurement began at 0 would reach."""
 
 
 @dataclass(frozen=True)
@@ -102,20 +104,19 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     groups, zero_s = place(taken, mapping, low_s, high_s)
     rotated = rotate(groups, mapping, remarks)
     table, counts, present, channels = quantise(groups, rotated)
+    lead_s = mapping.experiment.lead if mapping.experiment is not None else 0
+    zero_s -= lead_s
+    if lead_s:
+        remarks.append(f"time zero lies {lead_s} s before the first sample: so long the scene runs, to have settled")
     first_tick = {name: round((group.start_s - zero_s) * TICK_RATE_HZ) for name, group in groups.items()}
     edges = _edges(sources, mapping, moves, zero_s, groups, remarks)
     since = tuple(replace(blow, at_s=blow.at_s - zero_s) for blow in blows)
     kept = tuple(blow for blow in since if blow.at_s >= 0.0)
-    start = mapping.time.start or sources[0].start
-    if start is None:
-        remarks.append("the source does not tell when it was: the wall times in the recording are those of the import")
-        start = datetime.now(tz=UTC)
-    start = start if start.tzinfo is not None else start.replace(tzinfo=UTC)
-    begin = datetime.fromtimestamp(start.timestamp() + zero_s, tz=UTC)
+    begin = _began(sources[0], mapping, zero_s, remarks)
     end_s = max(first_tick[name] / TICK_RATE_HZ + group.rows / group.rate_hz for name, group in groups.items())
     experiment = None
     if mapping.experiment is not None:
-        speed = events.speed_before(groups, edges, kept)
+        speed = events.speed_before(groups, edges, kept, zero_s=zero_s)
         experiment = events.build_experiment(
             mapping.experiment, kept, duration_s=end_s, speed_hz=speed, table=table, remarks=remarks
         )
@@ -138,8 +139,23 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
 
 def _open(files: Sequence[Path], mapping: Mapping) -> list[Source]:
     if len({path.name for path in files}) < len(files):
-        raise InputError("input", "files of different names", ", ".join(path.name for path in files))
+        raise InputError("file", "files of different names", ", ".join(path.name for path in files))
     return [open_source(path, mapping.file) for path in files]
+
+
+def _began(source: Source, mapping: Mapping, zero_s: float, remarks: list[str]) -> datetime:
+    """Wall time of the recording's time zero."""
+    start = mapping.time.start or source.start
+    if start is not None:
+        if start.tzinfo is None:
+            remarks.append(f"{start.isoformat()} has no time zone: taken as UTC (time.start says otherwise)")
+            start = start.replace(tzinfo=UTC)
+        return datetime.fromtimestamp(start.timestamp() + zero_s, tz=UTC)
+    if _EPOCH_S[0] < zero_s < _EPOCH_S[1]:
+        remarks.append("times are so large that they were read as seconds since 1970-01-01, UTC")
+        return datetime.fromtimestamp(zero_s, tz=UTC)
+    remarks.append("the source does not tell when it was: the wall times in the recording are those of the import")
+    return datetime.now(tz=UTC)
 
 
 def _digest(path: Path) -> str:

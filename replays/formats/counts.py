@@ -105,7 +105,8 @@ def _counts(
     channel = target.model_copy(
         update={
             "label": entry.mapping.label or target.label, "sensitivity_v": sensitivity, "bias_v": bias_v,
-            "range_v": (low_v, high_v), "bandwidth_hz": rate_hz / 2.0, "highpass_hz": 0.0,
+            "range_v": (low_v, high_v), "bandwidth_hz": entry.mapping.bandwidth_hz or rate_hz / 2.0,
+            "highpass_hz": entry.mapping.highpass_hz,
             "noise_v": abs(sensitivity) * _noise(values), "adc_v": reach_v, "adc_bits": BITS, "rate_hz": rate_hz,
             "kind": NO_VOLTS if volts_per_unit is None else "imported",
         }
@@ -117,6 +118,10 @@ def _counts(
     if len(found) and not limits.min <= found.min() <= found.max() <= limits.max:
         raise InputError(f"channels.{entry.name}", "in reach of its counts", float(np.nanmax(np.abs(values))))
     return channel, found.astype(np.int32), f"2^{round(math.log2(abs(scale)))} {channel.unit}"
+
+
+_MANY = 5
+"""Of more stretches than this, the quietest tenth is below the mean."""
 
 
 def _noise(values: np.ndarray) -> float:
@@ -132,7 +137,10 @@ def _noise(values: np.ndarray) -> float:
     if not stretches:
         return 0.0
     rms = np.sqrt(np.mean(second[: stretches * length].reshape(stretches, length) ** 2, axis=1) / 6.0)
-    return float(np.quantile(rms, 0.1))
+    # Of plain noise, that tenth is too quiet: the mean of n squares has the relative variance 2 (1 + 2 sum rho^2) / n,
+    # with the correlations -2/3 and 1/6 of second differences one and two samples apart.
+    quiet = 1.0 - 1.2816 * math.sqrt(2.0 * (1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)) / length) / 2.0
+    return float(np.quantile(rms, 0.1)) / (quiet if stretches > _MANY else 1.0)
 
 
 def _told(entry: MappedSignal, channel: Channel, rule: str, values: np.ndarray, rate_hz: int) -> ImportedChannel:

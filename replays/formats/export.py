@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ import numpy as np
 from recorder.schemas import PART_SUFFIX
 from replays.formats import clock
 from replays.formats.selection import ROWS, Chunk, Selection, Table
-from rig.errors import InputError
+from rig.errors import InputError, check_new_file
 
 _WRITERS = {
     ".mf4": "mdf", ".tdms": "tdms", ".uff": "uff", ".csv": "delimited", ".parquet": "columnar", ".wav": "wav",
@@ -64,14 +63,7 @@ def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = SUFFIXE
     Raises:
         InputError: Another suffix, a folder that is missing or read-only, or an existing file.
     """
-    if path.suffix not in suffixes:
-        raise InputError("output", f"a file name that ends in {', '.join(suffixes)}", str(path))
-    if not path.parent.is_dir():
-        raise InputError("output", "in a folder that exists", str(path))
-    if path.is_dir() or (path.exists() and not force):
-        raise InputError("output", "a new file (--force replaces one)", f"{path}, which exists")
-    if not os.access(path.parent, os.W_OK):
-        raise InputError("output", "in a folder that can be written", str(path))
+    check_new_file(path, field="output", suffixes=suffixes, force=force)
 
 
 def merged(path: Path) -> bool:

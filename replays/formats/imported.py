@@ -67,7 +67,7 @@ def _catalogue(conversion: Conversion) -> dict[str, Any]:
 def _payloads(conversion: Conversion) -> Iterator[tuple[int, str, bytes]]:
     """Tick, key and bytes of everything, in order of time."""
     yield 0, wire.EVENTS, _event(0, "import", files=", ".join(file["name"] for file in conversion.document["files"]))
-    due = sorted(
+    due: list[tuple[int, str, bytes | wire.Block]] = sorted(
         [
             *((tick, wire.EVENTS, payload) for tick, payload in _happenings(conversion)),
             *(block for name in conversion.counts for block in _blocks(conversion, name)),
@@ -75,8 +75,13 @@ def _payloads(conversion: Conversion) -> Iterator[tuple[int, str, bytes]]:
         ],
         key=lambda item: item[0],
     )
-    yield from due
-    yield conversion.end_tick, wire.EVENTS, _event(conversion.end_tick, "end", reason="completed")
+    rows = wire.RowCount()
+    for tick, key, content in due:
+        if isinstance(content, wire.Block):
+            rows.follow(key, content)
+            content = wire.encode_block(content)
+        yield tick, key, content
+    yield conversion.end_tick, wire.EVENTS, _event(conversion.end_tick, "end", reason="completed", rows=rows.next)
 
 
 def _event(tick: int, event: str, **about: Any) -> bytes:
@@ -94,7 +99,7 @@ def _happenings(conversion: Conversion) -> Iterator[tuple[int, bytes]]:
             yield tick, _event(tick, command["command"], **about)
 
 
-def _blocks(conversion: Conversion, name: str) -> Iterator[tuple[int, str, bytes]]:
+def _blocks(conversion: Conversion, name: str) -> Iterator[tuple[int, str, wire.Block]]:
     rate = conversion.table.groups[name].rate_hz
     counts, present = conversion.counts[name], conversion.present[name]
     first = conversion.first_tick[name]
@@ -109,7 +114,7 @@ def _blocks(conversion: Conversion, name: str) -> Iterator[tuple[int, str, bytes
             tick = first + at * TICK_RATE_HZ / rate
             values = np.ascontiguousarray(counts[at : start + high])
             block = wire.Block(round(tick), base + at, float(rate), float(TICK_RATE_HZ), values)
-            yield block.tick, wire.sensor_key(name), wire.encode_block(block)
+            yield block.tick, wire.sensor_key(name), block
 
 
 def _runs(present: np.ndarray) -> list[tuple[int, int]]:
@@ -118,11 +123,11 @@ def _runs(present: np.ndarray) -> list[tuple[int, int]]:
     return [(int(low), int(high)) for low, high in edges.reshape(-1, 2)]
 
 
-def _edge_blocks(conversion: Conversion) -> Iterator[tuple[int, str, bytes]]:
+def _edge_blocks(conversion: Conversion) -> Iterator[tuple[int, str, wire.Block]]:
     length = round(_BLOCK_S * TICK_RATE_HZ)
     numbers = (conversion.edges // length).astype(np.int64)
     for number in np.unique(numbers).tolist():
         inside = np.flatnonzero(numbers == number)
         values = (conversion.edges[inside] - number * length)[:, None]
         block = wire.Block(number * length, int(inside[0]), 0.0, float(TICK_RATE_HZ), values)
-        yield block.tick, wire.EDGES, wire.encode_block(block)
+        yield block.tick, wire.EDGES, block

@@ -64,11 +64,13 @@ def find_signal(wanted: SignalName, sources: Sequence[Source], field_name: str) 
     if found:
         places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in found)
         raise InputError(f"{field_name}.group", f"given, as {wanted.source} stands in {places}", wanted.group)
+    if not inside:
+        groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
+        raise InputError(f"{field_name}.group", f"one of {', '.join(groups)}", wanted.group)
     names = list(dict.fromkeys(entry.name for _, entry in inside))
     close = difflib.get_close_matches(wanted.source, names, n=3, cutoff=0.4) or names[:12]
     more = f" ({len(names)} in all)" if len(names) > len(close) else ""
-    must = f"a signal of the file, such as {', '.join(close)}{more}" if names else "a signal of the file"
-    raise InputError(f"{field_name}.source", must, wanted.source)
+    raise InputError(f"{field_name}.source", f"a signal of the file, such as {', '.join(close)}{more}", wanted.source)
 
 
 def axis_of(source: Source, entry: Entry, signal: Signal, mapping: Mapping) -> clock.Axis:
@@ -198,7 +200,9 @@ def _starts(sources: Sequence[Source], remarks: list[str]) -> Moves:
             continue
         late_s = (_utc(source.start) - _utc(base)).total_seconds()
         moves.append((source.path.name, None, clock.Shift(late_s, 1.0, "")))
-        remarks.append(f"{source.path.name}: {late_s:+.6f} s by the times of day in the files")
+        zones = {source.start.tzinfo is None, base.tzinfo is None}
+        unsure = " (one of them without a time zone, taken as UTC)" if len(zones) > 1 else ""
+        remarks.append(f"{source.path.name}: {late_s:+.6f} s by the times of day in the files{unsure}")
     return moves
 
 

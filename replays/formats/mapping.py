@@ -25,6 +25,8 @@ class FileOptions(_Table):
     delimiter: str | None = None
     """One character, or tab, comma, semicolon, space."""
     decimal: Literal[".", ","] | None = None
+    thousands: Literal[",", ".", " ", "'"] | None = None
+    """What stands between groups of three digits."""
     header_line: Annotated[int, Field(ge=0)] | None = None
     """Line of the names, from 1; 0: there is none, and the columns are called "column 1" and so on."""
     units_line: Annotated[int, Field(ge=1)] | None = None
@@ -38,7 +40,7 @@ class FileOptions(_Table):
     time_unit: str | None = None
     """s, ms, us, ns, min, h, or datetime."""
     time_format: str | None = None
-    """Format of times that are neither numbers nor ISO 8601, as for Python's strptime."""
+    """Format of times that are neither numbers, nor ISO 8601, nor h:m:s, as for Python's strptime."""
 
     @field_validator("delimiter")
     @classmethod
@@ -60,7 +62,16 @@ class FileOptions(_Table):
         Raises:
             InputError: The first such option.
         """
-        for name in ("delimiter", "decimal", "header_line", "units_line", "first_line", "encoding", "time_format"):
+        for name in (
+            "delimiter",
+            "decimal",
+            "thousands",
+            "header_line",
+            "units_line",
+            "first_line",
+            "encoding",
+            "time_format",
+        ):
             if getattr(self, name) is not None:
                 raise InputError(f"file.{name}", f"left out with {path.suffix} files", getattr(self, name))
 
@@ -117,6 +128,10 @@ class ChannelMapping(SignalName):
     """Source value at zero, in its unit, or the mean of what is imported."""
     delay_us: FiniteFloat = 0.0
     """How late the source shows what happened [us]: a filter, a multiplexer."""
+    bandwidth_hz: PositiveFloat | None = None
+    """Corner of the low-pass before the converter [Hz]; left out: half of the rate, as nothing is known of it."""
+    highpass_hz: Annotated[FiniteFloat, Field(ge=0.0)] = 0.0
+    """Corner of an AC coupling [Hz]; 0: none."""
     full_scale: PositiveFloat | None = None
     """Source value (its amount, in its unit) from which on a sample counts as overrange."""
     missing: Literal["gap", "hold", "refuse"] = "gap"
@@ -195,6 +210,16 @@ class ExperimentMapping(_Table):
     """Speed of the drive [Hz]; measured: the mean of the channel `speed`, or of the edges, before the first command."""
     commands: tuple[dict[str, Any], ...] | Literal["scene", "detected"] = "scene"
     """Commands with at_s in the recording's time; those of the scene; or the blows that were found."""
+    lead_s: Annotated[int, Field(ge=0, le=60)] | None = None
+    """The recording's time zero lies so long before its first sample [s]: the scene runs from there, and what its own
+    start stirs up has died out. Left out: 5 where blows were found in a running rig, else 0."""
+
+    @property
+    def lead(self) -> int:
+        """The same, as a number [s]."""
+        if self.lead_s is not None:
+            return self.lead_s
+        return 5 if self.commands == "detected" else 0
 
 
 class Mapping(_Table):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.formats import unit as units
 from replays.formats.source import Entry, Signal, Source, damaged, even_rate_hz, library
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 _TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
 """The text in a comment that is XML."""
+_SYNC_NONE, _SYNC_TIME = 0, 1
+"""Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
 _IDENTITY, _LINEAR = 0, 1
 """Types of the conversion of a channel in MDF4; no conversion is the identity, too."""
 
@@ -86,7 +89,8 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
         if not rows:
             continue
         name = str(getattr(group.channel_group, "acq_name", "") or f"group {number}")
-        rate = even_rate_hz(mdf.get_master(number))
+        scale = _second(mdf, number)
+        rate = None if scale is None else even_rate_hz(mdf.get_master(number) * scale)
         master = mdf.masters_db.get(number)
         for index, channel in enumerate(group.channels):
             if index == master:
@@ -99,6 +103,21 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
             label = (text[1] or "") if text else str(channel.comment or "")
             entries.append(Entry(str(channel.name), name, unit, rows, rate, (number, index), label, number))
     return entries, texts
+
+
+def _second(mdf: Any, group: int) -> float | None:
+    """One unit of a group's master channel [s]; None where it has none, or one of an angle, a length or an index.
+
+    The format asks for seconds; some writers have other units all the same.
+    """
+    index = mdf.masters_db.get(group)
+    if index is None:
+        return None
+    master = mdf.groups[group].channels[index]
+    if getattr(master, "sync_type", _SYNC_TIME) not in (_SYNC_NONE, _SYNC_TIME):
+        return None
+    unit = str(master.unit or getattr(master.conversion, "unit", "") or "")
+    return units.size_si(unit) if units.kind(unit) == "time" else 1.0
 
 
 def _numeric(mdf: Any, group: int, index: int) -> bool:
@@ -123,7 +142,9 @@ def _signal(mdf: Any, group: int, index: int) -> Signal:
     if invalid is not None and np.any(invalid):
         values = values.astype(float)
         values[np.asarray(invalid, dtype=bool)] = np.nan
-    return Signal(values=values, scale=scale, offset=offset, times_s=np.asarray(raw.timestamps, dtype=float))
+    second = _second(mdf, group)
+    times_s = None if second is None else np.asarray(raw.timestamps, dtype=float) * second
+    return Signal(values=values, scale=scale, offset=offset, times_s=times_s)
 
 
 class Writer:

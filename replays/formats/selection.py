@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 
 from recorder.reader import Recording, Stream
-from replays.formats import unit as units
 from rig.channels import Channel
 from rig.errors import InputError
 from rig.wire import Block, sensor_key, truth_key
@@ -396,8 +395,3 @@ def _merge(tables: list[Table]) -> Table:
         parts=tuple(part for table in tables for part in table.parts),
         rate_hz=start.rate_hz, first_s=start.first_s, rows=last - first, shift=first,
     )  # fmt: skip
-
-
-def ordinate(column: Column) -> str:
-    """What a column's unit measures, for formats that have numbers for it."""
-    return units.kind(column.unit)

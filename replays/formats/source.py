@@ -112,19 +112,19 @@ def open_source(path: Path, options: FileOptions) -> Source:
     """
     name = _READERS.get(path.suffix.lower())
     if name is None:
-        raise InputError("input", f"a file that ends in {', '.join(_READERS)}", str(path))
+        raise InputError("file", f"a file that ends in {', '.join(_READERS)}", str(path))
     try:
         with path.open("rb") as file:
             empty = not file.read(1)
     except OSError as error:
-        raise InputError("input", "a file that can be read", f"{path} ({error.strerror})") from None
+        raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
     if empty:
-        raise InputError("input", "a file with something in it", str(path))
+        raise InputError("file", "a file with something in it", str(path))
     if name != "delimited":
         options.only_for_text(path)
     source: Source = importlib.import_module(f"replays.formats.{name}").open_file(path, options)
     if not source.entries:
-        raise InputError("input", "a file with signals in it", str(path))
+        raise InputError("file", "a file with signals in it", str(path))
     return replace(source, entries=_distinct(source.entries))
 
 
@@ -158,7 +158,7 @@ def library(name: str, module: str | None = None) -> Any:
 def damaged(path: Path, what: str, error: Exception | str) -> InputError:
     """The one line for whatever a library raises on a file that it cannot read."""
     text = error if isinstance(error, str) else f"{type(error).__name__}: {error}"
-    return InputError("input", f"an intact {what} file", f"{path} ({text})"[:300])
+    return InputError("file", f"an intact {what} file", f"{path} ({text})"[:300])
 
 
 def even_rate_hz(times_s: np.ndarray) -> float | None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.formats.columnar import is_time
+from replays.formats.dialect import is_time
 from replays.formats.source import Entry, Signal, Source, damaged, even_rate_hz, library
 
 if TYPE_CHECKING:
@@ -19,15 +22,32 @@ _RAW_INPUT = 0xFFFFFFFF
 """Input of the first scale: the raw values."""
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """npTDMS prints a line a read of a file that is cut off; it is said once, as an error."""
+    handler = logging.getLogger("nptdms.reader").handlers
+    level = [one.level for one in handler]
+    for one in handler:
+        one.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for one, before in zip(handler, level, strict=True):
+            one.setLevel(before)
+
+
 def open_file(path: Path, options: FileOptions) -> Source:
     """Look into a TDMS file.
 
     Raises:
-        InputError: It is none, or npTDMS is missing.
+        InputError: It is none, it is cut off, or npTDMS is missing.
     """
     nptdms = library("npTDMS", "nptdms")
     try:
-        file = nptdms.TdmsFile.read_metadata(path)
+        with _quiet():
+            file = nptdms.TdmsFile.read_metadata(path)
+        if file.file_status.incomplete_final_segment:
+            raise ValueError("it is cut off")
         groups = [(group.name, group.channels()) for group in file.groups()]
         starts = [
             channel.properties["wf_start_time"]
@@ -89,9 +109,13 @@ def _signal(group: Any, name: str, start: Any) -> Signal:
         first_s = late_s + float(properties.get("wf_start_offset", 0.0))
         return Signal(values=values, scale=scale, offset=offset, rate_hz=1.0 / step, first_s=first_s)
     stamps = next((other for other in group.channels() if is_time(other.name) and other.name != name), None)
-    if stamps is None or len(stamps) != len(values) or even_rate_hz(np.asarray(stamps[:2], dtype=float)) is None:
+    if stamps is None or len(stamps) != len(values):
         return Signal(values=values, scale=scale, offset=offset)
-    return Signal(values=values, scale=scale, offset=offset, times_s=np.asarray(stamps[:], dtype=float))
+    times = np.asarray(stamps[:])
+    if times.dtype.kind == "M":
+        times = (times - (times[0] if start is None else start)) / np.timedelta64(1, "us") * 1e-6
+    times_s = None if even_rate_hz(times) is None else times.astype(float)
+    return Signal(values=values, scale=scale, offset=offset, times_s=times_s)
 
 
 class Writer:

@@ -1,10 +1,11 @@
-"""A starting mapping, made of what is in the files: it imports as it is, and says what to change."""
+"""Mappings to start from: one made of what is in files, which imports as it is, and one that has every option."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Sequence
+from importlib.resources import files as files_of
 from pathlib import Path
 
 from replays.formats import unit as units
@@ -39,11 +40,10 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
             f"#   {group.name}: " + ", ".join(f"{channel.name} [{channel.unit}]" for channel in group.channels)
         )
     lines += [
-        '# Also: sensitivity = "7.87 V/mm", sign = -1, bias = "mean", delay_us = 12.5, full_scale = 9.9,',
-        '#   missing = "hold", label = "..."',
-        '#   [[rotate]] channels = ["ring_x", "ring_y"], angles_deg = [45, 135]',
-        '#   [[align]] reference = { source, file }, moved = { source, file }, method = "edge" or "correlation"',
-        "#   [keyphasor] source, threshold; [hammer] threshold_n, pre_s; [experiment] scene, set, speed_hz, commands",
+        '# A channel in volts: unit = "V", sensitivity = "200 mV/mil" (or "100 mV/g", "2 mV/N"), bias = "mean".',
+        "# Probes at other angles than 0 and 90 degrees: [[rotate]]. Another recorder's clock: [[align]]. To simulate",
+        "# it again (`rig validate`, `rig identify`): [experiment], with [hammer] and [keyphasor]. Every option is",
+        "# explained by `rig import --template EXAMPLE.toml`.",
         "",
     ]
     for source in sources:
@@ -59,6 +59,11 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
         for entry in source.entries:
             lines += ["", *_channel(entry, source, taken, rig=set(rig), several=len(sources) > 1)]
     return "\n".join(lines) + "\n"
+
+
+def example() -> str:
+    """A mapping with every option, explained, for a usual rig."""
+    return files_of("replays.formats").joinpath("example.toml").read_text(encoding="utf-8")
 
 
 def _rates(entries: Sequence[Entry]) -> list[str]:

@@ -25,6 +25,8 @@ _TIME_RESPONSE = (0, 1)
 """Function types that are time histories: general, time response."""
 _REAL = (2, 4)
 """Ordinates in single or double precision; 5 and 6 are complex."""
+_TAIL = 4096
+"""Bytes at the end of a file in which its last line is looked for."""
 _EXACT_RATE = re.compile(r"rate_hz=([0-9.eE+-]+)")
 _START = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S")
 _TIME, _GENERAL, _UNKNOWN = 17, 1, 0
@@ -41,30 +43,29 @@ def open_file(path: Path, options: FileOptions) -> Source:
     """Look into a universal file.
 
     Raises:
-        InputError: It is none, has no time history, or pyuff is missing.
+        InputError: It is none, is cut off, has no time history, or pyuff is missing.
     """
     pyuff = library("pyuff")
     try:
+        if not _ends(path):
+            raise ValueError("it is cut off")
         file = pyuff.UFF(str(path))
         kinds = list(np.atleast_1d(file.get_set_types()).astype(int))
         heads = {n: file.read_sets(n, header_only=True) for n, kind in enumerate(kinds) if kind == 58}
     except Exception as error:
         raise damaged(path, "universal", error) from None
     entries: list[Entry] = []
-    taken: dict[str, int] = {}
     for n, head in heads.items():
         if head["func_type"] not in _TIME_RESPONSE or head["ord_data_type"] not in _REAL:
             continue
         name = next((text for text in (head["id1"].strip(), head["rsp_ent_name"].strip()) if text not in ("", "NONE")),
                     f"set {n + 1}")  # fmt: skip
-        taken[name] = taken.get(name, 0) + 1
-        name = name if taken[name] == 1 else f"{name} #{taken[name]}"
         unit = head["ordinate_axis_units_lab"].strip()
         label = " ".join(head[f"id{k}"].strip() for k in (2, 5) if head[f"id{k}"].strip() not in ("", "NONE"))
         unit = "" if unit == "NONE" else unit
         entries.append(Entry(name, "", unit, int(head["num_pts"]), _rate_hz(head), n, label))
     if not entries:
-        raise InputError("input", "a universal file with time histories (dataset 58, real)", str(path))
+        raise InputError("file", "a universal file with time histories (dataset 58, real)", str(path))
 
     def read(entry: Entry) -> Signal:
         try:
@@ -82,6 +83,15 @@ def open_file(path: Path, options: FileOptions) -> Source:
     remarks = (f"{others} datasets that are no time history are passed over",) if others else ()
     start = _start([str(head["id3"]) for head in heads.values()])
     return Source(path=path, format="UFF58", entries=tuple(entries), read=read, remarks=remarks, start=start)
+
+
+def _ends(path: Path) -> bool:
+    """Whether the last line closes a dataset; pyuff passes over one that does not end."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _TAIL))
+        lines = file.read().rstrip(b"\0\x1a\r\n ").splitlines()
+    # After a line that closes one, another opens the next.
+    return bool(lines) and lines[-1].strip() == b"-1" and (len(lines) < 2 or lines[-2].strip() != b"-1")
 
 
 def _rate_hz(head: dict) -> float | None:

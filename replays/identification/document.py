@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from replays.identification.fit import Identification
-from rig.errors import InputError
+from rig.errors import check_new_file
 from rig.parameters import DEFAULT_SET, Parameter, load_parameters, set_names
 
 
@@ -56,12 +56,7 @@ def check_set(path: Path, *, force: bool) -> None:
     Raises:
         InputError: Another suffix, a folder that is missing, or an existing file.
     """
-    if path.suffix != ".toml":
-        raise InputError("output", "a file name that ends in .toml", str(path))
-    if not path.parent.is_dir():
-        raise InputError("output", "in a folder that exists", str(path))
-    if path.is_dir() or (path.exists() and not force):
-        raise InputError("output", "a new file (--force replaces one)", f"{path}, which exists")
+    check_new_file(path, field="output", suffixes=(".toml",), force=force)
 
 
 def write_set(text: str, path: Path) -> None:

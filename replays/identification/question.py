@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from recorder.reader import Recording
 from replays.experiment import Experiment
-from replays.sensitivity import channel_noise, scale_of, value_of, with_values
-from rig.channels import default_table
+from replays.prediction import Measured, measured
+from replays.sensitivity import ANGLE, CLOCK, scale_of, value_of, with_values
+from rig.channels import Channel
 from rig.errors import InputError
+from rig.kernels.signals import COLUMN
 from rig.parameters import load_parameters
 from rig.scenes import HammerCommand
 from rig.simulation import TICK_RATE_HZ
@@ -73,10 +75,12 @@ class Observation:
     Attributes:
         names: Channels.
         units: Their units.
-        times_s: Simulated time of the rows [s], shape (n,).
-        values: In each channel's unit, nan where a sample was lost, shape (n, channels).
+        times_s: Time of the rows of all groups together [s], shape (n,).
+        values: In each channel's unit, nan where there is no sample, shape (n, channels).
         noise: Standard deviation of each channel's noise, in its unit, shape (channels,).
         noise_from: Where it is from, by channel: "table", or "measured" where the table tells none.
+        parts: The same by group, with the recording's own calibration and filters.
+        rows: Where in `times_s` the rows of each group are.
     """
 
     names: tuple[str, ...]
@@ -85,10 +89,25 @@ class Observation:
     values: np.ndarray
     noise: np.ndarray
     noise_from: tuple[Literal["table", "measured"], ...]
+    parts: dict[str, Measured]
+    rows: dict[str, np.ndarray]
 
     def until(self, end_s: float) -> int:
         """Number of rows before a time."""
         return int(np.searchsorted(self.times_s, end_s - 1e-9))
+
+    def parts_until(self, rows: int) -> dict[str, Measured]:
+        """The groups in the first rows."""
+        ends = {name: int(np.searchsorted(self.rows[name], rows)) for name in self.parts}
+        return {name: self.parts[name].first(end) for name, end in ends.items() if end}
+
+    def placed(self, values: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
+        """Values by group as one table, nan where there is no sample, shape (rows, channels)."""
+        found = np.full((rows, len(self.names)), np.nan)
+        for name, held in values.items():
+            columns = np.array([self.names.index(channel) for channel in self.parts[name].names])
+            found[self.rows[name][: len(held), None], columns] = held
+        return found
 
 
 @dataclass(frozen=True)
@@ -120,7 +139,7 @@ def ask(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, tuple[float, float]] | None = None,
     channels: Sequence[str] | None = None,
-    window: tuple[float, float] | None = None,
+    window: tuple[float | None, float | None] = (None, None),
 ) -> Question:
     """Put a question to a recording.
 
@@ -132,7 +151,7 @@ def ask(
         bounds: Least and largest value by key.
         priors: Mean and standard deviation by key.
         channels: By which channels; None for all that it has, but for the keyphasor's pulses.
-        window: Simulated times between which samples are used [s]; None: from shortly before the first command to the
+        window: Simulated times between which samples are used [s]; None: from shortly before the first command, to the
             end.
 
     Raises:
@@ -177,57 +196,71 @@ def observe(
     experiment: Experiment,
     *,
     channels: Sequence[str] | None = None,
-    window: tuple[float, float] | None = None,
+    window: tuple[float | None, float | None] = (None, None),
 ) -> Observation:
     """Samples of a recording.
 
     Raises:
         InputError: It has none of these channels, or no samples in the window.
     """
-    known = default_table().channels
     groups = {
-        name: group.name
+        channel.name: group.name
         for group in recording.table.groups.values()
-        for name in group.names
-        if name in known and recording.messages.get(sensor_key(group.name))
+        for channel in group.channels
+        if channel.signal in COLUMN and recording.messages.get(sensor_key(group.name))
     }
     usable = [name for name in groups if name not in NOT_FITTED]
     wanted = list(channels) if channels else usable
     missing = [name for name in wanted if name not in usable]
     if missing or not wanted:
         raise InputError("channels", f"some that the recording has: {', '.join(usable)}", ", ".join(missing))
-    samples = {group: recording.samples(group) for group in dict.fromkeys(groups[name] for name in wanted)}
-    first_s = max(float(held.times_s[0]) for held in samples.values())
-    last_s = min(float(held.times_s[-1]) for held in samples.values())
-    start_s, end_s = window or (max(first_s, _first_command_s(experiment) - _QUIET_S), math.inf)
-    longest = max(samples.values(), key=lambda held: held.rate_hz)
-    period_s = 1.0 / longest.rate_hz
-    whole = longest.times_s
-    times_s = whole[(whole >= max(start_s, first_s) - 1e-9) & (whole < min(end_s, last_s + period_s) - 1e-9)]
-    if len(times_s) < 10:
+    whole = measured(recording, experiment.scene.sensors)
+    whole = {name: whole[name].only(wanted) for name in dict.fromkeys(groups[name] for name in wanted)}
+    first_s = max(float(part.times_s[0]) for part in whole.values())
+    last_s = min(float(part.times_s[-1]) for part in whole.values())
+    start_s, end_s = window
+    start_s = max(first_s, first_command_s(experiment) - _QUIET_S) if start_s is None else start_s
+    end_s = math.inf if end_s is None else end_s
+    period_s = max(1.0 / part.channels[0].rate_hz for part in whole.values())
+    parts = {}
+    for name, part in whole.items():
+        kept = (part.times_s >= max(start_s, first_s) - 1e-9) & (part.times_s < min(end_s, last_s + period_s) - 1e-9)
+        parts[name] = part.chosen(np.flatnonzero(kept)[:: -(-int(kept.sum()) // MOST_ROWS) or 1])
+    if min(len(part.times_s) for part in parts.values()) < 10:
         must = f"a window with samples in it; the recording goes from {first_s:.3f} to {last_s:.3f} s"
         raise InputError("window", must, [start_s, end_s])
-    values = np.full((len(times_s), len(wanted)), np.nan)
-    noise, sources = np.empty(len(wanted)), []
-    for column, name in enumerate(wanted):
-        held = samples[groups[name]]
-        place = np.searchsorted(held.times_s, times_s - 0.01 * period_s)
-        place = np.minimum(place, len(held.times_s) - 1)
-        there = np.abs(held.times_s[place] - times_s) < 0.01 * period_s
-        values[there, column] = held.column(name)[place[there]]
-        channel = recording.table.channels[name]
-        told = channel.noise_v > 0.0
-        noise[column] = channel_noise(channel) if told else measured_noise(values[:, column])
-        sources.append("table" if told else "measured")
-    thin = -(-len(times_s) // MOST_ROWS)
-    return Observation(
+    parts = {name: _with_noise(part) for name, part in parts.items()}
+    # Of a thousandth of a microsecond, equal times of two groups are the same row.
+    stamps = {name: np.rint(part.times_s * 1e9).astype(np.int64) for name, part in parts.items()}
+    union, first = np.unique(np.concatenate(list(stamps.values())), return_index=True)
+    own = {channel.name: (part, c) for part in parts.values() for c, channel in enumerate(part.channels)}
+    observation = Observation(
         names=tuple(wanted),
-        units=tuple(known[name].unit for name in wanted),
-        times_s=times_s[::thin],
-        values=values[::thin],
-        noise=noise,
-        noise_from=tuple(sources),
+        units=tuple(own[name][0].channels[own[name][1]].unit for name in wanted),
+        times_s=np.concatenate([part.times_s for part in parts.values()])[first],
+        values=np.empty(0),
+        noise=np.array([own[name][0].floor[own[name][1]] for name in wanted]),
+        noise_from=tuple("table" if _told(*own[name]) else "measured" for name in wanted),
+        parts=parts,
+        rows={name: np.searchsorted(union, held) for name, held in stamps.items()},
     )
+    values = observation.placed({name: part.values for name, part in parts.items()}, len(union))
+    return replace(observation, values=values)
+
+
+def _told(part: Measured, column: int) -> bool:
+    return part.channels[column].noise_v > 0.0
+
+
+def _with_noise(part: Measured) -> Measured:
+    """With the noise of the table and its rounding as white noise; measured where the table tells none."""
+    floor = np.array(
+        [
+            channel_noise(channel) if _told(part, c) else measured_noise(part.values[:, c])
+            for c, channel in enumerate(part.channels)
+        ]
+    )
+    return replace(part, floor=floor)
 
 
 def measured_noise(values: np.ndarray) -> float:
@@ -237,7 +270,13 @@ def measured_noise(values: np.ndarray) -> float:
     return spread or max(1e-9, 1e-6 * float(np.nanmax(np.abs(values), initial=0.0)))
 
 
-def _first_command_s(experiment: Experiment) -> float:
+def channel_noise(channel: Channel) -> float:
+    """Noise of a channel of the table, with what rounding in the converter adds, in its unit."""
+    return math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0)) / abs(channel.sensitivity_v)
+
+
+def first_command_s(experiment: Experiment) -> float:
+    """When the first blow comes [s]; 0 without one."""
     times = [timed.at_s for timed in experiment.scene.commands if isinstance(timed.request, HammerCommand)]
     times += [command.tick / TICK_RATE_HZ for command in experiment.commands if command.name == "hammer"]
     return min(times, default=0.0)
@@ -251,5 +290,9 @@ def _accepted(key: str) -> tuple[float, float]:
 
 
 def _unit(key: str) -> str:
+    if key in CLOCK:
+        return CLOCK[key][0]
+    if key == ANGLE:
+        return "rad"
     entries = load_parameters().entries
     return entries[key].unit if key in entries else _COMMAND_UNITS.get(key.split(".")[-1], "")

@@ -29,13 +29,7 @@ class Window:
         self.end_s = end_s
         observation = question.observation
         self.rows = observation.until(end_s)
-        times_s = observation.times_s[: self.rows]
-        rate_hz = question.experiment.scene.sensors.rate_hz
-        start_s = max(0.0, times_s[0] - 1.0 / rate_hz)
-        self._predictor = Predictor(
-            question.experiment, question.keys, channels=observation.names, start_s=start_s,
-            end_s=times_s[-1] + 2.0 / rate_hz,
-        )  # fmt: skip
+        self._predictor = Predictor(question.experiment, question.keys, observation.parts_until(self.rows))
         self._start = np.array([unknown.start for unknown in question.unknowns])
         self._scale = np.array([unknown.scale for unknown in question.unknowns])
         self._measured = observation.values[: self.rows] / observation.noise
@@ -57,8 +51,9 @@ class Window:
             InputError: A value that the model does not take.
             SimulationError: The state became non-finite.
         """
-        signals = self._predictor.signals(self.values(z))
-        return self._at_samples(signals.times_s, signals.values)
+        observation = self.question.observation
+        found = self._predictor.predict(self.values(z))
+        return observation.placed(found.values, self.rows) / observation.noise
 
     def residuals(self, z: np.ndarray) -> np.ndarray:
         """Measured less predicted, in units of the noise, 0 where a sample was lost, shape (rows, channels)."""
@@ -99,14 +94,3 @@ class Window:
             return z + aside, self.predicted(z + aside)
         except (InputError, SimulationError):
             return z, self.predicted(z)
-
-    def _at_samples(self, times_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Rows of the model at the times of the samples, over the noise."""
-        wanted = self.question.observation.times_s[: self.rows]
-        place = (wanted - times_s[0]) * self._predictor.rate_hz
-        whole = np.rint(place).astype(int)
-        if np.abs(place - whole).max(initial=0.0) < 0.01:
-            found = values[whole]
-        else:  # samples of another clock than the simulation's
-            found = np.column_stack([np.interp(wanted, times_s, column) for column in values.T])
-        return found / self.question.observation.noise

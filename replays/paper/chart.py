@@ -33,7 +33,7 @@ def draw_conditions(
                label="gains speed from here up (bare rig)")  # fmt: skip
     spins = [abs(rolling_whirl(constants, 2 * math.pi * t.spin_hz)[0]) / (2 * math.pi) for t in least]
     plane.plot([t.bare for t in least], spins, "D", color=BLUE, ms=7, mfc="none", mew=1.8,
-               label="keeps rolling from here on (bare rig)")  # fmt: skip
+               label="keeps whirling from here on (bare rig)")  # fmt: skip
     plane.plot([t.full for t in least], spins, "D", color=BLUE, ms=6, label="the same, full rig")
     plane.axhline(own.natural / (2 * math.pi), color="0.5", ls=":", lw=1.2, label="w_n on the magnets (eq. 42)")
     plane.plot(constants.contact.friction, 83.7, "*", color=ORANGE, ms=13, label="the paper: mu = 0.25, 83.7 Hz")

@@ -135,9 +135,9 @@ def toward_measured(found: list[Bar]) -> list[Bar]:
 
 def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
     """What each change makes of the force in whirl and of the highest reaction."""
-    figure = new_figure((14.0, 8.6), "What moves the force: one change at a time (ranges of assumed values are "
-    "assumed)",
-                        title_size=12)  # fmt: skip
+    figure = new_figure(
+        (14.0, 8.6), "What moves the force: one change at a time (ranges of assumed values are assumed)", title_size=12
+    )
     panels = figure.subplots(1, 2)
     shown = {
         "reaction_x_n": ("E - W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
@@ -199,18 +199,18 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
     figure = new_figure((14.0, 4.6), f"All assumed values at once: Latin hypercube, {len(spread)} runs", title_size=12)
     panels = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.15))
     shown = {
-        "reaction_x_n": ("E - W amplitude in whirl [N]", MEASURED_N),
-        "peak_x_n": ("highest E - W [N]", None),
-        "whirl_hz": ("whirl frequency [Hz]", -83.7),
+        "reaction_x_n": ("E - W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
+        "peak_x_n": ("highest E - W [N]", None, ""),
+        "whirl_hz": ("whirl frequency [Hz]", -83.7, "the paper, Fig. 14"),
     }
-    for axes, (name, (label, paper)) in zip(panels[:3], shown.items(), strict=True):
+    for axes, (name, (label, paper, text)) in zip(panels[:3], shown.items(), strict=True):
         values = column(spread, name)
         values = values[np.isfinite(values)]
         if name != "peak_x_n":
             values = values[[result.whirls for result in spread if math.isfinite(getattr(result, name))]]
         axes.hist(values, bins=30, color=SKY)
         if paper is not None:
-            axes.axvline(paper, color=RED, ls=(0, (4, 3)), lw=1.2, label=f"the paper, {paper:g}")
+            axes.axvline(paper, color=RED, ls=(0, (4, 3)), lw=1.2, label=f"{text}, {paper:g}")
             axes.legend(fontsize=8)
         axes.set(xlabel=label, ylabel="runs")
     entries = free_values()
@@ -222,7 +222,7 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
     panels[3].set_yticks(rows, [entry.key for entry in entries], fontsize=7.5)
     panels[3].invert_yaxis()
     panels[3].set(xlabel="rank correlation [1]", xlim=(-1.05, 1.05))
-    panels[3].legend(fontsize=8, loc="lower right")
+    panels[3].legend(fontsize=8, loc="lower left")
     draw_grid(*panels)
     return figure
 

@@ -49,7 +49,8 @@ def draw_magnets(one: Reproduction) -> Figure:
         figure.colorbar(filled, ax=axes, shrink=0.85, ticks=[-40, -20, 0, 20, 40])
     line = panels[2]
     along = map_force(axis, np.zeros_like(axis), model.constants.magnet)[:, 0]
-    line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label="map at K_mag = 1.7 kN/m (assumed)")
+    told = f"map at K_mag = {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
+    line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label=told)
     line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="spring K_mag")
     _axis_lines(line, -40.0, 40.0)
     line.set(title="through the centre", xlabel="x [mm]", ylabel="F_mag,x [N]", xlim=(-10, 10), ylim=(-46, 46))
@@ -195,7 +196,7 @@ def draw_east(found: dict[str, Reproduction]) -> Figure:
         axes.plot(t, run["P_E"][last] - preload, color=GREEN, lw=1.4, label="EAST alone, less its preload")
         axes.plot(t, run["normal_force"][last], color="0.3", lw=1.0, ls=":", label="normal force in the contact")
         _axis_lines(axes, 0.0, 900.0, text="the paper's axis, simulated and measured")
-        _axis_lines(axes, 500.0, text="end of Fig. 15's axis, measured")
+        axes.axhline(500.0, color=PINK, lw=1.2, ls=(0, (1, 2)), zorder=1, label="end of Fig. 15's axis, measured")
         axes.set(title=one.parameters, xlabel="time [ms]", ylabel="force [N]", xlim=(0, 12), ylim=(-650, 1450))
         axes.legend(fontsize=7.5, loc="upper right", ncols=2)
     draw_grid(*panels)

@@ -1,5 +1,6 @@
 """A recording played again to whoever listens, as if it were the rig.
 
-`tape` reads the files, `timeline` puts the payloads in the order of their deadlines, `edit` changes keys, channels and
-numbers, `readahead` reads while others wait, and `player` serves and paces.
+`tape` reads the files, `timeline` puts the payloads in the order of their deadlines, `readahead` reads while others
+wait, `edit` changes keys, channels and numbers, `outlet` publishes and counts, `playhead` keeps the time of the play,
+and `player` serves it and obeys.
 """

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import accumulate
-from typing import Protocol
 
-from replays.player.tape import Chunk, Message
+from replays.player.tape import Message, Tape
 from rig import wire
 
 _NS = 1_000_000_000
@@ -20,19 +19,6 @@ class By(StrEnum):
 
     SIMULATED = "simulated"
     ARRIVAL = "arrival"
-
-
-class Source(Protocol):
-    """What a timeline needs of a `Tape`."""
-
-    @property
-    def chunks(self) -> list[Chunk]:
-        """In the order of the recording."""
-        ...
-
-    def read(self, chunk: Chunk, /) -> Iterator[Message]:
-        """The messages of one chunk."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +55,12 @@ class Timeline:
     in them could be due next.
 
     Args:
-        source: Where the messages are.
+        tape: Where the messages are.
         by: What the deadlines follow.
     """
 
-    def __init__(self, source: Source, by: By = By.SIMULATED) -> None:
-        self._source = source
+    def __init__(self, tape: Tape, by: By = By.SIMULATED) -> None:
+        self._tape = tape
         self.by = by
 
     def play(self, from_ns: int, to_ns: int | None = None) -> Iterator[Batch]:
@@ -94,7 +80,7 @@ class Timeline:
             yield batch
 
     def _in_order(self, from_ns: int, to_ns: int | None) -> Iterator[Item]:
-        chunks = self._source.chunks
+        chunks = self._tape.chunks
         # Nothing that begins earlier than this stands in a chunk or in any after it.
         beginnings = list(accumulate((chunk.begin_ns for chunk in reversed(chunks)), min))[::-1]
         waiting: list[tuple[int, int, Item]] = []
@@ -108,7 +94,7 @@ class Timeline:
             if self.by is By.SIMULATED:
                 while waiting and waiting[0][0] <= beginning_ns:
                     yield heapq.heappop(waiting)[2]
-            for message in self._source.read(chunk):
+            for message in self._tape.read(chunk):
                 item = ages.item(message)
                 if message.time_ns < from_ns or (to_ns is not None and item.position_ns > to_ns):
                     continue

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rig.errors import InputError
+from rig.errors import InputError, check_new_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -149,10 +148,4 @@ def check_report(path: Path, *, force: bool) -> None:
     Raises:
         InputError: Another suffix, a folder that is missing or read-only, or an existing file.
     """
-    check_suffix(path)
-    if not path.parent.is_dir():
-        raise InputError("report", "in a folder that exists", str(path))
-    if path.is_dir() or (path.exists() and not force):
-        raise InputError("report", "a new file (--force replaces one)", f"{path}, which exists")
-    if not os.access(path.parent, os.W_OK):
-        raise InputError("report", "in a folder that can be written", str(path))
+    check_new_file(path, field="report", suffixes=SUFFIXES, force=force)

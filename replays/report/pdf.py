@@ -87,7 +87,7 @@ def _table(pdf: FPDF, table: Table) -> None:
     widths = _widths(pdf, table)
     with pdf.table(
         col_widths=widths,
-        width=sum(widths),
+        width=min(sum(widths), pdf.epw),  # a sum that is the page's width may be rounded above it
         align="L",
         text_align="L",
         line_height=4,

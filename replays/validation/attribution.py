@@ -16,9 +16,9 @@ from typing import Literal
 import numpy as np
 
 from replays.experiment import Experiment
+from replays.prediction import Measured, Prediction, predict
 from replays.sensitivity import scale_of, value_of, with_values
 from replays.validation.criteria import Attribution, Candidate
-from replays.validation.prediction import Measured, Prediction, predict
 from replays.validation.trajectory import scaled
 from rig.errors import InputError, SimulationError
 

@@ -106,6 +106,16 @@ class TruthCriterion(_Part):
     """Largest difference as a part of each column's largest value, beyond that of the perturbed run."""
 
 
+class Imported(_Part):
+    """What is asked of logs of other systems, which tell less exactly what was done and how loud their sensors are."""
+
+    reason: Reason
+    nuisances: tuple[str, ...]
+    """Numbers that are fitted before anything is compared."""
+    noise: NotNegative
+    """By this part the noise may be off that was read off the log."""
+
+
 class Candidate(_Part):
     """What may be off: numbers of the experiment that are changed together."""
 
@@ -143,6 +153,13 @@ class Criteria(_Part):
     ensemble: Ensemble
     statistics: tuple[StatisticCriterion, ...]
     attribution: Attribution
+    imported: Imported
+
+    def loosened(self, part: float) -> Criteria:
+        """For channels whose noise is known only to a part of it."""
+        wider = tuple(c.model_copy(update={"rms": c.rms * (1.0 + part), "peak": c.peak * (1.0 + part),
+                                           "drift": c.drift * (1.0 + part)}) for c in self.trajectory)  # fmt: skip
+        return self.model_copy(update={"trajectory": wider})
 
     def trajectory_of(self, channel: str) -> TrajectoryCriterion | None:
         """The criterion of a channel."""

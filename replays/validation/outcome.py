@@ -12,12 +12,13 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.experiment import Experiment
+from replays.identification.nuisance import is_imported, tune
+from replays.prediction import Measured, Prediction, bare, measured, predict
 from replays.sensitivity import value_of, with_values
 from replays.validation.attribution import Explained, attribute
 from replays.validation.bits import Bits, StreamBits
 from replays.validation.criteria import Criteria, load_criteria
 from replays.validation.phases import QUANTITIES, SPECTRA, Phase, View, find_phases, quantities, spectra, view_of
-from replays.validation.prediction import Measured, Prediction, bare, measured, predict
 from replays.validation.trajectory import ChannelResidual, foreseeable_s, residuals
 from rig.channels import default_table
 from rig.kernels.signals import COLUMN, TRUTH
@@ -102,6 +103,7 @@ class Validation:
         calibration: How the recording's channels differ from the rig's own table, in words.
         skipped: Rows that the recording lost.
         explained: Where something failed, what it may come from.
+        fitted: What was fitted before, as an imported log does not tell it exactly.
         parts: What was recorded.
         nominal: What was foretold.
     """
@@ -122,6 +124,7 @@ class Validation:
     calibration: tuple[str, ...]
     skipped: int
     explained: Explained | None
+    fitted: tuple[str, ...] = ()
     parts: dict[str, Measured] = field(repr=False, default_factory=dict)
     nominal: Prediction | None = field(repr=False, default=None)
 
@@ -149,6 +152,8 @@ class Validation:
     @property
     def bits_line(self) -> str:
         """How the payloads compare, in one line."""
+        if not self.bits:
+            return "imported: there are no payloads of this rig to compare"
         rows = sum(one.rows for one in self.bits.values())
         lost = f"; {self.skipped} rows that the recording lost are passed over" if self.skipped else ""
         if self.bit_exact:
@@ -184,6 +189,7 @@ class Validation:
                 "bit_exact": self.bit_exact,
                 "bits": {key: {**asdict(one), "equal": one.equal} for key, one in self.bits.items()},
                 "rows_lost": self.skipped,
+                "fitted": list(self.fitted),
                 "calibration": list(self.calibration),
                 "window": {"from_s": self.window_s[0], "to_s": self.window_s[1], "reason": self.window_reason},
                 "trajectory": [asdict(one) for one in self.residuals],
@@ -221,37 +227,50 @@ def validate(
     experiment = Experiment.of(recording)
     if changes:
         experiment = experiment.changed(changes)
-    parts = measured(recording, experiment.scene.sensors, longest_s=criteria.window.longest_s)
-    bits = Bits(recording)
-    step("re-simulated, payload by payload")
-    nominal = predict(experiment, parts, follow=bits.follow)
-    streams = bits.finish()
+    parts = recorded = measured(recording, experiment.scene.sensors, longest_s=criteria.window.longest_s)
+    tuned = None
+    streams: dict[str, StreamBits] = {}
+    if is_imported(recording):
+        tuned = tune(recording, experiment, criteria.imported.nuisances, progress=lambda text: step(f"log: {text}"))
+        experiment, parts = tuned.experiment, tuned.on_time(recorded)
+        criteria = criteria.loosened(criteria.imported.noise)
+        nominal = tuned.predict(recorded)
+    else:
+        bits = Bits(recording)
+        step("re-simulated, payload by payload")
+        nominal = predict(experiment, parts, follow=bits.follow)
+        streams = bits.finish()
     quick = bare(experiment)
     bit_exact = bool(streams) and all(stream.equal for stream in streams.values())
 
     step("perturbed, to see how far it can be foretold")
     rules = criteria.window
-    perturbed = predict(_perturbed(quick, rules.parameters, rules.perturbation), parts)
+    if tuned is not None:
+        perturbed = tuned.predict(recorded, aside=True)
+    else:
+        perturbed = predict(_perturbed(quick, rules.parameters, rules.perturbation), parts)
     begin = min(float(part.times_s[0]) for part in parts.values())
     end = max(float(part.times_s[-1]) for part in parts.values()) + 1e-9
     parted = foreseeable_s(parts, nominal, perturbed, share=rules.share)
+    change = "what the fit leaves open" if tuned is not None else f"a change of {rules.perturbation:g}"
     if parted is None:
-        reason = f"to the end: a change of {rules.perturbation:g} stays below {rules.share:g} of every channel's noise"
+        reason = f"to the end: {change} stays below {rules.share:g} of every channel's noise"
     else:
         end = parted
-        reason = f"a change of {rules.perturbation:g} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
+        reason = f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
     trajectory = residuals(parts, nominal, perturbed, criteria, end_s=end)
     tables = _recorded_truth(recording, longest_s=begin + rules.longest_s)
     truth = _judge_truth(tables, nominal, perturbed, criteria, end_s=end)
 
     step("statistics by phase, and their spread")
     phases, statistics = _statistics(quick, parts, nominal, tables, criteria)
+    fitted = tuple(one.line for one in tuned.fitted) if tuned is not None else ()
     validation = Validation(
         path=recording.path, scene=experiment.scene.name, criteria=criteria.title, changes=dict(changes or {}),
         bits=streams, bit_exact=bit_exact, declared=declared, window_s=(begin, end), window_reason=reason,
         residuals=tuple(trajectory), truth=tuple(truth), phases=tuple(phases), statistics=tuple(statistics),
         calibration=tuple(_calibration(recording)), skipped=sum(stream.lost for stream in recording.streams.values()),
-        explained=None, parts=parts, nominal=nominal,
+        explained=None, fitted=fitted, parts=parts, nominal=nominal,
     )  # fmt: skip
     if validation.good:
         return validation
@@ -259,7 +278,15 @@ def validate(
     explained = None
     if firsts:
         step("what explains the difference")
-        explained = attribute(quick, parts, nominal, criteria.attribution, from_s=min(firsts), step=step)
+        rules = criteria.attribution
+        if (
+            tuned is not None
+        ):  # numbers of the model hang together with what was fitted: `rig identify` fits all at once
+            rules = rules.model_copy(update={"candidates": ()})
+        explained = attribute(quick, parts, nominal, rules, from_s=min(firsts), step=step)
+        if tuned is not None and not explained.best:
+            told = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
+            explained = replace(explained, conclusion=told)
     return replace(validation, explained=explained)
 
 
@@ -411,6 +438,10 @@ def _calibration(recording: Recording) -> list[str]:
     """How the recording's channels differ from the rig's own table."""
     own = default_table().channels
     found = []
+    if is_imported(recording):
+        mapped = recording.scene["import"]["mapping"]["channels"]
+        untold = [name for name, entry in mapped.items() if "bandwidth_hz" not in entry]
+        return [f"no bandwidth told of {', '.join(untold)}: taken for half of the rate"] if untold else []
     for name, channel in recording.table.channels.items():
         if name not in own:
             found.append(f"{name}: not in the rig's own channel table")

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from replays.validation.prediction import Measured
+from replays.prediction import Measured
 from replays.whirl import whirl_frequency
 
 PHASES = ("free run", "impacts", "whirl", "rest", "decay")

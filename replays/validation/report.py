@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from replays.canvas import BLUE, ORANGE, RED, draw_grid, new_figure
+from replays.prediction import Measured
 from replays.report import Mark, Report, Row
 from replays.validation.outcome import Validation
 from replays.validation.phases import PHASES
-from replays.validation.prediction import Measured
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,6 +102,7 @@ def _about(found: Validation) -> list[Row]:
         Row(("rows lost", str(found.skipped))),
     ]
     rows += [Row(("changed", f"{key} = {value}")) for key, value in found.changes.items()]
+    rows += [Row(("fitted first", line)) for line in found.fitted]
     rows += [Row(("calibration", line), "open") for line in found.calibration]
     rows += [Row(("fails", failure), "bad") for failure in found.failures]
     return rows

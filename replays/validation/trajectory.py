@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from replays.prediction import Measured, Prediction
 from replays.validation.criteria import Criteria, TrajectoryCriterion
-from replays.validation.prediction import Measured, Prediction
 
 STRETCH = 128
 """Samples that one mean of the drift is taken over."""

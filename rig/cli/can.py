@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from functools import partial
 from typing import Annotated, Any
 
 import typer
+
+from rig.cli.display import stopping_on_signals
 
 app = typer.Typer(help="The virtual CAN bus.", no_args_is_help=True)
 
@@ -67,7 +67,8 @@ def hub(
     models = [BusModel(rates, error_rate=error_rate, seed=seed + number) for number in range(len(channels))]
     with ZenohServer(listen, expose=expose) as server, ExitStack() as stack:
         hubs = [Hub(model, name, server, acknowledge=acknowledge) for model, name in zip(models, channels, strict=True)]
-        with _stopping_on_signals() as stopped:
+        stopped = threading.Event()
+        with stopping_on_signals(stopped.set):
             for one in hubs:
                 stack.enter_context(one)
             buses = {one.channel: partial(HubBus, one) for one in hubs}
@@ -80,17 +81,6 @@ def hub(
                     typer.echo(_line(one.status()), err=True)
         for line in (*(_line(one.status()) for one in hubs), *outlets.summary()):
             typer.echo(line)
-
-
-@contextmanager
-def _stopping_on_signals() -> Iterator[threading.Event]:
-    stopped = threading.Event()
-    former = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stopped
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
 
 
 def _line(status: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.options import Channels, Force, FromS, RecordingFiles, ToS, names_of
 from rig.cli.progress import reporting
 
 
@@ -20,16 +21,14 @@ class Only(StrEnum):
 
 
 def cut(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of one run, in any order.")],
+    files: RecordingFiles,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="The new file, ends in .mcap.")],
-    from_s: Annotated[float, typer.Option("--from", metavar="S", help="Begin, in s of simulated time.")] = -math.inf,
-    to_s: Annotated[float, typer.Option("--to", metavar="S", help="End, in s of simulated time.")] = math.inf,
+    from_s: FromS = None,
+    to_s: ToS = None,
     only: Annotated[Only | None, typer.Option(help="Leave the others out.")] = None,
-    channels: Annotated[
-        str, typer.Option(metavar="NAME,NAME...", help="Keep only these channels of the sensors.")
-    ] = "",
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    channels: Channels = None,
+    force: Force = False,
 ) -> None:
     """Cut a recording, or join several files of one run; what is kept is kept byte for byte, trimmed at the edges."""
     from recorder.reader import join
@@ -41,10 +40,10 @@ def cut(
         made = cut_recording(
             join(files),
             output,
-            from_s=from_s,
-            to_s=to_s,
+            from_s=-math.inf if from_s is None else from_s,
+            to_s=math.inf if to_s is None else to_s,
             only=None if only is None else Only(only).value,
-            channels=tuple(name.strip() for name in channels.split(",") if name.strip()),
+            channels=tuple(names_of(channels)),
             force=force,
             on_progress=lambda done: report.part(done, f"writing {output}"),
         )

@@ -7,28 +7,27 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.options import Force, FromS, RecordingFile, ToS, names_of
 from rig.errors import InputError
 
 
 def export(
-    file: Annotated[Path, typer.Argument(help="A recording (.mcap).")],
+    file: RecordingFile,
     *,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="File to write: .mf4, .tdms, .uff, .csv, .parquet or .wav.")
     ],
     channels: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--channel", "-c", metavar="NAME", help="A channel, a group, or truth.TABLE[.COLUMN]; repeatable."
-        ),
+        str | None,
+        typer.Option("--channels", metavar="NAME,...", help="Only these channels, groups, or truth.TABLE[.COLUMN]."),
     ] = None,
     truth: Annotated[bool, typer.Option("--truth", help="The model's true state as well.")] = False,
     unit: Annotated[str, typer.Option(help="engineering, volts or counts.")] = "engineering",
-    from_s: Annotated[float | None, typer.Option(help="Start, in s of simulated time.")] = None,
-    to_s: Annotated[float | None, typer.Option(help="End, in s of simulated time.")] = None,
+    from_s: FromS = None,
+    to_s: ToS = None,
     rate_hz: Annotated[float | None, typer.Option(help="Bring all channels to this rate, in Hz.")] = None,
     method: Annotated[str, typer.Option(help="How: polyphase (band-limited) or linear.")] = "polyphase",
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Force = False,
 ) -> None:
     """Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration where they have a place.
 
@@ -48,7 +47,7 @@ def export(
     check_output(output, force=force)
     recording = Recording.open(file)
     selection = select(
-        recording, channels=channels or [], truth=truth, unit=unit, from_s=from_s, to_s=to_s, merged=merged(output)
+        recording, channels=names_of(channels), truth=truth, unit=unit, from_s=from_s, to_s=to_s, merged=merged(output)
     )
     with reporting() as reporter:
 

@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Engine, Json, Parameters
+from rig.cli.options import (
+    Channels,
+    Engine,
+    Force,
+    FromS,
+    Json,
+    Parameters,
+    RecordingFile,
+    ReportFile,
+    ToS,
+    names_of,
+    pairs,
+)
 from rig.cli.progress import reporting
 from rig.cli.tables import new_table, table_console
 
@@ -18,12 +30,12 @@ if TYPE_CHECKING:
 
 
 def identify(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording.")],
+    file: RecordingFile,
     *,
     fit: Annotated[
         list[str],
         typer.Option(
-            metavar="KEY[,KEY]",
+            metavar="KEY,...",
             help="What is asked for: a parameter, a number of the scene, or of a blow (hammer.1.force_n).",
         ),
     ],
@@ -35,10 +47,9 @@ def identify(
         list[str] | None,
         typer.Option(metavar="KEY=VALUE+-SIGMA", help="What is known from elsewhere: mean and standard deviation."),
     ] = None,
-    window: Annotated[
-        str | None, typer.Option(metavar="FROM:TO", help="Use samples between these simulated times only, in s.")
-    ] = None,
-    channels: Annotated[str | None, typer.Option(metavar="NAME[,NAME]", help="Use these channels only.")] = None,
+    from_s: FromS = None,
+    to_s: ToS = None,
+    channels: Channels = None,
     parameters: Parameters = None,
     scene: Annotated[
         str | None, typer.Option(metavar="SCENE", help="What was done, where the recording does not tell.")
@@ -47,9 +58,7 @@ def identify(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE.toml", help="Write the fitted parameter set.")
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a report with pictures, .html or .pdf.")
-    ] = None,
+    report: ReportFile = None,
     precision: Annotated[
         float, typer.Option(min=1e-9, help="Relative half width of the intervals that is fine enough.")
     ] = 1e-4,
@@ -58,8 +67,14 @@ def identify(
     whole: Annotated[
         bool, typer.Option("--whole", help="Go on as far as the model stays linear, even if it no longer fits.")
     ] = False,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact", help="Of an imported log: take its clock, the shaft's angle and the blow as it tells them."
+        ),
+    ] = False,
     json_output: Json = False,
-    force: Annotated[bool, typer.Option(help="Replace existing files.")] = False,
+    force: Force = False,
 ) -> None:
     """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell."""
     import json
@@ -68,6 +83,7 @@ def identify(
     from replays.identification import ask
     from replays.identification import identify as run
     from replays.identification.document import check_set, fitted_set, identification_document, write_set
+    from replays.identification.nuisance import asked_along, is_imported, shortly_before, turned
     from replays.identification.summary import report_of
     from replays.report import check_report
     from rig.kernels import COMPILE_NOTICE, compiled_before
@@ -76,17 +92,25 @@ def identify(
         check_set(output, force=force)
     if report is not None:
         check_report(report, force=force)
-    keys = [key.strip() for part in fit for key in part.split(",") if key.strip()]
+    keys = [key for part in fit for key in names_of(part)]
     recording = Recording.open(file)
+    experiment = _experiment(recording, parameters=parameters, scene=scene, engine=engine)
+    priors = {key: _two("prior", text, "+-") for key, text in pairs("--prior", prior, "KEY=VALUE+-SIGMA").items()}
+    if is_imported(recording) and not exact:
+        experiment = turned(recording, experiment)
+        along = asked_along(experiment, keys)
+        keys += list(along)
+        priors = {key: known for key, known in along.items() if known is not None} | priors
+        from_s = shortly_before(experiment) if from_s is None else from_s
     question = ask(
         recording,
-        _experiment(recording, parameters=parameters, scene=scene, engine=engine),
+        experiment,
         keys,
-        start={key: _number("start", text) for key, text in _pairs("start", start)},
-        bounds={key: _two("bounds", text, ":") for key, text in _pairs("bounds", bounds)},
-        priors={key: _two("prior", text, "+-") for key, text in _pairs("prior", prior)},
-        channels=[name.strip() for name in channels.split(",")] if channels else None,
-        window=_two("window", window, ":") if window else None,
+        start={key: _number("start", text) for key, text in pairs("--start", start, "KEY=VALUE").items()},
+        bounds={key: _two("bounds", text, ":") for key, text in pairs("--bounds", bounds, "KEY=LOW:HIGH").items()},
+        priors=priors,
+        channels=names_of(channels) or None,
+        window=(from_s, to_s),
     )
     if not compiled_before():
         typer.echo(COMPILE_NOTICE, err=True)
@@ -114,18 +138,6 @@ def _experiment(recording: Recording, *, parameters: str | None, scene: str | No
     if parameters is not None:
         experiment = experiment.changed({"parameters": parameters, "set": {}})
     return experiment.changed({"engine.name": engine}) if engine is not None else experiment
-
-
-def _pairs(option: str, given: list[str] | None) -> list[tuple[str, str]]:
-    from rig.errors import InputError
-
-    pairs = []
-    for text in given or []:
-        key, sign, value = text.partition("=")
-        if not sign:
-            raise InputError(option, "of the form KEY=...", text)
-        pairs.append((key.strip(), value.strip()))
-    return pairs
 
 
 def _number(option: str, text: str) -> float:

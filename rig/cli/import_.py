@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.options import Force
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,18 +16,23 @@ if TYPE_CHECKING:
 
 def import_(
     files: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
             metavar="FILE...", help=".mf4, .tdms, .uff, .csv, .txt, .lvm, .parquet or .wav; several to align."
         ),
-    ],
+    ] = None,
     *,
     mapping: Annotated[Path | None, typer.Option("--mapping", "-m", help="Which signal becomes which channel.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Recording to write, ends in .mcap.")] = None,
     template: Annotated[
-        Path | None, typer.Option("--template", metavar="FILE.toml", help="Write a starting mapping instead.")
+        Path | None,
+        typer.Option(
+            "--template",
+            metavar="FILE.toml",
+            help="Write a starting mapping instead; without logs, an example with every option.",
+        ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Force = False,
 ) -> None:
     """Turn logs of a real rig into a recording that `rig info`, `view`, `replay`, `validate` and `identify` read.
 
@@ -38,8 +44,10 @@ def import_(
     if template is not None:
         if output is not None:
             raise InputError("--output", "left out with --template", str(output))
-        _write_template(files, template, force=force)
+        _write_template(files or [], template, force=force)
         return
+    if not files:
+        raise InputError("FILE", "given", None)
     if output is None or mapping is None:
         raise InputError("--output", "given", None)
     from recorder.writer import check_destination
@@ -67,14 +75,15 @@ def import_(
 
 def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
     from replays.formats.export import check_output
-    from replays.formats.template import template
+    from replays.formats.template import example, template
 
     check_output(path, force=force, suffixes=(".toml",))
-    text = template(files)
+    text = template(files) if files else example()
     part = path.with_name(path.name + ".part")
     part.write_text(text, encoding="utf-8")
     part.replace(path)
-    typer.echo(f"{path}: a mapping to start from; lines with PLEASE CHECK are guesses")
+    told = "a mapping to start from; lines with PLEASE CHECK are guesses" if files else "an example with every option"
+    typer.echo(f"{path}: {told}")
 
 
 def _tell(conversion: Conversion, output: Path) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import Json
+from rig.cli.options import Json, RecordingFiles
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,10 +17,11 @@ if TYPE_CHECKING:
     from recorder.reader import Recording
 
 _MOST_GAPS = 20
+_SCENE = (("", "scene"), ("seed", "seed"), ("parameters", "parameter_set"))
 
 
 def info(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="A recording, finished or not; or its parts.")],
+    files: RecordingFiles,
     *,
     quick: Annotated[bool, typer.Option("--quick", help="Without reading the samples.")] = False,
     as_json: Json = False,
@@ -40,6 +42,7 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
     from dataclasses import asdict
 
     from recorder.health import examine
+    from recorder.schemas import GAPS
 
     about = recording.metadata["rig"]
     parts = [
@@ -62,7 +65,10 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
         "ended": recording.end_reason,
         **{name: about.get(name, "") for name in ("scene", "seed", "parameter_set", "created", "view_rate_hz")},
         "messages": recording.messages,
-        "gaps": [asdict(gap) for gap in recording.gaps],
+        "gaps": [
+            {**asdict(gap), "time_s": time_ns / 1e9}
+            for gap, (time_ns, _) in zip(recording.gaps, recording.payloads(GAPS), strict=True)
+        ],
         "events": recording.events,
     }
     if not quick:
@@ -85,19 +91,21 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
         file = f"{file} and {len(document['parts']) - 1} more"
     rows: list[tuple[str, str]] = [
         ("file", f"{file}, {size_mb:.1f} MB, {state}"),
-        ("scene", f"{document['scene']}, seed {document['seed']}, parameters {document['parameter_set']}"),
+        ("scene", ", ".join(f"{text} {document[name]}".strip() for text, name in _SCENE if document[name])),
         ("recorded", document["created"]),
     ]
     streams = document.get("streams", {})
     if filled := [stream for stream in streams.values() if stream["rows"]]:
         first_s = min(stream["first_time_s"] for stream in filled)
         last_s = max(stream["last_time_s"] for stream in filled)
-        rows.append(("time", f"{first_s:.4f} s to {last_s:.4f} s ({last_s - first_s:.4f} s simulated)"))
+        rows.append(("time", f"{first_s:.4f} s to {last_s:.4f} s ({last_s - first_s:.4f} s)"))
     for part in document["parts"]:
         for name in ("trigger", "cut", "recovered"):
             if name in part:
                 rows.append((name, ", ".join(f"{key} {value}" for key, value in part[name].items() if value)))
     rows.append(("ended", document["ended"]))
+    if "health" in document:
+        rows += _verdict(document)
     for name, value in rows:
         console.print(Text.assemble((f"{name:10}", "bold"), value), soft_wrap=True)
     if len(document["parts"]) > 1:
@@ -114,13 +122,37 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
         stamp = f"{time_s:9.4f} s  " if isinstance(time_s, float | int) else " " * 13
         style = "bold" if event.get("event") == "note" else ""
         console.print(Text(stamp + event_text(event)[1], style=style), soft_wrap=True)
-    gaps = recording.gaps
+    gaps = document["gaps"]
     console.print(f"gaps noted by the recorder: {len(gaps) or 'none'}")
     for gap in gaps[:_MOST_GAPS]:
-        what = f"{gap.size} messages" if gap.index < 0 else f"{gap.size} rows from {gap.index} on"
-        console.print(f"  {gap.key}: {what}", soft_wrap=True)
+        what = f"{gap['size']} messages" if gap["index"] < 0 else f"{gap['size']} rows from {gap['index']} on"
+        console.print(f"  {gap['time_s']:9.4f} s  {gap['key']}: {what}", soft_wrap=True)
     if len(gaps) > _MOST_GAPS:
         console.print(f"  and {len(gaps) - _MOST_GAPS} more")
+
+
+def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
+    """What is lost and what is in doubt, in a line each."""
+    lost = sum(stream["lost"] for stream in document["streams"].values())
+    health = document["health"]
+    doubtful = [channel["name"] for channel in health["channels"] if channel["findings"]]
+    doubts = len(health["findings"]) + len(health["warnings"])
+    found = [f"doubts in {', '.join(doubtful)}"] if doubtful else []
+    found += [f"{doubts} {'doubt' if doubts == 1 else 'doubts'} on the whole"] if doubts else []
+    return [
+        ("lost", f"{lost} rows in {len(document['gaps'])} gaps" if lost or document["gaps"] else "nothing"),
+        ("health", "; ".join(found) or f"{len(health['channels'])} channels without a doubt"),
+    ]
+
+
+def _number(value: float | None, noise: float) -> str:
+    """A value to the digit in which its noise is."""
+    if value is None:
+        return ""
+    digits = -math.floor(math.log10(abs(noise))) if noise else 0
+    if not 0 <= digits <= 6 or abs(value) >= 1e7:
+        return f"{value:.4g}"
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # no minus before a zero
 
 
 def _print_parts(console: Console, parts: list[dict[str, Any]]) -> None:
@@ -176,8 +208,8 @@ def _print_channels(console: Console, recording: Recording, health: dict[str, An
             if seen is None:
                 table.add_row(*row, *([""] * 5 if found else []), "" if found else channel.label)
                 continue
-            names = ("mean", "low", "high", "noise", "noise_calibrated")
-            numbers = [f"{seen[name]:.3g}" if seen[name] is not None else "?" for name in names]
+            numbers = [_number(seen[name], seen["noise"] or channel.scale) for name in ("mean", "low", "high")]
+            numbers += [f"{seen[name]:.2g}" if seen[name] is not None else "" for name in ("noise", "noise_calibrated")]
             table.add_row(
                 *row, *numbers, "; ".join(seen["findings"]) or "good", style="yellow" if seen["findings"] else None
             )
@@ -208,8 +240,6 @@ def _print_health(console: Console, health: dict[str, Any]) -> None:
 
 def _without_nan(value: Any) -> Any:
     """The same document with None for what was not measured: JSON has no nan."""
-    import math
-
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):

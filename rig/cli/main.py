@@ -47,7 +47,7 @@ from rig.cli import (
     validate,
     view,
 )
-from rig.errors import InputError, SimulationError
+from rig.errors import DiskError, InputError, SimulationError
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
@@ -91,17 +91,19 @@ _PANELS: dict[str, dict[str, Any]] = {
         "seek": seek.seek,
         "rate": rate.rate,
     },
-    "Recordings and pictures": {
-        "validate": validate.validate,
-        "sessions": sessions.sessions,
+    "Recordings": {
         "record": record.record,
         "view": view.view,
         "info": info.info,
-        "identify": identify.identify,
         "cut": cut.cut,
         "recover": recover.recover,
         "import": import_.import_,
         "export": export.export,
+    },
+    "Recordings against the model": {
+        "validate": validate.validate,
+        "identify": identify.identify,
+        "sessions": sessions.sessions,
     },
     "Without a clock": {
         "simulate": simulate.simulate,
@@ -131,7 +133,7 @@ def _rig(
 for _panel, _commands in _PANELS.items():
     for _name, _function in _commands.items():
         # A negative value such as `rig speed -1` is a value, not an option: the rig explains what is wrong with it.
-        _settings = {"ignore_unknown_options": True} if _name == "speed" else {}
+        _settings = {"ignore_unknown_options": True} if _name in ("speed", "rate", "seek", "step") else {}
         app.command(_name, rich_help_panel=_panel, context_settings=_settings)(_function)
 
 can.app.command()(can_messages.dbc)
@@ -145,7 +147,7 @@ def main(arguments: list[str] | None = None) -> None:
         code = app(args=arguments, standalone_mode=False)
     except InputError as error:
         _fail(str(error))
-    except SimulationError as error:
+    except (SimulationError, DiskError) as error:
         _fail(str(error), status=1)
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx is not None else "rig"

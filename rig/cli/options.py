@@ -1,4 +1,8 @@
-"""Arguments and options that several commands take, each worded once."""
+"""Arguments and options that several commands take, each worded once, and how their texts are read.
+
+`--output`, `-o` is what a command makes, `--report` a report beside it. Parts of a recording are `--from` and `--to` in
+s of simulated time; names are joined by commas; what is KEY=VALUE is repeated.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from rig.errors import InputError
 
 SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="Name of a scene, or the path of a scene file.")]
 SetName = Annotated[str, typer.Argument(metavar="[SET]", help="A parameter set, by name or path.")]
@@ -18,3 +24,47 @@ DurationS = Annotated[float | None, typer.Option(help="Length of the run, in s."
 Seed = Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")]
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")]
 Json = Annotated[bool, typer.Option("--json", help="As a JSON document.")]
+RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap), finished or cut off.")]
+_RECORDING_FILES = typer.Argument(
+    metavar="FILE...", help="A recording (.mcap), finished or cut off, or its parts in any order."
+)
+RecordingFiles = Annotated[list[Path], _RECORDING_FILES]
+OptionalRecordingFiles = Annotated[list[Path] | None, _RECORDING_FILES]
+FromS = Annotated[float | None, typer.Option("--from", metavar="S", help="Where to begin, in s of simulated time.")]
+ToS = Annotated[float | None, typer.Option("--to", metavar="S", help="Where to end, in s of simulated time.")]
+Channels = Annotated[str | None, typer.Option("--channels", metavar="NAME,...", help="Only these channels.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
+ReportFile = Annotated[
+    Path | None, typer.Option("--report", metavar="FILE", help="Write a report with pictures, .html or .pdf.")
+]
+Listen = Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where to listen.")]
+Expose = Annotated[
+    bool, typer.Option("--expose", help="Allow --listen and --can-socketcand on a host other than 127.0.0.1.")
+]
+
+
+def names_of(text: str | None) -> list[str]:
+    """The names in a list that is joined by commas; none where it was not given."""
+    return [name.strip() for name in (text or "").split(",") if name.strip()]
+
+
+def pairs(option: str, texts: list[str] | None, form: str) -> dict[str, str]:
+    """The two sides of texts such as KEY=VALUE.
+
+    Args:
+        option: Its name, for errors.
+        texts: What was given.
+        form: What each text should look like, for errors.
+
+    Raises:
+        InputError: A text has no such form, or a left side comes twice.
+    """
+    found: dict[str, str] = {}
+    for text in texts or []:
+        left, equals, right = (side.strip() for side in text.partition("="))
+        if not (left and equals and right):
+            raise InputError(option, form, text)
+        if left in found:
+            raise InputError(option, f"given once for {left}", text)
+        found[left] = right
+    return found

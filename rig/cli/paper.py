@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Json
+from rig.cli.options import Force, Json
 from rig.cli.progress import reporting
 from rig.cli.tables import new_table, table_console
 from rig.errors import InputError
@@ -28,7 +28,7 @@ def paper(
         bool, typer.Option("--quick/--full", help="Few, short runs (some seconds), or all of them (about a minute).")
     ] = False,
     processes: Annotated[int, typer.Option(min=1, max=64, help="Processes at a time.")] = 2,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Force = False,
     json_output: Json = False,
 ) -> None:
     """Make the paper's figures, tables and claims again, as printed and corrected, each with a verdict."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.connection import Connect
+from rig.cli.options import Force
 from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 
@@ -45,7 +46,7 @@ def record(
     history: Annotated[
         bool, typer.Option(help="From the start of the run on, as far as the rig's cache reaches.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    force: Force = False,
     rotate_mb: Annotated[
         float | None,
         typer.Option(help="A new file at about this size, in MB: NAME.0000.mcap, ...", rich_help_panel=_FILES),

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.options import Force
 from rig.cli.progress import reporting
 from rig.errors import InputError
 
@@ -18,7 +19,7 @@ def recover(
         Path | None,
         typer.Option("--output", "-o", help="The new file; without it FILE.recovered.mcap, beside the other."),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Force = False,
 ) -> None:
     """Make finished recordings of files that were cut off or damaged; these stay as they are."""
     from recorder.rewrite import recovered_path

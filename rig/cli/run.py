@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,13 +19,13 @@ from rig.cli.can_output import (
     CanSocketcand,
     can_output,
 )
-from rig.cli.options import Changes, DurationS, Engine, Parameters, SceneName, Seed
+from rig.cli.display import all_lateness, lateness, showing, stopping_on_signals
+from rig.cli.options import Changes, DurationS, Engine, Expose, Listen, Parameters, SceneName, Seed, pairs
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from rig.pacing import Clock
-    from rig.service import Service
 
 
 class Pace(StrEnum):
@@ -49,10 +45,8 @@ def run(
     block_ms: Annotated[
         float, typer.Option(help="Length of a published block, in ms; the last 3000 are kept for clients that stall.")
     ] = 10.0,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = DEFAULT_ENDPOINT,
-    expose: Annotated[
-        bool, typer.Option("--expose", help="Allow --listen and --can-socketcand on a host other than 127.0.0.1.")
-    ] = False,
+    listen: Listen = DEFAULT_ENDPOINT,
+    expose: Expose = False,
     parameters: Parameters = None,
     changes: Changes = None,
     engine: Engine = None,
@@ -109,7 +103,7 @@ def run(
                 bus.start(paced=paced)
                 typer.echo(f"rig: {bus}", err=True)
         typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
-        with stopping_on_signals(service.stop), _showing(service):
+        with stopping_on_signals(service.stop), showing(service.status, _words):
             summary = service.run()
     _print_summary(summary)
     if bus is not None:
@@ -129,12 +123,7 @@ def scene_overrides(
     Raises:
         InputError: A change is not of the form KEY=VALUE.
     """
-    overrides = {}
-    for text in changes:
-        key, equals, value = text.partition("=")
-        if not equals or not key.strip() or not value.strip():
-            raise InputError("--set", "KEY=VALUE, such as drive.speed_hz=5.2", text)
-        overrides[key.strip()] = value.strip()
+    overrides = pairs("--set", changes, "KEY=VALUE, such as drive.speed_hz=5.2")
     named = {"parameters": parameters, "engine.name": engine, "duration_s": duration_s, "seed": seed}
     return overrides | {key: str(value) for key, value in named.items() if value is not None}
 
@@ -156,77 +145,25 @@ def _clock(pace: Pace) -> Clock:
     return Lockstep() if pace is Pace.LOCKSTEP else FreeRun()
 
 
-@contextmanager
-def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """SIGINT and SIGTERM end the run in good order; a second SIGINT interrupts at once."""
-
-    def handle(number: int, _: object) -> None:
-        if number == signal.SIGINT:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        stop()
-
-    former = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
-def _showing(service: Service) -> Iterator[None]:
-    """Show the status while the run lasts: one live line on a terminal, else a line every 5 s."""
-    done = threading.Event()
-    # A thread of its own, so that a terminal that is held up (Ctrl-S) holds up nothing else.
-    show = _show_live if sys.stderr.isatty() else _show_lines
-    thread = threading.Thread(target=show, args=(service, done), name="display", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join(timeout=1.0)
-
-
-def _show_live(service: Service, done: threading.Event) -> None:
-    from rich.console import Console
-    from rich.live import Live
-
-    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
-        while not done.wait(0.5):
-            live.update(_line(service.status()), refresh=True)
-
-
-def _show_lines(service: Service, done: threading.Event) -> None:
-    while not done.wait(5.0):
-        typer.echo(_line(service.status()), err=True)
-
-
-def _line(status: dict[str, Any]) -> str:
-    late, queue = status["lateness_ms"], status["queue"]
-    parts = [
+def _words(status: dict[str, Any]) -> list[str]:
+    spin_hz = status["spin_hz"]
+    return [
         f"{status['time_s']:9.2f} s",
+        *([] if spin_hz is None else [f"spin {spin_hz:.2f} Hz"]),
         f"x{status['real_time_factor']:.4f}",
-        f"late p99 {late['p99']:.2f} max {late['max']:.2f} ms",
+        lateness(status),
         f"overruns {status['overruns']}",
-        f"dropped {queue['dropped']}",
-        f"clients {len(status['clients'])}",
+        f"dropped {status['queue']['dropped']}",
     ]
-    if status["spin_hz"] is not None:
-        parts.insert(1, f"spin {status['spin_hz']:.2f} Hz")
-    if status["congestion"].get("stalled_links"):
-        parts.append(f"stalled links {status['congestion']['stalled_links']:.0f}")
-    return "  ".join(parts)
 
 
 def _print_summary(summary: dict[str, Any]) -> None:
-    late, queue = summary["lateness_ms"], summary["queue"]
+    queue = summary["queue"]
     typer.echo(
         f"scene {summary['scene']}: {summary['reason']} at {summary['time_s']:.3f} s after {summary['wall_s']:.2f} s"
     )
     typer.echo(
-        f"real-time factor {summary['real_time_factor']:.6f}, lateness p50 {late['p50']:.3f} p99 {late['p99']:.3f}"
-        f" max {late['max']:.3f} last {late['last']:.3f} ms, overruns {summary['overruns']}"
+        f"real-time factor {summary['real_time_factor']:.6f}, {all_lateness(summary)}, overruns {summary['overruns']}"
     )
     typer.echo(
         f"{summary['samples_published']} samples a channel published, blocks dropped {queue['dropped']},"

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.options import Force
 from rig.cli.progress import reporting
 from rig.errors import InputError
 
@@ -15,7 +16,7 @@ def sessions(
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Only these.")] = None,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to.")],
-    force: Annotated[bool, typer.Option(help="Replace existing files.")] = False,
+    force: Force = False,
 ) -> None:
     """Make the reference sessions anew: small recordings with their quantities as text, to be reviewed as a diff."""
     from replays.sessions import SESSIONS, make

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import Changes, DurationS, Engine, Parameters, SceneName, Seed
+from rig.cli.options import Changes, DurationS, Engine, Force, Parameters, SceneName, Seed
+from rig.cli.progress import reporting
 
 
 def simulate(
@@ -20,18 +21,14 @@ def simulate(
     duration_s: DurationS = None,
     seed: Seed = None,
     check: Annotated[bool, typer.Option("--check", help="Run it again by finer steps and tell the error.")] = False,
-    force: Annotated[bool, typer.Option(help="Replace an existing file.")] = False,
+    force: Force = False,
 ) -> None:
     """Simulate a scene as fast as it goes and write every state, force and sensor to a file, named and with units."""
-    import sys
     import time
 
     from rig.pacing import rare_collections
 
     with rare_collections():
-        from rich.console import Console
-        from rich.progress import Progress
-
         from replays.export import check_run_output, writer_for
         from rig.cli.run import scene_overrides
         from rig.scenes import load_scene
@@ -52,15 +49,11 @@ def simulate(
         if not compiled_before():
             typer.echo(COMPILE_NOTICE, err=True)
         simulation.warm_up()
-    with (
-        Progress(console=Console(file=sys.stderr), transient=True, disable=not sys.stderr.isatty()) as progress,
-        writer_for(output, simulation, force=force) as writer,
-    ):
+    with reporting() as reporter, writer_for(output, simulation, force=force) as writer:
         begin = time.perf_counter()
-        bar = progress.add_task(scene, total=simulation.end_tick)
         for frame in frames(simulation):
             writer.write(frame)
-            progress.update(bar, completed=simulation.tick)
+            reporter.part(simulation.tick / (simulation.end_tick or simulation.tick), scene)
     seconds = simulation.tick / simulation.tick_rate_hz
     factor = seconds / (time.perf_counter() - begin)
     health = simulation.health()

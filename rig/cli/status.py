@@ -86,7 +86,9 @@ def status_table(document: dict[str, Any]) -> Table:
     table.add_row("simulated time", f"{document['time_s']:.3f} s{end} (tick {document['tick']})")
     if (play := document.get("replay")) is not None:
         rate = "burst" if play["rate"] is None else f"x{play['rate']:g}"
-        if play["paused"]:
+        if play["waiting_for"]:
+            rate += f", waiting for clients ({len(document['clients'])} of {play['waiting_for']})"
+        elif play["paused"]:
             rate += ", paused"
         passes = "endless" if play["passes"] is None else play["passes"]
         table.add_row("replay of", ", ".join(play["files"]))

@@ -8,6 +8,7 @@ import typer
 
 from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
 from rig.cli.connection import Connect
+from rig.cli.display import stopping_on_signals
 from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 
@@ -23,7 +24,6 @@ def twins(
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
     """Serve the six instruments of a running rig to their drivers; Ctrl-C switches them off."""
-    import signal
     import threading
 
     from drivers.twins import Twins
@@ -43,12 +43,7 @@ def twins(
             for twin in serving.twins:
                 typer.echo(f"{twin.CODEC.address.name:14s}{twin.url}")
             typer.echo("rig: open one with its driver, such as drivers.hammer.driver.Hammer; Ctrl-C ends", err=True)
-            ends = (signal.SIGINT, signal.SIGTERM)
-            before = {number: signal.signal(number, lambda *_: done.set()) for number in ends}
-            try:
+            with stopping_on_signals(done.set):
                 done.wait()
-            finally:
-                for number, handler in before.items():
-                    signal.signal(number, handler)
     except NoReplyError as error:
         raise RefusedError(str(error)) from None

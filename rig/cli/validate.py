@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Changes, Engine, Json
+from rig.cli.options import Changes, Engine, Force, Json, RecordingFile, ReportFile
 from rig.cli.progress import reporting
 from rig.cli.tables import new_table, table_console
 
@@ -20,7 +20,7 @@ _SAID = {True: "good", False: "FAILS", None: ""}
 
 
 def validate(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap).")],
+    file: RecordingFile,
     *,
     criteria: Annotated[
         Path | None,
@@ -31,10 +31,8 @@ def validate(
     declared: Annotated[
         bool, typer.Option("--declared", help="Judge by the declared comparison even where every bit is equal.")
     ] = False,
-    report: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a report with pictures, .html or .pdf.")
-    ] = None,
-    force: Annotated[bool, typer.Option(help="Replace an existing report.")] = False,
+    report: ReportFile = None,
+    force: Force = False,
     json_output: Json = False,
 ) -> None:
     """Do a recording again and hold it against the model: bit by bit, then by declared criteria.
@@ -80,6 +78,8 @@ def _show(found: Validation) -> None:
     changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
     console.print(f"{found.path.name}, scene {found.scene}" + (f", validated with {changed}" if changed else ""))
     console.print(found.bits_line)
+    for line in found.fitted:
+        console.print(line)
     for line in found.calibration:
         console.print(f"calibration: {line}")
     if not found.bit_exact or found.declared:

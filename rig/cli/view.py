@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.connection import Connect
-from rig.errors import InputError, RefusedError
+from rig.cli.options import Force, OptionalRecordingFiles
+from rig.errors import InputError, RefusedError, check_new_file
 from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def view(
-    file: Annotated[Path | None, typer.Argument(help="Recording to view (.mcap, or what is left of one).")] = None,
+    files: OptionalRecordingFiles = None,
     *,
     live: Annotated[bool, typer.Option("--live", help="View the running rig.")] = False,
     connect: Connect = DEFAULT_ENDPOINT,
@@ -32,12 +33,13 @@ def view(
     at_s: Annotated[
         float | None, typer.Option(help="Simulated time of the picture, in s; default: the last contact, else the end.")
     ] = None,
+    force: Force = False,
 ) -> None:
     """View a recording, or the running rig, in rerun.
 
     Opens a window where there is a screen; otherwise serves the viewer on 127.0.0.1 and prints the address.
     """
-    _check(file, live=live, web=web, save=save, screenshot=screenshot, at_s=at_s)
+    _check(files, live=live, web=web, save=save, screenshot=screenshot, at_s=at_s, force=force)
     _hush()
     from recorder.viewer.window import WindowError
 
@@ -45,17 +47,24 @@ def view(
         with _interruptible():
             if live:
                 _view_live(connect, wait_s=wait_s, web=web, save=save)
-            elif file is not None:
-                _view_file(file, web=web, save=save, screenshot=screenshot, at_s=at_s)
+            elif files:
+                _view_file(files, web=web, save=save, screenshot=screenshot, at_s=at_s)
     except WindowError as error:
         raise RefusedError(str(error)) from None
 
 
 def _check(
-    file: Path | None, *, live: bool, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None
+    files: list[Path] | None,
+    *,
+    live: bool,
+    web: bool,
+    save: Path | None,
+    screenshot: Path | None,
+    at_s: float | None,
+    force: bool,
 ) -> None:
     """Refuse what does not go together before anything starts."""
-    if (file is None) != live:
+    if bool(files) == live:
         raise InputError("view", "given either a FILE or --live", "both" if live else "neither")
     if sum((web, save is not None, screenshot is not None)) > 1:
         raise InputError("view", "given at most one of --web, --save and --screenshot", "several")
@@ -65,32 +74,22 @@ def _check(
         raise InputError("--at-s", "used with --screenshot", at_s)
     for option, path, suffix in (("--save", save, ".rrd"), ("--screenshot", screenshot, ".png")):
         if path is not None:
-            if path.suffix != suffix:
-                raise InputError(option, f"a file name that ends in {suffix}", str(path))
-            if not path.absolute().parent.is_dir():
-                raise InputError(option, "in a folder that exists", str(path))
-            _check_writable(option, path)
+            check_new_file(path, field=option, suffixes=(suffix,), force=force)
 
 
-def _check_writable(option: str, path: Path) -> None:
-    new = not path.exists()
-    try:
-        path.open("ab").close()
-    except OSError as error:
-        raise InputError(option, "a file that can be written", f"{path} ({error.strerror})") from None
-    if new:
-        path.unlink()
-
-
-def _view_file(file: Path, *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None) -> None:
-    from recorder.reader import Recording
+def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None) -> None:
+    from recorder.reader import join
     from recorder.viewer import blueprint, window
     from recorder.viewer.canvas import Canvas, new_stream
     from recorder.viewer.file import paint
     from recorder.viewer.geometry import Geometry
+    from recorder.viewer.painter import not_drawn
 
-    recording = Recording.open(file)
-    stream = new_stream(file.name)
+    recording = join(files)
+    name = recording.path.name + (f" and {len(files) - 1} more" if len(files) > 1 else "")
+    for text in not_drawn(recording.table):
+        typer.echo(f"not shown: {text}", err=True)
+    stream = new_stream(name)
     plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
     if save is not None:
         stream.save(save, default_blueprint=plan)
@@ -113,7 +112,7 @@ def _view_file(file: Path, *, web: bool, save: Path | None, screenshot: Path | N
             shown.picture(screenshot, at_s=at_s, end_s=painted.end_s)
             typer.echo(f"{screenshot}: at {at_s:.3f} s")
         else:
-            _tell(shown, file.name)
+            _tell(shown, name)
             _wait_for_the_end(shown)
 
 

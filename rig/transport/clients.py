@@ -21,7 +21,8 @@ _QUIET_S = 0.6
 
 @dataclass(frozen=True, slots=True)
 class _Report:
-    received_index: int
+    received_index: int | None
+    """None: it listens, and has nothing yet."""
     lost: int
     heard_s: float
     room: int | None
@@ -38,6 +39,8 @@ class Clients:
         self._now_s = now_s
         self._lock = threading.Lock()
         self._reports: dict[str, _Report] = {}
+        self._joined: dict[str, int] = {}
+        """Row that was next when a client was first seen that had nothing yet: what it will be measured from."""
         self.malformed = 0
         """Reports that could not be read."""
 
@@ -46,18 +49,27 @@ class Clients:
         name = key.rpartition("/")[2]
         try:
             document = wire.decode_document(payload)
-            room = None if document.get("room") is None else int(document["room"])
-            row = _Report(int(document["received_index"]), int(document.get("lost", 0)), self._now_s(), room)
+            index, room = _whole_or_none(document["received_index"]), _whole_or_none(document.get("room"))
+            row = _Report(index, int(document.get("lost", 0)), self._now_s(), room)
         except (ValueError, KeyError, TypeError):
             self.malformed += 1
             return
         with self._lock:
             for old in [key for key, old in self._reports.items() if row.heard_s - old.heard_s > _FORGOTTEN_S]:
-                del self._reports[old]
+                self._forget(old)
             if document.get("done") is True:
-                self._reports.pop(name, None)
+                self._forget(name)
             elif name in self._reports or len(self._reports) < _MOST:
                 self._reports[name] = row
+
+    def _forget(self, name: str) -> None:
+        self._reports.pop(name, None)
+        self._joined.pop(name, None)
+
+    @property
+    def present(self) -> int:
+        """How many are there: those that reported lately."""
+        return len(self._live())
 
     def rows(self, published: int, rate_hz: float) -> dict[str, dict[str, Any]]:
         """Each client for the status.
@@ -72,7 +84,7 @@ class Clients:
         return {
             name: {
                 "received_index": report.received_index,
-                "lag_s": round(max(0, published - report.received_index) / rate_hz, 4) if rate_hz else 0.0,
+                "lag_s": round(self._lacks(name, report, published) / rate_hz, 4) if rate_hz else 0.0,
                 "last_heard_s": round(now_s - report.heard_s, 3),
                 "lost": report.lost,
             }
@@ -81,19 +93,24 @@ class Clients:
 
     def behind(self, published: int) -> int:
         """Rows that the slowest client still lacks, of those that are there; 0 where nobody reports."""
-        return max((max(0, published - report.received_index) for report in self._live()), default=0)
+        return max((self._lacks(name, report, published) for name, report in self._live().items()), default=0)
 
     def crowded(self, published: int, most: int) -> bool:
         """Whether a client that is there has more on its way than so many rows, or than half of its own room."""
         return any(
-            published - report.received_index > (most if report.room is None else min(most, report.room // 2))
-            for report in self._live()
+            self._lacks(name, report, published) > (most if report.room is None else min(most, report.room // 2))
+            for name, report in self._live().items()
         )
 
-    def _live(self) -> list[_Report]:
+    def _lacks(self, name: str, report: _Report, published: int) -> int:
+        """Rows that a client still has to get."""
+        has = report.received_index
+        return max(0, published - (self._joined.setdefault(name, published) if has is None else has))
+
+    def _live(self) -> dict[str, _Report]:
         now_s = self._now_s()
         with self._lock:
-            return [report for report in self._reports.values() if now_s - report.heard_s < _GONE_S]
+            return {name: report for name, report in self._reports.items() if now_s - report.heard_s < _GONE_S}
 
     def settle(
         self,
@@ -121,3 +138,7 @@ class Clients:
             if self.behind(published) or counts.get("stalled_links", 0):
                 quiet_since = now
             time.sleep(0.1)
+
+
+def _whole_or_none(value: Any) -> int | None:
+    return None if value is None else int(value)

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import can  # noqa: TID253 - the subject
 import numpy as np
@@ -21,7 +22,7 @@ from drivers.console import Console
 from drivers.daq import Daq
 from recorder.reader import Recording
 from recorder.session import RecordingSession
-from replays.player.player import Player
+from replays.player.player import Part, Player
 from replays.player.tape import Tape
 from rig import wire
 from rig.cli.can_output import CanOutput
@@ -57,11 +58,11 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def playing(path: Path, clock: RealTime | FreeRun) -> Iterator[tuple[Player, str]]:
-    """A player that waits to be resumed, at an endpoint of its own."""
+def playing(path: Path, clock: RealTime | FreeRun, **options: Any) -> Iterator[tuple[Player, str]]:
+    """A player that waits for one client, at an endpoint of its own."""
     endpoint = free_endpoint()
     with ZenohServer(endpoint, wait=not isinstance(clock, RealTime)) as server:
-        player = Player(Tape([path]), server, clock, paused=True)
+        player = Player(Tape([path]), server, clock, wait_for=1, **options)
         player.prepare()
         thread = threading.Thread(target=player.run)
         thread.start()
@@ -75,13 +76,8 @@ def playing(path: Path, clock: RealTime | FreeRun) -> Iterator[tuple[Player, str
 @pytest.mark.parametrize("clock", [RealTime, FreeRun])
 def test_recorded_again_it_is_the_same_byte_for_byte(path: Path, tmp_path: Path, clock: type[FreeRun]) -> None:
     again = tmp_path / "again.mcap"
-    with playing(path, clock()) as (player, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
-        session = RecordingSession(client, again, name="recorder")
-        recorder = threading.Thread(target=session.run)
-        recorder.start()
-        until(lambda: "recorder" in player.status()["clients"])
-        Console(client).resume()
-        recorder.join(60.0)
+    with playing(path, clock()) as (_, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
+        RecordingSession(client, again, name="recorder").run()
     assert by_key(_payloads(again)) == by_key(payloads())
     first, second = Recording.open(path), Recording.open(again)
     assert (second.catalogue, second.parameters, second.scene) == (first.catalogue, first.parameters, first.scene)
@@ -98,20 +94,32 @@ def _payloads(path: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def test_a_daq_gets_every_row_of_a_burst(path: Path) -> None:
-    with playing(path, FreeRun()) as (player, endpoint), Daq.open(f"zenoh:{endpoint}", wait_s=10.0) as daq:
-        with ZenohClient(endpoint, wait_s=10.0) as client:
-            console = Console(client)
-            # A subscription takes effect a little after it was made: a DAQ that is there says how far it is.
-            while not any(name.startswith("daq") for name in player.status()["clients"]):
-                console.step_blocks(1)
-            console.resume()
+    # Room for far less than the recording: it must be waited for.
+    with playing(path, FreeRun()) as (_, endpoint), Daq.open(f"zenoh:{endpoint}", buffer_s=0.1, wait_s=10.0) as daq:
         got = list(daq.blocks(1000))
-        first = got[0].index
-        assert first % 200 == 0
-        assert first + sum(map(len, got)) == 200 * BLOCKS
+        assert (got[0].index, sum(map(len, got))) == (0, 200 * BLOCKS)
         assert (daq.dropped, daq.unmatched, sum(daq.lost.values())) == (0, 0, 0)
         force = np.concatenate([samples["P_N"] for samples in got])
-    assert np.allclose(force, Recording.open(path).samples("forces").column("P_N")[first:], rtol=1e-12)
+    assert np.allclose(force, Recording.open(path).samples("forces").column("P_N"), rtol=1e-12)
+
+
+def test_passes_without_end_have_consecutive_rows_for_a_daq(path: Path) -> None:
+    passes = 5
+    options = {"part": Part(loops=None), "renumber": True}
+    with playing(path, FreeRun(), **options) as (_, endpoint), Daq.open(f"zenoh:{endpoint}", wait_s=10.0) as daq:
+        rows = 200 * BLOCKS * passes
+        got = [daq.read(1000) for _ in range(rows // 1000)]
+        assert [samples.index for samples in got] == list(range(0, rows, 1000))
+        assert all(samples.gap == 0 for samples in got)
+        assert (daq.dropped, daq.unmatched, sum(daq.lost.values())) == (0, 0, 0)
+
+
+def test_two_replays_at_one_place_are_refused(path: Path) -> None:
+    with playing(path, RealTime()) as (_, endpoint), command("replay", str(path), "--listen", endpoint) as child:
+        _, errors = child.communicate(timeout=30.0)
+    assert child.returncode == 2
+    assert errors.count("\n") == 1
+    assert errors.startswith("rig: ")
 
 
 def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
@@ -182,10 +190,19 @@ def test_ctrl_c_ends_the_stream_and_says_so(path: Path) -> None:
         child.send_signal(signal.SIGINT)
         output, errors = child.communicate(timeout=30.0)
         until(lambda: bool(events))
-    assert child.returncode == 130
+    assert child.returncode == 0
     assert "replay: stopped" in output
-    assert errors.endswith("rig: interrupted\n")
+    assert "Traceback" not in errors
     assert (events[-1]["event"], events[-1]["reason"]) == ("end", "stopped")
+
+
+def test_clients_that_do_not_come_end_the_command(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from rig.cli.main import main
+
+    with pytest.raises(SystemExit) as end:
+        main(["replay", str(path), "--wait-for", "2", "--wait-s", "0.1", "--listen", free_endpoint()])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.endswith("rig: 0 of 2 clients were there after 0.1 s\n")
 
 
 @pytest.mark.parametrize(
@@ -195,7 +212,8 @@ def test_ctrl_c_ends_the_stream_and_says_so(path: Path) -> None:
         (("FILE", "--rate", "0"), "rate must be a number of 0.01 to 1000"),
         (("FILE", "--rate", "2", "--burst"), "rate must be left out with --burst"),
         (("FILE", "--from", "9"), "from must be within the recording, 0 to 0.6 s"),
-        (("FILE", "--remap", "a"), "--remap must be OLD=NEW"),
+        (("FILE", "--remap", "a"), "--remap must be KEY=KEY"),
+        (("FILE", "--wait-for", "2", "--pause"), "--wait-for must be left out with --pause"),
         (("FILE", "--can-rate", "1000"), "--can must be given with the other --can options"),
     ],
 )

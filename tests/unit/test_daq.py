@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import drivers.examples
+from drivers import stream
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
 from drivers.can.signals import default_messages
@@ -27,6 +28,7 @@ from drivers.samples import Sequence as RowSequence
 from drivers.sources.can import CanSource, Layout
 from drivers.sources.rig import RigSource
 from drivers.twins import Twins
+from rig import wire
 from rig.channels import default_table
 from rig.errors import InputError
 from rig.transport.memory import MemoryClient, MemoryServer
@@ -221,6 +223,17 @@ def test_an_end_that_overtakes_blocks_waits_for_them() -> None:
         rig.index["forces"] = BLOCK
         rig.publish("forces", blocks=2)
         assert sum(map(len, daq)) == 3 * BLOCK
+
+
+def test_an_end_that_does_not_tell_its_rows_gives_the_last_blocks_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "GRACE_S", 0.2)
+    with on_memory(channels=["P_N"]) as (rig, daq):
+        rig.publish("forces")
+        rig.server.publish(wire.EVENTS, b'{"event": "end", "reason": "completed"}')
+        rig.publish("forces", blocks=2)
+        assert [len(samples) for samples in daq.blocks(2 * BLOCK)] == [2 * BLOCK, BLOCK]
+        with pytest.raises(StreamEndedError, match="the rig's run has ended: completed"):
+            daq.read()
 
 
 def test_a_rig_that_is_killed_ends_the_blocks() -> None:

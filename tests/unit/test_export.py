@@ -95,6 +95,8 @@ def test_mcap_holds_events_parameters_and_scene(folder: Path, run: Run) -> None:
     assert [event["event"] for event in recording.events] == ["start", "hammer", "end"]
     assert {key: recording.events[1][key] for key in run.events[0]} == run.events[0]
     assert (recording.events[-1]["time_s"], recording.events[-1]["reason"]) == (DURATION_S, "completed")
+    last = {key: max(block.index + len(block.values) for block in recording.blocks(key)) for key in recording.streams}
+    assert recording.events[-1]["rows"] == last
     friction = recording.parameters["values"]["contact.friction"]
     assert (friction["value"], friction["kind"]) == (0.3, "assumed")
     assert recording.scene["seed"] == 5
@@ -138,7 +140,7 @@ def test_existing_file_is_replaced_only_by_force(suffix: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", ["run.txt", "run", "run.CSV", "run.csv.gz", ".csv"])
 def test_another_suffix_is_refused(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^output must be a file name that ends in \.mcap, \.parquet, \.csv"):
+    with pytest.raises(InputError, match=r"^output must be a file name that ends in \.mcap, \.parquet or \.csv"):
         check_run_output(tmp_path / name, force=False)
 
 
@@ -146,7 +148,7 @@ def test_folders_are_not_made_and_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^output must be in a folder that exists"):
         check_run_output(tmp_path / "none" / "run.csv", force=True)
     (tmp_path / "run.csv").mkdir()
-    with pytest.raises(InputError, match=r"^output must be a new file"):
+    with pytest.raises(InputError, match=r"^output must be a file, not a folder"):
         check_run_output(tmp_path / "run.csv", force=True)
 
 

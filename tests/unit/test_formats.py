@@ -6,6 +6,7 @@ import csv
 import json
 import wave
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +83,8 @@ def test_mdf_by_asammdf(recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / "x.mf4"
     written(recording, path, truth=True)
     with MDF(path) as mdf:
-        names = [group.channel_group.acq_name for group in mdf.groups]
+        groups: list[Any] = list(mdf.groups)
+        names = [group.channel_group.acq_name for group in groups]
         assert names[:5] == list(recording.table.groups)
         assert mdf.header.start_time.timestamp() == pytest.approx(recording.clock[0, 1], abs=1e-3)
         assert json.loads(mdf.header.description)["seed"] == "7"
@@ -158,7 +160,7 @@ def test_uff_by_pyuff(recording: Recording, tmp_path: Path) -> None:
     channels = list(recording.table.channels.values())
     assert list(file.get_set_types()) == [58] * len(channels)
     for n, channel in enumerate(channels):
-        found = file.read_sets(n)
+        found: Any = file.read_sets(n)
         assert (found["id1"], found["ordinate_axis_units_lab"]) == (channel.name, channel.unit)
         np.testing.assert_array_equal(found["data"], recording.samples(channel.group).column(channel.name))
 
@@ -281,12 +283,12 @@ def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp
     [
         (["-o", "x.xls"], "output must be a file name that ends in .mf4, .tdms, .uff"),
         (["-o", "no/x.csv"], "output must be in a folder that exists"),
-        (["-o", "x.csv", "-c", "disk_z"], "channel must be one of disk_x"),
-        (["-o", "x.csv", "-c", "truth.nothing"], "channel must be one of"),
+        (["-o", "x.csv", "--channels", "disk_z"], "channel must be one of disk_x"),
+        (["-o", "x.csv", "--channels", "truth.nothing"], "channel must be one of"),
         (["-o", "x.csv", "--unit", "mils"], "--unit must be engineering, volts or counts"),
         (["-o", "x.csv", "--method", "magic"], "--method must be polyphase or linear"),
-        (["-o", "x.csv", "--from-s", "5"], "range must be in the recording, 0 to 0.11995 s"),
-        (["-o", "x.csv", "--from-s", "0.1", "--to-s", "0.05"], "to_s must be after from_s"),
+        (["-o", "x.csv", "--from", "5"], "range must be in the recording, 0 to 0.11995 s"),
+        (["-o", "x.csv", "--from", "0.1", "--to", "0.05"], "to_s must be after from_s"),
         (["-o", "x.csv", "--rate-hz", "0"], "rate_hz must be between 1 and 1e6"),
         (["-o", "x.tdms", "--rate-hz", "1000", "--unit", "counts"], "unit must be engineering or volts"),
     ],

@@ -46,7 +46,7 @@ def test_writes_a_set_that_a_run_takes_and_a_report(
 ) -> None:
     fitted, page = tmp_path / "fitted.toml", tmp_path / "page.html"
     keys = "contact.friction,contact.stiffness,contact.smoothing_speed,hammer.1.force_n"
-    window = ("--window", "0.015:0.03")
+    window = ("--from", "0.015", "--to", "0.03")
     status = run(file, "--fit", keys, "--parameters", "corrected", *window, "-o", fitted, "--report", page)
     told = capsys.readouterr().out
     assert status == 0
@@ -71,7 +71,7 @@ def test_writes_a_set_that_a_run_takes_and_a_report(
 
 
 def test_json_has_a_number_only_where_there_is_one(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(file, "--fit", "contact.friction,magnet.stiffness", "--window", "0:0.018", "--json") == 0
+    assert run(file, "--fit", "contact.friction,magnet.stiffness", "--from", "0", "--to", "0.018", "--json") == 0
     document = json.loads(capsys.readouterr().out)
     friction, magnet = document["values"]["contact.friction"], document["values"]["magnet.stiffness"]
     assert friction["standing"] == "not seen"
@@ -137,7 +137,7 @@ def test_the_horizon_is_nearer_where_less_is_known(file: Path) -> None:
         (["--fit", "contact.friction", "--start", "magnet.stiffness=1"], "of a key that is fitted"),
         (["--fit", "contact.friction", "--start", "contact.friction=much"], "a number"),
         (["--fit", "contact.friction", "--channels", "truth_x"], "some that the recording has"),
-        (["--fit", "contact.friction", "--window", "5:6"], "a window with samples in it"),
+        (["--fit", "contact.friction", "--from", "5", "--to", "6"], "a window with samples in it"),
         (["--fit", "hammer.2.force_n"], "which has 1 of hammer"),
         (["--fit", "contact.friction", "-o", "fitted.json"], "ends in .toml"),
     ],
@@ -174,7 +174,7 @@ def test_single_samples_that_are_far_off_count_less(file: Path) -> None:
 
 
 def test_a_log_without_a_scene_takes_one_from_elsewhere(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ("--fit", "magnet.stiffness", "--window", "0:0.02", "--channels", "ring_x,ring_y", "--json")
+    arguments = ("--fit", "magnet.stiffness", "--from", "0", "--to", "0.02", "--channels", "ring_x,ring_y", "--json")
     assert run(file, *arguments) == 0
     own = json.loads(capsys.readouterr().out)
     assert run(file, *arguments, "--scene", "hammer") == 0

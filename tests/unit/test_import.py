@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import wave
+from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +16,12 @@ import pytest
 from recorder.reader import Recording
 from replays.experiment import Experiment
 from replays.formats import clock, unit
+from replays.formats import mapping as mappings
 from replays.formats.conversion import Conversion, convert
 from replays.formats.imported import write_recording
-from replays.formats.mapping import load_mapping
-from replays.formats.template import template
+from replays.formats.mapping import FileOptions
+from replays.formats.source import open_source
+from replays.formats.template import example, template
 from rig.cli.main import main
 from rig.errors import InputError
 
@@ -24,7 +29,7 @@ from rig.errors import InputError
 def imported(folder: Path, files: list[Path], mapping: str, *, name: str = "out") -> tuple[Conversion, Recording]:
     path = folder / f"{name}.toml"
     path.write_text(mapping)
-    conversion = convert(files, load_mapping(path))
+    conversion = convert(files, mappings.load_mapping(path))
     write_recording(conversion, folder / f"{name}.mcap")
     return conversion, Recording.open(folder / f"{name}.mcap")
 
@@ -99,7 +104,7 @@ def test_text_with_semicolons_and_decimal_commas(daq_text: tuple[Path, np.ndarra
     assert recording.scene["import"]["channels"]["P_N"]["source"] == "messung.txt Kraft N"
     assert recording.scene["import"]["mapping"]["channels"]["ring_x"]["sign"] == -1
     assert recording.events[0]["event"] == "import"
-    with pytest.raises(InputError, match="scene"):
+    with pytest.raises(InputError, match=r"scene it ran: add \[experiment\] to the mapping"):
         Experiment.of(recording)
 
 
@@ -115,9 +120,6 @@ def test_text_with_semicolons_and_decimal_commas(daq_text: tuple[Path, np.ndarra
     ],
 )
 def test_dialects_are_found_out(text: str, names: list[str], units: list[str] | None, tmp_path: Path) -> None:
-    from replays.formats.mapping import FileOptions
-    from replays.formats.source import open_source
-
     path = tmp_path / "x.csv"
     path.write_text(text)
     if units is None:
@@ -128,6 +130,67 @@ def test_dialects_are_found_out(text: str, names: list[str], units: list[str] | 
     source = open_source(path, FileOptions())
     assert [entry.name for entry in source.entries] == names
     assert [entry.unit for entry in source.entries] == units
+
+
+THREE = [[0.0, 0.1, 0.2], [1.5, 2.5, 3000.0]]
+WITH_HOLES = [[0.0, 0.1, 0.2], [1.0, 2.0, math.nan], [math.nan, math.nan, 5.0]]
+
+
+@pytest.mark.parametrize(
+    ("content", "columns"),
+    [
+        (b"\xef\xbb\xbftime,x [mm]\n0,1.5\n0.1,2.5\n0.2,3000\n", THREE),
+        (b"sep=;\r\ntime;x [mm]\r\n0,0;1,5\r\n0,1;2,5\r\n0,2;3000\r\n", THREE),
+        (b'"time, s","x, mm"\n0,1.5\n0.1,2.5\n0.2,3000\n', THREE),
+        (b'time,x [mm]\n0,"1.5"\n0.1,"2.5"\n0.2,"3,000"\n', THREE),
+        (b"time;x [mm]\n0,0;1,5\n0,1;2,5\n0,2;3.000,0\n", THREE),
+        ("time;x [mm]\n0,0;1,5\n0,1;2,5\n0,2;3\u00a0000,0\n".encode(), THREE),
+        (b"time,x [mm],\n0,1.5,\n0.1,2.5,\n0.2,3000,\n", THREE),
+        (b"time,x [mm]\n0,1.5,\n0.1,2.5,\n0.2,3000,\n", THREE),
+        (b"time;x [mm];\n0,0;1,5\n0,1;2,5\n0,2;3000\n", THREE),
+        (b"time,x [mm]\r\r\n0,1.5\r\r\n0.1,2.5\r\r\n0.2,3000\r\r\n", THREE),
+        (b"time,x [mm]\n\n0,1.5\n0.1,2.5\n\n0.2,3000\n", THREE),
+        ("time\tx [mm]\n0,0\t1,5\n0,1\t2,5\n0,2\t3000\n".encode("utf-16"), THREE),
+        (b"time,x [mm],y\n0,1,\n0.1,2,\n0.2,,5\n", WITH_HOLES),
+        (b"x [mm]\n1,5\n2,5\n3,5\n", [None, [1.5, 2.5, 3.5]]),
+        (b"when,x [mm]\n10:00:00.0,1.5\n10:00:00.1,2.5\n10:00:00.2,3000\n", [[36000, 36000.1, 36000.2], THREE[1]]),
+        (b"Date;x [mm]\n2026-11-21 10:00:00,5;1,5\n2026-11-21 10:00:00,6;2,5\n2026-11-21 10:00:00,7;3000\n",
+         [[0.5, 0.6, 0.7], THREE[1]]),
+        (b"t,x [mm]\n2026-11-21T10:00:00.5+02:00,1.5\n2026-11-21T10:00:00.6+02:00,2.5\n"
+         b"2026-11-21T10:00:00.7+02:00,3000\n",
+         [[0.5, 0.6, 0.7], THREE[1]]),
+    ],
+)  # fmt: skip
+def test_no_line_of_a_text_file_is_lost(content: bytes, columns: list[list[float] | None], tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_bytes(content)
+    source = open_source(path, FileOptions())
+    assert [entry.name for entry in source.entries] == ["x", "y"][: len(columns) - 1]
+    assert source.entries[0].unit == "mm"
+    signals = [source.read(entry) for entry in source.entries]
+    for signal, expected in zip(signals, columns[1:], strict=True):
+        np.testing.assert_array_equal(signal.values, expected)
+    times_s = signals[0].times_s
+    assert (times_s is None) == (columns[0] is None)
+    if times_s is not None:
+        np.testing.assert_allclose(times_s, columns[0] or [], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("time", "hour_utc"), [("2026-11-21T10:00:00+02:00", 8), ("2026-11-21T10:00:00", 10), ("2026-11-21T10:00:00Z", 10)]
+)
+def test_wall_time_of_text(time: str, hour_utc: int, tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text(f"time,P_N [N]\n{time},1\n{time.replace(':00:00', ':00:01')},2\n")
+    conversion, _ = imported(tmp_path, [path], '[channels.P_N]\nsource = "P_N"\n')
+    assert (conversion.start.hour, conversion.start.utcoffset()) == (hour_utc, timedelta(0))
+    assert any("no time zone" in remark for remark in conversion.remarks) == (len(time) == 19)
+
+
+def test_seconds_since_1970_tell_when_it_was(tmp_path: Path) -> None:
+    path = rows_csv(tmp_path / "x.csv", {"time": 1_800_000_000.0 + np.arange(100) / 100, "P_N [N]": np.arange(100.0)})
+    conversion, _ = imported(tmp_path, [path], '[channels.P_N]\nsource = "P_N"\n')
+    assert conversion.start.timestamp() == pytest.approx(1_800_000_000.0, abs=1e-3)
 
 
 def test_labview_measurement_file(tmp_path: Path) -> None:
@@ -210,6 +273,25 @@ def test_mdf_of_another_system_keeps_its_integers(daq_mdf: Path, tmp_path: Path)
     exact = (np.arange(1, 1 + len(edges)) - 0.3) / 40.0
     assert len(edges) == 6
     assert np.all((exact > edges - 1 / 51_200) & (exact <= edges + 1 / 51_200))
+
+
+def test_mdf_masters_in_milliseconds_and_of_an_angle(tmp_path: Path) -> None:
+    from asammdf import MDF, Signal
+
+    path, t = tmp_path / "x.mf4", np.arange(50) / 1000
+    with MDF(version="4.10") as mdf:
+        for number, (name, stamps) in enumerate((("a", 1e3 * t), ("b", t))):
+            mdf.append([Signal(np.arange(50.0), stamps, name=name, unit="N")], common_timebase=True)
+            master: Any = mdf.groups[number].channels[0]
+            master.unit, master.sync_type = ("ms", 1) if name == "a" else ("rad", 2)
+        mdf.save(path)
+    by_time, by_angle = open_source(path, FileOptions()).entries
+    assert by_time.rate_hz == pytest.approx(1000.0)
+    assert by_angle.rate_hz is None
+    _, recording = imported(tmp_path, [path], '[channels.P_N]\nsource = "a"\n')
+    np.testing.assert_allclose(recording.samples("forces").times_s, t, rtol=0, atol=1e-9)
+    with pytest.raises(InputError, match=r"^time\.rate_hz must be given, as the file tells no rate of b"):
+        imported(tmp_path, [path], '[channels.P_N]\nsource = "b"\n', name="angle")
 
 
 def test_a_mean_is_taken_off_within_the_range(tmp_path: Path) -> None:
@@ -326,7 +408,7 @@ def test_parquet_with_instants_and_integers(tmp_path: Path) -> None:
 def test_an_import_that_is_interrupted_leaves_nothing(daq_mdf: Path, tmp_path: Path) -> None:
     path = tmp_path / "m.toml"
     path.write_text(MDF_MAPPING)
-    conversion = convert([daq_mdf], load_mapping(path))
+    conversion = convert([daq_mdf], mappings.load_mapping(path))
 
     def stop(part: float) -> None:
         raise KeyboardInterrupt
@@ -424,6 +506,103 @@ def test_files_lie_as_their_times_of_day_say(tmp_path: Path) -> None:
     np.testing.assert_allclose(samples.column("P_S"), samples.column("P_N"), atol=1e-6)
 
 
+def test_one_group_of_a_file_is_aligned_and_the_others_stay(tmp_path: Path) -> None:
+    """A TDMS file of two devices: the second one's clock is 0.0123 s late, and only its group moves."""
+    from nptdms import ChannelObject, TdmsWriter
+
+    late_s = 0.0123
+    about = {"wf_increment": 1e-3, "wf_start_time": np.datetime64("2026-11-21T10:00:00.000000"), "unit_string": "N"}
+    t = np.arange(1000) / 1000
+    path = tmp_path / "x.tdms"
+    with TdmsWriter(path) as writer:
+        writer.write_segment([
+            ChannelObject("A", "trigger", (t >= 0.5) * 5.0, about), ChannelObject("A", "north", np.sin(20 * t), about),
+            ChannelObject("B", "trigger", (t + late_s >= 0.5) * 5.0, about),
+            ChannelObject("B", "south", np.sin(20 * (t + late_s)), about),
+        ])  # fmt: skip
+    mapping = """
+[resample]
+method = "polyphase"
+[[align]]
+reference = { source = "trigger", group = "A" }
+moved = { source = "trigger", group = "B" }
+scope = "group"
+[channels.P_N]
+source = "north"
+[channels.P_S]
+source = "south"
+"""
+    conversion, recording = imported(tmp_path, [path], mapping)
+    samples = recording.samples("forces")
+    # Edges are found to a sample: 0.0123 s is 12.3 of them, and both triggers rise half way between two.
+    np.testing.assert_allclose(samples.column("P_N"), np.sin(20 * (samples.times_s + 0.012)), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(samples.column("P_S"), samples.column("P_N"), rtol=0, atol=20 * 1.01e-3)
+    assert "x.tdms, group B: moved by +12.0000 ms" in " ".join(conversion.remarks)
+    with pytest.raises(InputError, match='scope "group"'):
+        imported(tmp_path, [path], mapping.replace('scope = "group"\n', ""), name="file")
+
+
+def test_a_clock_that_is_some_ppm_off_is_put_right(tmp_path: Path) -> None:
+    """Stamps that run 12 ppm fast make a rate of 999.988 Hz: at 1000 Hz nothing may drift."""
+    n = np.arange(40_000)
+    t = n / 1000 * (1 + 12e-6)
+    path = rows_csv(tmp_path / "x.csv", {"time": t, "P_N [N]": np.sin(300 * t)})
+    mapping = '[resample]\nmethod = "polyphase"\nrate_hz = 1000\n[channels.P_N]\nsource = "P_N"\n'
+    conversion, recording = imported(tmp_path, [path], mapping)
+    samples = recording.samples("forces")
+    inside = slice(60, -60)  # where the filter has samples on both sides
+    expected = np.sin(300 * samples.times_s)
+    np.testing.assert_allclose(samples.column("P_N")[inside], expected[inside], rtol=0, atol=1e-5)
+    assert "999.988 Hz to 1000 Hz" in conversion.channels[0].time
+
+
+def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
+    """Logs of a usual rig, made here in volts; what comes out is the motion that they were made of."""
+    text = example()
+    for model in (each for each in vars(mappings).values() if hasattr(each, "model_fields")):
+        for name in model.model_fields:
+            assert re.search(rf"^(# )?\[*{name}\b|\b{name} = ", text, re.MULTILINE), f"{model.__name__}.{name}"
+    rate = 20_000
+    t = np.arange(20_000) / rate
+    x, y = 0.02 * np.sin(250 * t), 0.03 * np.cos(90 * t)  # mm
+    per_mm = 0.2 / 0.0254
+    near = [per_mm * (math.cos(angle) * x + math.sin(angle) * y) for angle in np.radians([45, 135])]
+    delayed = 30.0 * np.sin(400 * (t - 12.5e-6))
+    blow = np.where(np.abs(t - 0.5) < 2.5e-3, 100.0 * np.cos(np.pi * (t - 0.5) / 5e-3), 0.0)
+    trigger = np.where((t > 0.1) & (t < 0.3) | (t > 0.7), 5.0, 0.0)
+    late = 1000  # samples by which the second recorder began later
+    rows_csv(tmp_path / "daq.csv", {
+        "time": t, "Prox 1": near[0] - 10.0, "Prox 2": near[1] - 9.0, "Acc 1": delayed / 9.80665 * 100.0,
+        "Charge 1": -2e-3 * 50.0 * np.sin(100 * t), "Pt100": 1.0 + t, "Trigger": trigger,
+        "Key": 5.0 * (np.modf(6.2 * t + 0.3)[0] < 0.2),
+    })  # fmt: skip
+    rows_csv(tmp_path / "hammer.csv", {
+        "time": t[:-late], "Hammer": 2.25e-3 * blow[late:], "Trigger": trigger[late:],
+    })  # fmt: skip
+    conversion, recording = imported(tmp_path, [tmp_path / "daq.csv", tmp_path / "hammer.csv"], text)
+    zero_s = conversion.document["zero_s"]
+    probes = recording.samples("probes")
+    at = np.rint((probes.times_s + zero_s) * rate).astype(int)
+    inside = slice(100, -100)
+    for name, motion in (("ring_x", x), ("ring_y", y)):
+        found, expected = probes.column(name), motion[at]
+        # The mean of what was imported is taken for zero.
+        assert np.ptp((found - expected)[inside]) < 1e-6
+    house = recording.samples("accelerations")
+    # Samples that nobody had to move stay as they are, at times in whole microseconds.
+    acceleration = 30.0 * np.sin(400 * (house.times_s + zero_s))  # m/s^2
+    np.testing.assert_allclose(house.column("inner_x"), acceleration, rtol=0, atol=30 * 400 * 0.6e-6)
+    force = recording.samples("forces")
+    np.testing.assert_allclose(
+        force.column("P_E")[inside], 50.0 * np.sin(100 * (force.times_s + zero_s))[inside], rtol=0, atol=1e-4
+    )
+    (timed,) = Experiment.of(recording).scene.commands
+    assert timed.at_s == pytest.approx(4.0 + 0.2, abs=1e-4)
+    assert timed.at_s + zero_s == pytest.approx(0.5 - 2.5e-3, abs=1e-4)  # time zero lies before the log
+    assert Experiment.of(recording).scene.drive.speed_hz == pytest.approx(6.2, rel=1e-3)
+    assert recording.samples("bearing").names == ("oil_temperature",)
+
+
 def test_missing_values_are_gaps_or_held_or_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     lines = ["time,P_N [N]", *(f"{n / 1000},{'NaN' if n in (3, 4, 9) else n}" for n in range(20))]
@@ -505,10 +684,10 @@ def test_a_blow_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
     conversion, recording = imported(tmp_path, [path], HAMMER_MAPPING)
     assert len(conversion.blows) == 1
     experiment = Experiment.of(recording)
-    assert experiment.first_s == 0.0
+    assert experiment.first_s == 5.0  # time zero lies before the first sample, so that the scene settles
     (timed,) = experiment.scene.commands
     blow = timed.request.model_dump()
-    assert timed.at_s == pytest.approx(0.25, abs=2e-4)
+    assert timed.at_s == pytest.approx(5.25, abs=2e-4)
     assert blow["force_n"] == pytest.approx(87.0, rel=0.01)
     assert blow["duration_ms"] == pytest.approx(6.5, rel=0.02)
     assert experiment.scene.drive.speed_hz == pytest.approx(5.2)
@@ -516,7 +695,7 @@ def test_a_blow_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
     assert experiment.scene.sensors.groups == ("probes", "drive", "hammer")
     assert experiment.scene.sensors.rate_hz == 10_000
     assert [event["event"] for event in recording.events] == ["import", "hammer", "end"]
-    assert experiment.scene.duration_s == pytest.approx(2.0 - (0.73211 - 0.25), abs=2e-4)
+    assert experiment.scene.duration_s == pytest.approx(7.0 - (0.73211 - 0.25), abs=2e-4)
     assert recording.metadata["rig"]["scene"] == "hammer"
 
 
@@ -676,16 +855,16 @@ def test_wrong_mappings_are_one_line(
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("x.mf4", b"MDF     4.10 and nothing more", "input must be an intact MDF file"),
-        ("x.tdms", b"TDSm\x0e\x00\x00", "input must be"),
-        ("x.uff", b"    -1\n    58\nrubbish\n", "input must be"),
-        ("x.wav", b"RIFF1234WAVE", "input must be an intact WAV file"),
-        ("x.parquet", b"PAR1....PAR1", "input must be an intact Parquet file"),
-        ("x.csv", b"\0\1\2\3" * 50, "input must be a text file"),
-        ("x.csv", b"just words\nand more\n", "input must be a text file with lines of numbers"),
-        ("x.csv", b"a,b\n1,2\n2,3\n3,4\n4,5\n5,6,7\n", "input must be a text file of 2 columns throughout"),
-        ("x.csv", b"", "input must be a file with something in it"),
-        ("x.xlsx", b"PK", "input must be a file that ends in .mf4"),
+        ("x.mf4", b"MDF     4.10 and nothing more", "file must be an intact MDF file"),
+        ("x.tdms", b"TDSm\x0e\x00\x00", "file must be"),
+        ("x.uff", b"    -1\n    58\nrubbish\n", "file must be"),
+        ("x.wav", b"RIFF1234WAVE", "file must be an intact WAV file"),
+        ("x.parquet", b"PAR1....PAR1", "file must be an intact Parquet file"),
+        ("x.csv", b"\0\1\2\3" * 50, "file must be a text file"),
+        ("x.csv", b"just words\nand more\n", "file must be a text file with lines of numbers"),
+        ("x.csv", b"a,b\n1,2\n2,3\n3,4\n4,5\n5,6,7\n", "file must be a text file of 2 columns throughout"),
+        ("x.csv", b"", "file must be a file with something in it"),
+        ("x.xlsx", b"PK", "file must be a file that ends in .mf4"),
         ("x.csv", b"time,x [mm]\n0,1\n1,2\n1,3\n0,4\n", "time stamps must be ascending"),
     ],
 )

@@ -220,7 +220,12 @@ CASES = [
     change("sensors.groups=probes", "sensors.groups", "a list"),
     change("set=3", "set", "a valid dictionary"),
     # Options.
-    Case("no such scene", ("simulate", "nosuch", "-o", "out.csv"), "scene", "one of drop, hammer, partial-rub, run-up, stable-run"),
+    Case(
+        "no such scene",
+        ("simulate", "nosuch", "-o", "out.csv"),
+        "scene",
+        "one of drop, hammer, partial-rub, run-up, stable-run",
+    ),
     Case("scene is a folder", ("simulate", ".", "-o", "out.csv"), "scene", "the path of a .toml file"),
     Case(
         "scene of another suffix",
@@ -256,10 +261,12 @@ CASES = [
     Case("time without picture", ("view", "x.mcap", "--at-s", "1"), "--at-s", "used with --screenshot"),
     Case("view rate", ("record", "-o", "x.mcap", "--view-rate-hz", "-1"), "view_rate_hz", "between 0 (none) and 1e6"),
     # Files.
-    Case("output of another suffix", ("simulate", "drop", "-o", "out.txt"), "output", "ends in .mcap, .parquet, .csv"),
+    Case(
+        "output of another suffix", ("simulate", "drop", "-o", "out.txt"), "output", "ends in .mcap, .parquet or .csv"
+    ),
     Case("output in no folder", ("simulate", "drop", "-o", "nodir/out.csv"), "output", "in a folder that exists"),
     Case("output exists", DROP, "output", "a new file (--force replaces one)", {"out.csv": "precious"}),
-    Case("output is a folder", (*DROP, "--force"), "output", "a new file", {"out.csv": None}),
+    Case("output is a folder", (*DROP, "--force"), "output", "a file, not a folder", {"out.csv": None}),
     Case("recording of another suffix", ("record", "-o", "x.txt"), "output", "ends in .mcap"),
     Case("recording exists", ("record", "-o", "x.mcap"), "output", "a new file", {"x.mcap": b"precious"}),
     Case("demo in a file", ("demo", "-o", "taken"), "--output", "a new folder", {"taken": "precious"}),

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import subprocess
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +27,7 @@ from replays.paper.spread import (
     rank_correlation,
 )
 from replays.paper.statement import SETS, Statement, claims, number, printed_values, statements
-from replays.report.document import Heading, Picture, Table
+from replays.report.document import Heading, Picture, Report, Table
 from rig.cli.main import main
 from rig.parameters import load_parameters
 
@@ -170,6 +175,19 @@ def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list
     assert all(len(findings.results[name]) == len(group) for name, group in planned_groups(quick=True).items())
 
 
+@pytest.fixture
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything is drawn, but small, and where it comes to lie is not worked out: most of the time goes there."""
+    picture = Report.picture
+
+    def small(report: Report, figure: Any, caption: str, *, dpi: int = 25) -> None:
+        figure.set_layout_engine("none")
+        picture(report, figure, caption, dpi=min(dpi, 25))
+
+    monkeypatch.setattr(Report, "picture", small)
+
+
+@pytest.mark.usefixtures("small_pictures")
 def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: Path):
     report = write_up(findings, quick=True)
     headings = [part.text for part in report.parts if isinstance(part, Heading) and part.level == 1]
@@ -202,6 +220,37 @@ def test_two_processes_give_what_one_gives():
     told: list[str] = []
     assert str(list(outcomes(blows, processes=2, progress=told.append))) == str(list(outcomes(blows, processes=1)))
     assert told == [blow.label for blow in blows]
+
+
+_POOL = """
+import os, signal
+from replays.paper.blow import Blow, outcomes
+blows = [Blow(force_n=20.0, duration_s=0.05)] * 400
+for n, _ in enumerate(outcomes(blows, processes=2)):
+    if n == 0:
+        import multiprocessing
+        print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.wallclock
+def test_workers_end_when_their_parent_is_killed():
+    killed = subprocess.run([sys.executable, "-c", _POOL], capture_output=True, text=True, timeout=120)
+    workers = [int(number) for number in killed.stdout.split()]
+    assert len(workers) == 2, killed.stderr
+    end = time.monotonic() + 20.0
+    while any(map(_lives, workers)):
+        assert time.monotonic() < end, workers
+        time.sleep(0.05)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 @pytest.mark.parametrize("name", ["report.txt", "missing/report.html"])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from drivers.console import Console
-from recorder.reader import Recording
+from recorder.reader import Recording, join
 from replays.player import player as player_module
 from replays.player.edit import Edit
 from replays.player.player import Part, Player
@@ -133,6 +133,28 @@ def test_a_range_has_the_whole_blocks_inside_it(tape: Tape, from_ms: int) -> Non
     assert ticks == [10_000 * number for number in range(first, to_ms // 10)]
 
 
+@pytest.mark.parametrize("kind", ["whole", "cut off", "parts"])
+def test_chunks_hold_every_message_once_and_tell_their_times(folder: Path, path: Path, kind: str) -> None:
+    files = [path]
+    if kind == "cut off":
+        files = [folder / "chunks.mcap.part"]
+        files[0].write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    elif kind == "parts":
+        written = list(stream(BLOCKS))
+        half = next(n for n, (key, _) in enumerate(written) if n > len(written) / 2 and key == PROBES)
+        parts = {"first": written[:half], "second": written[half:]}
+        files = [write_recording(folder / f"chunks-{name}.mcap", part) for name, part in parts.items()]
+    recording = join(files)
+    assert len(recording.chunks) > 4
+    found = []
+    for chunk in recording.chunks:
+        messages = list(recording.read(chunk))
+        times_ns = [time_ns for _, time_ns, _, _ in messages]
+        assert (chunk.begin_ns, chunk.end_ns) == (min(times_ns), max(times_ns))
+        found += messages
+    assert found == list(recording.everything())
+
+
 # A whole play.
 
 
@@ -155,6 +177,22 @@ def test_nothing_adds_up_though_every_sleep_is_late(tape: Tape, rate: float) -> 
             assert -1 <= at_ns - due_ns <= 700_001
     assert heard.at_ns[-1] - begin_ns - DURATION_NS / rate <= 700_001
     assert summary["lateness_ms"]["max"] <= 0.701
+
+
+def test_one_that_cannot_keep_up_says_how_far_it_is_behind(tape: Tape) -> None:
+    for slow_ns, behind in ((0, False), (20_000_000, True)):
+        time = FakeTime(oversleep_ns=0)
+        server = MemoryServer()
+        MemoryClient(server).subscribe(
+            PROBES, lambda *_, time=time, slow_ns=slow_ns: setattr(time, "ns", time.ns + slow_ns)
+        )
+        player = Player(tape, server, RealTime(now_ns=time.now_ns, sleep=time.sleep))
+        begin_ns = time.ns
+        summary = player.run()
+        late_s = (time.ns - begin_ns - DURATION_NS) / 1e9
+        assert (summary["replay"]["behind_s"] > 0.5) == behind
+        assert abs(summary["replay"]["behind_s"] - (late_s if behind else 0.0)) < 0.1
+        assert any("behind" in text for text in player.status()["warnings"]) == behind
 
 
 def test_documents_are_answered_from_the_file_and_the_status_says_what_it_is(tape: Tape) -> None:
@@ -465,6 +503,40 @@ def test_a_burst_waits_for_what_clients_report(tape: Tape, monkeypatch: pytest.M
         until(lambda: len(heard.blocks()) == BLOCKS)
 
 
+def test_a_play_begins_when_all_are_there_that_it_waits_for(tape: Tape) -> None:
+    with running(tape, clock=FreeRun(), wait_for=2) as (player, heard, console):
+        play = player.status()["replay"]
+        assert (play["waiting_for"], play["paused"]) == (2, True)
+        heard.client.report(f"{wire.CLIENTS}/a", b'{"received_index": null}')
+        console.step_blocks(2)
+        assert len(heard.blocks()) == 2, "one is not enough; it may be stepped and sought in"
+        console.seek(0.0)
+        heard.client.report(f"{wire.CLIENTS}/b", b'{"received_index": null}')
+        until(lambda: bool(heard.events) and heard.events[-1]["event"] == "end")
+        assert player.status()["replay"]["waiting_for"] == 0
+        assert len(heard.blocks()) == 2 + BLOCKS
+
+
+@pytest.mark.parametrize("ends", ["resume", "pause", "stop"])
+def test_waiting_is_ended_by_commands(tape: Tape, ends: str) -> None:
+    with running(tape, rate=0.01, wait_for=1) as (player, heard, console):
+        getattr(console, ends)()
+        assert player.status()["replay"]["paused"] is (ends != "resume")
+        if ends != "stop":
+            assert player.status()["replay"]["waiting_for"] == 0
+            heard.client.report(f"{wire.CLIENTS}/a", b'{"received_index": null}')
+    assert heard.events[-1]["reason"] == "stopped"
+    assert heard.blocks() == []
+
+
+def test_who_does_not_come_is_not_waited_for_for_ever(tape: Tape) -> None:
+    server = MemoryServer()
+    heard = Heard(server)
+    with pytest.raises(RefusedError, match=r"0 of 1 clients were there after 0\.05 s"):
+        Player(tape, server, FreeRun(), wait_for=1, wait_s=0.05).run()
+    assert [event["reason"] for event in heard.events] == ["failed: 0 of 1 clients were there after 0.05 s"]
+
+
 def test_the_scene_tells_latecomers_the_commands_so_far(folder: Path) -> None:
     command = {"event": "command", "id": 1, "tick": 200_000, "time_s": 0.2, "command": "hammer", "request": {}}
     payloads = list(stream(BLOCKS))
@@ -518,7 +590,7 @@ def test_a_damaged_file_ends_the_stream_and_says_so(folder: Path, path: Path) ->
     with pytest.raises(InputError, match="file must be an intact recording"):
         player.run()
     assert heard.events[-1]["event"] == "end"
-    assert heard.events[-1]["reason"].startswith("failed: InputError: file must be an intact recording")
+    assert heard.events[-1]["reason"].startswith("failed: file must be an intact recording")
     assert heard.blocks(), "what came before went out"
 
 
@@ -550,3 +622,11 @@ def test_a_client_with_little_room_is_not_overrun() -> None:
     assert not clients.crowded(10**6, 100), "who is not heard any more is not waited for"
     clients.take(f"{wire.CLIENTS}/c", b'{"received_index": 0, "room": "much"}')
     assert clients.malformed == 1
+    clients.take(f"{wire.CLIENTS}/d", b'{"received_index": null, "room": 60}')
+    assert clients.present == 1
+    assert not clients.crowded(5000, 100), "it is measured from where it joined"
+    assert clients.crowded(5031, 100)
+    clients.take(f"{wire.CLIENTS}/d", b'{"received_index": 5031, "room": 60}')
+    assert not clients.crowded(5061, 100)
+    clients.take(f"{wire.CLIENTS}/d", b'{"received_index": 5031, "done": true}')
+    assert clients.present == 0

@@ -132,3 +132,15 @@ def test_impossible_options_are_refused_before_a_rig_is_looked_for(tmp_path, cap
     assert must in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_refuses_is_told_in_a_line(path, tmp_path, capsys, monkeypatch):
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(SystemExit) as exit_info:
+        main(["cut", str(path), "-o", str(tmp_path / "new.mcap")])
+    assert exit_info.value.code == 1
+    assert capsys.readouterr().err.strip().endswith("new.mcap.part could not be begun")
+    assert not list(tmp_path.glob("new*"))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import recorder.health
 from recorder.health import ChannelHealth, Health, examine
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
@@ -37,10 +40,10 @@ def volts_of(name: str) -> np.ndarray:
     return channel.bias_v + signal + channel.noise_v * rng.normal(size=ROWS)
 
 
-def record(path: Path, changed: dict[str, np.ndarray] | None = None, **options: object) -> Health:
+def record(path: Path, changed: dict[str, np.ndarray] | None = None, **options: Any) -> Health:
     """Write the channels, some of them changed, and examine what was written."""
     about = documents()
-    scene = {**about[SCENE], "scene": {"sensors": options.get("sensors", {})}}
+    scene = {**about[SCENE], "scene": {"sensors": options.get("sensors", {})}, **dict(options.get("about", {}))}
     with RecordingWriter(
         path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=scene, view_rate_hz=0.0
     ) as file:
@@ -57,6 +60,8 @@ def record(path: Path, changed: dict[str, np.ndarray] | None = None, **options: 
                 if name == "probes" or start != late:
                     file.write(sensor_key(name), encode_block(block), wall_ns)
         file.write(EVENTS, encode_document({"event": "warning", "tick": 5, "text": "the shaft has gone"}), 0)
+        if "event" in options:
+            file.write(EVENTS, encode_document({"tick": 0, **dict(options["event"])}), 0)
         status = {"tick": 5, "lateness_ms": {"max": 3.0}, "warnings": ["doubtful"], "queue": {"dropped": 2}}
         file.write(STATUS, encode_document(status), 0)
         file.finish("completed")
@@ -130,6 +135,27 @@ def test_the_clock_is_measured(tmp_path, ppm):
     # The wall clock runs ahead by ppm, so the simulation lags by it.
     assert health.pace_ppm == pytest.approx(-ppm, abs=2.0)
     assert health.jitter_max_ms < 0.1
+
+
+def test_history_that_arrived_at_once_does_not_bend_the_clock():
+    wall_s = np.arange(20) * 0.5
+    simulated_s = np.where(wall_s < 2.0, wall_s * 10.0, 16.5 + wall_s * (1.0 + 50e-6))
+    slope, jitter_ms, _, strays = recorder.health._pace(np.column_stack((simulated_s, wall_s)))
+    assert slope == pytest.approx(1.0 + 50e-6, abs=1e-6)
+    assert jitter_ms < 0.1
+    assert strays == pytest.approx(0.2, abs=0.01)
+
+
+@pytest.mark.parametrize("event", [{"event": "start", "pace": "none"}, {"event": "import", "files": "a.csv"}])
+def test_wall_times_that_no_clock_told_are_no_clock(tmp_path, event):
+    assert math.isnan(record(tmp_path / "a.mcap", event=event).pace)
+
+
+def test_an_import_is_not_judged_by_a_calibration_that_it_does_not_have(tmp_path):
+    still = {name: np.full(ROWS, _channel(name).bias_v) for name in default_table().groups["probes"].names}
+    health = record(tmp_path / "a.mcap", still, about={"import": {}})
+    assert all(math.isnan(each.noise_calibrated) for each in health.channels)
+    assert not any(channel(health, name).findings for name in still)
 
 
 def test_a_block_at_another_time_than_its_rows_and_what_the_rig_said(tmp_path):

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections import defaultdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from recorder.reader import Recording, join
 from recorder.rewrite import cut, recover, recovered_path
@@ -166,6 +170,41 @@ def test_a_file_cut_in_its_calibration_is_refused_and_nothing_is_left(path, tmp_
     assert list(tmp_path.iterdir()) == [part]
 
 
+def test_a_file_cut_at_any_byte_loses_nothing_that_was_flushed(tmp_path):
+    items = list(stream(4, block_ms=2))
+    file = writer(tmp_path / "run.mcap", sync_every_s=0.0, view_rate_hz=100.0)
+    flushed = [(file.part.stat().st_size, 0)]
+    for number, (key, payload) in enumerate(items):
+        file.write(key, payload, number)
+        flushed.append((file.part.stat().st_size, number + 1))
+    raw = file.part.read_bytes()
+    file.finish("completed")
+    source, target = tmp_path / "cut.mcap.part", tmp_path / "whole.mcap"
+    for size in np.random.default_rng(3).integers(flushed[0][0], len(raw) + 1, 60).tolist():
+        source.write_bytes(raw[:size])
+        recover(source, target, force=True)
+        kept = [(key, payload) for key, *_, payload in Recording.open(target).everything() if key.startswith("rig/")]
+        assert kept == items[: len(kept)]
+        assert len(kept) >= max(count for end, count in flushed if end <= size)
+
+
+def test_damage_behind_the_calibration_is_never_a_reason_to_refuse(path, chunks, items, tmp_path):
+    raw, sent = path.read_bytes(), of(items)
+    first = chunks[0][0]
+    rng = np.random.default_rng(4)
+    for place in rng.integers(first, len(raw) - 8, 25).tolist():
+        damaged = bytearray(raw)
+        damaged[place] ^= 0xFF
+        source = tmp_path / "damaged.mcap"
+        source.write_bytes(damaged)
+        recovered = Recording.open(recover(source, tmp_path / "new.mcap", force=True).path)
+        for key in recovered.messages:
+            if key in sent:
+                assert {payload for _, payload in recovered.payloads(key)} <= set(sent[key])
+        if place > chunks[-1][0] + chunks[-1][1] + HEAD:
+            assert recovered.messages[PROBES] == len(sent[PROBES])
+
+
 def test_the_name_of_a_recovered_file():
     assert recovered_path(Path("a/x.mcap.part")) == recovered_path(Path("a/x.mcap")) == Path("a/x.recovered.mcap")
 
@@ -205,6 +244,53 @@ def test_cuts_behind_each_other_join_to_the_whole(path, tmp_path):
         np.testing.assert_array_equal(again.samples(group).index, whole.samples(group).index)
     np.testing.assert_array_equal(again.truth("state").values, whole.truth("state").values)
     np.testing.assert_array_equal(again.edges(), whole.edges())
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory) -> Recording:
+    """280 ms in blocks of 7 ms, which no round time divides."""
+    return Recording.open(write(tmp_path_factory.mktemp("short") / "run.mcap", list(stream(40, block_ms=7))))
+
+
+def rows(recording: Recording, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ticks, numbers and values of all rows."""
+    blocks = list(recording.blocks(key))
+    ticks = [
+        block.tick + (block.values[:, 0] if key == EDGES else block.times_s * 1e6 - block.tick) for block in blocks
+    ]
+    numbers = [np.arange(block.index, block.index + len(block.values)) for block in blocks]
+    return np.concatenate(ticks), np.concatenate(numbers), np.concatenate([block.values for block in blocks])
+
+
+@settings(
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+@given(
+    st.lists(
+        st.one_of(st.integers(1, 279_000).map(lambda tick: tick / 1e6), st.integers(1, 39).map(lambda n: n * 0.007)),
+        min_size=2,
+        max_size=2,
+        unique=True,
+    )
+)
+def test_pieces_of_any_cuts_hold_each_row_once_and_join_to_the_whole(short, tmp_path_factory, times_s):
+    folder = tmp_path_factory.mktemp("cuts")
+    edges_s = [-np.inf, *sorted(times_s), np.inf]
+    pieces = []
+    for from_s, to_s in pairwise(edges_s):
+        # A piece between two rows of all streams holds nothing and is refused.
+        with contextlib.suppress(InputError):
+            pieces.append(cut(short, folder / f"{len(pieces)}.mcap", from_s=from_s, to_s=to_s).path)
+    joined = Recording.open(cut(join(pieces), folder / "joined.mcap").path)
+    for key in (PROBES, truth_key("state"), EDGES):
+        for found, expected in zip(rows(joined, key), rows(short, key), strict=True):
+            assert np.array_equal(found, expected)
+        assert joined.streams[key].lost == 0
+    for piece, (from_s, to_s) in zip(pieces, pairwise(edges_s), strict=len(pieces) == 3):
+        if len(pieces) == 3 and PROBES in (recording := Recording.open(piece)).messages:
+            ticks = rows(recording, PROBES)[0]
+            assert ticks[0] >= from_s * 1e6 - 1e-6
+            assert ticks[-1] < to_s * 1e6 - 1e-6
 
 
 def test_channels_and_kinds_are_left_out_with_their_calibration(path, tmp_path):

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import recorder.series
 from recorder.reader import Recording, join
 from recorder.rewrite import cut, recover
 from recorder.series import Limits, Series, part_path
 from recorder.writer import RecordingError, RecordingWriter
 from rig.errors import InputError
-from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Gap, encode_block, encode_document, sensor_key
+from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Gap, encode_block, encode_document, schema_of, sensor_key
 
 from .recorder_stream import block_of, documents, stream
 
@@ -130,12 +131,36 @@ def test_a_part_knows_the_commands_before_it(tmp_path, items):
 
 
 def test_rows_lost_at_a_seam_are_a_gap(tmp_path):
-    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(60) if number not in (29, 30, 31)]
+    missing = {(PROBES, encode_block(block_of(PROBES, number))) for number in (29, 30, 31)}
     file = series(tmp_path / "run.mcap", rotate_s=0.3)
-    write(file, blocks)
+    write(file, [item for item in stream(60) if item not in missing])
     assert [Recording.open(part).gaps for part in file.files] == [[], [Gap(PROBES, 5800, 600)]]
-    assert file.counts().lost == {PROBES: 600}
+    assert {key: lost for key, lost in file.counts().lost.items() if lost} == {PROBES: 600}
     assert join(file.files).streams[PROBES].lost == 600
+
+
+def test_history_that_comes_stream_by_stream_stands_in_the_first_part(tmp_path, items):
+    then, now = (
+        [item for item in items if schema_of(item[0])][:700],
+        [item for item in items if schema_of(item[0])][700:],
+    )
+    file = series(tmp_path / "run.mcap", rotate_s=0.1)
+    write(file, sorted(then, key=lambda item: item[0]) + now)
+    extents = []
+    for part in file.files:
+        streams = [stream for key, stream in Recording.open(part).streams.items() if key.startswith("rig/truth/")]
+        extents.append({(round(stream.first_time_s, 3), round(stream.last_time_s, 2)) for stream in streams})
+    assert len(extents) > 2
+    assert [len(each) for each in extents] == [1] * len(extents)
+    assert next(iter(extents[0]))[0] == 0.0
+    assert all(stream.lost == 0 for stream in join(file.files).streams.values())
+
+
+def test_a_stream_that_never_comes_holds_up_no_rotation_for_long(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder.series, "_CATCH_UP_S", 0.0)
+    file = series(tmp_path / "run.mcap", rotate_s=0.1)
+    write(file, [(PROBES, encode_block(block_of(PROBES, number))) for number in range(100)])
+    assert len(file.files) == 10
 
 
 def test_rotation_by_size(tmp_path):
@@ -190,7 +215,12 @@ def test_room_is_left_on_the_disk(tmp_path, monkeypatch):
         ({"rotate_s": float("nan")}, "rotate_s must be from 0.1"),
         ({"budget_mb": 1.0}, "budget_mb must be from 5"),
         ({"keep_free_mb": -1.0}, "keep_free_mb must be from 0"),
+        ({"budget_mb": -1.0}, "budget_mb must be from 5"),
         ({"when_full": "remove-oldest"}, "stop for a recording in one file"),
+        (
+            {"when_full": "remove-oldest", "rotate_mb": 5.0, "budget_mb": 9.0},
+            "budget_mb must be at least two files, 10",
+        ),
     ],
 )
 def test_impossible_limits_are_refused(limits, must):
@@ -210,6 +240,33 @@ def test_parts_of_an_earlier_recording_are_not_mixed_with_new_ones(tmp_path, ite
     assert not old.exists()
     assert other.read_text() == "somebody else's"
     assert len(file.files) == 4
+
+
+def test_force_removes_no_file_of_a_recording_in_the_making(tmp_path, items):
+    path = tmp_path / "run.mcap"
+    first = series(path, rotate_s=0.1)
+    for number, (key, payload) in enumerate(items[:300]):
+        first.write(key, payload, number)
+    there = sorted(tmp_path.iterdir())
+    assert len(there) > 2
+    with pytest.raises(InputError, match="no other recording is writing to"):
+        series(path, rotate_s=0.1, force=True)
+    assert sorted(tmp_path.iterdir()) == there
+    first.finish("completed")
+    write(series(path, rotate_s=10.0, force=True), items)
+    assert [file.name for file in tmp_path.iterdir()] == ["run.0000.mcap"]
+
+
+def test_an_oldest_file_that_cannot_be_removed_ends_the_recording_well(tmp_path, items, monkeypatch):
+    def refused(self: Path, **_: object) -> None:
+        raise OSError(30, "Read-only file system", str(self))
+
+    file = series(tmp_path / "run.mcap", rotate_mb=1.0, budget_mb=5.0, when_full="remove-oldest")
+    monkeypatch.setattr(Path, "unlink", refused)
+    write(file, list(stream(600)))
+    assert "Read-only file system" in file.ended
+    assert file.out_of_room
+    assert all(Recording.open(part).complete for part in file.files)
 
 
 def test_a_removed_folder_leaves_a_copy_in_the_nearest_one(tmp_path, items):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import threading
 import time
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import pytest
 import recorder.session
 from recorder.reader import Recording
 from recorder.session import RIG_LOST, Progress, RecordingSession, Summary
+from rig.channels import default_table
 from rig.errors import InputError
 from rig.transport import NoReplyError
 from rig.transport.memory import MemoryClient, MemoryServer
@@ -24,6 +26,7 @@ from rig.wire import (
     decode_document,
     encode_block,
     encode_document,
+    schema_of,
     sensor_key,
     truth_key,
 )
@@ -181,8 +184,124 @@ def test_ends_after_a_simulated_time(path):
     summary = record(RecordingSession(client, path, duration_s=0.2), client, play(client, blocks))
     assert summary.reason == "duration reached"
     assert summary.first_time_s == pytest.approx(1.0)
-    assert summary.duration_s >= 0.2
+    assert summary.duration_s == pytest.approx(0.2 - 50e-6)
     assert Recording.open(path).complete
+
+
+def test_a_time_to_record_ends_for_all_streams_at_the_same_block(path):
+    client = ScriptedClient()
+    items = list(stream(60))
+    summary = record(RecordingSession(client, path, duration_s=0.205), client, play(client, items[:-1]))
+    assert summary.reason == "duration reached"
+    streams = Recording.open(path).streams
+    for group in default_table().groups:
+        assert streams[sensor_key(group)].rows == 21 * 200
+    assert streams[truth_key("state")].rows == 21 * 20
+    assert summary.lost == {}
+
+
+def test_streams_that_begin_a_block_apart_are_all_recorded_for_the_time(path):
+    client = ScriptedClient()
+    items = [item for item in stream(60) if schema_of(item[0])]
+    place = items.index((sensor_key("hammer"), encode_block(block_of(sensor_key("hammer"), 3))))
+    summary = record(RecordingSession(client, path, duration_s=0.2), client, play(client, items[place:]))
+    streams = Recording.open(path).streams
+    assert {streams[sensor_key(group)].rows for group in default_table().groups} == {4000}
+    assert summary.duration_s == pytest.approx(0.21, abs=1e-3)
+
+
+def test_a_rig_that_is_started_again_is_not_mixed_into_the_recording(path):
+    client = ScriptedClient()
+    items = list(stream(20))[1:-1]
+
+    def act() -> None:
+        for item in items:
+            client.publish(*item)
+        client.on_alive(False)
+        for item in items[:30]:  # before its token
+            client.publish(*item)
+        client.on_alive(True)
+        for item in items[30:]:
+            client.publish(*item)
+
+    summary = record(RecordingSession(client, path), client, act)
+    assert (summary.reason, summary.gaps, summary.lost) == (RIG_LOST, 0, {})
+    recording = Recording.open(path)
+    assert recording.complete
+    for key in {key for key, _ in items if key != STATUS}:
+        assert [p for _, p in recording.payloads(key)] == [p for k, p in items if k == key]
+
+
+def test_a_fault_of_the_recorder_itself_is_told_and_the_file_is_finished(path, monkeypatch):
+    client = ScriptedClient()
+    blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(20)]
+    real = recorder.session.RecordingWriter.write
+    calls = [0]
+
+    def breaks(self, key: str, payload: bytes, wall_ns: int):
+        calls[0] += 1
+        if calls[0] > 10:
+            raise TypeError("a mistake")
+        return real(self, key, payload, wall_ns)
+
+    monkeypatch.setattr(recorder.session.RecordingWriter, "write", breaks)
+    summary = record(RecordingSession(client, path), client, play(client, blocks))
+    assert "TypeError: a mistake" in summary.error
+    assert summary.rows[PROBES] == 2000
+    assert Recording.open(path).complete
+
+
+def test_payloads_with_impossible_times_and_half_characters_are_kept_and_end_nothing(path):
+    client = ScriptedClient()
+    head = struct.Struct("<qqddII")
+    good = encode_block(block_of(PROBES, 0))
+    wrong = []
+    for tick, index, rate_hz, tick_rate_hz in (
+        (2**62, 0, 20e3, 1e6),
+        (-(2**62), 0, 20e3, 1e6),
+        (0, 2**62, 20e3, 1e6),
+        (0, -5, 20e3, 1e6),
+        (0, 0, 0.0, 1e6),
+        (0, 0, 1e-300, 1e6),
+        (0, 0, float("inf"), 1e6),
+        (0, 0, float("nan"), 1e6),
+        (0, 0, 20e3, 0.0),
+        (0, 0, 20e3, float("nan")),
+    ):
+        raw = bytearray(good)
+        head.pack_into(raw, 4, tick, index, rate_hz, tick_rate_hz, *head.unpack_from(good, 4)[4:])
+        wrong.append((PROBES, bytes(raw)))
+    notes = [
+        (EVENTS, b'{"event":"note","tick":' + b"9" * 400 + b',"text":"x"}'),
+        (EVENTS, b'{"event":"note","tick":3,"text":"\\ud800 half","tags":["\\udfff"]}'),
+        (EVENTS, b'{"event":"note","tick":9007199254740991,"text":"late"}'),
+        (STATUS, b'{"tick":1e400,"time_s":NaN}'),
+        (EVENTS, b'{"event":"start","tick":true}'),
+        (EVENTS, b"9" * 5000),
+    ]
+    items = [(PROBES, good), *wrong, *notes, (PROBES, encode_block(block_of(PROBES, 1)))]
+    summary = record(
+        RecordingSession(client, path, duration_s=1.0), client, play(client, [*items, list(stream(1))[-1]])
+    )
+    assert (summary.reason, summary.error) == ("completed", "")
+    assert summary.malformed == len(wrong) + 1
+    assert (summary.rows, summary.lost) == ({PROBES: 400}, {})
+    recording = Recording.open(path)
+    assert recording.samples("probes").index.tolist() == list(range(400))
+    assert [payload for _, payload in recording.payloads(PROBES)] == [p for key, p in items if key == PROBES]
+
+
+def test_what_is_being_written_still_counts_against_the_backlog():
+    inbox = recorder.session._Inbox(100)
+    for _ in range(3):
+        inbox.put(PROBES, bytes(40), 0)
+    assert inbox.dropped == 1
+    assert len(inbox.take(0.0) or []) == 2
+    inbox.put(PROBES, bytes(40), 0)
+    assert inbox.dropped == 2
+    assert inbox.take(0.0) == []
+    inbox.put(PROBES, bytes(40), 0)
+    assert (inbox.dropped, inbox.waiting_bytes, inbox.high_water_bytes) == (2, 40, 80)
 
 
 def test_stop_keeps_everything_received(path):

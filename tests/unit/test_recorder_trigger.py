@@ -131,6 +131,46 @@ def test_the_time_before_a_trigger_is_whole_even_if_it_was_captured_before(tmp_p
     assert extent(file.files[1])[0] == pytest.approx(1.0, abs=0.011)
 
 
+def pulses(file: Captures, rows: list[int], blocks: range) -> None:
+    """Probes of 10 ms blocks, at rest but for single rows of 0.3 mm."""
+    group = default_table().groups["probes"]
+    channel = group.channels[0]
+    for number in blocks:
+        counts = np.zeros((200, len(group.channels)), np.int32)
+        counts[:, 0] = round(-channel.offset / channel.scale)
+        counts[[row for row in rows if 0 <= row < 200], 0] = round((0.3 - channel.offset) / channel.scale)
+        rows = [row - 200 for row in rows]
+        file.write(PROBES, encode_block(Block(number * 10_000, number * 200, 20e3, TICK_RATE_HZ, counts)), number)
+
+
+def test_the_time_after_counts_from_the_last_crossing_even_in_one_block(tmp_path):
+    file = captures(tmp_path / "run.mcap", "disk_x>0.2", pre_s=0.0, post_s=0.0205)
+    pulses(file, [200, 220, 399], range(10))  # the second block begins beyond the level: a crossing at a block's edge
+    (path,) = file.files
+    recording = Recording.open(path)
+    assert recording.metadata["trigger"]["time_s"] == "0.010000000"
+    assert extent(path) == (pytest.approx(0.01), pytest.approx(0.05 - 50e-6))
+    assert [each["time_s"] for each in json.loads(recording.metadata["end"]["triggers"])] == [0.01, 0.01995]
+
+
+def test_triggers_without_end_take_no_memory_without_end(tmp_path):
+    file = captures(tmp_path / "run.mcap", "note", pre_s=0.0, post_s=1.0)
+    feed(file, range(5))
+    for number in range(3000):
+        file.write(*event("note", 0.04, text=str(number)), number)
+    feed(file, range(5, 300))
+    assert len(file._ring) < 300
+    end = Recording.open(file.files[0]).metadata["end"]
+    assert (end["trigger_count"], len(json.loads(end["triggers"]))) == ("3000", 1000)
+
+
+def test_an_event_of_a_far_time_does_not_hold_up_the_ring(tmp_path):
+    file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.1)
+    file.write(*event("command", 1e6, id=1, command="speed", request={}), 0)
+    feed(file, range(500))
+    assert len(file._ring) < 200
+
+
 def test_streams_that_are_behind_are_waited_for(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.2)
     file.write(FORCES, encode_block(block_of(FORCES, 0)), 0)

@@ -422,6 +422,32 @@ def test_clock_pairs_join_simulated_and_wall_time(tmp_path):
     np.testing.assert_allclose(pairs[:, 1] - pairs[:, 0], 10.0, atol=1e-9)
 
 
+def test_the_size_of_the_index_is_known_beforehand(tmp_path, items):
+    with writer(tmp_path / "run.mcap", sync_every_s=0.0) as file:
+        for number, (key, payload) in enumerate(items):
+            file.write(key, payload, number)
+        before, promised = file.part.stat().st_size, file.index_bytes
+        begun = writer(tmp_path / "empty.mcap")
+        head = begun.part.stat().st_size
+        begun.finish("completed")
+        file.finish("completed")
+    index = (tmp_path / "run.mcap").stat().st_size - before
+    assert len(items) > 100
+    assert index - ((tmp_path / "empty.mcap").stat().st_size - head) < promised
+    assert promised < 6 * index
+
+
+def test_a_wall_clock_that_is_set_back_goes_on_being_recorded(tmp_path):
+    with writer(tmp_path / "run.mcap") as file:
+        for number in range(400):
+            wall_ns = 10**18 + number * 10_000_000 - (3600 * 10**9 if number >= 200 else 0)
+            file.write(PROBES, encode_block(block_of(PROBES, number)), wall_ns)
+        file.finish("completed")
+    clock = Recording.open(tmp_path / "run.mcap").clock
+    assert len(clock) == 8
+    assert clock[4][1] < clock[3][1]
+
+
 def test_a_document_without_a_tick_takes_the_latest_time(tmp_path, items):
     path = tmp_path / "run.mcap"
     write(path, [*items, (EVENTS, encode_document({"event": "warning", "text": "late"}))])

@@ -101,3 +101,14 @@ def test_places_that_no_report_can_go_to(tmp_path: Path, name: str, complaint: s
 def test_an_existing_report_is_replaced_when_asked(tmp_path: Path) -> None:
     (tmp_path / "old.pdf").write_bytes(b"")
     check_report(tmp_path / "old.pdf", force=True)
+
+
+def test_tables_of_any_width_go_into_a_pdf(tmp_path: Path) -> None:
+    """Columns that just fill a page must not be wider than it by a rounding error."""
+    report = Report("Tables", "")
+    for columns in range(1, 12):
+        for length in range(1, 60, 7):
+            cells = [f"{'word ' * (length // (1 + n))}{n}" for n in range(columns)]
+            report.table(cells, [cells])
+    report.write(tmp_path / "tables.pdf")
+    assert (tmp_path / "tables.pdf").read_bytes().startswith(b"%PDF")

@@ -1,12 +1,17 @@
-"""Channels without noise and their derivatives: the sensors' own chain, keys of every kind, quotients that hold."""
+"""Channels without noise and their derivatives: a recording's own channels, keys of every kind, quotients that hold."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from replays.experiment import Experiment
-from replays.sensitivity import Predictor, derivatives, signals, value_of, with_values
+from replays.prediction import Measured, sampled
+from replays.sensitivity import Predictor, value_of, with_values
+from rig.channels import Channel, default_table
 from rig.errors import InputError
 from rig.offline import SentCommand, simulate
 from rig.scenes import load_scene
@@ -14,46 +19,98 @@ from rig.scenes import load_scene
 CHANNELS = ("disk_x", "ring_y", "P_E", "inner_x", "speed", "hammer")
 
 
+def rows(names: tuple[str, ...], times_s: np.ndarray, **own: Any) -> dict[str, Measured]:
+    """Rows wanted of some channels, each group on its own; `own` changes their calibration."""
+    found = {}
+    for name in names:
+        channel = Channel.model_validate(default_table().channels[name].model_dump() | own)
+        one = np.ones(1)
+        empty = np.zeros((len(times_s), 1))
+        found[name] = Measured(name, (channel,), times_s, np.arange(len(times_s)), empty, one, one > 0.0, ideal=False)
+    return found
+
+
+def shown(experiment: Experiment, *names: str, start_s: float = 0.0, end_s: float = 0.03, **own: Any) -> np.ndarray:
+    times_s = np.arange(round(start_s * 20_000), round(end_s * 20_000)) / 20_000
+    found = Predictor(experiment, (), rows(names, times_s, **own)).predict(())
+    return np.concatenate([found.values[name] for name in names], axis=1)
+
+
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
     return Experiment(scene=load_scene("hammer", {"duration_s": 0.06}))
 
 
-def test_signals_are_the_recorded_ones_but_for_noise_and_rounding(experiment: Experiment) -> None:
-    found = signals(experiment, channels=CHANNELS, start_s=0.01, end_s=0.05)
+def test_channels_are_the_recorded_ones_but_for_noise_and_rounding(experiment: Experiment) -> None:
+    found = shown(experiment, *CHANNELS, start_s=0.01, end_s=0.05)
     run = simulate(experiment.changed({"sensors.noise": False}).scene)
-    assert found.contacts > 2
     for column, name in enumerate(CHANNELS):
         rounding = abs(run.table.channels[name].scale)
-        recorded = run.samples[name][200:1000]
-        assert np.abs(found.values[:, column] - recorded).max() <= 0.51 * rounding
-    assert np.array_equal(found.times_s, run.sample_times_s[200:1000])
+        assert np.abs(found[:, column] - run.samples[name][200:1000]).max() <= 0.51 * rounding
 
 
-def test_a_slower_rate_has_every_second_sample(experiment: Experiment) -> None:
-    whole = signals(experiment, channels=["ring_x"], end_s=0.03)
-    half = signals(experiment, channels=["ring_x"], end_s=0.03, rate_hz=10_000)
-    assert np.array_equal(half.values, whole.values[::2])
-    with pytest.raises(InputError, match="a divisor of the sensors' 20000 Hz"):
-        signals(experiment, channels=["ring_x"], end_s=0.03, rate_hz=3_000)
+def test_a_recordings_own_calibration_counts_and_not_the_rigs(experiment: Experiment) -> None:
+    """Volts clip where its conditioner does, and its low-pass delays: by tau = 2.613 / (2 pi f), Butterworth's."""
+    usual = shown(experiment, "P_E")
+    assert usual.max() > 3000.0
+    clipped = shown(experiment, "P_E", bandwidth_hz=18_500.0, range_v=(-3.0, 3.0))
+    assert clipped.max() == pytest.approx(3000.0, rel=1e-6)
+    slow = shown(experiment, "hammer", end_s=0.06, bandwidth_hz=200.0)[:, 0]
+    quick = shown(experiment, "hammer", end_s=0.06, bandwidth_hz=18_500.0)[:, 0]  # none: half of the rows' rate
+    times_s = np.arange(len(slow)) / 20_000
+    delay_s = slow @ times_s / slow.sum() - quick @ times_s / quick.sum()
+    assert delay_s == pytest.approx(2.6131 / (2.0 * np.pi * 200.0), rel=0.03)
+
+
+def test_a_late_start_is_the_same_as_from_the_start() -> None:
+    """Far behind the start the channels are worked out from shortly before the rows wanted on."""
+    experiment = Experiment(scene=load_scene("hammer", {"duration_s": 4.0}))
+    whole, late = (shown(experiment, "ring_x", "inner_x", start_s=start, end_s=3.6)[-100:] for start in (0.0, 3.5))
+    assert np.abs(whole[:, 0] - late[:, 0]).max() < 1e-8
+    assert np.abs(whole[:, 1] - late[:, 1]).max() < 1e-3 * np.abs(whole[:, 1]).max()
+
+
+def test_values_between_samples_are_those_of_the_polynomial() -> None:
+    times = np.arange(40.0)
+    quintic = np.column_stack([(times / 20.0 - 1.0) ** 5, np.sin(2.0 * np.pi * times / 8.0)])
+    places = np.linspace(3.3, 35.9, 57)
+    found = sampled(quintic, places)
+    assert found[:, 0] == pytest.approx((places / 20.0 - 1.0) ** 5, abs=1e-12)
+    assert np.abs(found[:, 1] - np.sin(2.0 * np.pi * places / 8.0)).max() < 2e-3
+    assert np.array_equal(sampled(quintic, np.array([0.0, 7.0, 39.0])), quintic[[0, 7, 39]])
+
+
+def test_a_clock_that_is_late_and_fast_shows_what_was_before(experiment: Experiment) -> None:
+    from scipy.interpolate import CubicSpline
+
+    times_s = np.arange(200, 600) / 20_000
+    predictor = Predictor(experiment, ("clock.offset_s", "clock.rate_ppm"), rows(("ring_x",), times_s))
+    found = predictor.predict((1e-4, 2000.0)).values["ring_x"][:, 0]
+    model = shown(experiment, "ring_x", end_s=0.04)[:, 0]
+    there_s = times_s - 1e-4 - 2e-3 * (times_s - times_s[0])
+    assert found == pytest.approx(CubicSpline(np.arange(len(model)) / 20_000, model)(there_s), abs=1e-4)
+    assert np.abs(found - model[200:600]).max() > 1e-2
 
 
 def test_derivatives_are_secants_of_small_steps(experiment: Experiment) -> None:
     keys = ("magnet.stiffness", "contact.stiffness", "contact.friction", "hammer.1.force_n")
-    found = derivatives(experiment, keys, channels=["ring_x", "P_E"], end_s=0.034)
+    parts = rows(("ring_x", "P_E"), np.arange(680) / 20_000)
+    predictor = Predictor(experiment, keys, parts)
+    found = predictor.derivatives(predictor.start)
     assert found.good.all()
-    for place, (key, part) in enumerate(zip(keys, (1e-5, 1e-3, 1e-5, 1e-5), strict=True)):
-        step = part * value_of(experiment, key)
-        moved = with_values(experiment, {key: value_of(experiment, key) + step})
-        other = signals(moved, channels=["ring_x", "P_E"], end_s=0.034).values
-        secant = (other - found.base.values) / step
-        scale = np.abs(found.values[place]).max(axis=0)
-        assert (np.abs(secant - found.values[place]).max(axis=0) < 0.02 * scale).all()
+    for place, part in enumerate((1e-5, 1e-3, 1e-5, 1e-5)):
+        moved = predictor.start.copy()
+        step = part * moved[place]
+        moved[place] += step
+        for name, values in predictor.predict(moved).values.items():
+            secant = (values - found.base.values[name]) / step
+            slope = found.slopes[place][name]
+            assert np.abs(secant - slope).max() < 0.02 * np.abs(slope).max()
 
 
 def test_a_value_that_acts_on_nothing_has_no_derivative(experiment: Experiment) -> None:
-    found = derivatives(experiment, ["contact.friction"], channels=CHANNELS, end_s=0.02)  # before the blow
-    assert not found.values.any()
+    predictor = Predictor(experiment, ["contact.friction"], rows(CHANNELS, np.arange(400) / 20_000))  # before the blow
+    assert not any(slope.any() for slope in predictor.derivatives(predictor.start).slopes[0].values())
 
 
 def test_rules_give_way_to_numbers(experiment: Experiment) -> None:
@@ -61,8 +118,7 @@ def test_rules_give_way_to_numbers(experiment: Experiment) -> None:
     assert sag_mm == pytest.approx(-1.5606, abs=1e-3)
     moved = with_values(experiment, {"ring.offset_y": sag_mm + 0.01})
     assert moved.scene.load_parameters().rule("ring.offset_y") is None
-    shown = signals(moved, channels=["ring_y"], end_s=0.001).values[0, 0]
-    assert shown == pytest.approx(-0.01, abs=1e-6)
+    assert shown(moved, "ring_y", end_s=0.001)[0, 0] == pytest.approx(-0.01, abs=1e-6)
 
 
 def test_commands_are_numbered_by_time_wherever_they_are_from() -> None:
@@ -73,7 +129,7 @@ def test_commands_are_numbered_by_time_wherever_they_are_from() -> None:
     assert value_of(both, "hammer.2.force_n") == 50.0
     assert value_of(both, "hammer.2.direction") == pytest.approx(90.0)
     same = with_values(both, {"hammer.2.force_n": 50.0})
-    a, b = (signals(one, channels=["ring_x", "hammer"], end_s=0.12).values for one in (both, same))
+    a, b = (shown(one, "ring_x", "hammer", end_s=0.12) for one in (both, same))
     assert np.array_equal(a, b)
     for key in ("hammer.3.force_n", "hammer.1.loudness", "contact.frictionn", "engine.name"):
         with pytest.raises(InputError):
@@ -81,7 +137,16 @@ def test_commands_are_numbered_by_time_wherever_they_are_from() -> None:
 
 
 def test_times_of_blows_are_interpolated_between_rows(experiment: Experiment) -> None:
-    predictor = Predictor(experiment, ["hammer.1.duration_ms"], channels=["hammer"], end_s=0.03)
-    low, middle, high = (predictor.signals([value]).values for value in (5.0, 5.01, 5.025))
-    assert np.allclose(middle, 0.6 * low + 0.4 * high)
+    """A half sine that begins between two rows: its impulse about any time is that of the formula."""
+    parts = rows(("hammer",), np.arange(600) / 20_000)
+    parts = {"hammer": replace(parts["hammer"], ideal=True)}
+    predictor = Predictor(experiment, ["hammer.1.duration_ms"], parts)
+    low, middle, high = (predictor.predict([value]).values["hammer"].sum() for value in (5.0, 5.01, 5.025))
+    assert middle == pytest.approx(0.6 * low + 0.4 * high, rel=1e-4)
     assert not np.allclose(low, high)
+
+
+def test_a_blow_behind_the_window_is_not_simulated(experiment: Experiment) -> None:
+    predictor = Predictor(experiment, ["hammer.1.duration_ms"], rows(("ring_x",), np.arange(200) / 20_000))
+    predictor.predict([5.01])
+    assert predictor.runs == 1

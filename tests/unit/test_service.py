@@ -382,11 +382,13 @@ def test_reports_of_clients_are_in_the_status_with_their_lag() -> None:
         rig.console.step(100_000)
         client = rig.listener.client
         client.report(f"{wire.CLIENTS}/recorder", json.dumps({"received_index": 1_000, "lost": 3}).encode())
-        for bad in (b"", b"{}", b"[]", b'{"received_index": "x"}', b'{"received_index": null}'):
+        for bad in (b"", b"{}", b"[]", b'{"received_index": "x"}', b'{"received_index": []}'):
             client.report(f"{wire.CLIENTS}/broken", bad)
+        client.report(f"{wire.CLIENTS}/early", b'{"received_index": null}')
         status = rig.console.status()
         assert status["samples_published"] == 2_000
-        assert status["clients"].keys() == {"recorder"}
+        assert status["clients"].keys() == {"recorder", "early"}
+        assert status["clients"]["early"]["lag_s"] == 0.0, "who has just come is behind nothing"
         row = status["clients"]["recorder"]
         assert (row["received_index"], row["lost"], row["lag_s"]) == (1_000, 3, 0.05)
         assert "5 client reports could not be read" in status["warnings"]

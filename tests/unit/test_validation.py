@@ -12,11 +12,11 @@ import pytest
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from replays.experiment import Experiment
+from replays.prediction import Measured, Prediction, bare, measured, predict
 from replays.validation import load_criteria, outcome, validate
 from replays.validation.attribution import Explained, attribute
 from replays.validation.criteria import DEFAULT
 from replays.validation.phases import View, find_phases, quantities, spectrum_distance
-from replays.validation.prediction import Measured, Prediction, bare, measured, predict
 from rig.errors import InputError
 from rig.offline import frames
 from rig.scenes import load_scene

@@ -9,10 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recorder.schemas import event_text
 from recorder.viewer import blueprint, file, spectrum
 from recorder.viewer.canvas import Canvas, new_stream
 from recorder.viewer.geometry import Geometry
-from recorder.viewer.painter import text_of
+from recorder.viewer.painter import not_drawn
+from rig import wire
+from rig.channels import ChannelTable, default_table
+from rig.cli.main import main
+from tests.unit.player_recording import BLOCKS, write_recording
+from tests.unit.recorder_stream import stream
 from tests.unit.viewer_recording import (
     CLEARANCE_MM,
     DISK_RATIO,
@@ -157,7 +163,7 @@ def test_contact_is_told_apart_by_source(painted: Any, recording: Synthetic) -> 
 def test_events_are_a_log_with_levels(painted: Any) -> None:
     _, saved, _ = painted
     texts = [text for (text,) in saved["/events", "TextLog:text"].values]
-    assert texts[1] == "hammer: force_n 100, duration_ms 5, direction x"
+    assert texts[1] == "hammer: force_n 100.0, duration_ms 5.0, direction x"
     assert [level for (level,) in saved["/events", "TextLog:level"].values] == ["INFO", "INFO", "WARN", "INFO"]
 
 
@@ -252,5 +258,44 @@ def test_an_empty_recording_is_drawn_as_such(tmp_path: Path) -> None:
 
 def test_event_texts_are_one_line() -> None:
     command = {"event": "command", "tick": 1, "time_s": 0.1, "id": 3, "command": "speed", "request": {"speed_hz": 5.2}}
-    assert text_of(command) == "command: id 3, command speed, speed_hz 5.2"
-    assert text_of({"event": "end", "reason": "completed", "rows": {"a": 1}}) == "end: reason completed"
+    assert event_text(command)[1] == "command: id 3, command speed, speed_hz 5.2"
+    assert event_text({"event": "end", "reason": "completed", "rows": {"a": 1}})[1] == "end: reason completed"
+
+
+def test_other_channels_get_the_views_that_they_can_fill() -> None:
+    table = default_table()
+    assert not_drawn(table) == []
+    foreign = table.groups["forces"].model_copy(
+        update={"name": "log", "channels": (table.channels["P_N"].model_copy(update={"name": "rpm"}),)}
+    )
+    other = ChannelTable(groups={"log": foreign})
+    assert [text.split(" (no")[0] for text in not_drawn(other)] == [
+        "orbit, spectrum, contact",
+        "reaction",
+        "turning of the rotor",
+    ]
+    for given, whole in ((table, True), (other, False)):
+        plan = blueprint.layout(given, Geometry(), live=False)
+        found = {str(view.origin) for view in _views(plan.root_container)}
+        assert "/events" in found
+        assert {"/orbit/ring" in found, "/spectrum/now" in found, "/contact" in found} == {whole}
+
+
+def _views(container: Any) -> list[Any]:
+    if not hasattr(container, "contents") or hasattr(container, "origin"):
+        return [container]
+    return [view for inner in container.contents for view in _views(inner)]
+
+
+def test_the_command_takes_parts_and_shows_notes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    written = list(stream(BLOCKS))
+    note = {"event": "note", "tick": 5000, "time_s": 0.005, "text": "bearing is warm", "tags": ["look"]}
+    half = next(n for n, (key, _) in enumerate(written) if n > len(written) / 2 and key == wire.sensor_key("probes"))
+    halves = [[*written[:half], (wire.EVENTS, wire.encode_document(note))], written[half:]]
+    files = [write_recording(tmp_path / f"{n}.mcap", half) for n, half in enumerate(halves)]
+    with pytest.raises(SystemExit) as end:
+        main(["view", str(files[1]), str(files[0]), "--save", str(tmp_path / "both.rrd")])
+    assert end.value.code == 0
+    assert f"{BLOCKS * 0.01 - 5e-5:.3f} s" in capsys.readouterr().out
+    saved = Saved(tmp_path / "both.rrd")
+    assert "note: bearing is warm #look" in [text for (text,) in saved["/events", "TextLog:text"].values]
