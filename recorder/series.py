@@ -27,6 +27,10 @@ MB = 1_000_000
 MOST_PARTS = 1_000_000
 _PENDING_BYTES = 2 * MB
 """What may still come to a file at its end, but for its index: a chunk that is not yet on the disk."""
+_NEW_BYTES = 300_000
+"""What a file takes that was only just begun, with its end."""
+_FLUSH_BYTES = MB // 4
+"""At the budget, more than that in memory is flushed, for it is less once it is compressed; less is let go."""
 _CHECK_S = 0.25
 _BEHIND_NS = NS
 """Simulated time by which streams may be apart at a seam: more, and one of them is still catching up [ns]."""
@@ -120,6 +124,54 @@ def lack_of_room(folder: Path, keep_free_mb: float, *, index_bytes: int = 0) -> 
     return f"less than {keep_free_mb:g} MB are free on the disk"
 
 
+class Room:
+    """What the files of a recording may still take of the disk."""
+
+    def __init__(self, folder: Path, limits: Limits, *, monotonic_s: Callable[[], float] = time.monotonic) -> None:
+        """Take the folder and its limits.
+
+        Args:
+            folder: Where the files are.
+            limits: What they may take.
+            monotonic_s: Clock that times the looks at the disk [s].
+        """
+        self._folder = folder
+        self._limits = limits
+        self._monotonic_s = monotonic_s
+        self._checked_s = -1e9
+        self._unchecked_bytes = 0
+
+    def needs_look(self, payload_bytes: int, finished_bytes: int, writer: RecordingWriter) -> bool:
+        """Whether it is time for `lack`, after a payload of that size; costs next to nothing."""
+        self._unchecked_bytes += payload_bytes
+        if self._over_budget(finished_bytes, writer):
+            return True
+        return self._unchecked_bytes >= MB // 2 or self._monotonic_s() - self._checked_s >= _CHECK_S
+
+    def lack(self, finished_bytes: int, writer: RecordingWriter | None = None) -> str:
+        """What there is no more room for; empty if there is room for all.
+
+        Args:
+            finished_bytes: Size of the finished files that are there [bytes].
+            writer: The file that is being written; None for one that is to be begun.
+        """
+        self._checked_s = self._monotonic_s()
+        self._unchecked_bytes = 0
+        if self._over_budget(finished_bytes, writer):
+            if writer is not None and writer.unflushed_bytes > _FLUSH_BYTES:
+                writer.sync()
+            if self._over_budget(finished_bytes, writer):
+                return f"the budget of {self._limits.budget_mb:g} MB is used up"
+        index_bytes = 0 if writer is None else writer.index_bytes
+        return lack_of_room(self._folder, self._limits.keep_free_mb, index_bytes=index_bytes)
+
+    def _over_budget(self, finished_bytes: int, writer: RecordingWriter | None) -> bool:
+        if self._limits.budget_mb is None:
+            return False
+        file_bytes = _NEW_BYTES if writer is None else writer.final_bytes
+        return finished_bytes + file_bytes > self._limits.budget_mb * MB
+
+
 class Commands:
     """The scene document, kept up to date: whoever has only a later file needs the commands that came before it."""
 
@@ -152,6 +204,7 @@ class Series:
     """
 
     out_of_room = False
+    remarks: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -184,12 +237,12 @@ class Series:
         self._limits = limits
         self._open_writer = open_writer
         self._monotonic_s = monotonic_s
+        self._room = Room(path.parent, limits, monotonic_s=monotonic_s)
         self._commands = Commands(scene)
         self._closed = Counts()
         self._sizes: list[int] = []
+        self._finished_bytes = 0
         self._number = 0
-        self._checked_s = -1e9
-        self._unchecked_bytes = 0
         self._reached_ns: dict[str, int] = {}
         self._expected: set[str] = set()
         self._full_s: float | None = None
@@ -224,10 +277,13 @@ class Series:
             self._rotate()
         document = self._writer.write(key, payload, wall_ns)
         self._commands.follow(key, document)
-        self._unchecked_bytes += len(payload)
-        if self._unchecked_bytes >= MB // 2 or self._monotonic_s() - self._checked_s >= _CHECK_S:
-            self._check_room()
+        if self._room.needs_look(len(payload), self._finished_bytes, self._writer):
+            self._make_room()
         return document
+
+    def kept(self) -> list[Counts]:
+        """What the files hold: it is all of one stretch."""
+        return [self.counts()]
 
     def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
         """Record that the transport lost messages for good."""
@@ -302,6 +358,7 @@ class Series:
         old.finish("rotated", notes={"next": new.name})
         self.files.append(old.path)
         self._sizes.append(old.size_bytes)
+        self._finished_bytes += old.size_bytes
         try:
             writer = self._open(new, previous=old.path.name, from_start=False, due=dict(old.next_index))
         except (InputError, RecordingError) as error:
@@ -309,10 +366,8 @@ class Series:
         self._closed += old.counts()
         self._writer = writer
 
-    def _check_room(self) -> None:
-        self._checked_s = self._monotonic_s()
-        self._unchecked_bytes = 0
-        while why := self._lack():
+    def _make_room(self) -> None:
+        while why := self._room.lack(self._finished_bytes, self._writer):
             if self._limits.when_full == "stop" or not self.files:
                 self.ended, self.out_of_room = why, True
                 return
@@ -322,14 +377,5 @@ class Series:
                 self.ended, self.out_of_room = f"{why}, and {self.files[0]} stays ({error.strerror})", True
                 return
             self.files.pop(0)
-            self._sizes.pop(0)
+            self._finished_bytes -= self._sizes.pop(0)
             self.removed += 1
-
-    def _lack(self) -> str:
-        """What there is no more room for."""
-        limits = self._limits
-        if limits.budget_mb is not None:
-            used = sum(self._sizes) + self._writer.size_bytes + self._writer.index_bytes + _PENDING_BYTES
-            if used > limits.budget_mb * MB:
-                return f"the budget of {limits.budget_mb:g} MB is used up"
-        return lack_of_room(self.path.parent, limits.keep_free_mb, index_bytes=self._writer.index_bytes)

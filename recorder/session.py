@@ -17,7 +17,7 @@ from recorder.trigger import Capture, Captures, check_captures
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_view_rate
 from rig.channels import ChannelTable
 from rig.errors import InputError
-from rig.transport import Client
+from rig.transport import Client, NoReplyError
 from rig.wire import (
     ALIVE,
     CATALOGUE,
@@ -67,6 +67,7 @@ class Progress:
         backlog_bytes: Bytes in the inbox.
         dropped: Payloads that found the inbox full.
         files: Finished files.
+        remarks: What the user should know at once, a line each; more come behind these.
     """
 
     time_s: float
@@ -77,6 +78,7 @@ class Progress:
     backlog_bytes: int = 0
     dropped: int = 0
     files: int = 0
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,10 @@ class Summary:
         path: The last file; the .part file if it could not be finished.
         reason: Why the session ended.
         error: What went wrong at the disk or in the recorder, or that there was no more room; empty if nothing did.
-        first_time_s: Simulated time of the first row [s].
-        duration_s: Simulated time from the first to the last row [s].
-        rows: Rows received by key.
-        lost: Rows lost by key, only keys that lost some.
+        first_time_s: Simulated time of the first row in the files [s].
+        duration_s: Simulated time from the first to the last row; of all captures in sum [s].
+        rows: Rows in the files by key.
+        lost: Rows that were lost, by key, only keys that lost some; of captures also those lost between them.
         gaps: Number of gaps that they are in.
         missed: Messages that the transport gave up, by key.
         dropped: Payloads that found the inbox full; they are among the lost.
@@ -99,6 +101,9 @@ class Summary:
         files: All files that are there, in order; among them a .part file that could not be finished.
         removed: Files that were removed for want of room.
         high_water_bytes: Most that ever waited in the inbox.
+        received_s: Simulated time from the first to the last row received, kept or not [s].
+        fired: Triggers that came; None where it was not recorded around triggers.
+        remarks: What the user should know, a line each.
     """
 
     path: Path
@@ -116,6 +121,9 @@ class Summary:
     files: tuple[Path, ...] = ()
     removed: int = 0
     high_water_bytes: int = 0
+    received_s: float = 0.0
+    fired: int | None = None
+    remarks: tuple[str, ...] = ()
 
 
 class Sink(Protocol):
@@ -126,6 +134,7 @@ class Sink(Protocol):
     removed: int
     ended: str
     out_of_room: bool
+    remarks: tuple[str, ...]
 
     @property
     def part(self) -> Path:
@@ -144,6 +153,10 @@ class Sink(Protocol):
 
     def counts(self) -> Counts:
         """What was received so far."""
+        ...
+
+    def kept(self) -> list[Counts]:
+        """What stands in the files, for each stretch of time that is recorded without a pause."""
         ...
 
     def write(self, key: str, payload: bytes, wall_ns: int) -> dict[str, Any] | None:
@@ -239,6 +252,7 @@ class RecordingSession:
         duration_s: float | None = None,
         view_rate_hz: float = 500.0,
         history: bool = False,
+        wait_s: float = 0.0,
         force: bool = False,
         limits: Limits | None = None,
         capture: Capture | None = None,
@@ -256,6 +270,7 @@ class RecordingSession:
             view_rate_hz: Rate of the plottable messages [Hz]; 0 writes none.
             history: Also record what the rig's cache still holds from before; rows since the start of the run that it
                 no longer holds count as lost.
+            wait_s: How long a rig may take to answer at the beginning [s]: one that is being prepared listens already.
             force: Replace an existing file.
             limits: Size of the files, and what they may take of the disk.
             capture: Record only around triggers.
@@ -269,13 +284,16 @@ class RecordingSession:
         if duration_s is not None and not duration_s > 0.0:
             raise InputError("duration_s", "above 0", duration_s)
         check_view_rate(view_rate_hz)
+        if not wait_s >= 0.0:
+            raise InputError("wait_s", "at least 0", wait_s)
         self._limits = limits or Limits()
         self._capture = capture
         if capture is None:
             check_series(path, self._limits, force=force)
         else:
-            if self._limits.rotates or self._limits.budget_mb is not None:
-                raise InputError("limits", "without rotation and budget for triggered recording", self._limits)
+            for field in ("rotate_mb", "rotate_s"):
+                if (given := getattr(self._limits, field)) is not None:
+                    raise InputError(field, "left out where it is recorded around triggers", given)
             check_captures(path, capture, force=force)
             check_room(path, self._limits)
         self.path = path
@@ -284,6 +302,7 @@ class RecordingSession:
         self._duration_ns = math.inf if duration_s is None else duration_s * NS
         self._view_rate_hz = view_rate_hz
         self._history = history
+        self._wait_s = wait_s
         self._force = force
         self._wall_ns = wall_ns
         self._monotonic_s = monotonic_s
@@ -323,9 +342,7 @@ class RecordingSession:
             NoReplyError: No rig answers.
             InputError: The file cannot be created.
         """
-        catalogue, parameters, scene = (
-            decode_document(self._client.request(key)) for key in (CATALOGUE, PARAMETERS, SCENE)
-        )
+        catalogue, parameters, scene = (decode_document(self._ask(key)) for key in (CATALOGUE, PARAMETERS, SCENE))
         writer = self._open_sink(catalogue, parameters, scene)
         self._tick_rate_hz = round(catalogue["tick_rate_hz"])
         self._streams = {sensor_key(group) for group in writer.table.groups}
@@ -348,6 +365,16 @@ class RecordingSession:
         if not self._rig_lost:
             self._report(writer, done=True)  # lets the rig drop its cache at once
         return self._summary(writer, reason, trouble)
+
+    def _ask(self, key: str) -> bytes:
+        """Request a document, again for as long as a rig may take to answer."""
+        deadline_s = self._monotonic_s() + self._wait_s
+        while True:
+            try:
+                return self._client.request(key)
+            except NoReplyError:
+                if self._stop_reason or self._monotonic_s() >= deadline_s:
+                    raise
 
     def _open_sink(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> Sink:
         def open_writer(path: Path, *, from_start: bool, **options: Any) -> RecordingWriter:
@@ -379,8 +406,9 @@ class RecordingSession:
             tick_rate_hz=round(catalogue["tick_rate_hz"]),
             scene=scene,
             open_writer=open_writer,
-            keep_free_mb=self._limits.keep_free_mb,
+            limits=self._limits,
             force=self._force,
+            monotonic_s=self._monotonic_s,
         )
 
     # On the transport's threads.
@@ -516,6 +544,7 @@ class RecordingSession:
             backlog_bytes=self._inbox.waiting_bytes,
             dropped=self._inbox.dropped,
             files=len(writer.files),
+            remarks=writer.remarks,
         )
 
     def _finish(self, writer: Sink, reason: str) -> str:
@@ -543,14 +572,15 @@ class RecordingSession:
         if trouble and writer.part.exists():
             files = (*files, writer.part)
         counts = writer.counts()
-        first_ns = counts.first_time_ns or 0
+        kept = writer.kept()
+        in_files = sum(kept, Counts())
         return Summary(
             path=files[-1] if files else writer.path,
             reason=reason,
             error=trouble or (writer.ended if writer.out_of_room else ""),
-            first_time_s=first_ns / NS,
-            duration_s=(counts.last_time_ns - first_ns) / NS if counts.first_time_ns is not None else 0.0,
-            rows=counts.rows,
+            first_time_s=(in_files.first_time_ns or 0) / NS,
+            duration_s=sum(each.extent_ns for each in kept) / NS,
+            rows=in_files.rows,
             lost={key: lost for key, lost in counts.lost.items() if lost},
             gaps=counts.gaps,
             missed=counts.missed,
@@ -560,4 +590,7 @@ class RecordingSession:
             files=files,
             removed=writer.removed,
             high_water_bytes=self._inbox.high_water_bytes,
+            received_s=counts.extent_ns / NS,
+            fired=writer.fired if isinstance(writer, Captures) else None,
+            remarks=writer.remarks,
         )

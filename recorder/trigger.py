@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ import numpy as np
 
 from recorder.payload import block_in, tick_in
 from recorder.schemas import PART_SUFFIX
-from recorder.series import Commands, lack_of_room
+from recorder.series import Commands, Limits, Room
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination, remove
 from rig.channels import ChannelTable
 from rig.errors import InputError
@@ -36,6 +37,11 @@ MOST_CAPTURES = 1000
 _MOST_FIRED = 1000
 """Triggers that a file lists; more are only counted."""
 _MOST_PRE_S = 120.0
+LONGEST_S = 60.0
+"""Longest length of a capture unless told otherwise [s of simulated time]."""
+REARM_S = 0.25
+"""A level starts a new capture only if nothing was beyond it for so long: whirl crosses one twice a turn, and would
+otherwise start captures for as long as it lasts [s of simulated time]."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,7 @@ class Trigger:
 
     @classmethod
     def parse(cls, text: str) -> Trigger:
-        """Read a trigger: an event such as `hammer`, or a level such as `P_E>500`, `speed<5` or `|disk_x|>0.5`.
+        """Read a trigger: an event such as `hammer`, or a level such as `P_E>3200`, `speed<5` or `|disk_x|>0.5`.
 
         Raises:
             InputError: It is neither.
@@ -66,7 +72,7 @@ class Trigger:
         if text in EVENT_NAMES:
             return cls(text=text, name=text)
         match = _LEVEL.fullmatch(text)
-        must = f"one of {', '.join(EVENT_NAMES)}, or like P_E>500, speed<5 or |disk_x|>0.5"
+        must = f"one of {', '.join(EVENT_NAMES)}, or like P_E>3200, speed<5 or |disk_x|>0.5"
         if match is None or match[1] != match[3]:
             raise InputError("trigger", must, text)
         try:
@@ -82,6 +88,12 @@ class Trigger:
         values = np.abs(values) if self.magnitude else values
         return values > self.level if self.above else values < self.level
 
+    def already(self, unit: str) -> str:
+        """What to say where the first value is beyond the level, in this unit."""
+        name = f"|{self.name}|" if self.magnitude else self.name
+        side, other = ("above", "below") if self.above else ("below", "above")
+        return f"{name} is {side} {self.level:g} {unit} already; waiting until it has been {other}"
+
 
 @dataclass(frozen=True)
 class Capture:
@@ -93,14 +105,18 @@ class Capture:
         post_s: Time kept after it [s of simulated time].
         count: The recording ends after so many captures; None if it does not.
         again: A trigger during a capture makes it longer, to `post_s` after the last one; or is ignored. Either way
-            it is counted, and noted in the file.
+            it is counted, and noted in the file. None: an event makes it longer, a level is ignored, for it can be
+            crossed again for as long as the rig whirls.
+        longest_s: Longest length of a capture, with the time before the trigger [s of simulated time]; None for
+            `LONGEST_S`, or `pre_s` and `post_s` where they are more.
     """
 
     triggers: tuple[Trigger, ...]
     pre_s: float = 0.5
     post_s: float = 2.0
     count: int | None = None
-    again: Literal["extend", "ignore"] = "extend"
+    again: Literal["extend", "ignore"] | None = None
+    longest_s: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.pre_s <= _MOST_PRE_S:
@@ -109,8 +125,23 @@ class Capture:
             raise InputError("post_s", "above 0, at most 1e6", self.post_s)
         if self.count is not None and not 1 <= self.count <= MOST_CAPTURES:
             raise InputError("count", f"from 1 to {MOST_CAPTURES}", self.count)
-        if self.again not in ("extend", "ignore"):
+        if self.again not in ("extend", "ignore", None):
             raise InputError("again", "extend or ignore", self.again)
+        least_s = self.pre_s + self.post_s
+        if self.longest_s is not None and not least_s <= self.longest_s <= 1e6:
+            raise InputError("longest_s", f"at least pre_s and post_s, {least_s:g}, at most 1e6", self.longest_s)
+        if self.longest_s is None:
+            object.__setattr__(self, "longest_s", max(LONGEST_S, least_s))
+
+    @property
+    def longest_ns(self) -> int:
+        """Longest length of a capture [ns of simulated time]."""
+        assert self.longest_s is not None
+        return round(self.longest_s * NS)
+
+    def extends(self, trigger: Trigger) -> bool:
+        """Whether this trigger makes a capture longer that is being made."""
+        return trigger.level is None if self.again is None else self.again == "extend"
 
     def check(self, table: ChannelTable) -> None:
         """Refuse channels that the rig does not have.
@@ -163,6 +194,10 @@ class _Open:
 
     writer: RecordingWriter
     end_ns: int
+    latest_end_ns: int
+    """Where it ends at the latest, at its longest length."""
+    full: bool = False
+    """It would have gone on otherwise."""
     fired: list[dict[str, Any]] = field(default_factory=list)
     count: int = 1
 
@@ -172,12 +207,13 @@ class Captures:
 
     Attributes:
         files: The finished files, in order.
-        ended: Why the recording ends, where the number of captures was limited; empty before.
+        ended: Why the recording ends, where the number of captures or their room was limited; empty before.
+        out_of_room: It is for want of room.
         fired: Triggers so far, those during a capture included.
+        remarks: What the user should know at once, a line each.
     """
 
     removed = 0
-    out_of_room = False
 
     def __init__(
         self,
@@ -188,8 +224,9 @@ class Captures:
         tick_rate_hz: int,
         scene: dict[str, Any],
         open_writer: Callable[..., RecordingWriter],
-        keep_free_mb: float = 0.0,
+        limits: Limits | None = None,
         force: bool = False,
+        monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Check names and triggers; a file is opened by the first trigger.
 
@@ -200,8 +237,9 @@ class Captures:
             tick_rate_hz: Ticks per simulated second.
             scene: The rig's scene document.
             open_writer: Opens one file, given its path and the keywords `scene`, `due`, `metadata` and `from_start`.
-            keep_free_mb: Room that is left to others on the disk [MB]; without it, no further capture is begun.
+            limits: Budget, and room that is left to others on the disk; by default neither.
             force: Replace what is there of that name.
+            monotonic_s: Clock that times the looks at the disk [s].
 
         Raises:
             InputError: The name or a channel cannot be used.
@@ -214,16 +252,21 @@ class Captures:
         self.table = table
         self.files: list[Path] = []
         self.ended = ""
+        self.out_of_room = False
         self.fired = 0
+        self.remarks: tuple[str, ...] = ()
         self.next_index: dict[str, int] = {}
         self._capture = capture
         self._tick_rate_hz = tick_rate_hz
-        self._keep_free_mb = keep_free_mb
+        self._limits = limits or Limits(keep_free_mb=0.0)
+        self._room = Room(path.parent, self._limits, monotonic_s=monotonic_s)
         self._commands = Commands(scene)
         self._open_writer = open_writer
         self._pre_ns, self._post_ns = round(capture.pre_s * NS), round(capture.post_s * NS)
         self._ring: deque[_Item] = deque()
         self._beyond: dict[Trigger, bool] = {}
+        self._beyond_ns: dict[Trigger, int] = {}
+        """Simulated time of the latest value beyond each level [ns]."""
         self._reached_ns: dict[str, int] = {}
         self._latest_ns = 0
         self._first_ns: int | None = None
@@ -232,6 +275,7 @@ class Captures:
         self._missed: dict[str, int] = {}
         self._malformed = 0
         self._size_bytes = 0
+        self._kept: list[Counts] = []
         self._number = 0
         self._open: _Open | None = None
 
@@ -248,6 +292,10 @@ class Captures:
             malformed=self._malformed,
             size_bytes=self._size_bytes + (writing.writer.size_bytes if writing else 0),
         )
+
+    def kept(self) -> list[Counts]:
+        """What the files hold, capture by capture."""
+        return [*self._kept, self._open.writer.counts()] if self._open else list(self._kept)
 
     def write(self, key: str, payload: bytes, wall_ns: int) -> dict[str, Any] | None:
         """Take one payload: into the ring, and into the capture that is open."""
@@ -267,15 +315,15 @@ class Captures:
         item = _Item(key, payload, wall_ns, start_ns, end_ns, self._latest_ns)
         self._ring.append(item)
         if self._open is not None and start_ns <= self._open.end_ns:
-            self._open.writer.write(key, payload, wall_ns)
+            self._write(key, payload, wall_ns)
         # The ring's own scene: what was sent before the first thing that it still holds. It is emptied by the time at
         # which things came, as an event can name a tick that is far off.
         while self._ring and self._ring[0].came_ns < self._latest_ns - self._pre_ns - _LATE_NS:
             gone = self._ring.popleft()
             if gone.key == EVENTS:
                 self._commands.follow(EVENTS, _document(gone.payload))
-        for trigger, time_ns in self._fired_by(key, document, block):
-            self._fire(trigger, time_ns)
+        for trigger, time_ns, is_new in self._fired_by(key, document, block):
+            self._fire(trigger, time_ns, is_new=is_new)
         self._close_if_over()
         return document
 
@@ -324,13 +372,27 @@ class Captures:
         tick = tick_in(document)
         return self._latest_ns if tick is None else max(0, tick * NS // self._tick_rate_hz)
 
-    def _fired_by(self, key: str, document: dict[str, Any] | None, block: Block | None) -> list[tuple[Trigger, int]]:
-        """Triggers that this payload sets off, with their simulated times [ns]."""
+    def _write(self, key: str, payload: bytes, wall_ns: int) -> None:
+        """To the capture that is open, as long as there is room for it."""
+        assert self._open is not None
+        if self.ended:
+            return
+        writer = self._open.writer
+        writer.write(key, payload, wall_ns)
+        if self._room.needs_look(len(payload), self._size_bytes, writer) and (
+            why := self._room.lack(self._size_bytes, writer)
+        ):
+            self.ended, self.out_of_room = why, True
+
+    def _fired_by(
+        self, key: str, document: dict[str, Any] | None, block: Block | None
+    ) -> list[tuple[Trigger, int, bool]]:
+        """Triggers that this payload sets off, with their simulated times [ns], and whether each may start a capture."""
         found = []
         for trigger in self._capture.triggers:
             if trigger.level is None:
                 if key == EVENTS and document is not None and document.get("event") == trigger.name:
-                    found.append((trigger, self._time_of(document)))
+                    found.append((trigger, self._time_of(document), True))
                 continue
             group = self.table.groups.get(key.removeprefix(SENSORS + "/")) if block is not None else None
             if block is None or group is None or trigger.name not in group.names:
@@ -341,31 +403,49 @@ class Captures:
             channel = group.channels[column]
             beyond = trigger.crossed(block.values[:, column] * channel.scale + channel.offset)
             # What is beyond its level from the first row on has not crossed it.
+            if trigger not in self._beyond and beyond[0]:
+                self.remarks += (trigger.already(channel.unit),)
             before = np.concatenate(([self._beyond.get(trigger, True)], beyond[:-1]))
             self._beyond[trigger] = bool(beyond[-1])
-            rows = np.flatnonzero(beyond & ~before).tolist()
-            # The first starts a capture, the last makes it longer.
+            there = np.flatnonzero(beyond)
+            if not len(there):
+                continue
+            begin_ns, row_ns = block.tick * NS // self._tick_rate_hz, NS / block.rate_hz
+            crossings = np.flatnonzero(beyond & ~before)
+            # Time for which nothing was beyond the level, at each crossing.
+            places = np.searchsorted(there, crossings)
+            before_ns = np.where(
+                places > 0, there[places - 1] * row_ns, self._beyond_ns.get(trigger, -math.inf) - begin_ns
+            )
+            is_new = crossings * row_ns - before_ns >= REARM_S * NS
+            self._beyond_ns[trigger] = begin_ns + round(int(there[-1]) * row_ns)
+            # One that may start a capture, or else the first, counts, and the last, which may make it longer.
+            picked = dict.fromkeys((int(np.argmax(is_new)), len(crossings) - 1)) if len(crossings) else ()
             found += [
-                (trigger, block.tick * NS // self._tick_rate_hz + round(row * NS / block.rate_hz))
-                for row in dict.fromkeys((*rows[:1], *rows[-1:]))
+                (trigger, begin_ns + round(int(crossings[which]) * row_ns), bool(is_new[which])) for which in picked
             ]
         return found
 
-    def _fire(self, trigger: Trigger, time_ns: int) -> None:
+    def _fire(self, trigger: Trigger, time_ns: int, *, is_new: bool) -> None:
+        during = self._open is not None and time_ns <= self._open.end_ns
+        if not (during or is_new):
+            return
         self.fired += 1
         about = {"trigger": trigger.text, "time_s": time_ns / NS}
         if self._open is not None and time_ns <= self._open.end_ns:
             self._open.count += 1
             if len(self._open.fired) < _MOST_FIRED:
                 self._open.fired.append(about)
-            if self._capture.again == "extend":
-                self._open.end_ns = max(self._open.end_ns, time_ns + self._post_ns)
+            if self._capture.extends(trigger):
+                end_ns = max(self._open.end_ns, time_ns + self._post_ns)
+                self._open.full = self._open.full or end_ns > self._open.latest_end_ns
+                self._open.end_ns = min(end_ns, self._open.latest_end_ns)
             return
         if self._open is not None:
-            self._close("captured")
+            self._close_captured()
         if self.ended:
             return
-        if why := lack_of_room(self.path.parent, self._keep_free_mb):
+        if why := self._room.lack(self._size_bytes):
             self.ended, self.out_of_room = why, True
             return
         self._number += 1
@@ -376,7 +456,8 @@ class Captures:
                 "time_s": f"{time_ns / NS:.9f}",
                 "pre_s": f"{self._capture.pre_s:g}",
                 "post_s": f"{self._capture.post_s:g}",
-                "again": self._capture.again,
+                "again": "extend" if self._capture.extends(trigger) else "ignore",
+                "longest_s": f"{self._capture.longest_s:g}",
                 "number": str(self._number),
             }
         }
@@ -386,11 +467,12 @@ class Captures:
             writer = self._open_writer(path, scene=scene, due=None, metadata=metadata, from_start=False)
         except InputError as error:
             raise RecordingError(f"recording stopped: {error}; the captures before it are kept") from None
-        self._open = _Open(writer, time_ns + self._post_ns, [about])
+        latest_end_ns = time_ns - self._pre_ns + self._capture.longest_ns
+        self._open = _Open(writer, time_ns + self._post_ns, latest_end_ns, fired=[about])
         self.part = writer.part
         for item in self._ring:
             if item.end_ns >= start_ns and item.start_ns <= self._open.end_ns:
-                writer.write(item.key, item.payload, item.wall_ns)
+                self._write(item.key, item.payload, item.wall_ns)
 
     def _scene_before(self, start_ns: int) -> dict[str, Any]:
         """The scene with the commands that came before what the file will hold."""
@@ -406,7 +488,12 @@ class Captures:
             return
         late = self._latest_ns >= self._open.end_ns + _LATE_NS
         if late or min(self._reached_ns.values(), default=0) >= self._open.end_ns:
-            self._close("captured")
+            self._close_captured()
+
+    def _close_captured(self) -> None:
+        assert self._open is not None
+        full = f", up to its longest length of {self._capture.longest_s:g} s" if self._open.full else ""
+        self._close("captured" + full)
 
     def _close(self, reason: str, notes: dict[str, str] | None = None) -> None:
         writing, self._open = self._open, None
@@ -417,6 +504,9 @@ class Captures:
         writing.writer.finish(reason, notes={**(notes or {}), **fired})
         self.files.append(writing.writer.path)
         self._size_bytes += writing.writer.size_bytes
+        self._kept.append(writing.writer.counts())
+        if self.ended:
+            return
         if self._capture.count is not None and self._number >= self._capture.count:
             self.ended = f"{self._number} captures made"
 

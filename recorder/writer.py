@@ -39,6 +39,10 @@ if TYPE_CHECKING:
 
 NS = 1_000_000_000
 _CHUNK_BYTES = 1 << 20
+_MESSAGE_BYTES = 47
+"""What a message takes besides its data: its head, and its place in the index of the chunk."""
+_END_BYTES = 100_000
+"""What comes to a file when it is finished, its index aside: channels and schemas again, and the last plotted rows."""
 _SET_BACK_NS = 60 * NS
 """Step back of the wall clock after which clock pairs begin anew; smaller ones are of streams that came in turn."""
 
@@ -70,6 +74,11 @@ class Counts:
     missed: dict[str, int] = field(default_factory=dict)
     malformed: int = 0
     size_bytes: int = 0
+
+    @property
+    def extent_ns(self) -> int:
+        """Simulated time from the first to the last row [ns]."""
+        return 0 if self.first_time_ns is None else self.last_time_ns - self.first_time_ns
 
     def __add__(self, later: Counts) -> Counts:
         firsts = [each.first_time_ns for each in (self, later) if each.first_time_ns is not None]
@@ -266,6 +275,7 @@ class RecordingWriter:
         self._clock_ns = 0
         self._chunks = 0
         self._chunk_bytes = 0
+        self._unflushed_bytes = 0
         self._begun = False
         self._topics: dict[str, _Topic] = {}
         self._schema_ids: dict[str, int] = {}
@@ -315,6 +325,16 @@ class RecordingWriter:
     def index_bytes(self) -> int:
         """About what the index at the end of the file will take: it names each chunk, and each topic in it [bytes]."""
         return (60 + 10 * len(self._topics)) * self._chunks
+
+    @property
+    def unflushed_bytes(self) -> int:
+        """What waits in memory for the next flush, not yet compressed [bytes]."""
+        return self._unflushed_bytes
+
+    @property
+    def final_bytes(self) -> int:
+        """What the file comes to at most if it is finished now [bytes]."""
+        return self.size_bytes + self._unflushed_bytes + self.index_bytes + _END_BYTES
 
     @property
     def streams(self) -> set[str]:
@@ -416,6 +436,11 @@ class RecordingWriter:
         """Flush to the disk if the last flush was long enough ago."""
         with self._guard():
             self._sync_if_due()
+
+    def sync(self) -> None:
+        """Flush to the disk now."""
+        with self._guard():
+            self._sync()
 
     def abandon(self) -> None:
         """Close without finishing and remove what was written; a file that was to be replaced stays."""
@@ -595,6 +620,7 @@ class RecordingWriter:
         topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
         self.messages += 1
         self._chunk_bytes += len(payload)
+        self._unflushed_bytes += len(payload) + _MESSAGE_BYTES
         if self._chunk_bytes >= _CHUNK_BYTES:
             self._chunks += 1
             self._chunk_bytes = 0
@@ -663,6 +689,7 @@ class RecordingWriter:
         os.fsync(self._file.fileno())
         self._check_name()
         self.size_bytes = self._file.tell()
+        self._unflushed_bytes = self._chunk_bytes = 0
         self._synced_s = self._monotonic_s()
 
     def _readme(self, catalogue: dict[str, Any]) -> str:
@@ -722,6 +749,6 @@ view/events: rcl_interfaces/msg/Log of rig/events.
 Attachments: catalogue.json (channel table with calibration), parameters.json, scene.json.
 Metadata "rig" opens the file; metadata "end" closes it with the end reason and the counts.
 Metadata "series": one of several files in a row; its number, the file before it, and the row due of each stream.
-Metadata "trigger": recorded around a trigger only. "cut", "recovered": what this file was made of.
+Metadata "trigger": recorded around a trigger only; what ended it stands in "end". "cut", "recovered": what this file was made of.
 A file without "end" was cut off; what stands in it is good.
 """

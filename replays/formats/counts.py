@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from replays.formats import unit as units
 from replays.formats.mapped import BITS, MappedSignal
 from replays.formats.placement import PlacedGroup, whole_rate
 from replays.formats.selection import NO_VOLTS
@@ -144,14 +145,16 @@ def _noise(values: np.ndarray) -> float:
 
 
 def _told(entry: MappedSignal, channel: Channel, rule: str, values: np.ndarray, rate_hz: int) -> ImportedChannel:
-    unit = entry.mapping.unit or entry.entry.unit or "1"
-    bias = f" - {entry.bias:.6g}" if entry.bias else ""
+    unit = units.canonical(entry.mapping.unit or entry.entry.unit or "1")
+    source = f"(source {'-' if entry.bias > 0.0 else '+'} {abs(entry.bias):.6g})" if entry.bias else "source"
+    ratio = "" if unit == channel.unit else f" {channel.unit} per {unit}"
+    gain = f"{entry.gain:.9g}{ratio} * " if ratio or entry.gain != 1.0 else ""
     delay = f", {-entry.mapping.delay_us:+g} us" if entry.mapping.delay_us else ""
     drift = (entry.axis.rate_hz / rate_hz - 1.0) * 1e6 if entry.axis.rows and whole_rate(entry.axis) == rate_hz else 0.0
     return ImportedChannel(
         name=entry.name, unit=channel.unit,
         source=" ".join(text for text in (entry.source.path.name, entry.entry.group, entry.entry.name) if text),
-        formula=f"{entry.gain:.9g} {channel.unit}/{unit} * (source{bias})",
+        formula=f"{gain}{source}",
         time=f"{entry.axis.note}{delay}; " + ("; ".join(entry.touched) or "samples as they were"),
         counts=rule, rate_hz=rate_hz, jitter_us=entry.axis.jitter_s[1] * 1e6, drift_ppm=drift, missing=entry.missing,
         overrange=entry.overrange, low=float(np.nanmin(values)), high=float(np.nanmax(values)),

@@ -110,7 +110,7 @@ def _parse(path: Path, layout: Layout, options: FileOptions, stamps: int | None)
         row = bad[0]
         line = f"line {row.number + layout.first - skipped}: " if row.number else ""
         raise InputError(
-            "input", f"a text file of {layout.width} columns throughout",
+            "file", f"a text file of {layout.width} columns throughout",
             f"{path}, where {len(bad)} lines are not so ({line}{row.actual_columns} columns, {row.text[:40]!r})",
         )  # fmt: skip
     if not table.num_rows:

@@ -33,7 +33,7 @@ def write_recording(
 
     experiment = conversion.experiment
     scene: dict[str, Any] = {"name": NO_SCENE, "seed": ""}
-    parameters: dict[str, Any] = {"set": "none", "values": {}}
+    parameters: dict[str, Any] = {"set": "", "values": {}}
     if experiment is not None:
         scene, parameters = experiment.scene, experiment.parameters
     writer = RecordingWriter(

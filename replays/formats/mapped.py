@@ -63,7 +63,7 @@ def find_signal(wanted: SignalName, sources: Sequence[Source], field_name: str) 
         return found[0]
     if found:
         places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in found)
-        raise InputError(f"{field_name}.group", f"given, as {wanted.source} stands in {places}", wanted.group)
+        raise InputError(f"{field_name}.group", f"given, as {wanted.source} stands in {places}", wanted.group or "none")
     if not inside:
         groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
         raise InputError(f"{field_name}.group", f"one of {', '.join(groups)}", wanted.group)
@@ -93,7 +93,7 @@ def axis_of(source: Source, entry: Entry, signal: Signal, mapping: Mapping) -> c
     elif signal.rate_hz is not None:
         axis = clock.Axis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
     else:
-        raise InputError("time.rate_hz", f"given, as the file tells no rate of {what}", None)
+        raise InputError("time.rate_hz", f"given, as the file tells no rate of {what}", "none")
     return axis
 
 
@@ -122,12 +122,13 @@ def take(name: str, wanted: ChannelMapping, sources: Sequence[Source], mapping: 
     unit = entry.unit if wanted.unit is None else wanted.unit
     volts = units.size_si(unit) if units.kind(unit) == "voltage" else None
     if wanted.sensitivity is not None:
+        per_unit_v = units.sensitivity_v(wanted.sensitivity, target.unit, field=f"{where}.sensitivity")
         if volts is None:
-            raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit)
-        gain = volts / units.sensitivity_v(wanted.sensitivity, target.unit, field=f"{where}.sensitivity")
+            raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit or "none")
+        gain = volts / per_unit_v
     else:
         if wanted.unit is None and not entry.unit and target.unit != "1":
-            raise InputError(f"{where}.unit", f"given, as {source.path.name} tells none", None)
+            raise InputError(f"{where}.unit", f"given, as {source.path.name} tells none", "none")
         # A pulse may stay in volts: only when it passes its level matters.
         pulse = volts is not None and target.unit == "1"
         gain = volts if pulse and volts is not None else units.factor(unit, target.unit, field=f"{where}.unit")

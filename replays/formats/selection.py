@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -280,7 +281,7 @@ def select(
         InputError: No such channel, an empty range, or nothing in it.
     """
     if from_s is not None and to_s is not None and not to_s > from_s:
-        raise InputError("to_s", f"after from_s = {from_s:g}", to_s)
+        raise InputError("--to", f"after --from {from_s:g}", to_s)
     wanted = _wanted(recording, channels, truth=truth)
     streams = recording.streams
     tables: dict[tuple[str, float, int], list[Table]] = {}
@@ -297,7 +298,8 @@ def select(
     if not tables:
         held = [s for s in streams.values() if s.rows]
         low, high = min((s.first_time_s for s in held), default=0.0), max((s.last_time_s for s in held), default=0.0)
-        raise InputError("range", f"in the recording, {low:g} to {high:g} s", f"{from_s} to {to_s} s")
+        ends = [f"{word} {end:g} s" for word, end in (("from", from_s), ("to", to_s)) if end is not None]
+        raise InputError("range", f"in the recording, {low:g} to {high:g} s", " ".join(ends) or "all of it")
     return Selection(recording=recording, tables=tuple(_merge(alike) for alike in tables.values()), unit=unit)
 
 
@@ -326,13 +328,28 @@ def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> di
     chosen: dict[str, set[int]] = {}
     for channel in [*channels, *(["truth"] if truth else [])]:
         if channel not in places:
-            near = [name for name in places if name.split(".")[0] == "truth" or name in groups]
-            names = [*(name for group in groups.values() for name in group), *near]
-            raise InputError("channel", f"one of {', '.join(dict.fromkeys(names))}", channel)
+            raise InputError("channel", _near(channel, groups, truths), channel)
         for key, c in places[channel]:
             chosen.setdefault(key, set()).add(c)
     order = [*(sensor_key(name) for name in groups), *(truth_key(name) for name in truths)]
     return {key: sorted(chosen[key]) for key in order if key in chosen}
+
+
+def _near(channel: str, groups: dict[str, list[str]], truths: dict[str, list[str]]) -> str:
+    """What a name that is none could have been."""
+    prefix, _, rest = channel.partition(".")
+    table, _, column = rest.partition(".")
+    if prefix == "truth" and table in truths:
+        near = difflib.get_close_matches(column, truths[table], n=3)
+        return f"truth.{table}.COLUMN with one of {', '.join(near or truths[table])}"
+    if prefix == "truth":
+        tables = ", ".join(f"truth.{name}" for name in truths)
+        return f"one of {tables}" if truths else "one of the sensors: the recording has no truth"
+    sensors = [*(name for group in groups.values() for name in group), *groups]
+    near = difflib.get_close_matches(channel, sensors, n=3)
+    if near:
+        return f"one of the recording's, such as {', '.join(near)}"
+    return f"a channel of the recording, one of its groups ({', '.join(groups)}) or truth.TABLE"
 
 
 def _table(

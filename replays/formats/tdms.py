@@ -46,8 +46,6 @@ def open_file(path: Path, options: FileOptions) -> Source:
     try:
         with _quiet():
             file = nptdms.TdmsFile.read_metadata(path)
-        if file.file_status.incomplete_final_segment:
-            raise ValueError("it is cut off")
         groups = [(group.name, group.channels()) for group in file.groups()]
         starts = [
             channel.properties["wf_start_time"]
@@ -58,6 +56,8 @@ def open_file(path: Path, options: FileOptions) -> Source:
         start = min(starts) if starts else None
     except Exception as error:
         raise damaged(path, "TDMS", error) from None
+    if file.file_status.incomplete_final_segment:
+        raise damaged(path, "TDMS", "it is cut off")
     entries, texts = [], 0
     for number, (name, channels) in enumerate(groups):
         for channel in channels:

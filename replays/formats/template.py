@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.resources import files as files_of
 from pathlib import Path
 
@@ -13,6 +14,11 @@ from replays.formats.mapping import FileOptions
 from replays.formats.source import Entry, Source, open_source
 from rig.channels import default_table
 
+CHECK = "PLEASE CHECK"
+"""Marks a line that is a guess."""
+_LABEL = 60
+_TABLES = ("[[align]]", "[keyphasor]", "[hammer]", "[experiment]")
+"""What stands at the end of a mapping, to be taken up."""
 _USUAL_HZ = (100, 200, 500, 1000, 2000, 2500, 5000, 10_000, 20_000, 25_000, 50_000, 100_000)
 
 
@@ -42,8 +48,8 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
     lines += [
         '# A channel in volts: unit = "V", sensitivity = "200 mV/mil" (or "100 mV/g", "2 mV/N"), bias = "mean".',
         "# Probes at other angles than 0 and 90 degrees: [[rotate]]. Another recorder's clock: [[align]]. To simulate",
-        "# it again (`rig validate`, `rig identify`): [experiment], with [hammer] and [keyphasor]. Every option is",
-        "# explained by `rig import --template EXAMPLE.toml`.",
+        "# it again (`rig validate`, `rig identify`): [experiment], with [hammer] and [keyphasor], as at the end. Every",
+        "# option is explained by `rig import --template EXAMPLE.toml`.",
         "",
     ]
     for source in sources:
@@ -58,12 +64,23 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
     for source in sources:
         for entry in source.entries:
             lines += ["", *_channel(entry, source, taken, rig=set(rig), several=len(sources) > 1)]
+    lines += ["", "# Take away the `# ` of what you need:"]
+    for table in _TABLES:
+        lines += ["#", *(f"# {line}" for line in _example_of(table))]
     return "\n".join(lines) + "\n"
 
 
 def example() -> str:
     """A mapping with every option, explained, for a usual rig."""
     return files_of("replays.formats").joinpath("example.toml").read_text(encoding="utf-8")
+
+
+def _example_of(table: str) -> list[str]:
+    """The lines of one table of the example, without options at their default."""
+    lines = example().splitlines()
+    start = next(n for n, line in enumerate(lines) if line.startswith(table))
+    stop = next((n for n, line in enumerate(lines[start + 1 :], start + 1) if line.startswith("[")), len(lines))
+    return [line for line in lines[start:stop] if line and not line.startswith("#")]
 
 
 def _rates(entries: Sequence[Entry]) -> list[str]:
@@ -94,7 +111,7 @@ def _channel(entry: Entry, source: Source, taken: set[str], *, rig: set[str], se
         name, number = f"{plain}_{number}", number + 1
     taken.add(name)
     rate = f"{entry.rate_hz:.9g} Hz" if entry.rate_hz else "no rate"
-    label = f"  {' '.join(entry.label.split())[:60]}" if entry.label else ""
+    label = f"  {_label(entry)}".rstrip()
     lines = [f"[channels.{_key(name)}]    # {entry.rows} values, {rate}{label}", f"source = {_quoted(entry.name)}"]
     if entry.group:
         lines.append(f"group = {_quoted(entry.group)}")
@@ -108,19 +125,29 @@ def _channel(entry: Entry, source: Source, taken: set[str], *, rig: set[str], se
         sensitivity = default_table().channels[name].sensitivity_v
         lines += [
             f"unit = {_quoted(entry.unit)}",
-            f'sensitivity = "{sensitivity:g} V/{target}"    # PLEASE CHECK: assumed',
+            f'sensitivity = "{sensitivity:g} V/{target}"    # {CHECK}: assumed',
         ]
     elif fits:
         lines.append(f"unit = {_quoted(entry.unit)}")
     else:
         told = f"the file says {entry.unit!r}" if entry.unit else "the file tells none"
-        lines.append(f"unit = {_quoted(target)}    # PLEASE CHECK: {told}")
+        lines.append(f"unit = {_quoted(target)}    # {CHECK}: {told}")
     if not ours:
         group = re.sub(r"\W+", "_", entry.group or source.path.stem).strip("_").lower() or "imported"
         if group in default_table().groups:
             group += "_log"
         lines += [f"to = {_quoted(group)}", f"to_unit = {_quoted(target)}"]
     return lines
+
+
+def _label(entry: Entry) -> str:
+    """What the file says of a signal, in a few words; of a comment that is JSON, its label."""
+    text = entry.label
+    if text.lstrip().startswith("{"):
+        with suppress(ValueError):
+            text = str(json.loads(text).get("label", ""))
+    text = " ".join(text.split())
+    return text if len(text) <= _LABEL else f"{text[: _LABEL - 3]}..."
 
 
 def _key(name: str) -> str:

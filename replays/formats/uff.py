@@ -46,14 +46,14 @@ def open_file(path: Path, options: FileOptions) -> Source:
         InputError: It is none, is cut off, has no time history, or pyuff is missing.
     """
     pyuff = library("pyuff")
+    if not _ends(path):
+        raise damaged(path, "universal (UFF)", "it is cut off")
     try:
-        if not _ends(path):
-            raise ValueError("it is cut off")
         file = pyuff.UFF(str(path))
         kinds = list(np.atleast_1d(file.get_set_types()).astype(int))
         heads = {n: file.read_sets(n, header_only=True) for n, kind in enumerate(kinds) if kind == 58}
     except Exception as error:
-        raise damaged(path, "universal", error) from None
+        raise damaged(path, "universal (UFF)", error) from None
     entries: list[Entry] = []
     for n, head in heads.items():
         if head["func_type"] not in _TIME_RESPONSE or head["ord_data_type"] not in _REAL:
@@ -76,7 +76,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
             if int(data["abscissa_spacing"]) == 0:
                 return Signal(values=values, times_s=np.array(data["x"], dtype=float)[: entry.rows])
         except Exception as error:
-            raise damaged(path, f"universal (function {entry.name})", error) from None
+            raise damaged(path, f"universal (UFF; function {entry.name})", error) from None
         return Signal(values=values, rate_hz=_rate_hz(data), first_s=float(data["abscissa_min"]))
 
     others = len(kinds) - len(entries)

@@ -107,4 +107,8 @@ def sensitivity_v(text: str, target: str, *, field: str) -> float:
         number = 0.0
     if match is None or not number or not math.isfinite(number) or kind(match[2]) != "voltage":
         raise InputError(field, 'volts per unit, such as "7.87 V/mm", "200 mV/mil" or "100 mV/g"', text)
+    if kind(match[3]) != kind(target):
+        allowed = [name for name, (what, _) in _UNITS.items() if what == kind(target)]
+        must = f"volts per unit of {kind(target)} ({', '.join(allowed)})" if allowed else f"volts per {target}"
+        raise InputError(field, must, text)
     return number * size_si(match[2]) / factor(match[3], target, field=field)

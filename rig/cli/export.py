@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import Force, FromS, RecordingFile, ToS, names_of
+from rig.cli.options import Force, FromS, RecordingFiles, ToS, names_of
 from rig.errors import InputError
 
 
 def export(
-    file: RecordingFile,
+    files: RecordingFiles,
     *,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="File to write: .mf4, .tdms, .uff, .csv, .parquet or .wav.")
@@ -29,12 +29,12 @@ def export(
     method: Annotated[str, typer.Option(help="How: polyphase (band-limited) or linear.")] = "polyphase",
     force: Force = False,
 ) -> None:
-    """Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration where they have a place.
+    """Write a recording, or several parts as one, as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration where they have a place.
 
     CSV and WAV have none: FILE.json stands beside them. CSV, Parquet and WAV hold one rate: channels of several make as
     many files, or --rate-hz brings them to one.
     """
-    from recorder.reader import Recording
+    from recorder.reader import join
     from replays.formats.export import check_output, merged
     from replays.formats.export import export as write
     from replays.formats.selection import select
@@ -45,14 +45,14 @@ def export(
     if method not in ("polyphase", "linear"):
         raise InputError("--method", "polyphase or linear", method)
     check_output(output, force=force)
-    recording = Recording.open(file)
+    recording = join(files)
     selection = select(
         recording, channels=names_of(channels), truth=truth, unit=unit, from_s=from_s, to_s=to_s, merged=merged(output)
     )
     with reporting() as reporter:
 
         def tell(part: float) -> None:
-            reporter.part(part, f"exporting {file.name}")
+            reporter.part(part, f"exporting {recording.path.name}")
 
         written = write(selection, output, rate_hz=rate_hz, method=method, force=force, progress=tell)
     for made in written:

@@ -96,6 +96,7 @@ def identify(
     recording = Recording.open(file)
     experiment = _experiment(recording, parameters=parameters, scene=scene, engine=engine)
     priors = {key: _two("prior", text, "+-") for key, text in pairs("--prior", prior, "KEY=VALUE+-SIGMA").items()}
+    along: dict[str, tuple[float, float] | None] = {}
     if is_imported(recording) and not exact:
         experiment = turned(recording, experiment)
         along = asked_along(experiment, keys)
@@ -124,6 +125,8 @@ def identify(
         typer.echo(json.dumps(identification_document(found, recording=file.name), indent=2, allow_nan=False))
         return
     _show(found, file.name)
+    if along:
+        typer.echo(f"fitted along, as an imported log does not tell it exactly: {', '.join(along)}")
     if output is not None:
         typer.echo(f"written  {output}: a parameter set, as in `rig run hammer --parameters {output}`")
     if report is not None:

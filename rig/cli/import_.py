@@ -47,9 +47,9 @@ def import_(
         _write_template(files or [], template, force=force)
         return
     if not files:
-        raise InputError("FILE", "given", None)
+        raise InputError("FILE", "given: the logs to import", "none")
     if output is None or mapping is None:
-        raise InputError("--output", "given", None)
+        raise InputError("--output", "given: a recording to write, such as -o log.mcap", "none")
     from recorder.writer import check_destination
     from replays.formats.conversion import convert
     from replays.formats.imported import write_recording
@@ -62,7 +62,8 @@ def import_(
         try:
             conversion = convert(files, checked, say=reporter.step)
         except InputError as error:
-            if error.field.split(".")[0] not in Mapping.model_fields:
+            # What is wrong with a file is no fault of the mapping, whose table [file] has other fields.
+            if error.field == "file" or error.field.split(".")[0] not in Mapping.model_fields:
                 raise
             raise InputError(f"{mapping.name}: {error.field}", error.must, error.received) from None
 
@@ -75,15 +76,21 @@ def import_(
 
 def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
     from replays.formats.export import check_output
-    from replays.formats.template import example, template
+    from replays.formats.template import CHECK, example, template
 
     check_output(path, force=force, suffixes=(".toml",))
     text = template(files) if files else example()
     part = path.with_name(path.name + ".part")
     part.write_text(text, encoding="utf-8")
     part.replace(path)
-    told = "a mapping to start from; lines with PLEASE CHECK are guesses" if files else "an example with every option"
+    guesses = text.count(CHECK)
+    told = "a mapping to start from" if files else "an example with every option"
+    told += f"; {guesses} {'line' if guesses == 1 else 'lines'} with {CHECK}" if guesses else ""
     typer.echo(f"{path}: {told}")
+
+
+_JITTER_US, _DRIFT_PPM, _DUST = 1e-3, 1e-2, 1e-6
+"""Less than this is rounding: of time stamps, of clocks, and beside a channel's largest value."""
 
 
 def _tell(conversion: Conversion, output: Path) -> None:
@@ -91,28 +98,56 @@ def _tell(conversion: Conversion, output: Path) -> None:
 
     from rig.cli.tables import new_table, table_console
 
-    console = table_console(highlight=False)
+    console = table_console(width=100, highlight=False)
     size = output.stat().st_size / 1e6
     seconds = conversion.end_tick / 1e6
     console.print(f"{output}: {len(conversion.channels)} channels, {seconds:.6g} s, {size:.1f} MB, from "
                   f"{conversion.start.isoformat()}", soft_wrap=True, markup=False)  # fmt: skip
+    columns = _columns(conversion)
     table = new_table("")
-    for heading in ("channel", "source", "formula", "time and samples", "counts", "from", "to"):
-        table.add_column(heading, overflow="fold")
-    for heading in ("rate", "jitter", "clock", "missing", "overrange"):
-        table.add_column(heading, justify="right", overflow="fold")
-    for channel in conversion.channels:
+    for heading in columns:
+        text = heading in ("channel", "source", "value", "unit")
+        table.add_column(heading, justify="left" if text else "right", no_wrap=True, overflow="ellipsis")
+    for row, channel in zip(zip(*columns.values(), strict=True), conversion.channels, strict=True):
         trouble = channel.missing or channel.overrange
-        cells = (
-            channel.name, channel.source, channel.formula, channel.time, channel.counts, f"{channel.low:.4g}",
-            f"{channel.high:.4g} {channel.unit}", f"{channel.rate_hz} Hz", f"{channel.jitter_us:.2g} us",
-            f"{channel.drift_ppm:+.2g} ppm", str(channel.missing), str(channel.overrange),
-        )  # fmt: skip
         # Names in brackets are names, not rich's markup.
-        table.add_row(*(Text(cell) for cell in cells), style="yellow" if trouble else None)
+        table.add_row(*(Text(cell) for cell in row), style="yellow" if trouble else None)
     console.print(table)
+    for line in _in_common(conversion):
+        console.print(line, markup=False)
     for remark in conversion.remarks:
-        console.print(remark, soft_wrap=True, markup=False)
+        console.print(remark, markup=False)
     if conversion.experiment is None:
-        console.print("no scene: it cannot be simulated again until the mapping has an [experiment]", soft_wrap=True,
-                      markup=False)  # fmt: skip
+        console.print("no scene: it cannot be simulated again until the mapping has an [experiment]", markup=False)
+
+
+def _columns(conversion: Conversion) -> dict[str, list[str]]:
+    """The table's columns by heading; those in which nothing stands are left out."""
+    channels, files = conversion.channels, conversion.document["files"]
+    only = f"{files[0]['name']} " if len(files) == 1 else ""
+    ends = [max(abs(channel.low), abs(channel.high)) * _DUST for channel in channels]
+    columns = {
+        "channel": [channel.name for channel in channels],
+        "source": [channel.source.removeprefix(only) for channel in channels],
+        "value": [channel.formula for channel in channels],
+        "low": [f"{c.low if abs(c.low) > dust else 0.0:.4g}" for c, dust in zip(channels, ends, strict=True)],
+        "high": [f"{c.high if abs(c.high) > dust else 0.0:.4g}" for c, dust in zip(channels, ends, strict=True)],
+        "unit": ["" if channel.unit == "1" else channel.unit for channel in channels],
+        "missing": [f"{channel.missing or ''}" for channel in channels],
+        "overrange": [f"{channel.overrange or ''}" for channel in channels],
+        "jitter, us": [f"{c.jitter_us:.2g}" if c.jitter_us >= _JITTER_US else "" for c in channels],
+        "clock, ppm": [f"{c.drift_ppm:+.2g}" if abs(c.drift_ppm) >= _DRIFT_PPM else "" for c in channels],
+    }
+    return {heading: cells for heading, cells in columns.items() if any(cells)}
+
+
+def _in_common(conversion: Conversion) -> list[str]:
+    """What was done to the samples, each thing once, with the channels that it was done to."""
+    done: dict[str, list[str]] = {}
+    for channel in conversion.channels:
+        # A count of the source's own differs from channel to channel, and stands in the recording.
+        rule = channel.counts.split(",")[0] if "," in channel.counts else "a power of two of the unit"
+        for text in (f"{channel.rate_hz} Hz, {channel.time}", f"one count: {rule}"):
+            done.setdefault(text, []).append(channel.name)
+    whole = len(conversion.channels)
+    return [f"{'all' if len(names) == whole else ', '.join(names)}: {text}" for text, names in done.items()]

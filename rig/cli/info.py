@@ -197,10 +197,12 @@ def _print_channels(console: Console, recording: Recording, health: dict[str, An
             continue
         for channel in group.channels:
             ends = sorted((volts - channel.bias_v) / channel.sensitivity_v for volts in channel.range_v)
+            # Of an imported channel, the ends of its counts are no range.
+            known = not channel.kind.startswith("imported") or channel.range_v != (-channel.adc_v, channel.adc_v)
             row = [
                 channel.name,
                 channel.unit,
-                f"{ends[0]:.4g} to {ends[1]:.4g}",
+                f"{ends[0]:.4g} to {ends[1]:.4g}" if known else "not known",
                 f"{abs(channel.scale):.2g}",
                 f"{group.rate_hz} Hz",
             ]

@@ -33,6 +33,11 @@ class Again(StrEnum):
     IGNORE = "ignore"
 
 
+_PRE_S, _POST_S = 0.5, 2.0
+_LINK_S = 1.0
+"""Time that the connection to a rig that is there may take [s]."""
+
+
 def record(
     output: Annotated[Path, typer.Option("--output", "-o", help="File to record to, ends in .mcap.")],
     *,
@@ -46,6 +51,9 @@ def record(
     history: Annotated[
         bool, typer.Option(help="From the start of the run on, as far as the rig's cache reaches.")
     ] = False,
+    wait_s: Annotated[
+        float, typer.Option(metavar="S", help="Wait that long for the rig to be there, in s.", min=0.0)
+    ] = 0.0,
     force: Force = False,
     rotate_mb: Annotated[
         float | None,
@@ -58,22 +66,41 @@ def record(
         list[str] | None,
         typer.Option(
             help="Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
-            "'P_E>500' or '|disk_x|>0.5'; may be repeated. One file each: NAME.hammer-001.mcap, ...",
+            "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, bias and preload included); may be repeated. A level "
+            "fires where it is crossed, and anew once it has not been for 0.25 s. One file each: "
+            "NAME.hammer-001.mcap, ...",
             rich_help_panel=_TRIGGERS,
         ),
     ] = None,
     pre_s: Annotated[
-        float, typer.Option(help="Simulated time kept before a trigger, in s.", rich_help_panel=_TRIGGERS)
-    ] = 0.5,
+        float | None,
+        typer.Option(
+            help="Simulated time kept before a trigger, in s.", rich_help_panel=_TRIGGERS, show_default=f"{_PRE_S:g}"
+        ),
+    ] = None,
     post_s: Annotated[
-        float, typer.Option(help="Simulated time kept after a trigger, in s.", rich_help_panel=_TRIGGERS)
-    ] = 2.0,
+        float | None,
+        typer.Option(
+            help="Simulated time kept after a trigger, in s.", rich_help_panel=_TRIGGERS, show_default=f"{_POST_S:g}"
+        ),
+    ] = None,
+    longest_s: Annotated[
+        float | None,
+        typer.Option(
+            help="Longest length of a capture, in s of simulated time.", rich_help_panel=_TRIGGERS, show_default="60"
+        ),
+    ] = None,
     trigger_count: Annotated[
         int | None, typer.Option(help="End after so many captures.", rich_help_panel=_TRIGGERS)
     ] = None,
     again: Annotated[
-        Again, typer.Option(help="What a trigger does during a capture.", rich_help_panel=_TRIGGERS)
-    ] = Again.EXTEND,
+        Again | None,
+        typer.Option(
+            help="What a trigger does during a capture: make it longer, or nothing.",
+            rich_help_panel=_TRIGGERS,
+            show_default="extend for events, ignore for levels",
+        ),
+    ] = None,
     budget_mb: Annotated[
         float | None, typer.Option(help="What all files of this recording may take, in MB.", rich_help_panel=_DISK)
     ] = None,
@@ -109,9 +136,13 @@ def record(
         when_full=WhenFull(when_full).value,
     )
     triggers = tuple(Trigger.parse(text) for text in trigger or ())
-    capture = Capture(triggers, pre_s, post_s, trigger_count, Again(again).value) if triggers else None
-    if capture is None and trigger_count is not None:
-        raise InputError("trigger_count", "used with --trigger", trigger_count)
+    around = {"pre_s": pre_s, "post_s": post_s, "count": trigger_count, "again": again, "longest_s": longest_s}
+    given = {name: value for name, value in around.items() if value is not None}
+    if given and not triggers:
+        name, value = next(iter(given.items()))
+        option = "trigger_count" if name == "count" else name
+        raise InputError(option, "used with --trigger", value)
+    capture = Capture(triggers, **{"pre_s": _PRE_S, "post_s": _POST_S, **given}) if triggers else None
 
     def session_of(client: ZenohClient | None) -> RecordingSession:
         return RecordingSession(
@@ -121,6 +152,7 @@ def record(
             duration_s=duration_s,
             view_rate_hz=view_rate_hz,
             history=history,
+            wait_s=wait_s,
             force=force,
             limits=limits,
             capture=capture,
@@ -129,7 +161,7 @@ def record(
 
     session_of(None)  # whatever is wrong with the options is said before a rig is looked for
     try:
-        with ZenohClient(connect) as client:
+        with ZenohClient(connect, wait_s=max(_LINK_S, wait_s)) as client:
             summary = _run(session_of(client))
     except NoReplyError as error:
         raise RefusedError(str(error)) from None
@@ -151,11 +183,20 @@ def _run(session: RecordingSession) -> Summary:
         for each in ends:
             signal.signal(each, before[each])
 
+    def remark(lines: tuple[str, ...]) -> None:
+        nonlocal told
+        for line in lines[told:]:
+            console.print(line, markup=False, soft_wrap=True)
+        told = len(lines)
+
     before = {number: signal.signal(number, stop) for number in ends}
+    console = Console(stderr=True, highlight=False)
+    told = 0
     try:
-        with Console(stderr=True).status(f"recording {session.path}: waiting for the rig") as status:
+        with console.status(f"recording {session.path}: waiting for the rig") as status:
 
             def show(progress: Progress) -> None:
+                remark(progress.remarks)
                 lost = f"[red]{progress.lost} lost[/]" if progress.lost else "0 lost"
                 files = f", {progress.files} files finished" if progress.files else ""
                 backlog = f", {progress.backlog_bytes / 1e6:.1f} MB wait" if progress.backlog_bytes > 1e6 else ""
@@ -164,7 +205,9 @@ def _run(session: RecordingSession) -> Summary:
                     f"{progress.size_bytes / 1e6:.1f} MB{files}{backlog}"
                 )
 
-            return session.run(show)
+            summary = session.run(show)
+            remark(summary.remarks)
+            return summary
     finally:
         for number in ends:
             signal.signal(number, before[number])
@@ -181,11 +224,19 @@ def _tell(summary: Summary) -> None:
         files = f"{summary.files[0]} to {summary.path.name} ({len(summary.files)} files)"
     elif not summary.files:
         files = f"{summary.path}: no file"
-    typer.echo(
-        f"{files}: {summary.duration_s:.3f} s from {summary.first_time_s:.3f} s on, "
-        f"{sum(sensors)} samples in {len(sensors)} streams, {truth} rows of truth, "
-        f"{summary.size_bytes / 1e6:.1f} MB; ended: {summary.reason}"
-    )
+    if summary.fired is not None and not summary.files:
+        came = "no trigger came" if not summary.fired else f"{summary.fired} triggers came"
+        typer.echo(f"{came} in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
+    else:
+        around = ""
+        if summary.fired is not None:
+            triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
+            around = f" (around {triggers}, of {summary.received_s:.3f} s received)"
+        typer.echo(
+            f"{files}: {summary.duration_s:.3f} s from {summary.first_time_s:.3f} s on{around}, "
+            f"{sum(sensors)} samples in {len(sensors)} streams, {truth} rows of truth, "
+            f"{summary.size_bytes / 1e6:.1f} MB; ended: {summary.reason}"
+        )
     if summary.removed:
         typer.echo(f"{summary.removed} older files were removed to make room")
     if summary.lost or summary.missed:
@@ -193,7 +244,8 @@ def _tell(summary: Summary) -> None:
             typer.echo(f"lost: {lost} rows of {key}")
         for key, missed in summary.missed.items():
             typer.echo(f"lost: {missed} messages of {key}, says the transport")
-        typer.echo(f"the gaps ({summary.gaps}) are recorded in the file on recorder/gaps")
+        inside = ", those inside a capture," if summary.fired is not None else ""
+        typer.echo(f"the gaps ({summary.gaps}){inside} are recorded in the file on recorder/gaps")
     else:
         typer.echo("lost: nothing")
     if summary.dropped:

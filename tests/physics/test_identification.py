@@ -117,7 +117,7 @@ def test_moduli_act_only_together(tmp_path: Path) -> None:
 
 
 def test_a_drop_tells_neither_friction_nor_magnets(tmp_path: Path) -> None:
-    """Released, the shaft has neither their stiffness nor their damping; the sag that the ring's rule takes is given."""
+    """Released, the shaft has neither their stiffness nor their damping; the ring's place is given, not by the sag."""
     recording = recorded(tmp_path / "d.mcap", "drop", duration_s=0.06, seed=3, ring__offset_y=-1.56)
     keys = ("contact.friction", "magnet.stiffness", "contact.restitution")
     found = identify(ask(recording, Experiment.of(recording), keys))

@@ -804,8 +804,13 @@ X = '[channels.disk_x]\nsource = "x"\n'
         ),
         (
             "[channels.disk_x]\nsource = 'y'\nsensitivity = '1 V/N'\n",
-            "m.toml: channels.disk_x.sensitivity must be a unit of length",
+            "m.toml: channels.disk_x.sensitivity must be volts per unit of length",
         ),
+        (
+            X + "sensitivity = '2 bananas'\n",
+            "m.toml: channels.disk_x.sensitivity must be volts per unit, such as",
+        ),
+        (X + "group = 'fast'\n", "m.toml: channels.disk_x.group must be one of"),
         (X + "sensitivity = '7 V/mm'\n", "m.toml: channels.disk_x.unit must be V or mV with a sensitivity"),
         (X + "factor = 0.0\n", "m.toml: channels.disk_x.factor must be another number than 0"),
         (X + "file = 'q.csv'\n", "m.toml: channels.disk_x.file must be one of x.csv"),
