@@ -204,6 +204,21 @@ class Recording:
             return self.metadata.get("end", {}).get("reason", "unknown")
         return "cut off: the recorder did not finish the file"
 
+    @property
+    def span_s(self) -> tuple[float, float] | None:
+        """Simulated times of the first and the last row, without a look at the samples [s]; None if there is none.
+
+        As the recorder counted them; of a file that it did not finish those of its messages, which is to the block.
+        """
+        if self.complete:
+            end = self.metadata.get("end", {})
+            if not {"first_time_s", "last_time_s"} <= set(end) or end.get("rows", "{}") == "{}":
+                return None
+            return float(end["first_time_s"]), float(end["last_time_s"])
+        if not self._chunks:
+            return None
+        return min(each.begin_ns for each in self._chunks) / 1e9, max(each.end_ns for each in self._chunks) / 1e9
+
     @cached_property
     def events(self) -> list[dict[str, Any]]:
         """The rig's events, in order of arrival."""
@@ -617,6 +632,12 @@ class Joined(Recording):
     def chunks(self) -> tuple[Chunk, ...]:
         """Where its messages are, part after part."""
         return tuple(replace(chunk, part=number) for number, part in enumerate(self._parts) for chunk in part.chunks)
+
+    @property
+    def span_s(self) -> tuple[float, float] | None:
+        """Simulated times of the first and the last row of all files [s]."""
+        spans = [span for part in self._parts if (span := part.span_s) is not None]
+        return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
 
     @property
     def end_reason(self) -> str:

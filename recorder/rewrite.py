@@ -50,6 +50,30 @@ def recovered_path(source: Path) -> Path:
     return source.with_name(f"{name}.recovered.mcap")
 
 
+def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None) -> bool:
+    """Whether there is nothing to recover: a finished file under its final name, of which all can be read.
+
+    Args:
+        source: The file.
+        on_progress: Called with the part done, 0 to 1.
+
+    Raises:
+        InputError: The file is being written, or cannot be read.
+    """
+    if source.name.endswith(schemas.PART_SUFFIX):
+        return False
+    with _unlocked(source):
+        try:
+            recording = Recording.open(source)
+            total = max(1, sum(recording.messages.values()))
+            for number, _ in enumerate(recording.everything() if recording.complete else ()):
+                if on_progress is not None and number % _TELL_EVERY == 0:
+                    on_progress(number / total)
+        except InputError:
+            return False
+        return recording.complete
+
+
 def recover(
     source: Path,
     output: Path | None = None,

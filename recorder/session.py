@@ -375,6 +375,7 @@ class RecordingSession:
             except NoReplyError:
                 if self._stop_reason or self._monotonic_s() >= deadline_s:
                     raise
+                time.sleep(0.05)
 
     def _open_sink(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> Sink:
         def open_writer(path: Path, *, from_start: bool, **options: Any) -> RecordingWriter:

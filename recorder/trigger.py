@@ -387,7 +387,7 @@ class Captures:
     def _fired_by(
         self, key: str, document: dict[str, Any] | None, block: Block | None
     ) -> list[tuple[Trigger, int, bool]]:
-        """Triggers that this payload sets off, with their simulated times [ns], and whether each may start a capture."""
+        """Triggers that this payload sets off, with their simulated times [ns], and whether it may start a capture."""
         found = []
         for trigger in self._capture.triggers:
             if trigger.level is None:
@@ -414,9 +414,8 @@ class Captures:
             crossings = np.flatnonzero(beyond & ~before)
             # Time for which nothing was beyond the level, at each crossing.
             places = np.searchsorted(there, crossings)
-            before_ns = np.where(
-                places > 0, there[places - 1] * row_ns, self._beyond_ns.get(trigger, -math.inf) - begin_ns
-            )
+            earlier_ns = self._beyond_ns.get(trigger, -math.inf) - begin_ns
+            before_ns = np.where(places > 0, there[places - 1] * row_ns, earlier_ns)
             is_new = crossings * row_ns - before_ns >= REARM_S * NS
             self._beyond_ns[trigger] = begin_ns + round(int(there[-1]) * row_ns)
             # One that may start a capture, or else the first, counts, and the last, which may make it longer.
@@ -427,19 +426,19 @@ class Captures:
         return found
 
     def _fire(self, trigger: Trigger, time_ns: int, *, is_new: bool) -> None:
-        during = self._open is not None and time_ns <= self._open.end_ns
-        if not (during or is_new):
+        writing = self._open if self._open is not None and time_ns <= self._open.end_ns else None
+        if writing is None and not is_new:
             return
         self.fired += 1
         about = {"trigger": trigger.text, "time_s": time_ns / NS}
-        if self._open is not None and time_ns <= self._open.end_ns:
-            self._open.count += 1
-            if len(self._open.fired) < _MOST_FIRED:
-                self._open.fired.append(about)
+        if writing is not None:
+            writing.count += 1
+            if len(writing.fired) < _MOST_FIRED:
+                writing.fired.append(about)
             if self._capture.extends(trigger):
-                end_ns = max(self._open.end_ns, time_ns + self._post_ns)
-                self._open.full = self._open.full or end_ns > self._open.latest_end_ns
-                self._open.end_ns = min(end_ns, self._open.latest_end_ns)
+                end_ns = max(writing.end_ns, time_ns + self._post_ns)
+                writing.full = writing.full or end_ns > writing.latest_end_ns
+                writing.end_ns = min(end_ns, writing.latest_end_ns)
             return
         if self._open is not None:
             self._close_captured()

@@ -749,6 +749,7 @@ view/events: rcl_interfaces/msg/Log of rig/events.
 Attachments: catalogue.json (channel table with calibration), parameters.json, scene.json.
 Metadata "rig" opens the file; metadata "end" closes it with the end reason and the counts.
 Metadata "series": one of several files in a row; its number, the file before it, and the row due of each stream.
-Metadata "trigger": recorded around a trigger only; what ended it stands in "end". "cut", "recovered": what this file was made of.
+Metadata "trigger": recorded around a trigger only; what ended it stands in "end".
+"cut", "recovered": what this file was made of.
 A file without "end" was cut off; what stands in it is good.
 """

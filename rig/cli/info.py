@@ -64,6 +64,7 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
         "complete": recording.complete,
         "ended": recording.end_reason,
         **{name: about.get(name, "") for name in ("scene", "seed", "parameter_set", "created", "view_rate_hz")},
+        "span_s": recording.span_s,
         "messages": recording.messages,
         "gaps": [
             {**asdict(gap), "time_s": time_ns / 1e9}
@@ -99,6 +100,10 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
         first_s = min(stream["first_time_s"] for stream in filled)
         last_s = max(stream["last_time_s"] for stream in filled)
         rows.append(("time", f"{first_s:.4f} s to {last_s:.4f} s ({last_s - first_s:.4f} s)"))
+    elif not streams and document["span_s"] is not None:
+        first_s, last_s = document["span_s"]
+        about = "" if document["complete"] else "about "
+        rows.append(("time", f"{about}{first_s:.4f} s to {last_s:.4f} s ({last_s - first_s:.4f} s)"))
     for part in document["parts"]:
         for name in ("trigger", "cut", "recovered"):
             if name in part:

@@ -66,9 +66,8 @@ def record(
         list[str] | None,
         typer.Option(
             help="Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
-            "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, bias and preload included); may be repeated. A level "
-            "fires where it is crossed, and anew once it has not been for 0.25 s. One file each: "
-            "NAME.hammer-001.mcap, ...",
+            "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
+            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
             rich_help_panel=_TRIGGERS,
         ),
     ] = None,
@@ -121,6 +120,8 @@ def record(
     """Record all streams of a running rig to FILE.mcap, losslessly; Ctrl-C ends the recording well."""
     import os
 
+    from rich.console import Console
+
     from recorder.series import MB, Limits
     from recorder.session import RIG_LOST, RecordingSession
     from recorder.trigger import Capture, Trigger
@@ -136,7 +137,13 @@ def record(
         when_full=WhenFull(when_full).value,
     )
     triggers = tuple(Trigger.parse(text) for text in trigger or ())
-    around = {"pre_s": pre_s, "post_s": post_s, "count": trigger_count, "again": again, "longest_s": longest_s}
+    around = {
+        "pre_s": pre_s,
+        "post_s": post_s,
+        "count": trigger_count,
+        "again": None if again is None else Again(again).value,
+        "longest_s": longest_s,
+    }
     given = {name: value for name, value in around.items() if value is not None}
     if given and not triggers:
         name, value = next(iter(given.items()))
@@ -161,16 +168,18 @@ def record(
 
     session_of(None)  # whatever is wrong with the options is said before a rig is looked for
     try:
-        with ZenohClient(connect, wait_s=max(_LINK_S, wait_s)) as client:
-            summary = _run(session_of(client))
+        with Console(stderr=True).status(f"waiting for a rig at {connect}"):
+            rig = ZenohClient(connect, wait_s=max(_LINK_S, wait_s))
+        with rig as client:
+            summary = run_session(session_of(client))
     except NoReplyError as error:
         raise RefusedError(str(error)) from None
-    _tell(summary)
+    tell(summary)
     if summary.error or summary.reason == RIG_LOST:
         raise typer.Exit(1)
 
 
-def _run(session: RecordingSession) -> Summary:
+def run_session(session: RecordingSession) -> Summary:
     """Record with a line of progress; the first SIGINT or SIGTERM ends it well, a second one at once."""
     import signal
 
@@ -213,7 +222,7 @@ def _run(session: RecordingSession) -> Summary:
             signal.signal(number, before[number])
 
 
-def _tell(summary: Summary) -> None:
+def tell(summary: Summary) -> None:
     """What became of a recording, line by line."""
     from rig.wire import SENSORS, TRUTH
 

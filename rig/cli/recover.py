@@ -21,19 +21,34 @@ def recover(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Make finished recordings of files that were cut off or damaged; these stay as they are."""
+    """Make finished recordings of files that were cut off or damaged; these stay as they are.
+
+    Of a file that is whole nothing is made, unless with --force.
+    """
     from recorder.rewrite import recovered_path
     from recorder.writer import check_destination
 
     if output is not None and len(files) > 1:
         raise InputError("--output", "used with one FILE", f"{len(files)} files")
-    outputs = [output or recovered_path(file) for file in files]
-    for file, new in zip(files, outputs, strict=True):
+    for file in files:
         if not file.is_file():
             raise InputError("file", "a file that can be read", str(file))
+    broken = [file for file in files if force or not _is_whole(file)]
+    outputs = [output or recovered_path(file) for file in broken]
+    for new in outputs:
         check_destination(new, force=force)
-    for file, new in zip(files, outputs, strict=True):
+    for file, new in zip(broken, outputs, strict=True):
         _recover(file, new, force=force)
+
+
+def _is_whole(file: Path) -> bool:
+    from recorder.rewrite import is_whole
+
+    with reporting() as report:
+        whole = is_whole(file, on_progress=lambda done: report.part(done, f"reading {file}"))
+    if whole:
+        typer.echo(f"{file} is whole: nothing is to be recovered, nothing was written (--force makes a copy)")
+    return whole
 
 
 def _recover(file: Path, new: Path, *, force: bool) -> None:

@@ -17,6 +17,7 @@ from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     import rerun as rr
+    import rerun.blueprint as rrb
 
     from recorder.viewer.window import Kind, Window
 
@@ -92,9 +93,8 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
     stream = new_stream(name)
     plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
     if save is not None:
-        stream.save(save, default_blueprint=plan)
-        painted = paint(recording, Canvas(stream))
-        _close(stream)
+        with _saved(stream, save, plan):
+            painted = paint(recording, Canvas(stream))
         size = save.stat().st_size / 1e6
         typer.echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
         return
@@ -134,12 +134,8 @@ def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> 
         stream = new_stream(f"rig at {connect}")
         plan = blueprint.layout(described.table, described.geometry, live=True)
         if save is not None:
-            stream.save(save, default_blueprint=plan)
-            view = live.LiveView(client, Canvas(stream), described)
-            try:
-                typer.echo(view.run())
-            finally:
-                _close(stream)
+            with _saved(stream, save, plan, until_interrupted=True):
+                typer.echo(live.LiveView(client, Canvas(stream), described).run())
             return
         with window.Window(_kind(web=web), memory="512MiB") as shown:
             stream.connect_grpc(shown.url, default_blueprint=plan)
@@ -187,6 +183,31 @@ def _close(stream: rr.RecordingStream, *, timeout_s: float = 5.0) -> None:
     with suppress(RuntimeError, ValueError):  # the viewer is gone: nobody misses the rest
         stream.flush(timeout_sec=timeout_s)
     stream.disconnect()
+
+
+@contextmanager
+def _saved(
+    stream: rr.RecordingStream, path: Path, plan: rrb.Blueprint, *, until_interrupted: bool = False
+) -> Iterator[None]:
+    """Write what is drawn inside to a file that has its name only once it is whole.
+
+    Args:
+        stream: What is drawn to.
+        path: The file.
+        plan: The blueprint.
+        until_interrupted: Ctrl-C is how it ends, not a reason to throw it away.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        try:
+            stream.save(part, default_blueprint=plan)
+            with suppress(*([KeyboardInterrupt] if until_interrupted else [])):
+                yield
+        finally:
+            _close(stream)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 @contextmanager

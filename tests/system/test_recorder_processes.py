@@ -288,6 +288,17 @@ def test_a_rotating_recorder_loses_nothing_at_its_seams(tmp_path):
             assert len(payloads) >= 200 or schema_of(key) is None, key
 
 
+def test_a_recorder_waits_for_a_rig_that_comes_later(tmp_path):
+    port = free_port()
+    with recorder(tmp_path / "run.mcap", port, "wait_s=30.0, duration_s=0.3, keep_free_mb=0.0") as process:
+        time.sleep(3.0)  # longer than a recorder waits that was not told to
+        assert process.poll() is None
+        with publisher(port):
+            output, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 0, errors
+    assert "ended: duration reached" in output
+
+
 def test_a_trigger_makes_a_file_of_its_own(tmp_path):
     port = free_port()
     options = "trigger=['hammer'], pre_s=0.2, post_s=0.3, trigger_count=1"

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from recorder.reader import Recording
+from recorder.session import Progress, Summary
 from recorder.writer import RecordingWriter
 from rig.cli.main import main
+from rig.cli.record import run_session, tell
 from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, encode_document, sensor_key
 
 from .recorder_stream import documents, stream
@@ -105,6 +109,44 @@ def test_recover_takes_several_files(path, tmp_path, capsys):
         assert Recording.open(tmp_path / f"{number}.recovered.mcap").end_reason == "recovered"
 
 
+def test_of_a_whole_file_nothing_is_made(path, tmp_path, capsys):
+    source = tmp_path / "run.mcap"
+    source.write_bytes(path.read_bytes())
+    assert run("recover", source) == 0
+    assert "run.mcap is whole" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [source]
+    assert run("recover", source, "--force") == 0
+    assert (tmp_path / "run.recovered.mcap").exists()
+
+
+def test_a_finished_file_with_a_damaged_chunk_is_not_whole(path, tmp_path, capsys):
+    source = tmp_path / "run.mcap"
+    data = bytearray(path.read_bytes())
+    chunk = Recording.open(path).chunks[0]
+    data[chunk.offset + chunk.length // 2] ^= 0xFF
+    source.write_bytes(data)
+    assert run("recover", source) == 0
+    assert "1 damaged chunks" in capsys.readouterr().out
+    # A .part that was finished but not yet renamed is still to become a recording.
+    part = tmp_path / "other.mcap.part"
+    part.write_bytes(path.read_bytes())
+    assert run("recover", part) == 0
+    assert (tmp_path / "other.recovered.mcap").exists()
+
+
+def test_quick_info_tells_the_times_of_cuts_and_of_files_that_were_cut_off(path, tmp_path, capsys):
+    cut, broken = tmp_path / "cut.mcap", tmp_path / "broken.mcap"
+    assert run("cut", path, "-o", cut, "--from", 0.2, "--to", 0.4) == 0
+    broken.write_bytes(path.read_bytes()[:-300])
+    capsys.readouterr()
+    assert run("info", "--quick", cut) == 0
+    assert "time      0.2000 s to 0.4000 s (0.2000 s)" in capsys.readouterr().out
+    assert run("info", "--quick", broken) == 0
+    assert "time      about 0.0000 s to 0.6000 s" in capsys.readouterr().out
+    assert run("info", "--quick", "--json", cut, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["span_s"] == [0.2, 0.39995]
+
+
 def test_nothing_is_recovered_where_one_file_is_missing(path, tmp_path, capsys):
     part = tmp_path / "0.mcap.part"
     part.write_bytes(path.read_bytes()[:-200])
@@ -119,8 +161,16 @@ def test_nothing_is_recovered_where_one_file_is_missing(path, tmp_path, capsys):
         (["--rotate-mb", "0"], "rotate_mb must be"),
         (["--rotate-s", "nan"], "rotate_s must be"),
         (["--trigger", "hit"], "trigger must be one of"),
-        (["--trigger", "hammer", "--rotate-s", "5"], "limits must be without rotation"),
+        (
+            ["--trigger", "hammer", "--rotate-s", "5"],
+            "rotate_s must be left out where it is recorded around triggers; instead received 5.0",
+        ),
         (["--trigger-count", "3"], "trigger_count must be used with --trigger"),
+        (["--pre-s", "0.5"], "pre_s must be used with --trigger; instead received 0.5"),
+        (["--post-s", "3"], "post_s must be used with --trigger"),
+        (["--again", "ignore"], "again must be used with --trigger; instead received 'ignore'"),
+        (["--longest-s", "9"], "longest_s must be used with --trigger"),
+        (["--trigger", "hammer", "--longest-s", "1"], "longest_s must be at least"),
         (["--when-full", "remove-oldest"], "when_full must be stop"),
         (["--backlog-mb", "0"], "backlog_mb must be"),
         (["--duration-s", "0"], "duration_s must be"),
@@ -132,6 +182,50 @@ def test_impossible_options_are_refused_before_a_rig_is_looked_for(tmp_path, cap
     assert must in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def _summary(**values: Any) -> Summary:
+    about = {
+        "path": Path("run.mcap"),
+        "reason": "completed",
+        "error": "",
+        "first_time_s": 0.0,
+        "duration_s": 0.0,
+        "rows": {},
+        "lost": {},
+        "gaps": 0,
+        "missed": {},
+        "dropped": 0,
+        "malformed": 0,
+        "size_bytes": 0,
+    }
+    return Summary(**{**about, **values})
+
+
+def test_a_triggered_recording_counts_what_it_kept(capsys):
+    tell(_summary(fired=0, received_s=6.4))
+    assert capsys.readouterr().out.splitlines()[0] == (
+        "no trigger came in 6.400 s; nothing was written; ended: completed"
+    )
+    files = (Path("run.hammer-001.mcap"),)
+    tell(_summary(path=files[0], files=files, fired=2, received_s=9.0, duration_s=2.5, rows={sensor_key("probes"): 50}))
+    assert capsys.readouterr().out.startswith(
+        "run.hammer-001.mcap: 2.500 s from 0.000 s on (around 2 triggers, of 9.000 s received), 50 samples in 1 streams"
+    )
+
+
+def test_remarks_are_printed_once(capsys):
+    class Session:
+        path = Path("run.mcap")
+
+        def run(self, show: Callable[[Progress], None]) -> Summary:
+            for remarks in ((), ("first",), ("first",), ("first", "second")):
+                show(Progress(0.0, 0, 0, 0, 0, remarks=remarks))
+            return _summary(remarks=("first", "second", "third"))
+
+    run_session(Session())  # type: ignore[arg-type]
+    lines = [line for line in capsys.readouterr().err.splitlines() if line in ("first", "second", "third")]
+    assert lines == ["first", "second", "third"]
 
 
 def test_a_disk_that_refuses_is_told_in_a_line(path, tmp_path, capsys, monkeypatch):

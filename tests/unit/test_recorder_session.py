@@ -11,7 +11,9 @@ import pytest
 
 import recorder.session
 from recorder.reader import Recording
+from recorder.series import Limits
 from recorder.session import RIG_LOST, Progress, RecordingSession, Summary
+from recorder.trigger import Capture, Trigger
 from rig.channels import default_table
 from rig.errors import InputError
 from rig.transport import NoReplyError
@@ -21,6 +23,7 @@ from rig.wire import (
     CATALOGUE,
     CLIENTS,
     EVENTS,
+    PARAMETERS,
     STATUS,
     Gap,
     decode_document,
@@ -455,6 +458,50 @@ def test_without_a_rig_there_is_no_file(path):
     with pytest.raises(NoReplyError):
         RecordingSession(client, path).run()
     assert list(path.parent.iterdir()) == []
+
+
+def test_a_rig_that_is_being_prepared_is_waited_for(path):
+    client = ScriptedClient()
+    reply = client.replies.pop(PARAMETERS)
+    session = RecordingSession(client, path, wait_s=10.0)
+    threading.Timer(0.2, client.replies.__setitem__, (PARAMETERS, reply)).start()
+    assert record(session, client, play(client, list(stream(5)))).reason == "completed"
+    del client.replies[PARAMETERS]
+    with pytest.raises(InputError, match="wait_s must be at least 0"):
+        RecordingSession(client, path, force=True, wait_s=-1.0)
+
+
+def test_around_triggers_the_summary_tells_what_is_in_the_files(path):
+    client = ScriptedClient()
+    capture = Capture((Trigger.parse("note"), Trigger.parse("P_N>-1e9")), pre_s=0.1, post_s=0.2)
+    items = list(stream(100))
+    note = encode_document({"event": "note", "tick": 500_000, "time_s": 0.5, "text": "now"})
+    items.insert(len(items) // 2, (EVENTS, note))
+    progress: list[Progress] = []
+    session = RecordingSession(client, path, capture=capture, limits=Limits(budget_mb=50.0))
+    summary = record(session, client, play(client, items), progress)
+    (file,) = summary.files
+    kept = Recording.open(file).streams
+    assert summary.rows[PROBES] == kept[PROBES].rows < 10_000
+    assert summary.duration_s == pytest.approx(kept[PROBES].last_time_s - kept[PROBES].first_time_s)
+    assert summary.received_s == pytest.approx(1.0, abs=0.01)
+    assert summary.fired == 1
+    assert summary.remarks == ("P_N is above -1e+09 N already; waiting until it has been below",)
+
+
+def test_without_a_trigger_nothing_is_counted_as_recorded(path):
+    client = ScriptedClient()
+    session = RecordingSession(client, path, capture=Capture((Trigger.parse("hammer"),)))
+    summary = record(session, client, play(client, list(stream(50))))
+    assert (summary.files, summary.fired, summary.duration_s, summary.rows) == ((), 0, 0.0, {})
+    assert summary.received_s == pytest.approx(0.5, abs=0.01)
+
+
+def test_rotation_and_triggers_together_are_refused_by_name(path):
+    with pytest.raises(InputError, match=r"^rotate_mb must be left out .* around triggers; instead received 5\.0$"):
+        RecordingSession(
+            ScriptedClient(), path, capture=Capture((Trigger.parse("hammer"),)), limits=Limits(rotate_mb=5.0)
+        )
 
 
 def test_an_error_of_the_transport_still_closes_the_file_well(path, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
+from recorder.series import Limits
 from recorder.trigger import Capture, Captures, Trigger
 from recorder.writer import RecordingWriter
 from rig.channels import default_table
@@ -21,7 +23,7 @@ from .recorder_stream import TICK_RATE_HZ, block_of, documents
 PROBES, FORCES = sensor_key("probes"), sensor_key("forces")
 
 
-def captures(path: Path, *triggers: str, force: bool = False, **options: Any) -> Captures:
+def captures(path: Path, *triggers: str, force: bool = False, limits: Limits | None = None, **options: Any) -> Captures:
     about = documents()
 
     def open_writer(name: Path, *, from_start: bool, **more: Any) -> RecordingWriter:
@@ -36,6 +38,7 @@ def captures(path: Path, *triggers: str, force: bool = False, **options: Any) ->
         tick_rate_hz=TICK_RATE_HZ,
         scene=about[SCENE],
         open_writer=open_writer,
+        limits=limits,
         force=force,
     )
 
@@ -144,13 +147,91 @@ def pulses(file: Captures, rows: list[int], blocks: range) -> None:
 
 
 def test_the_time_after_counts_from_the_last_crossing_even_in_one_block(tmp_path):
-    file = captures(tmp_path / "run.mcap", "disk_x>0.2", pre_s=0.0, post_s=0.0205)
+    file = captures(tmp_path / "run.mcap", "disk_x>0.2", pre_s=0.0, post_s=0.0205, again="extend")
     pulses(file, [200, 220, 399], range(10))  # the second block begins beyond the level: a crossing at a block's edge
     (path,) = file.files
     recording = Recording.open(path)
     assert recording.metadata["trigger"]["time_s"] == "0.010000000"
     assert extent(path) == (pytest.approx(0.01), pytest.approx(0.05 - 50e-6))
     assert [each["time_s"] for each in json.loads(recording.metadata["end"]["triggers"])] == [0.01, 0.01995]
+
+
+def _forces(file: Captures, values_of: Callable[[np.ndarray], np.ndarray], blocks: range) -> None:
+    for number in blocks:
+        if not file.ended:
+            file.write(*_level_block(number, values_of((np.arange(200) + 200 * number) / 20_000)), number)
+
+
+def test_a_level_that_is_passed_already_is_told_once(tmp_path):
+    file = captures(tmp_path / "run.mcap", "P_E>500", "|P_E|<100")
+    _forces(file, lambda time_s: np.where(time_s < 0.5, 3000.0, 3100.0), range(100))
+    assert file.remarks == ("P_E is above 500 N already; waiting until it has been below",)
+    assert file.fired == 0
+    quiet = captures(tmp_path / "other.mcap", "|P_E|<100")
+    _forces(quiet, lambda time_s: 0.0 * time_s, range(3))
+    assert quiet.remarks == ("|P_E| is below 100 N already; waiting until it has been above",)
+
+
+def _whirl(time_s: np.ndarray) -> np.ndarray:
+    """Beyond 500 N twice a turn at 40 Hz, from 1 s to 6 s and from 7 s on."""
+    whirling = ((time_s >= 1.0) & (time_s < 6.0)) | (time_s >= 7.0)
+    return np.where(whirling, 1000.0 * np.sin(2 * np.pi * 40.0 * (time_s - 1.0)), 0.0)
+
+
+def test_whirl_is_captured_where_it_begins_and_not_for_as_long_as_it_lasts(tmp_path):
+    file = captures(tmp_path / "run.mcap", "|P_E|>500", pre_s=0.1, post_s=0.5)
+    _forces(file, _whirl, range(900))
+    recordings = [Recording.open(path) for path in file.files]
+    crossing_s = 1.0 + 1.0 / (12 * 40.0)  # where the sine is one half
+    starts = [float(each.metadata["trigger"]["time_s"]) for each in recordings]
+    assert starts == pytest.approx([crossing_s, 6.0 + crossing_s], abs=1e-4)
+    for path, start_s in zip(file.files, starts, strict=True):
+        assert extent(path, FORCES) == pytest.approx((start_s - 0.1, start_s + 0.5), abs=0.011)
+    assert [each.metadata["end"]["reason"] for each in recordings] == ["captured", "captured"]
+
+
+def test_a_capture_that_is_made_longer_has_a_longest_length(tmp_path):
+    file = captures(tmp_path / "run.mcap", "|P_E|>500", pre_s=0.1, post_s=0.5, again="extend", longest_s=2.0)
+    _forces(file, _whirl, range(950))
+    first, second = (Recording.open(path) for path in file.files)
+    assert first.streams[FORCES].last_time_s - first.streams[FORCES].first_time_s == pytest.approx(2.0, abs=0.021)
+    assert first.end_reason == second.end_reason == "captured, up to its longest length of 2 s"
+    assert first.metadata["trigger"]["longest_s"] == "2"
+    assert float(second.metadata["trigger"]["time_s"]) == pytest.approx(7.002, abs=1e-3)
+
+
+def test_a_blow_during_a_capture_makes_it_longer_and_a_level_does_not(tmp_path):
+    file = captures(tmp_path / "run.mcap", "|P_E|>500", "hammer", pre_s=0.0, post_s=0.5)
+    _forces(file, _whirl, range(130))
+    file.write(*event("hammer", 1.3), 0)
+    _forces(file, _whirl, range(130, 300))
+    (path,) = file.files
+    assert extent(path, FORCES)[1] == pytest.approx(1.8, abs=0.011)
+
+
+def test_what_is_kept_is_counted_apart_from_what_came(tmp_path):
+    file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.2, post_s=0.5)
+    feed(file, range(300), {100: [event("hammer", 1.0)]})
+    (kept,) = file.kept()
+    assert kept.rows[PROBES] == Recording.open(file.files[0]).streams[PROBES].rows == 71 * 200
+    assert kept.extent_ns / 1e9 == pytest.approx(0.71, abs=1e-3)
+    assert file.counts().extent_ns / 1e9 == pytest.approx(3.0, abs=0.011)
+
+
+def test_the_budget_holds_for_captures(tmp_path):
+    file = captures(
+        tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=1.0, limits=Limits(budget_mb=5.0, keep_free_mb=0.0)
+    )
+    for number in range(3000):
+        if not file.ended:
+            feed(file, range(number, number + 1), {number: [event("hammer", number / 100)]} if not number % 150 else {})
+    file.finish(file.ended)
+    assert file.ended == "the budget of 5 MB is used up"
+    assert file.out_of_room
+    assert 4_000_000 < sum(path.stat().st_size for path in tmp_path.iterdir()) <= 5_000_000
+    assert all(Recording.open(path).complete for path in file.files)
+    end = Recording.open(file.files[-1]).end_reason
+    assert end in ("captured", "the budget of 5 MB is used up, before the capture was over")
 
 
 def test_triggers_without_end_take_no_memory_without_end(tmp_path):
@@ -229,6 +310,8 @@ def test_an_unknown_channel_is_refused(tmp_path):
         ({"pre_s": 1e3}, "pre_s must be from 0 to 120"),
         ({"post_s": 0.0}, "post_s must be"),
         ({"count": 0}, "count must be"),
+        ({"longest_s": 2.0}, "longest_s must be at least pre_s and post_s, 2.5"),
+        ({"longest_s": float("nan")}, "longest_s must be"),
     ],
 )
 def test_impossible_captures_are_refused(options, must):

@@ -299,3 +299,28 @@ def test_the_command_takes_parts_and_shows_notes(tmp_path: Path, capsys: pytest.
     assert f"{BLOCKS * 0.01 - 5e-5:.3f} s" in capsys.readouterr().out
     saved = Saved(tmp_path / "both.rrd")
     assert "note: bearing is warm #look" in [text for (text,) in saved["/events", "TextLog:text"].values]
+
+
+def test_a_picture_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded, target = tmp_path / "run.mcap", tmp_path / "run.rrd"
+    write_recording(recorded, list(stream(20)))
+    seen: list[list[str]] = []
+    paint = file.paint
+
+    def spied(*arguments: Any) -> file.Painted:
+        seen.append(sorted(path.name for path in tmp_path.glob("run.rrd*")))
+        return paint(*arguments)
+
+    def fails(*arguments: Any) -> file.Painted:
+        paint(*arguments)
+        raise OSError(28, "No space left on device", "run.rrd")
+
+    target.write_text("precious")
+    for change, code in ((fails, 1), (spied, 0)):
+        monkeypatch.setattr(file, "paint", change)
+        with pytest.raises(SystemExit) as ended:
+            main(["view", str(recorded), "--save", str(target), "--force"])
+        assert (ended.value.code or 0) == code
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]
+        assert (target.read_bytes() == b"precious") == bool(code)
+    assert seen == [["run.rrd", "run.rrd.part"]]
