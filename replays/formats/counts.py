@@ -147,7 +147,7 @@ def _noise(values: np.ndarray) -> float:
 def _told(entry: MappedSignal, channel: Channel, rule: str, values: np.ndarray, rate_hz: int) -> ImportedChannel:
     unit = units.canonical(entry.mapping.unit or entry.entry.unit or "1")
     source = f"(source {'-' if entry.bias > 0.0 else '+'} {abs(entry.bias):.6g})" if entry.bias else "source"
-    ratio = "" if unit == channel.unit else f" {channel.unit} per {unit}"
+    ratio = "" if unit == channel.unit else f" {channel.unit} per {unit}".replace(" 1 per", " per")
     gain = f"{entry.gain:.9g}{ratio} * " if ratio or entry.gain != 1.0 else ""
     delay = f", {-entry.mapping.delay_us:+g} us" if entry.mapping.delay_us else ""
     drift = (entry.axis.rate_hz / rate_hz - 1.0) * 1e6 if entry.axis.rows and whole_rate(entry.axis) == rate_hz else 0.0

@@ -24,7 +24,7 @@ _RAW_INPUT = 0xFFFFFFFF
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """npTDMS prints a line a read of a file that is cut off; it is said once, as an error."""
+    """Of a file that is cut off, npTDMS prints a line a read; it is said once, as an error."""
     handler = logging.getLogger("nptdms.reader").handlers
     level = [one.level for one in handler]
     for one in handler:

@@ -42,14 +42,13 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
         "# rig's channels (then drop `to` and `to_unit`), so that pictures, verdicts and models know it:",
     ]
     for group in default_table().groups.values():
-        lines.append(
-            f"#   {group.name}: " + ", ".join(f"{channel.name} [{channel.unit}]" for channel in group.channels)
-        )
+        names = (channel.name + (f" [{channel.unit}]" if channel.unit != "1" else "") for channel in group.channels)
+        lines.append(f"#   {group.name}: {', '.join(names)}")
     lines += [
         '# A channel in volts: unit = "V", sensitivity = "200 mV/mil" (or "100 mV/g", "2 mV/N"), bias = "mean".',
         "# Probes at other angles than 0 and 90 degrees: [[rotate]]. Another recorder's clock: [[align]]. To simulate",
-        "# it again (`rig validate`, `rig identify`): [experiment], with [hammer] and [keyphasor], as at the end. Every",
-        "# option is explained by `rig import --template EXAMPLE.toml`.",
+        "# it again (`rig validate`, `rig identify`): [experiment], with [hammer] and [keyphasor], as at the end.",
+        "# Every option is explained by `rig import --template EXAMPLE.toml`.",
         "",
     ]
     for source in sources:

@@ -25,8 +25,10 @@ _TIME_RESPONSE = (0, 1)
 """Function types that are time histories: general, time response."""
 _REAL = (2, 4)
 """Ordinates in single or double precision; 5 and 6 are complex."""
+_DELIMITER, _BLANK = b"    -1", b"\0\x1a\r\n "
+"""What stands before and behind a dataset, and what may follow it."""
 _TAIL = 4096
-"""Bytes at the end of a file in which its last line is looked for."""
+"""Bytes at the end of a file in which that is looked for."""
 _EXACT_RATE = re.compile(r"rate_hz=([0-9.eE+-]+)")
 _START = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S")
 _TIME, _GENERAL, _UNKNOWN = 17, 1, 0
@@ -86,12 +88,12 @@ def open_file(path: Path, options: FileOptions) -> Source:
 
 
 def _ends(path: Path) -> bool:
-    """Whether the last line closes a dataset; pyuff passes over one that does not end."""
+    """Whether the file ends with the close of a dataset; pyuff passes over one that does not end."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - _TAIL))
-        lines = file.read().rstrip(b"\0\x1a\r\n ").splitlines()
-    # After a line that closes one, another opens the next.
-    return bool(lines) and lines[-1].strip() == b"-1" and (len(lines) < 2 or lines[-2].strip() != b"-1")
+        end = file.read().rstrip(_BLANK)
+    # Binary numbers are followed by it without a new line; after one that closes, another opens the next dataset.
+    return end.endswith(_DELIMITER) and not end.removesuffix(_DELIMITER).rstrip(_BLANK).endswith(_DELIMITER)
 
 
 def _rate_hz(head: dict) -> float | None:

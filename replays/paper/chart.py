@@ -37,7 +37,7 @@ def draw_conditions(
     plane.plot([t.full for t in least], spins, "D", color=BLUE, ms=6, label="the same, full rig")
     plane.axhline(own.natural / (2 * math.pi), color="0.5", ls=":", lw=1.2, label="w_n on the magnets (eq. 42)")
     plane.plot(constants.contact.friction, 83.7, "*", color=ORANGE, ms=13, label="the paper: mu = 0.25, 83.7 Hz")
-    plane.set(xlabel="friction mu [1]", ylabel="|whirl frequency| [Hz]", ylim=(6, 300))
+    plane.set(xlabel="friction mu", ylabel="|whirl frequency| [Hz]", ylim=(6, 300))
     plane.legend(fontsize=8, loc="lower left")
     shown = set()
     for row, start in enumerate(starts):
@@ -49,7 +49,7 @@ def draw_conditions(
             scan.plot(there, [row] * len(there), mark, color=colour, ms=6, label=label)
     scan.axvline(constants.contact.friction, color="0.5", ls=":", lw=1.2, label="the paper's mu")
     scan.set_yticks(range(len(starts)), [f"{start.force_n:g} N" for start in starts])
-    scan.set(xlabel="friction mu [1]", ylabel="blow of 5 ms at 6.2 Hz", ylim=(-0.6, len(starts) + 0.2),
+    scan.set(xlabel="friction mu", ylabel="blow of 5 ms at 6.2 Hz", ylim=(-0.6, len(starts) + 0.2),
              title="what becomes of a blow")  # fmt: skip
     scan.legend(fontsize=8, loc="upper right", ncols=3)
     draw_grid(plane, scan)

@@ -221,7 +221,7 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
     panels[3].barh(rows - 0.2, np.nan_to_num(peak), height=0.38, color=ORANGE, label="highest force")
     panels[3].set_yticks(rows, [entry.key for entry in entries], fontsize=7.5)
     panels[3].invert_yaxis()
-    panels[3].set(xlabel="rank correlation [1]", xlim=(-1.05, 1.05))
+    panels[3].set(xlabel="rank correlation", xlim=(-1.05, 1.05))
     panels[3].legend(fontsize=8, loc="lower left")
     draw_grid(*panels)
     return figure
@@ -235,7 +235,7 @@ def draw_mobility(results: Results) -> Figure:
     panels = figure.subplots(1, 4)
     shown = {
         "peak_normal_n": "highest normal force [N]",
-        "contacts": "impacts until it whirls [1]",
+        "contacts": "impacts until it whirls",
         "roll_s": "from the blow until it rolls [s]",
         "reaction_x_n": "E - W amplitude in whirl [N]",
     }
@@ -246,7 +246,7 @@ def draw_mobility(results: Results) -> Figure:
         middle = [median(results[f"mobility {scale:g}"], name) for scale in SCALES]
         axes.semilogx(SCALES, middle, color=BLUE, lw=1.6, label="median of the phases")
         axes.axhline(median(results["alternative house rigid"], name), color="0.5", ls=":", lw=1.4, label="rigid")
-        axes.set(xlabel="support over the corrected one [1]", ylabel=label)
+        axes.set(xlabel="support over the corrected one", ylabel=label)
         axes.margins(y=0.25)
         axes.legend(fontsize=8, loc="upper left")
     draw_grid(*panels)

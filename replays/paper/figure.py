@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PAPER = {"color": "0.45", "lw": 1.0, "ls": (0, (4, 3)), "zorder": 1}
+_IMPACTS_MS = 14.0
 _BEFORE, _IMPACTS, _SETTLED = GREEN, RED, BLUE
 
 
@@ -59,6 +60,18 @@ def draw_magnets(one: Reproduction) -> Figure:
     return figure
 
 
+def first_impacts(penetration: np.ndarray, times_ms: np.ndarray) -> tuple[float, float]:
+    """A stretch of time [ms] from just before the first contact, short enough that ringing houses show as waves.
+
+    Args:
+        penetration: Depth of contact [m], shape (n,).
+        times_ms: When [ms], shape (n,).
+    """
+    touching = np.flatnonzero(penetration > 0.0)
+    start = float(times_ms[touching[0]]) if len(touching) else float(times_ms[0])
+    return start - 1.0, start + _IMPACTS_MS
+
+
 def draw_drop(found: dict[str, Reproduction]) -> Figure:
     """Figure 10 (and 11): trajectory, y(t), SOUTH reaction, inner house."""
     figure = new_figure(
@@ -88,8 +101,10 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         _axis_lines(house, -100.0, 100.0, text="the paper's axis, +-100")
         house.set(ylabel="inner house [m/s^2]")
         house.margins(y=0.35)
-        for axes in (height, force, house):
-            axes.set(xlabel="time [ms]", xlim=(0, 200))
+        height.set(xlabel="time [ms]", xlim=(0, 200))
+        first = first_impacts(run["penetration"], t)
+        for axes in (force, house):
+            axes.set(xlabel="time, first impacts [ms]", xlim=first)
         for axes in panels[row]:
             axes.legend(fontsize=7.5, loc="upper right")
         draw_grid(*panels[row])

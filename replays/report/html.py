@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 def render(report: Report) -> bytes:
     """The report as a page."""
-    return _template().render(report=report, kind=lambda part: type(part).__name__).encode()
+    from replays.report.document import Heading
+
+    contents = [(number, part) for number, part in enumerate(report.parts) if isinstance(part, Heading)]
+    return _template().render(report=report, contents=contents, kind=lambda part: type(part).__name__).encode()
 
 
 @cache

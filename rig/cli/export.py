@@ -29,10 +29,10 @@ def export(
     method: Annotated[str, typer.Option(help="How: polyphase (band-limited) or linear.")] = "polyphase",
     force: Force = False,
 ) -> None:
-    """Write a recording, or several parts as one, as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration where they have a place.
+    """Write a recording, or its parts as one, as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration.
 
-    CSV and WAV have none: FILE.json stands beside them. CSV, Parquet and WAV hold one rate: channels of several make as
-    many files, or --rate-hz brings them to one.
+    CSV and WAV have no place for them: FILE.json stands beside them. CSV, Parquet and WAV hold one rate: channels of
+    several make as many files, or --rate-hz brings them to one.
     """
     from recorder.reader import join
     from replays.formats.export import check_output, merged

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.folder import check_folder
 from rig.cli.options import Force, Json
 from rig.cli.progress import reporting
 from rig.cli.tables import new_table, table_console
-from rig.errors import InputError
 
 if TYPE_CHECKING:
     from replays.paper.document import Findings
@@ -40,8 +40,8 @@ def paper(
 
     if output is not None:
         check_report(output, force=force)
-    if pictures is not None and not pictures.is_dir():
-        raise InputError("--pictures", "a folder that exists", str(pictures))
+    if pictures is not None:
+        check_folder(pictures, field="--pictures")
     if not compiled_before():
         typer.echo(COMPILE_NOTICE, err=True)
     with reporting() as reporter:
@@ -50,7 +50,10 @@ def paper(
         if output is not None:
             reporter.say("report")
             write_up(findings, quick=quick).write(output)
-        drawn = draw_pictures(findings, pictures) if pictures is not None else []
+        drawn = []
+        if pictures is not None:
+            pictures.mkdir(exist_ok=True)
+            drawn = draw_pictures(findings, pictures)
     if json_output:
         typer.echo(json.dumps(summary(findings), indent=2, allow_nan=False))
         return
@@ -58,7 +61,9 @@ def paper(
     for path in drawn:
         typer.echo(f"picture  {path}")
     if output is not None:
-        typer.echo(f"\nreport  {output}")
+        typer.echo(f"report  {output}")
+    elif not drawn:
+        typer.echo("nothing is written; -o paper.html writes the report with all figures and tables")
 
 
 def summary(findings: Findings) -> dict[str, object]:
@@ -80,12 +85,21 @@ def summary(findings: Findings) -> dict[str, object]:
 def _show(findings: Findings) -> None:
     from rich.text import Text
 
+    from replays.paper.document import JUDGED_BY, count
+
     table = new_table("the paper's statements, and ours")
     for heading in ("statement", "the paper", "as-printed", "corrected", "verdict"):
-        table.add_column(heading, justify="right" if heading in ("as-printed", "corrected") else "left")
+        right = heading in ("as-printed", "corrected")
+        table.add_column(heading, justify="right" if right else "left", no_wrap=right)
     colours = {"good": "green", "bad": "bold red", "open": "yellow", "plain": ""}
-    for line in [*findings.lines, *findings.claims]:
+    lines = [*findings.lines, *findings.claims]
+    for line in lines:
         row = line.row()
-        says, _, paper_says, printed, corrected, verdict = row.cells
-        table.add_row(Text(says), paper_says, printed, corrected, Text(verdict, style=colours[row.mark]))
-    table_console().print(table)
+        says, _, paper_says, printed, corrected, _ = row.cells
+        verdict = " / ".join(dict.fromkeys(line.verdicts.values()))  # in the order of the columns, one if they agree
+        table.add_row(Text(says), Text(paper_says), printed, corrected, Text(verdict, style=colours[row.mark]))
+    console = table_console(width=100, highlight=False)
+    console.print(table)
+    counts = count(lines)
+    console.print(f"corrected: {counts['agrees']} agree, {counts['differs']} differ, {counts['cannot be judged']} "
+                  f"cannot be judged ({JUDGED_BY})", markup=False)  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import tomllib
 import wave
 from datetime import timedelta
 from pathlib import Path
@@ -887,6 +888,112 @@ def test_damaged_files_are_one_line(
     assert printed.err.startswith(f"rig: {message}"), printed.err
     assert printed.err.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["m.toml", name])
+
+
+# pyuff leaves the file that it writes to the garbage collector.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("suffix", [".tdms", ".uff"])
+@pytest.mark.parametrize("kept", [0.02, 0.6, 0.97])
+def test_a_file_that_is_cut_off_is_one_line(
+    suffix: str, kept: float, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    whole, cut = tmp_path / f"whole{suffix}", tmp_path / f"cut{suffix}"
+    t = np.arange(20_000) / RATE_HZ
+    if suffix == ".tdms":
+        import nptdms
+
+        about = {"wf_increment": 1.0 / RATE_HZ, "unit_string": "mm"}
+        with nptdms.TdmsWriter(whole) as writer:
+            writer.write_segment([nptdms.ChannelObject("g", name, np.sin(t), about) for name in ("x", "y")])
+    else:
+        import pyuff
+
+        file = pyuff.UFF(str(whole))
+        for name in ("x", "y"):
+            file.write_sets(pyuff.prepare_58(
+                binary=1, func_type=1, rsp_node=1, rsp_dir=1, ref_node=1, ref_dir=1, data=np.sin(t), x=t, id1=name,
+                abscissa_spacing=1, abscissa_min=0.0, abscissa_inc=1.0 / RATE_HZ, abscissa_spec_data_type=17,
+                ordinate_spec_data_type=8, orddenom_spec_data_type=0, num_pts=len(t), ord_data_type=4, z_axis_value=0.0,
+                z_axis_spec_data_type=0, ordinate_axis_units_lab="mm",
+            ), "add")  # fmt: skip
+    assert {entry.name for entry in open_source(whole, FileOptions()).entries} == {"x", "y"}
+    content = whole.read_bytes()
+    cut.write_bytes(content[: int(kept * len(content))])
+    (tmp_path / "m.toml").write_text("[channels.disk_y]\nsource = 'y'\nunit = 'mm'\n")
+    with pytest.raises(SystemExit) as end:
+        main(["import", str(cut), "-m", str(tmp_path / "m.toml"), "-o", str(tmp_path / "o.mcap")])
+    printed = capfd.readouterr()
+    assert end.value.code == 2
+    assert printed.err.startswith("rig: file must be an intact ")
+    assert "it is cut off" in printed.err or kept < 0.1
+    assert printed.err.count("\n") == 1
+    assert "m.toml" not in printed.err.split("instead")[0]
+
+
+def test_a_group_that_is_none_is_told(daq_mdf: Path, tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text("[channels.disk_y]\nsource = 'Speed'\ngroup = 'sluggish'\n")
+    with pytest.raises(InputError, match=r"disk_y\.group must be one of Fast, Slow; instead received 'sluggish'"):
+        convert([daq_mdf], mappings.load_mapping(tmp_path / "m.toml"))
+
+
+def test_the_import_is_told_in_a_line_a_channel(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "log.csv"
+    t = np.arange(500) / 1000.0
+    rows_csv(path, {"time": t, "a": np.sin(t), "b": np.cos(t), "c": np.sin(t)})
+    units_of = {"disk_x": ("a", "mm"), "ring_y": ("b", "um"), "inner_x": ("c", "m/s^2")}
+    mapping = "".join(f"[channels.{n}]\nsource = '{s}'\nunit = '{u}'\n" for n, (s, u) in units_of.items())
+    (tmp_path / "m.toml").write_text(mapping + "bias = -2.0\n")
+    with pytest.raises(SystemExit) as end:
+        main(["import", str(path), "-m", str(tmp_path / "m.toml"), "-o", str(tmp_path / "o.mcap")])
+    assert end.value.code == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines[1:])) <= 100
+    (x,), (y,), (a,) = ([line.split() for line in lines if line.startswith(f" {name} ")] for name in units_of)
+    assert x[:3] == ["disk_x", "a", "source"]
+    assert x[-1] == "mm"
+    assert y[2:8] == ["0.001", "mm", "per", "um", "*", "source"]
+    assert " ".join(a[2:6]) == "(source + 2) 2"
+    text = "\n".join(lines)
+    assert text.count("samples as they were") == 1
+    assert not re.search(r"e-\d\d", text), "no dust"
+    assert "jitter" not in text
+
+
+def test_what_is_not_known_of_an_imported_channel_is_not_told(
+    daq_mdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    imported(tmp_path, [daq_mdf], template([daq_mdf]))
+    with pytest.raises(SystemExit):
+        main(["info", str(tmp_path / "out.mcap")])
+    printed = capsys.readouterr().out
+    assert printed.count("not known") == 3, printed
+    assert "seed" not in printed
+    assert "parameters" not in printed
+
+
+def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = tmp_path / "t.toml"
+    with pytest.raises(SystemExit):
+        main(["import", str(daq_mdf), "--template", str(target)])
+    assert "PLEASE CHECK" not in capsys.readouterr().out, "there are none"
+    text = target.read_text()
+    plain, _, rest = text.partition("# Take away the `# ` of what you need:\n")
+    taken_up = "\n".join(line.removeprefix("#").removeprefix(" ") for line in rest.splitlines())
+    tables = tomllib.loads(plain.replace("[channels.Speed]", "[channels.hammer]") + taken_up)
+    mapping = mappings.Mapping(**tables)
+    assert mapping.align
+    assert mapping.keyphasor
+    assert mapping.hammer
+    assert mapping.experiment
+
+
+def test_a_comment_that_is_json_is_told_by_its_label(tmp_path: Path) -> None:
+    from replays.formats.source import Entry
+    from replays.formats.template import _label
+
+    assert _label(Entry("x", "", "mm", 1, None, label=json.dumps({"name": "x", "label": "Ring"}))) == "Ring"
+    assert _label(Entry("x", "", "mm", 1, None, label="{not json")) == "{not json"
+    assert _label(Entry("x", "", "mm", 1, None, label="long " * 20)).endswith("...")
 
 
 @pytest.mark.parametrize(

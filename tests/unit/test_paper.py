@@ -17,6 +17,7 @@ import pytest
 from replays.paper.blow import BLOW_AT, Blow, Outcome, outcome, outcomes
 from replays.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
 from replays.paper.document import Findings, all_questions, find, planned_groups, steps, write_up
+from replays.paper.figure import first_impacts
 from replays.paper.spread import (
     assumed_values,
     changes,
@@ -265,3 +266,56 @@ def test_number():
     assert [number(x) for x in (math.nan, 0.0, 1234.5, 538.61, 1e-4, 1.28)] == [
         "none", "0", "1234", "538.6", "0.0001", "1.28",
     ]  # fmt: skip
+
+
+def test_terminal_tells_the_total_and_the_rule(findings: Findings, capsys, monkeypatch):
+    monkeypatch.setattr("replays.paper.document.find", lambda **_: findings)
+    with pytest.raises(SystemExit) as end:
+        main(["paper", "--quick"])
+    assert end.value.code == 0
+    printed = capsys.readouterr().out
+    lines = [*findings.lines, *findings.claims]
+    kinds = [line.verdicts["corrected"] for line in lines]
+    agree, differ, neither = (kinds.count(kind) for kind in ("agrees", "differs", "cannot be judged"))
+    said = " ".join(printed.split())
+    assert f"corrected: {agree} agree, {differ} differ, {neither} cannot be judged (" in said
+    assert "more than 2/5" in said
+    assert "nothing is written" in said
+    assert max(map(len, printed.splitlines())) <= 100
+
+
+def test_a_folder_for_pictures_is_made_beside_others(findings: Findings, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("replays.paper.document.find", lambda **_: findings)
+    drawn: list[Path] = []
+    monkeypatch.setattr("replays.paper.document.draw_pictures", lambda _, folder: drawn.append(folder) or [])
+    (tmp_path / "file").write_text("")
+    for name, code in (("new", 0), ("new", 0), ("no/new", 2), ("file", 2)):
+        with pytest.raises(SystemExit) as end:
+            main(["paper", "--quick", "--pictures", str(tmp_path / name)])
+        assert end.value.code == code, capsys.readouterr().err
+    assert drawn == [tmp_path / "new"] * 2
+    assert (tmp_path / "new").is_dir()
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_what_is_corrected_on_purpose_does_not_differ(findings: Findings):
+    report = write_up(findings, quick=True)
+    table = next(part for part in report.parts if isinstance(part, Table) and part.headings[0] == "symbol")
+    kept = load_parameters("corrected")
+    for printed, row in zip(printed_values(), table.rows, strict=True):
+        agrees = abs(kept[printed.key] / printed.value - 1.0) < 5e-3
+        assert (row.cells[-1], row.mark) == (("agrees", "good") if agrees else ("corrected", "open"))
+    assert {row.cells[0] for row in table.rows if row.mark == "open"} == {
+        "M_oh (as-printed holds M_ih + M_oh)", "K_ft, printed of one; both sets hold a pair's k_T"
+    }  # fmt: skip
+
+
+def test_ringing_houses_are_drawn_as_waves(findings: Findings):
+    one = findings.found["corrected"]
+    start, end = first_impacts(one.drop["penetration"], one.drop.times_s * 1e3)
+    touching = one.drop.times_s[one.drop["penetration"] > 0.0] * 1e3
+    assert start < touching[0] < end
+    inside = (one.drop.times_s * 1e3 > start) & (one.drop.times_s * 1e3 < end)
+    force = (one.drop["P_S"] - one.drop["P_N"])[inside]
+    waves = np.count_nonzero(np.diff(np.sign(force - force.mean()))) / 2
+    assert 5 < waves < 40, "more would be a block on a panel of some 200 pixels"

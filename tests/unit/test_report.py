@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -112,3 +113,26 @@ def test_tables_of_any_width_go_into_a_pdf(tmp_path: Path) -> None:
             report.table(cells, [cells])
     report.write(tmp_path / "tables.pdf")
     assert (tmp_path / "tables.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_long_report_begins_with_its_contents(tmp_path: Path) -> None:
+    report = Report("Long")
+    for number in range(3):
+        report.heading(f"Part {number} & more")
+        report.heading("The same", level=2)
+        report.text("Something.")
+    report.write(tmp_path / "long.html")
+    page = (tmp_path / "long.html").read_text()
+    contents = page[page.index("<nav>") : page.index("</nav>")]
+    targets = re.findall(r'href="#([^"]+)">([^<]+)<', contents)
+    assert [text for _, text in targets] == [
+        text for number in range(3) for text in (f"Part {number} &amp; more", "The same")
+    ]
+    below = page[page.index("</nav>") :]
+    for target, text in targets:
+        assert re.search(rf'<h[23] id="{target}">{text}<', below), "each link leads to its own heading"
+    assert len({target for target, _ in targets}) == len(targets)
+    short = Report("Short")
+    short.heading("Alone")
+    short.write(tmp_path / "short.html")
+    assert "<nav>" not in (tmp_path / "short.html").read_text()
