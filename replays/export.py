@@ -53,7 +53,7 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
     """The writer that the suffix asks for."""
     check_run_output(path, force=force)
     if path.suffix == ".mcap":
-        return _McapRun(path, simulation, force=force)
+        return McapRun(path, simulation, force=force)
     return _TableRun(path, simulation, columnar.Rows if path.suffix == ".parquet" else delimited.Rows)
 
 
@@ -137,24 +137,48 @@ class _TableRun:
         self._writer.write(list(rows.T))
 
 
-class _McapRun:
+class McapRun:
     """The same file as `rig record` would have made, with the simulated clock for the wall clock."""
 
-    def __init__(self, path: Path, simulation: Simulation, *, force: bool) -> None:
+    def __init__(
+        self,
+        path: Path,
+        simulation: Simulation,
+        *,
+        force: bool = False,
+        view_rate_hz: float = 500.0,
+        epoch_ns: int | None = None,
+    ) -> None:
+        """Prepare; the file begins where the context does.
+
+        Args:
+            path: The file, ends in .mcap.
+            simulation: What is run.
+            force: Replace an existing file.
+            view_rate_hz: Rate of the plottable messages [Hz of simulated time]; 0 writes none.
+            epoch_ns: Wall time at which the run begins [unix ns], at which the recorder's clocks stand still: the same
+                run gives the same bytes. None for now.
+        """
         self.path, self.simulation, self._force = path, simulation, force
+        self._view_rate_hz, self._epoch_ns = view_rate_hz, epoch_ns
         self._background = _Background()
 
     def __enter__(self) -> Self:
         from recorder.writer import RecordingWriter
 
-        self._wall_ns = time.time_ns()
+        epoch_ns = self._epoch_ns
+        self._wall_ns = time.time_ns() if epoch_ns is None else epoch_ns
         simulation = self.simulation
         self._writer = RecordingWriter(
             self.path,
             catalogue=simulation.catalogue(),
             parameters=simulation.parameters_document(),
             scene=simulation.scene_document(),
+            view_rate_hz=self._view_rate_hz,
+            from_start=True,
             force=self._force,
+            wall_ns=time.time_ns if epoch_ns is None else lambda: epoch_ns,
+            monotonic_s=time.monotonic if epoch_ns is None else lambda: 0.0,
         )
         self._rows = wire.RowCount()
         self._event({"event": "start", "scene": simulation.scene.name, "seed": simulation.scene.seed, "pace": "none"})
@@ -186,10 +210,10 @@ class _McapRun:
             self._rows.follow(key, block)
 
     def _event(self, event: dict[str, Any]) -> None:
-        tick = self.simulation.tick
+        tick = int(event.get("tick", self.simulation.tick))  # a frame's own: the simulation is further on by now
         stamp = {"tick": tick, "time_s": tick / self.simulation.tick_rate_hz}
         payload = wire.encode_document(self._rows.tell({**stamp, **event}))
-        self._writer.write(wire.EVENTS, payload, self._wall(stamp["tick"]))
+        self._writer.write(wire.EVENTS, payload, self._wall(tick))
 
     def _wall(self, tick: int) -> int:
         return self._wall_ns + tick * 1_000_000_000 // self.simulation.tick_rate_hz

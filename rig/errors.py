@@ -18,7 +18,8 @@ class InputError(ValueError):
         self.field = field
         self.must = must
         self.received = received
-        super().__init__(f"{field} must be {must}; instead received {received!r}")
+        shown = "nothing" if received is None else repr(received)  # as for a field that is missing
+        super().__init__(f"{field} must be {must}; instead received {shown}")
 
 
 class RefusedError(InputError):

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from recorder.reader import Recording
-from recorder.writer import RecordingWriter
+from replays.export import McapRun
 from replays.validation import validate
 from replays.validation.outcome import Validation
 from rig.offline import frames
 from rig.scenes import load_scene
-from rig.simulation import TICK_RATE_HZ, Simulation
-from rig.wire import EDGES, EVENTS, encode_block, encode_document, sensor_key, truth_key
+from rig.simulation import Simulation
 
 FOLDER = Path(__file__).parent
 COMMAND = "rig sessions -o replays/sessions --force"
@@ -74,38 +73,9 @@ def make(session: Session, folder: Path, *, step: Callable[[str], None] = lambda
 
 def _record(session: Session, path: Path) -> None:
     simulation = Simulation(load_scene(session.scene, {**_SMALL, **session.changes}))
-    writer = RecordingWriter(
-        path, catalogue=simulation.catalogue(), parameters=simulation.parameters_document(),
-        scene=simulation.scene_document(), view_rate_hz=0.0, from_start=True, force=True, wall_ns=lambda: _EPOCH_NS,
-        monotonic_s=lambda: 0.0,
-    )  # fmt: skip
-    whole = False
-    try:
-        _write_event(writer, {"event": "start", "scene": session.scene, "seed": simulation.scene.seed, "tick": 0})
+    with McapRun(path, simulation, force=True, view_rate_hz=0.0, epoch_ns=_EPOCH_NS) as writer:
         for frame in frames(simulation):
-            for event in frame.events:
-                _write_event(writer, event)
-            blocks = {sensor_key(name): block for name, block in frame.samples.items()}
-            blocks |= {truth_key(name): block for name, block in frame.truth.items()}
-            if frame.edges is not None:
-                blocks[EDGES] = frame.edges
-            for key, block in blocks.items():
-                writer.write(key, encode_block(block), _wall_ns(frame.tick))
-        _write_event(writer, {"event": "end", "reason": "completed", "tick": simulation.tick})
-        writer.finish("completed")
-        whole = True
-    finally:
-        if not whole:
-            writer.abandon()
-
-
-def _write_event(writer: RecordingWriter, event: dict[str, Any]) -> None:
-    tick = int(event["tick"])
-    writer.write(EVENTS, encode_document({"time_s": tick / TICK_RATE_HZ, **event}), _wall_ns(tick))
-
-
-def _wall_ns(tick: int) -> int:
-    return _EPOCH_NS + tick * (1_000_000_000 // TICK_RATE_HZ)
+            writer.write(frame)
 
 
 def quantities_text(session: Session, found: Validation) -> str:

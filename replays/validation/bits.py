@@ -1,4 +1,7 @@
-"""Payload against payload: every recorded block beside the same rows of a re-simulation, encoded again."""
+"""Payload against payload: every recorded block beside the same rows of a re-simulation, encoded again.
+
+Columns are matched by name: of a recording that was cut to some channels, these are compared.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recorder.reader import Recording
+from rig.channels import ChannelTable
 from rig.simulation import TICK_RATE_HZ, Frame
 from rig.wire import EDGES, Block, encode_block, schema_of, sensor_key, truth_key
 
@@ -24,6 +28,7 @@ class StreamBits:
         largest: Largest difference, in counts or SI.
         skipped: Rows that the recording lost.
         beyond: Rows with nothing to hold them against.
+        columns: Columns recorded, and columns that the rig makes, where they are not the same in the same order.
     """
 
     rows: int = 0
@@ -33,19 +38,42 @@ class StreamBits:
     largest: float = 0.0
     skipped: int = 0
     beyond: int = 0
+    columns: tuple[int, int] | None = None
 
     @property
     def equal(self) -> bool:
-        """Every payload is equal, byte for byte."""
+        """Every payload is equal, byte for byte, in the columns that were recorded."""
         return self.different == 0 and self.beyond == 0
+
+    @property
+    def picked(self) -> str:
+        """Which columns were compared, in words; empty where all are there, in their order."""
+        if self.columns is None:
+            return ""
+        here, there = self.columns
+        return f"{here} of {there}" if here < there else "in another order"
 
 
 class Bits:
     """Follows a re-simulation frame by frame; only rows that recorded blocks still wait for are kept."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, made: ChannelTable) -> None:
+        """Begin.
+
+        Args:
+            recording: What was recorded.
+            made: The channels of the re-simulation.
+        """
         keys = sorted(key for key in recording.messages if schema_of(key) is not None and key in recording.streams)
         self.streams = {key: _Follower(key, recording.blocks(key)) for key in keys}
+        for name, group in recording.table.groups.items():
+            follower = self.streams.get(sensor_key(name))
+            if follower is None or name not in made.groups:
+                continue
+            there = made.groups[name].names
+            if group.names != there and set(group.names) <= set(there):
+                follower.picked = [there.index(channel) for channel in group.names]
+                follower.found.columns = (len(group.names), len(there))
 
     def follow(self, frame: Frame) -> None:
         """Take the next frame."""
@@ -66,6 +94,8 @@ class Bits:
 class _Follower:
     key: str
     recorded: Iterator[Block]
+    picked: list[int] | None = None
+    """Columns of the re-simulation that were recorded, in that order; None for all."""
     found: StreamBits = field(default_factory=StreamBits)
     _waiting: Block | None = None
     _rows: list[np.ndarray] = field(default_factory=list)
@@ -74,7 +104,7 @@ class _Follower:
     _next: int | None = None
 
     def take(self, block: Block) -> None:
-        values = block.values
+        values = block.values if self.picked is None else block.values[:, self.picked]
         if self.key == EDGES:  # ticks from the block's own tick: to the rig's tick zero, exactly
             values = values + block.tick
         if not self._rows:

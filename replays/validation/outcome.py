@@ -12,7 +12,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.experiment import Experiment
-from replays.identification.nuisance import is_imported, tune
+from replays.identification.nuisance import Tuned, is_imported, tune
 from replays.prediction import Measured, Prediction, bare, measured, predict
 from replays.sensitivity import value_of, with_values
 from replays.validation.attribution import Explained, attribute
@@ -58,6 +58,11 @@ class StatisticResult:
     reason: str
 
     @property
+    def title(self) -> str:
+        """The quantity with its unit."""
+        return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
+
+    @property
     def good(self) -> bool | None:
         """Within the criterion; None where there is none."""
         if self.limit is None:
@@ -80,6 +85,28 @@ class TruthResult:
     def good(self) -> bool:
         """Within the criterion."""
         return self.relative <= self.limit
+
+
+@dataclass(frozen=True)
+class Failure:
+    """One criterion that is not met, as what reads it wants to say it.
+
+    Attributes:
+        criterion: What is asked for, with its unit.
+        recorded: What the recording has.
+        foretold: What it should have.
+        limit: What is allowed.
+    """
+
+    criterion: str
+    recorded: str
+    foretold: str
+    limit: str
+
+    @property
+    def line(self) -> str:
+        """All of it in one line."""
+        return f"{self.criterion}: {self.recorded} against {self.foretold} ({self.limit})"
 
 
 @dataclass(frozen=True)
@@ -106,6 +133,7 @@ class Validation:
         fitted: What was fitted before, as an imported log does not tell it exactly.
         parts: What was recorded.
         nominal: What was foretold.
+        files: Number of files that the recording was in.
     """
 
     path: Path
@@ -127,6 +155,7 @@ class Validation:
     fitted: tuple[str, ...] = ()
     parts: dict[str, Measured] = field(repr=False, default_factory=dict)
     nominal: Prediction | None = field(repr=False, default=None)
+    files: int = 1
 
     @property
     def good(self) -> bool:
@@ -134,20 +163,37 @@ class Validation:
         return (self.bit_exact and not self.declared) or not self.failures
 
     @property
-    def failures(self) -> list[str]:
-        """Every criterion that is not met, in words."""
-        found = [
-            f"{one.channel}: residual {one.rms:.3g} floors RMS, {one.peak:.3g} at most, drift {one.drift:.3g}"
-            for one in self.residuals
-            if one.good is False
-        ]
-        found += [f"truth {one.table}.{one.column}: off by {one.relative:.2g}" for one in self.truth if not one.good]
-        found += [
-            f"{one.phase}, {one.quantity}: {one.recorded:.5g} against {one.foretold:.5g} {one.unit}".rstrip()
-            for one in self.statistics
-            if one.good is False
-        ]
+    def failures(self) -> list[Failure]:
+        """Every criterion that is not met."""
+        found = []
+        for one in self.residuals:
+            if one.good is False and one.broken is not None:
+                measure, value, limit = one.broken
+                criterion = f"{one.channel}, residual over noise: {measure}"
+                found.append(Failure(criterion, f"{value:.3g}", one.alone(measure), f"at most {limit:.3g}"))
+        for one in self.truth:
+            if not one.good:
+                criterion = f"truth {one.table}.{one.column}, part that it is off"
+                found.append(Failure(criterion, f"{one.relative:.2g}", "0", f"at most {one.limit:.2g}"))
+        for one in self.statistics:
+            if one.good is False and one.limit is not None:
+                limit = f"+- {one.limit:.2g}"
+                found.append(Failure(f"{one.phase}, {one.title}", f"{one.recorded:.5g}", f"{one.foretold:.5g}", limit))
         return found
+
+    @property
+    def title(self) -> str:
+        """Name of the recording, of several parts that of the first."""
+        return self.path.name + (f" and {self.files - 1} more" if self.files > 1 else "")
+
+    @property
+    def calibration_line(self) -> str:
+        """How the recording's channels differ from the rig's own table, in one line; empty where they do not."""
+        if len(self.calibration) < 2:
+            return "".join(self.calibration)
+        names = [line.partition(":")[0] for line in self.calibration]
+        shown = ", ".join(names[:3]) + (", ..." if names[3:] else "")
+        return f"{len(names)} channels ({shown}) differ from the rig's own table; the report says how"
 
     @property
     def bits_line(self) -> str:
@@ -156,6 +202,8 @@ class Validation:
             return "imported: there are no payloads of this rig to compare"
         rows = sum(one.rows for one in self.bits.values())
         lost = f"; {self.skipped} rows that the recording lost are passed over" if self.skipped else ""
+        cut = [f"{key.rpartition('/')[2]} {one.picked}" for key, one in self.bits.items() if one.picked]
+        lost += f"; of the channels, by name: {', '.join(cut)}" if cut else ""
         if self.bit_exact:
             return f"bit-exact: all payloads of {len(self.bits)} streams, {rows} rows{lost}"
         off = [(key, one) for key, one in self.bits.items() if not one.equal]
@@ -174,8 +222,17 @@ class Validation:
         if self.good:
             basis = "bit by bit" if self.bit_exact and not self.declared else f"by the criteria: {self.criteria}"
             return f"good, {basis}"
-        failures = self.failures
-        return f"FAILS {len(failures)} criteria: " + "; ".join(failures[:3]) + ("; ..." if failures[3:] else "")
+        channels = [one.channel for one in self.residuals if one.good is False]
+        tables = [one.table for one in self.truth if not one.good]
+        phases = [one.phase for one in self.statistics if one.good is False]
+        parts = [f"trajectory of {_few(channels)}"] if channels else []
+        parts += [f"truth of {_few(tables)}"] if tables else []
+        if phases:
+            parts.append(
+                "quantities: " + ", ".join(f"{phases.count(name)} of {name}" for name in dict.fromkeys(phases))
+            )
+        asked = sum(one.good is not None for one in (*self.residuals, *self.statistics)) + len(self.truth)
+        return f"FAILS {len(self.failures)} of {asked} criteria: {'; '.join(parts)}"
 
     def document(self) -> dict[str, Any]:
         """All of it but the samples, as a JSON document."""
@@ -196,10 +253,14 @@ class Validation:
                 "truth": [{**asdict(one), "good": one.good} for one in self.truth],
                 "phases": [asdict(one) for one in self.phases],
                 "statistics": [{**asdict(one), "good": one.good} for one in self.statistics],
-                "failures": self.failures,
+                "failures": [asdict(one) for one in self.failures],
                 "explained": None if self.explained is None else asdict(self.explained),
             }
         )
+
+
+def _few(names: list[str]) -> str:
+    return " and ".join(names) if len(names) < 3 else f"{names[0]}, {names[1]} and {len(names) - 2} more"
 
 
 def validate(
@@ -227,67 +288,95 @@ def validate(
     experiment = Experiment.of(recording)
     if changes:
         experiment = experiment.changed(changes)
-    parts = recorded = measured(recording, experiment.scene.sensors, longest_s=criteria.window.longest_s)
-    tuned = None
-    streams: dict[str, StreamBits] = {}
-    if is_imported(recording):
-        tuned = tune(recording, experiment, criteria.imported.nuisances, progress=lambda text: step(f"log: {text}"))
-        experiment, parts = tuned.experiment, tuned.on_time(recorded)
-        criteria = criteria.loosened(criteria.imported.noise)
-        nominal = tuned.predict(recorded)
-    else:
-        bits = Bits(recording)
-        step("re-simulated, payload by payload")
-        nominal = predict(experiment, parts, follow=bits.follow)
-        streams = bits.finish()
-    quick = bare(experiment)
-    bit_exact = bool(streams) and all(stream.equal for stream in streams.values())
-
-    step("perturbed, to see how far it can be foretold")
-    rules = criteria.window
-    if tuned is not None:
-        perturbed = tuned.predict(recorded, aside=True)
-    else:
-        perturbed = predict(_perturbed(quick, rules.parameters, rules.perturbation), parts)
-    begin = min(float(part.times_s[0]) for part in parts.values())
-    end = max(float(part.times_s[-1]) for part in parts.values()) + 1e-9
-    parted = foreseeable_s(parts, nominal, perturbed, share=rules.share)
-    change = "what the fit leaves open" if tuned is not None else f"a change of {rules.perturbation:g}"
-    if parted is None:
-        reason = f"to the end: {change} stays below {rules.share:g} of every channel's noise"
-    else:
-        end = parted
-        reason = f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
-    trajectory = residuals(parts, nominal, perturbed, criteria, end_s=end)
-    tables = _recorded_truth(recording, longest_s=begin + rules.longest_s)
-    truth = _judge_truth(tables, nominal, perturbed, criteria, end_s=end)
-
+    again = _again(recording, experiment, criteria, step)
+    begin, end, reason = _window(again)
+    trajectory = residuals(again.parts, again.nominal, again.perturbed, again.criteria, end_s=end)
+    tables = _recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
+    truth = _judge_truth(tables, again.nominal, again.perturbed, criteria, end_s=end)
     step("statistics by phase, and their spread")
-    phases, statistics = _statistics(quick, parts, nominal, tables, criteria)
-    fitted = tuple(one.line for one in tuned.fitted) if tuned is not None else ()
+    phases, statistics = _statistics(again.quick, again.parts, again.nominal, tables, criteria)
     validation = Validation(
         path=recording.path, scene=experiment.scene.name, criteria=criteria.title, changes=dict(changes or {}),
-        bits=streams, bit_exact=bit_exact, declared=declared, window_s=(begin, end), window_reason=reason,
-        residuals=tuple(trajectory), truth=tuple(truth), phases=tuple(phases), statistics=tuple(statistics),
+        bits=again.bits, bit_exact=bool(again.bits) and all(one.equal for one in again.bits.values()),
+        declared=declared, window_s=(begin, end), window_reason=reason, residuals=tuple(trajectory),
+        truth=tuple(truth), phases=tuple(phases), statistics=tuple(statistics),
         calibration=tuple(_calibration(recording)), skipped=sum(stream.lost for stream in recording.streams.values()),
-        explained=None, fitted=fitted, parts=parts, nominal=nominal,
+        explained=None, fitted=tuple(one.line for one in again.tuned.fitted) if again.tuned is not None else (),
+        parts=again.parts, nominal=again.nominal, files=len(recording.parts),
     )  # fmt: skip
-    if validation.good:
-        return validation
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
-    explained = None
-    if firsts:
-        step("what explains the difference")
-        rules = criteria.attribution
-        if (
-            tuned is not None
-        ):  # numbers of the model hang together with what was fitted: `rig identify` fits all at once
-            rules = rules.model_copy(update={"candidates": ()})
-        explained = attribute(quick, parts, nominal, rules, from_s=min(firsts), step=step)
-        if tuned is not None and not explained.best:
-            told = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
-            explained = replace(explained, conclusion=told)
-    return replace(validation, explained=explained)
+    if validation.good or not firsts:
+        return validation
+    step("what explains the difference")
+    return replace(validation, explained=_explained(again, from_s=min(firsts), step=step))
+
+
+@dataclass(frozen=True)
+class _Again:
+    """The recording done again.
+
+    Attributes:
+        quick: The same motion, with sensors that cost little.
+        criteria: Loosened for an imported log.
+        parts: What was recorded, on the model's clock.
+        nominal: What was foretold.
+        perturbed: The same, as far off as another build or a fit may be.
+        bits: By key; empty for an imported log.
+        tuned: What was fitted before, of an imported log.
+    """
+
+    quick: Experiment
+    criteria: Criteria
+    parts: dict[str, Measured]
+    nominal: Prediction
+    perturbed: Prediction
+    bits: dict[str, StreamBits]
+    tuned: Tuned | None
+
+
+def _again(recording: Recording, experiment: Experiment, criteria: Criteria, step: Callable[[str], None]) -> _Again:
+    rules = criteria.window
+    parts = measured(recording, experiment.scene.sensors, longest_s=rules.longest_s)
+    aside = "perturbed, to see how far it can be foretold"
+    if is_imported(recording):
+        tuned = tune(recording, experiment, criteria.imported.nuisances, progress=lambda text: step(f"log: {text}"))
+        nominal = tuned.predict(parts)
+        step(aside)
+        return _Again(
+            quick=bare(tuned.experiment), criteria=criteria.loosened(criteria.imported.noise),
+            parts=tuned.on_time(parts), nominal=nominal, perturbed=tuned.predict(parts, aside=True), bits={},
+            tuned=tuned,
+        )  # fmt: skip
+    bits = Bits(recording, experiment.simulation().table)
+    step("re-simulated, payload by payload")
+    nominal = predict(experiment, parts, follow=bits.follow)
+    quick = bare(experiment)
+    step(aside)
+    perturbed = predict(_perturbed(quick, rules.parameters, rules.perturbation), parts)
+    return _Again(quick, criteria, parts, nominal, perturbed, bits.finish(), None)
+
+
+def _window(again: _Again) -> tuple[float, float, str]:
+    """Begin and end of what is compared sample by sample [s], and how the end was found."""
+    rules, parts = again.criteria.window, again.parts
+    begin = min(float(part.times_s[0]) for part in parts.values())
+    parted = foreseeable_s(parts, again.nominal, again.perturbed, share=rules.share)
+    change = "what the fit leaves open" if again.tuned is not None else f"a change of {rules.perturbation:g}"
+    if parted is None:
+        end = max(float(part.times_s[-1]) for part in parts.values()) + 1e-9
+        return begin, end, f"to the end: {change} stays below {rules.share:g} of every channel's noise"
+    return begin, parted, f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
+
+
+def _explained(again: _Again, *, from_s: float, step: Callable[[str], None]) -> Explained:
+    rules = again.criteria.attribution
+    if again.tuned is not None:  # numbers of the model hang together with what was fitted: `rig identify` fits all
+        rules = rules.model_copy(update={"candidates": ()})
+    explained = attribute(again.quick, again.parts, again.nominal, rules, from_s=from_s, step=step)
+    if again.tuned is not None and not explained.best:
+        told = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
+        explained = replace(explained, conclusion=told)
+    return explained
 
 
 def _perturbed(experiment: Experiment, keys: tuple[str, ...], part: float) -> Experiment:
@@ -351,26 +440,52 @@ def _statistics(
     tables: dict[str, tuple[np.ndarray, np.ndarray]],
     criteria: Criteria,
 ) -> tuple[list[Phase], list[StatisticResult]]:
+    look = _viewer(experiment, parts)
     recorded = {name: part.values for name, part in parts.items()}
-    channels = {channel.name: (name, c) for name, part in parts.items() for c, channel in enumerate(part.channels)}
+    floors = {name: _floor(parts, names) for name, names in SPECTRA.items()}
+    phases = find_phases(look(recorded, _whole(parts)), floor_n=_floor(parts, ("P_N", "P_S", "P_E", "P_W")))
+    members = _ensemble(experiment, parts, criteria)
+    results = []
+    for number, phase in enumerate(phases):
+        seen, there = look(recorded, phase), look(nominal.values, phase)
+        others = [look(loud, phase) for loud, _ in members]
+        samples: dict[str, tuple[float, list[float]]] = {}  # recorded, and of every member
+        read = [quantities(other, phase.name) for other in others]
+        for name, value in quantities(seen, phase.name).items():
+            samples[name] = value, [one[name] for one in read]
+        distances = [spectra(other, there, floors) for other in others]
+        for name, value in spectra(seen, there, floors).items():
+            samples[name] = value, [one.get(name, 1.0) for one in distances]
+        for name, columns in _TRUTH.items() if "energy" in tables else ():
+            ends = [_energy(tables["energy"], columns, phase, prediction) for _, prediction in members]
+            samples[name] = _energy(tables["energy"], columns, phase, nominal)[0], [foretold for _, foretold in ends]
+        results += [_judge(number, phase, name, *sample, criteria) for name, sample in samples.items()]
+    return phases, results
+
+
+def _floor(parts: dict[str, Measured], names: tuple[str, ...]) -> float:
+    """Floor of the sum of those channels that are there."""
+    floors = [part.floor[c] for part in parts.values() for c, name in enumerate(part.names) if name in names]
+    return math.hypot(*floors)
+
+
+def _viewer(experiment: Experiment, parts: dict[str, Measured]) -> Callable[[dict[str, np.ndarray], Phase], View]:
+    """What shows a phase of values, with what the model tells of the transducers at rest and of the clearance."""
     model = build_model(experiment.scene.load_parameters(), experiment.scene.model)
     row = experiment.simulation().first_row
-    base = {name: float(row[COLUMN[parts[g].channels[c].signal]] / parts[g].channels[c].si)
-            for name, (g, c) in channels.items() if name.startswith("P_")}  # fmt: skip
+    channels = {channel.name: channel for part in parts.values() for channel in part.channels}
+    base = {name: float(row[COLUMN[channel.signal]] / channel.si)
+            for name, channel in channels.items() if name.startswith("P_")}  # fmt: skip
+    touches = math.nan
+    if "ring_x" in channels:
+        touches = model.constants.contact.clearance * 1e3 + 6.0 * _floor(parts, ("ring_x",))
+    return lambda values, phase: view_of(parts, values, phase, base=base, touches=touches)
 
-    def floor(names: tuple[str, ...]) -> float:
-        return math.hypot(*(parts[channels[n][0]].floor[channels[n][1]] for n in names if n in channels))
 
-    touches = model.constants.contact.clearance * 1e3 + 6.0 * floor(("ring_x",))
-    if "ring_x" not in channels:
-        touches = math.nan
-
-    floors = {name: floor(names) for name, names in SPECTRA.items()}
-
-    def view(values: dict[str, np.ndarray], phase: Phase) -> View:
-        return view_of(parts, values, phase, base=base, touches=touches)
-
-    phases = find_phases(view(recorded, _whole(parts)), floor_n=floor(("P_N", "P_S", "P_E", "P_W")))
+def _ensemble(
+    experiment: Experiment, parts: dict[str, Measured], criteria: Criteria
+) -> list[tuple[dict[str, np.ndarray], Prediction]]:
+    """Perturbed runs: what the channels show with noise of their own, and what is foretold without."""
     generator = np.random.default_rng(0)  # of the ensemble's noise and perturbations: the same in every validation
     members = []
     for _ in range(criteria.ensemble.members):
@@ -381,37 +496,21 @@ def _statistics(
             for name, values in prediction.values.items()
         }
         members.append((loud, prediction))
+    return members
 
-    results = []
-    for number, phase in enumerate(phases):
-        there = view(nominal.values, phase)
-        read = quantities(view(recorded, phase), phase.name)
-        others = [quantities(view(loud, phase), phase.name) for loud, _ in members]
-        distances = spectra(view(recorded, phase), there, floors)
-        spread = [spectra(view(loud, phase), there, floors) for loud, _ in members]
-        energy = {}
-        if "energy" in tables:
-            energy = {name: _energy(tables["energy"], columns, phase, nominal) for name, columns in _TRUTH.items()}
-        for name, value in {**read, **distances, **{k: v[0] for k, v in energy.items()}}.items():
-            if name in distances:
-                sample = [one.get(name, 1.0) for one in spread]
-            elif name in energy:
-                sample = [_energy(tables["energy"], _TRUTH[name], phase, prediction)[1] for _, prediction in members]
-            else:
-                sample = [one[name] for one in others]
-            foretold, deviation = float(np.median(sample)), float(np.std(sample, ddof=1))
-            criterion = criteria.statistic_of(phase.name, name)
-            limit = None
-            if criterion is not None:
-                limit = criterion.relative * abs(foretold) + criterion.absolute + criterion.spread * deviation
-            results.append(
-                StatisticResult(
-                    number,
-                    phase.name, name, QUANTITIES[name].unit, value, foretold, deviation, limit,
-                    criterion.reason if criterion else "",
-                )
-            )  # fmt: skip
-    return phases, results
+
+def _judge(
+    number: int, phase: Phase, name: str, value: float, sample: list[float], criteria: Criteria
+) -> StatisticResult:
+    foretold, deviation = float(np.median(sample)), float(np.std(sample, ddof=1))
+    criterion = criteria.statistic_of(phase.name, name)
+    limit = None
+    if criterion is not None:
+        limit = criterion.relative * abs(foretold) + criterion.absolute + criterion.spread * deviation
+    return StatisticResult(
+        number=number, phase=phase.name, quantity=name, unit=QUANTITIES[name].unit, recorded=value, foretold=foretold,
+        spread=deviation, limit=limit, reason=criterion.reason if criterion else "",
+    )  # fmt: skip
 
 
 def _energy(

@@ -115,7 +115,7 @@ QUANTITIES = {
     "sense": Quantity("", "1 forward, -1 backward", _RING, lambda view: math.copysign(1.0, _whirl(view)), ("whirl",)),
     "radius": Quantity("mm", "mean radius in the ring", _RING, lambda view: float(view.radius().mean()),
                        ("whirl", "rest")),
-    "contact_fraction": Quantity("1", "share of samples in contact", _RING,
+    "contact_fraction": Quantity("", "share of samples in contact", _RING,
                                  lambda view: float(view.contact().mean()), ("impacts", "whirl", "rest")),
     "impacts": Quantity("", "contacts that begin", _RING, _impacts, ("impacts",)),
     "mean_force": Quantity("N", "mean size of the reaction, both axes", _FORCES,
@@ -136,9 +136,9 @@ QUANTITIES = {
     "spin_lowest": Quantity("Hz", "lowest of the tachometer, means over 5 ms", ("speed",),
                             lambda view: _lowest(view), ("impacts",)),
     # Read off two views at once: see `spectrum_distance`.
-    "spectrum_ring": Quantity("1", "distance of the full spectra of the shaft in the ring", _RING, lambda _: 0.0),
-    "spectrum_disk": Quantity("1", "distance of the full spectra of the disk", _DISK, lambda _: 0.0),
-    "spectrum_force": Quantity("1", "distance of the full spectra of the reaction", _FORCES, lambda _: 0.0),
+    "spectrum_ring": Quantity("", "distance of the full spectra of the shaft in the ring", _RING, lambda _: 0.0),
+    "spectrum_disk": Quantity("", "distance of the full spectra of the disk", _DISK, lambda _: 0.0),
+    "spectrum_force": Quantity("", "distance of the full spectra of the reaction", _FORCES, lambda _: 0.0),
     # From the truth, where it was recorded.
     "dissipated": Quantity("J", "dissipated within the phase (truth)", (), lambda _: math.nan),
     "drive_work": Quantity("J", "work of the drive within the phase (truth)", (), lambda _: math.nan),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,51 +14,92 @@ from replays.validation.outcome import Validation
 from replays.validation.phases import PHASES
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _POINTS = 6000
 """Points of a line; of more, each is the extremes of a few."""
+_BEFORE_S, _AFTER_S = 5e-3, 60e-3
+"""A closer look begins and ends so long before and behind what is of interest."""
 _MARKS: dict[bool | None, Mark] = {True: "good", False: "bad", None: "plain"}
 _WORDS = {True: "good", False: "fails", None: "not asked"}
 
 
 def make_report(found: Validation) -> Report:
     """All of a validation as a report."""
-    report = Report(f"Validation of {found.path.name}", f"{found.bits_line}. {found.verdict_line}.")
+    report = Report(f"Validation of {found.title}", f"{_sentence(found.verdict_line)}.")
+    _conclusion(report, found)
+    _bits(report, found)
+    _trajectory(report, found)
+    _phases(report, found)
+    if found.calibration:
+        report.heading("Calibration")
+        report.text("The recording's own calibration is used throughout. Against the rig's own channel table it has:")
+        report.table(("channel", "differs in"), [tuple(line.partition(": ")[::2]) for line in found.calibration])
+    return report
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:]
+
+
+def _conclusion(report: Report, found: Validation) -> None:
+    """What comes out of it: first what explains the difference, then every criterion that fails."""
+    one = found.explained
+    if one is not None:
+        report.text(f"The first difference is at {one.from_s:.4f} s. {_sentence(one.conclusion)}.")
+    report.text(f"{_sentence(found.bits_line)}.")
     report.table(("what", "is"), _about(found))
-    if found.explained is not None:
-        one = found.explained
-        report.heading("What explains the difference")
-        report.text(f"The first difference is at {one.from_s:.4f} s. {one.conclusion[0].upper()}{one.conclusion[1:]}.")
+    if found.failures and not found.good:
+        report.heading("Criteria that fail")
         report.table(
-            ("kind", "what", "change", "explains", "noise left", "seen to [s]"),
-            [
-                Row((e.kind, e.name, e.change, f"{e.explained:.2%}", f"{e.left:.3g}", f"{e.to_s:.3f}"),
-                    "good" if e.name in one.best else "plain")
-                for e in one.ranked[:20]
-            ],
-            caption="Each candidate alone, fitted to the recorded channels over their noise; `explains` is the part of "
-            "the residual's sum of squares beyond noise that it takes away, `noise left` 1 where only noise is left.",
-        )  # fmt: skip
+            ("criterion", "recorded", "foretold", "limit", "verdict"),
+            [Row((f.criterion, f.recorded, f.foretold, f.limit, "fails"), "bad") for f in found.failures],
+            caption="Of a residual the first measure beyond its limit; +- is the largest difference.",
+        )
+    if one is None or not one.ranked:
+        return
+    report.heading("What explains the difference")
+    report.table(
+        ("kind", "what", "change", "explains", "left", "seen to [s]", "verdict"),
+        [
+            Row((e.kind, e.name, e.change, f"{e.explained:.2%}", f"{e.left:.3g}", f"{e.to_s:.3f}",
+                 "named" if e.name in one.best else ""), "good" if e.name in one.best else "plain")
+            for e in one.ranked[:20]
+        ],
+        caption="Each candidate alone, fitted to the recorded channels over their noise; `explains` is the part of "
+        "the residual's sum of squares beyond noise that it takes away, `left` the RMS of the residual that remains "
+        "over the noise: 1 where only noise is left.",
+    )  # fmt: skip
+
+
+def _bits(report: Report, found: Validation) -> None:
+    if not found.bits:
+        return
     report.heading("Bits")
     report.table(
-        ("stream", "rows", "payloads that differ", "first difference [s]", "largest", "lost rows", "verdict"),
+        ("stream", "columns", "rows", "payloads that differ", "first difference [s]", "largest", "lost rows",
+         "verdict"),
         [
-            Row((key, str(b.rows), str(b.different),
+            Row((key, b.picked or "all", str(b.rows), str(b.different),
                  "" if b.first_s is None else f"{b.first_s:.6f}", f"{b.largest:.3g}",
                  str(b.skipped), "equal" if b.equal else "differs"), "good" if b.equal else "open")
             for key, b in found.bits.items()
         ],
         caption="Largest difference in counts of the converter, or SI for truth.",
     )  # fmt: skip
+
+
+def _trajectory(report: Report, found: Validation) -> None:
     report.heading("Trajectory")
     begin, end = found.window_s
     report.text(f"Compared sample by sample from {begin:.4f} to {end:.4f} s: {found.window_reason}.")
     report.table(
         ("channel", "noise", "RMS", "limit", "largest", "drift", "reason of the limit", "verdict"),
         [
-            Row((r.channel, f"{r.floor:.3g} {r.unit}", f"{r.rms:.3f}", f"{r.limit:.3f}", f"{r.peak:.2f}",
-                 f"{r.drift:.2f}", r.reason, _WORDS[r.good]), _MARKS[r.good])
+            Row((r.channel, f"{r.floor:.3g} {r.unit}".rstrip(), f"{r.rms:.3f}",
+                 "" if math.isinf(r.limit) else f"{r.limit:.3f}", f"{r.peak:.2f}", f"{r.drift:.2f}", r.reason,
+                 _WORDS[r.good]), _MARKS[r.good])
             for r in found.residuals
         ],
         caption="Residual over the noise of the recording's own channel table; drift: largest mean of 128 samples, in "
@@ -71,14 +113,20 @@ def make_report(found: Validation) -> Report:
                 for t in found.truth
             ],
         )
+    zooms = _zooms(found)
+    told = "".join(f" and from {begin:.3f} to {end:.3f} s ({why})" for why, begin, end in zooms)
     for part in found.parts.values():
-        report.picture(_group(found, part), f"{part.group}: recorded over foretold, and the residual over its noise.")
+        caption = f"{part.group}: recorded over foretold as a whole{told}, and the residual over its noise."
+        report.picture(_group(found, part, zooms), caption)
+
+
+def _phases(report: Report, found: Validation) -> None:
     report.heading("Phases")
     report.table(
-        ("phase", "quantity", "recorded", "foretold", "spread", "limit", "unit", "verdict"),
+        ("phase", "quantity", "recorded", "foretold", "spread", "limit", "verdict"),
         [
-            Row((s.phase, s.quantity, f"{s.recorded:.6g}", f"{s.foretold:.6g}", f"{s.spread:.2g}",
-                 "" if s.limit is None else f"{s.limit:.2g}", s.unit, _WORDS[s.good]), _MARKS[s.good])
+            Row((s.phase, s.title, f"{s.recorded:.6g}", f"{s.foretold:.6g}", f"{s.spread:.2g}",
+                 "" if s.limit is None else f"+- {s.limit:.2g}", _WORDS[s.good]), _MARKS[s.good])
             for s in found.statistics
         ],
         caption="Foretold is the median, spread the standard deviation over perturbed re-simulations with noise; "
@@ -90,12 +138,11 @@ def make_report(found: Validation) -> Report:
         report.picture(
             _orbits(found, pairs), "Orbits and full spectra (two-sided, of x + j y), over the whole recording."
         )
-    return report
 
 
 def _about(found: Validation) -> list[Row]:
     rows = [
-        Row(("recording", str(found.path.name))),
+        Row(("recording", found.title)),
         Row(("scene", found.scene)),
         Row(("criteria", found.criteria)),
         Row(("phases", "; ".join(f"{p.name} {p.from_s:.3f} to {p.to_s:.3f} s" for p in found.phases))),
@@ -103,8 +150,8 @@ def _about(found: Validation) -> list[Row]:
     ]
     rows += [Row(("changed", f"{key} = {value}")) for key, value in found.changes.items()]
     rows += [Row(("fitted first", line)) for line in found.fitted]
-    rows += [Row(("calibration", line), "open") for line in found.calibration]
-    rows += [Row(("fails", failure), "bad") for failure in found.failures]
+    if found.calibration:
+        rows.append(Row(("calibration", found.calibration_line.removesuffix("; the report says how"))))
     return rows
 
 
@@ -113,32 +160,73 @@ def _foretold(found: Validation, part: Measured) -> np.ndarray:
     return found.nominal.values[part.group]
 
 
-def _group(found: Validation, part: Measured) -> Figure:
-    """Overlay and residual of every channel of a group."""
-    n = len(part.channels)
-    figure = new_figure((10.0, 1.9 * n + 0.6), layout="constrained")
-    panels = figure.subplots(n, 2, squeeze=False, sharex=True)
+def _zooms(found: Validation) -> list[tuple[str, float, float]]:
+    """Windows that are worth a closer look: why, begin and end [s]; of two that overlap, one for both."""
+    last_s = max(float(part.times_s[-1]) for part in found.parts.values())
+    starts = []
+    if found.explained is not None:
+        starts.append(("the first difference", found.explained.from_s))
+    contacts = [phase.from_s for phase in found.phases if phase.name not in ("free run", "decay")]
+    if contacts:
+        starts.append(("the first contact", contacts[0]))
+    starts.sort(key=lambda start: start[1])
+    zooms: list[tuple[str, float, float]] = []
+    for why, start in starts:
+        if zooms and start < zooms[-1][2]:
+            before, begin, _ = zooms.pop()
+            zooms.append((f"{before}, {why}", begin, start + _AFTER_S))
+        else:
+            zooms.append((why, start - _BEFORE_S, start + _AFTER_S))
+    return [(why, begin, min(end, last_s)) for why, begin, end in zooms if begin < last_s]
+
+
+def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, float]]) -> Figure:
+    """Overlay of every channel of a group as a whole; overlay and residual of each closer look."""
+    n, columns = len(part.channels), 1 + 2 * max(1, len(zooms))
+    figure = new_figure((5.0 * columns, 1.9 * n + 0.6), layout="constrained")
+    panels = figure.subplots(n, columns, squeeze=False, sharex="col")
     values = _foretold(found, part)
-    begin, end = float(part.times_s[0]), float(part.times_s[-1])
-    if found.explained is not None:  # what is of interest begins at the first difference
-        begin, end = found.explained.from_s - 0.02, found.explained.to_s
-    rows = slice(*np.searchsorted(part.times_s, (begin, end)))
-    times = part.times_s[rows]
+    whole = ("", float(part.times_s[0]), float(part.times_s[-1]))
     for c, channel in enumerate(part.channels):
-        left, right = panels[c]
-        left.plot(*_thin(times, part.values[rows, c]), color=BLUE, lw=1.0, label="recorded")
-        left.plot(*_thin(times, values[rows, c]), color=ORANGE, lw=0.8, ls="--", label="foretold")
-        right.plot(*_thin(times, (part.values[rows, c] - values[rows, c]) / part.floor[c]), color=RED, lw=0.7)
-        left.set_ylabel(f"{channel.name} [{channel.unit}]")
-        right.set_ylabel("residual / noise")
-        for axes in (left, right):
-            axes.axvline(found.window_s[1], color="0.6", lw=0.8, ls=":")
-        draw_grid(left, right)
+        _overlay(panels[c][0], part, values, c, whole)
+        panels[c][0].set_ylabel(channel.name if channel.unit == "1" else f"{channel.name} [{channel.unit}]")
+        for k, window in enumerate(zooms or [whole]):
+            left, right = panels[c][1 + 2 * k : 3 + 2 * k]
+            _overlay(left, part, values, c, window)
+            _residual(right, part, values, c, window)
+    for column, axes in enumerate(panels[0]):
+        _, begin, end = whole if column == 0 or not zooms else zooms[(column - 1) // 2]
+        if begin < found.window_s[1] < end - 1e-6:
+            for row in panels[:, column]:
+                row.axvline(found.window_s[1], color="0.6", lw=0.8, ls=":")
+            axes.set_title("dotted: end of the sample by sample comparison", fontsize=9)
+        if end > begin:
+            axes.set_xlim(begin, end)
     panels[0][0].legend(loc="upper right", fontsize=8)
-    panels[0][1].set_title("dotted: end of the window", fontsize=9)
+    draw_grid(*panels.ravel())
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
     return figure
+
+
+def _rows(part: Measured, window: tuple[str, float, float]) -> slice:
+    _, begin, end = window
+    first, last = np.searchsorted(part.times_s, (begin, end + 1e-9))
+    return slice(int(first), int(last))
+
+
+def _overlay(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tuple[str, float, float]) -> None:
+    rows = _rows(part, window)
+    times = part.times_s[rows]
+    axes.plot(*_thin(times, part.values[rows, c]), color=BLUE, lw=1.0, label="recorded")
+    axes.plot(*_thin(times, values[rows, c]), color=ORANGE, lw=0.8, ls="--", label="foretold")
+
+
+def _residual(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tuple[str, float, float]) -> None:
+    rows = _rows(part, window)
+    off = (part.values[rows, c] - values[rows, c]) / part.floor[c]
+    axes.plot(*_thin(part.times_s[rows], off), color=RED, lw=0.7)
+    axes.set_ylabel("residual / noise")
 
 
 def _thin(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -30,6 +30,8 @@ class ChannelResidual:
         peak: Largest of it.
         drift: Largest mean over a stretch, in standard errors of such a mean.
         limit: The criterion's limit of `rms`, with its standard errors.
+        peak_limit: That of `peak`.
+        drift_limit: That of `drift`.
         good: Within the criterion; None where there is none for it.
         first_s: First time at which a limit is passed [s]; None where none is.
         reason: The criterion's.
@@ -47,6 +49,23 @@ class ChannelResidual:
     good: bool | None
     first_s: float | None
     reason: str
+    peak_limit: float = math.inf
+    drift_limit: float = math.inf
+
+    @property
+    def broken(self) -> tuple[str, float, float] | None:
+        """The first measure that is beyond its limit, the plainest first: its name, its value, its limit."""
+        measures = (
+            ("RMS", self.rms, self.limit),
+            ("largest", self.peak, self.peak_limit),
+            ("drift", self.drift, self.drift_limit),
+        )
+        return next((one for one in measures if not one[1] <= one[2]), None)  # not a number is beyond, too
+
+    @staticmethod
+    def alone(measure: str) -> str:
+        """What is left where there is noise alone, in words."""
+        return "1" if measure == "RMS" else "noise"
 
 
 def foreseeable_s(
@@ -107,19 +126,25 @@ def _judge(part: Measured, c: int, z: np.ndarray, criterion: TrajectoryCriterion
     means = z[:whole].reshape(-1, STRETCH).mean(axis=1) * math.sqrt(STRETCH) if whole else np.empty(0)
     drift = float(np.abs(means).max()) if len(means) else 0.0
     limit, good, first = math.inf, None, None
+    peak_limit = drift_limit = math.inf
     if criterion is not None:
         limit = criterion.rms + criterion.sigmas / math.sqrt(2.0 * len(z))
         random = bool(part.random[c])
+        peak_limit = criterion.peak
+        drift_limit = criterion.drift if random else math.inf
+        limit = limit if random else math.inf
         # Rounding alone is no noise: its mean does not shrink, and its RMS may be its bound.
-        good = peak <= criterion.peak and (not random or (rms <= limit and drift <= criterion.drift))
+        good = peak <= peak_limit and rms <= limit and drift <= drift_limit
         if not good:
             over = np.flatnonzero(np.abs(z) > min(criterion.peak, _SURE))
             starts = [float(part.times_s[over[0]])] if len(over) else []
-            slow = np.flatnonzero(np.abs(means) > criterion.drift) if random else []
+            slow = np.flatnonzero(np.abs(means) > drift_limit)
             starts += [float(part.times_s[slow[0] * STRETCH])] if len(slow) else []
             first = min(starts, default=float(part.times_s[0]))
     channel = part.channels[c]
+    unit = "" if channel.unit == "1" else channel.unit
     return ChannelResidual(
-        group=part.group, channel=channel.name, unit=channel.unit, floor=float(part.floor[c]), n=len(z), rms=rms,
-        peak=peak, drift=drift, limit=limit, good=good, first_s=first, reason=criterion.reason if criterion else "",
+        group=part.group, channel=channel.name, unit=unit, floor=float(part.floor[c]), n=len(z), rms=rms, peak=peak,
+        drift=drift, limit=limit, good=good, first_s=first, reason=criterion.reason if criterion else "",
+        peak_limit=peak_limit, drift_limit=drift_limit,
     )  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.folder import check_folder
 from rig.cli.options import Force
 from rig.cli.progress import reporting
 from rig.errors import InputError
@@ -15,7 +16,7 @@ from rig.errors import InputError
 def sessions(
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Only these.")] = None,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to; made if missing.")],
     force: Force = False,
 ) -> None:
     """Make the reference sessions anew: small recordings with their quantities as text, to be reviewed as a diff."""
@@ -25,11 +26,11 @@ def sessions(
     for name in wanted:
         if name not in SESSIONS:
             raise InputError("session", f"one of {', '.join(SESSIONS)}", name)
-    if not output.is_dir():
-        raise InputError("output", "a folder that exists", str(output))
+    check_folder(output, field="--output")
     taken = [path for name in wanted for path in (output / f"{name}.mcap", output / f"{name}.toml") if path.exists()]
     if taken and not force:
         raise InputError("output", "a folder without them (--force replaces them)", str(taken[0]))
+    output.mkdir(exist_ok=True)
     with reporting() as reporter:
         reporter.begin(len(wanted))
         for name in wanted:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Changes, Engine, Force, Json, RecordingFile, ReportFile
+from rig.cli.options import Changes, Engine, Force, Json, RecordingFiles, ReportFile
 from rig.cli.progress import reporting
 from rig.cli.tables import new_table, table_console
 
@@ -15,12 +16,15 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from replays.validation import Validation
+    from replays.validation.attribution import Explained, Explanation
 
 _SAID = {True: "good", False: "FAILS", None: ""}
+_TELLING = 0.01
+"""What explains less than this part of the difference is not worth a line."""
 
 
 def validate(
-    file: RecordingFile,
+    files: RecordingFiles,
     *,
     criteria: Annotated[
         Path | None,
@@ -41,7 +45,7 @@ def validate(
     """
     import json
 
-    from recorder.reader import Recording
+    from recorder.reader import join
     from replays.report import check_report
     from replays.validation import load_criteria
     from replays.validation import validate as hold
@@ -53,7 +57,7 @@ def validate(
         check_report(report, force=force)
     rules = load_criteria(criteria)
     overrides = {key: read_value(value) for key, value in scene_overrides(changes or [], engine=engine).items()}
-    recording = Recording.open(file)
+    recording = join(files)
     if not compiled_before():
         typer.echo(COMPILE_NOTICE, err=True)
     with reporting() as reporter:
@@ -76,49 +80,52 @@ def validate(
 def _show(found: Validation) -> None:
     console = table_console(width=160, highlight=False)
     changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
-    console.print(f"{found.path.name}, scene {found.scene}" + (f", validated with {changed}" if changed else ""))
+    console.print(f"{found.title}, scene {found.scene}" + (f", validated with {changed}" if changed else ""))
+    console.print(found.verdict_line)
+    if found.explained is not None:
+        console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")
     console.print(found.bits_line)
     for line in found.fitted:
         console.print(line)
-    for line in found.calibration:
-        console.print(f"calibration: {line}")
-    if not found.bit_exact or found.declared:
-        begin, end = found.window_s
-        console.print(f"trajectory from {begin:.4f} to {end:.4f} s: {found.window_reason}\n")
-        console.print(_trajectory(found))
+    if found.calibration:
+        console.print(f"calibration: {found.calibration_line}")
+    if found.bit_exact and not found.declared:
+        return
+    if found.explained is not None and any(_counts(one) for one in found.explained.ranked):
         console.print()
-        if found.truth:
-            console.print(_truth(found))
-            console.print()
-        console.print(_statistics(found))
+        console.print(_explanations(found.explained))
+        console.print("left: RMS of the residual that remains, over the noise; 1 is noise alone")
+    begin, end = found.window_s
+    console.print(f"\ntrajectory from {begin:.4f} to {end:.4f} s: {found.window_reason}\n")
+    console.print(_trajectory(found))
     console.print()
-    if found.explained is not None:
-        one = found.explained
-        console.print(_explanations(found))
-        console.print(f"\nfirst difference at {one.from_s:.4f} s; {one.conclusion}")
-    console.print(found.verdict_line)
+    if found.truth:
+        console.print(_truth(found))
+        console.print()
+    console.print(_statistics(found))
 
 
 def _trajectory(found: Validation) -> Table:
     table = new_table("Trajectory: residual over the channel's own noise")
-    for header in ("channel", "noise", "RMS", "limit", "largest", "drift", "", "first at"):
-        table.add_column(header, justify="left" if header in ("channel", "") else "right")
+    for header in ("channel", "noise", "RMS", "limit", "largest", "drift", "first at", "verdict"):
+        table.add_column(header, justify="left" if header in ("channel", "verdict") else "right")
     for one in found.residuals:
-        first = "" if one.first_s is None else f"{one.first_s:.4f} s"
-        cells = (
-            f"{one.floor:.3g} {one.unit}",
+        table.add_row(
+            one.channel,
+            f"{one.floor:.3g} {one.unit}".rstrip(),
             f"{one.rms:.3f}",
-            f"{one.limit:.3f}",
+            "" if math.isinf(one.limit) else f"{one.limit:.3f}",
             f"{one.peak:.2f}",
             f"{one.drift:.2f}",
+            "" if one.first_s is None else f"{one.first_s:.4f} s",
+            _SAID[one.good],
         )
-        table.add_row(one.channel, *cells, _SAID[one.good], first)
     return table
 
 
 def _truth(found: Validation) -> Table:
     table = new_table("Truth: largest difference as a part of the column's largest value")
-    for header in ("table", "column that is off most", "off by", "limit", ""):
+    for header in ("table", "column that is off most", "off by", "limit", "verdict"):
         table.add_column(header, justify="right" if header in ("off by", "limit") else "left")
     for one in found.truth:
         table.add_row(one.table, one.column, f"{one.relative:.1e}", f"{one.limit:.1e}", _SAID[one.good])
@@ -127,21 +134,26 @@ def _truth(found: Validation) -> Table:
 
 def _statistics(found: Validation) -> Table:
     table = new_table("Phases")
-    for header in ("phase", "quantity", "recorded", "foretold", "limit", "", "unit"):
-        table.add_column(header, justify="left" if header in ("phase", "quantity", "", "unit") else "right")
+    for header in ("phase", "quantity", "recorded", "foretold", "limit", "verdict"):
+        table.add_column(header, justify="right" if header in ("recorded", "foretold", "limit") else "left")
     for one in found.statistics:
-        limit = "" if one.limit is None else f"{one.limit:.2g}"
-        table.add_row(
-            one.phase, one.quantity, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good], one.unit
-        )
+        limit = "" if one.limit is None else f"+- {one.limit:.2g}"
+        # Names in square brackets would be read as markup.
+        title = one.title.replace("[", "\\[")
+        table.add_row(one.phase, title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])
     return table
 
 
-def _explanations(found: Validation) -> Table:
-    assert found.explained is not None
-    table = new_table("What explains the difference")
-    for header in ("kind", "what", "change", "explains", "left", "seen to"):
-        table.add_column(header, justify="left" if header in ("kind", "what", "change") else "right")
-    for one in found.explained.ranked[:12]:
-        table.add_row(one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s")
+def _counts(one: Explanation) -> bool:
+    return one.explained >= _TELLING
+
+
+def _explanations(explained: Explained) -> Table:
+    table = new_table("What explains the difference, each candidate alone")
+    for header in ("kind", "what", "change", "explains", "left", "seen to", "verdict"):
+        table.add_column(header, justify="right" if header in ("explains", "left", "seen to") else "left")
+    for one in [one for one in explained.ranked if _counts(one)][:12]:
+        told = "named" if one.name in explained.best else ""
+        row = (one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s", told)
+        table.add_row(*row)
     return table

@@ -8,11 +8,12 @@ measured spread.
 from __future__ import annotations
 
 import tomllib
+from pathlib import Path
 
 import pytest
 
 from recorder.reader import Recording
-from replays.sessions import FOLDER, SESSIONS
+from replays.sessions import FOLDER, SESSIONS, make
 from replays.validation import validate
 from replays.whirl import parameter_si
 
@@ -26,6 +27,16 @@ def test_every_session_is_there_and_small() -> None:
     sizes = [path.stat().st_size for path in FOLDER.glob("*.mcap")]
     assert max(sizes) < 300_000
     assert sum(sizes) < 2_000_000
+
+
+def test_the_same_build_makes_the_same_bytes(tmp_path: Path) -> None:
+    """And the end tells how many rows there are, so that a reader can see a loss at the very end."""
+    twice = [make(SESSIONS["drop"], tmp_path)[0].read_bytes() for _ in range(2)]
+    assert twice[0] == twice[1]
+    recording = Recording.open(tmp_path / "drop.mcap")
+    end = recording.events[-1]
+    assert end["event"] == "end"
+    assert end["rows"] == {key: one.rows for key, one in recording.streams.items()}
 
 
 @pytest.mark.parametrize("name", SESSIONS)

@@ -41,10 +41,14 @@ def test_a_failure_ends_in_1_and_a_report_names_the_cause(
     code, out, _ = run(capsys, "validate", str(recording), "--set", "contact.restitution=0.88", "--report", str(report))
     assert code == 1
     assert "contact.restitution +2.27 %" in out
+    lines = out.splitlines()
+    assert lines[1].startswith("FAILS ")  # what comes out of it, before any table
+    assert "contact.restitution +2.27 %" in lines[2]
     page = report.read_text(encoding="utf-8")
     assert "Contact.restitution" in page or "contact.restitution +2.27 %" in page
     assert page.count("data:image/png") == 6  # five groups, orbits and spectra
     assert 'src="http' not in page
+    assert page.index("Criteria that fail") < page.index("What explains the difference") < page.index(">Bits<")
 
 
 def test_json_and_another_engine(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,6 +75,22 @@ def test_wrong_input_ends_in_2(
     assert error.startswith(f"rig: {message}")
     assert error.count("\n") == 1
     assert out == ""
+
+
+def test_several_files_are_taken_as_one(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    assert run(capsys, "cut", str(recording), "-o", str(first), "--to", "0.04")[0] == 0
+    assert run(capsys, "cut", str(recording), "-o", str(second), "--from", "0.04")[0] == 0
+    code, out, _ = run(capsys, "validate", str(second), str(first))
+    assert code == 0
+    assert out.startswith("a.mcap and 1 more")
+    assert "good, bit by bit" in out
+
+
+def test_a_new_folder_is_made_for_sessions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, "sessions", "drop", "-o", str(tmp_path / "new"))[0] == 0
+    assert (tmp_path / "new" / "drop.mcap").is_file()
+    assert run(capsys, "sessions", "drop", "-o", str(tmp_path / "no" / "new"))[0] == 2
 
 
 def test_sessions_are_written_only_where_they_may(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

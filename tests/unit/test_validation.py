@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorder.reader import Recording
+from recorder.reader import Recording, join
+from recorder.rewrite import cut
 from recorder.writer import RecordingWriter
 from replays.experiment import Experiment
 from replays.prediction import Measured, Prediction, bare, measured, predict
@@ -90,6 +91,13 @@ def test_the_first_criterion_that_fits_holds() -> None:
     assert spin.relative < force.relative
 
 
+def test_what_is_missing_is_called_missing(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text("[window]\nlongest_s = 1.0\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"^own\.toml\.title must be given; instead received nothing$"):
+        load_criteria(path)
+
+
 # Spectra and phases, against closed forms.
 
 
@@ -152,6 +160,24 @@ def test_one_count_is_found_with_its_time(hammer: Recording, monkeypatch: pytest
     assert (stream.first_s, stream.first_column, stream.largest) == (83 / 2000, 1, 1.0)
 
 
+@pytest.mark.parametrize("names", [("disk_x", "disk_y", "P_N"), ("ring_y", "disk_x", "speed")])
+def test_of_some_channels_the_bits_are_compared_by_name(
+    hammer: Recording, tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    small = tmp_path / "small.mcap"
+    cut(hammer, small, from_s=0.02, to_s=0.05, only="sensors", channels=names)
+    found = validate(Recording.open(small))
+    assert found.bit_exact
+    assert sum(one.rows for one in found.bits.values()) == 2 * 60
+    assert "probes 2 of 4" in found.bits_line
+    # ... and not by place: another channel's counts under a name are another's.
+    recording = Recording.open(small)
+    group = recording.table.groups["probes"]
+    turned = group.model_copy(update={"channels": group.channels[::-1]})
+    recording.table.groups["probes"] = turned
+    assert not validate(recording).bit_exact
+
+
 def test_gaps_and_a_late_begin_are_passed_over(tmp_path: Path) -> None:
     found = validate(record(tmp_path / "gap.mcap", leave_out=(0, 3)), declared=True)
     assert found.bit_exact
@@ -159,6 +185,18 @@ def test_gaps_and_a_late_begin_are_passed_over(tmp_path: Path) -> None:
     assert found.bits[sensor_key("probes")].rows == 80
     assert found.bits[sensor_key("probes")].skipped == 20
     assert found.skipped == 5 * 20 + 4
+
+
+def test_parts_of_one_run_are_one_recording(hammer: Recording, tmp_path: Path) -> None:
+    ends = (0.0, 0.03, 0.06)
+    paths = [tmp_path / f"part{k}.mcap" for k in range(2)]
+    for path, begin, end in zip(paths, ends, ends[1:], strict=False):
+        cut(hammer, path, from_s=begin, to_s=end)
+    found = validate(join(paths[::-1]))
+    assert found.bit_exact
+    assert found.skipped == 0
+    assert sum(one.rows for one in found.bits.values()) == 5 * 120 + 4 * 6
+    assert found.title == "part0.mcap and 1 more"
 
 
 def test_another_seed_changes_sensors_and_not_the_motion(hammer: Recording) -> None:
@@ -178,6 +216,9 @@ def test_few_channels_and_no_truth_are_enough(tmp_path: Path) -> None:
     assert not wrong.good
     assert wrong.explained is not None
     assert wrong.explained.best == ("contact.friction",)
+    assert wrong.verdict_line.startswith(f"FAILS {len(wrong.failures)} of ")
+    assert len(wrong.verdict_line) < 200
+    assert all(one.limit and one.line for one in wrong.failures)
 
 
 def test_rows_of_another_clock_lie_between_the_models_own(
