@@ -39,7 +39,8 @@ def fitted_set(found: Identification, *, recording: str) -> str:
                 source = f"not seen in {recording}, {span}: as the search began"
                 lines += _entry(key, entry, value=finding.unknown.start, kind="assumed", source=source)
             continue
-        told = f"95 % interval +-{finding.half_width:.3g} {entry.unit}" if math.isfinite(finding.half_width) else ""
+        unit = "" if entry.unit == "1" else f" {entry.unit}"
+        told = f"95 % interval +-{finding.half_width:.3g}{unit}" if math.isfinite(finding.half_width) else ""
         told = told or f"no interval of its own, {finding.words}"
         source = f"rig identify, {recording}, {span}: {told}"
         lines += _entry(key, entry, value=finding.value, kind="fitted", source=source)
@@ -110,6 +111,7 @@ def identification_document(found: Identification, *, recording: str) -> dict[st
             for stage in found.stages
         ],
         "simulations": found.runs,
+        "spread_made_smaller": found.narrowed,
     }
 
 

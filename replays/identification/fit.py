@@ -18,6 +18,10 @@ PRECISION = 1e-4
 """Half of a 95 % interval, as a part of a value's scale, that is fine enough to look no further ahead."""
 SPREAD = 0.1
 """How far off the start may be, as a part of a value's scale."""
+_NARROWER = 0.3
+"""By this the spread of a value is made smaller that bends the first window, ..."""
+_LEAST_SPREAD = 1e-4
+"""... down to here."""
 _ENOUGH = 0.01
 """Half of an interval, as a part of the scale, with which samples that the model does not explain can be left out."""
 _LOOK_S = 0.05
@@ -71,6 +75,7 @@ class Identification:
         stages: How the window grew.
         why: Why the window ends where it does.
         runs: Simulations.
+        narrowed: By key, a smaller spread than was asked for, with which the first window was linear.
     """
 
     question: Question
@@ -80,6 +85,7 @@ class Identification:
     stages: tuple[Stage, ...]
     why: str
     runs: int
+    narrowed: dict[str, float]
 
     @property
     def values(self) -> dict[str, float]:
@@ -120,10 +126,12 @@ def identify(
     end_s = first_s  # of the last window that was accepted
     look_s, growth_s = _LOOK_S, math.inf
     seen = search.horizon(min(limit_s, end_s + look_s))
-    if not seen.whole and seen.time_s < first_s + _LEAST_S:
-        must = f"begun while the shaft's motion can be predicted, before the first contacts: by {first_s:.4f} s its "
-        must += f"response to what is not known, above all {seen.by}, is no longer linear (or a smaller --spread)"
-        raise InputError("window", must, [first_s, limit_s])
+    while not seen.whole and seen.time_s < first_s + _LEAST_S:
+        if not search.narrow(seen.by):
+            must = "one whose first samples can be predicted (begin it before the first contacts, or start nearer "
+            must += f"to the truth): a change of {seen.by} by {_LEAST_SPREAD:g} of its scale already bends them"
+            raise InputError("window", must, [first_s, limit_s])
+        seen = search.horizon(min(limit_s, end_s + look_s))
     good: _State | None = None
     astray, shortened = 0, False
     for _ in range(_MOST_STAGES):
@@ -131,7 +139,7 @@ def identify(
         reached_s = min(limit_s, end_s + growth_s, max(seen.time_s, end_s + _LEAST_S))
         why = "as far as was looked ahead" if seen.whole else _BENDS.format(seen.by)
         if progress is not None:
-            progress(f"window to {reached_s:.4f} s")
+            progress(f"fitting: window to {reached_s:.2f} s, {search.known_of(precision)} values known")
         before = search.state
         stage = search.extend(reached_s, why)
         look_s = 2.0 * look_s if seen.whole else _LOOK_S
@@ -171,7 +179,7 @@ def identify(
         why = f"no more than {_MOST_STAGES} stages are tried"
     search.state = good or search.state
     if progress is not None:
-        progress("intervals")
+        progress("fitted; intervals of the values")
     return search.finish(why, robust=robust)
 
 
@@ -199,6 +207,7 @@ class _Search:
         self.covariance = np.diag(self._loose**2)
         self.stages: tuple[Stage, ...] = ()
         self.window: Window | None = None
+        self.narrowed: dict[str, float] = {}
         self.jump = 0.0
         self.runs = 0
 
@@ -218,9 +227,26 @@ class _Search:
         self.runs += window.runs
         return found
 
+    def narrow(self, key: str) -> bool:
+        """Begin with a smaller spread of one value; False if that is as small as it gets."""
+        place = self.question.keys.index(key)
+        if 2.0 * self._loose[place] < _LEAST_SPREAD:
+            return False
+        self._loose[place] *= _NARROWER
+        self.narrowed[key] = 2.0 * self._loose[place]
+        self.covariance = np.diag(self._loose**2)
+        return True
+
     def known(self, stage: Stage, part: float) -> bool:
-        """Whether all values were known within a part of their scales after a stage."""
-        return bool((stage.half_widths < part * self.scale).all())
+        """Whether all that is asked for was known within a part of its scale after a stage."""
+        asked = np.array([not unknown.along for unknown in self.question.unknowns])
+        return bool((stage.half_widths < part * self.scale)[asked].all())
+
+    def known_of(self, part: float) -> str:
+        """How many of the values asked for are known so far within a part of their scales."""
+        asked = np.array([not unknown.along for unknown in self.question.unknowns])
+        last = self.stages[-1].half_widths if self.stages else np.full(len(self.scale), math.inf)
+        return f"{int(((last < part * self.scale) & asked).sum())} of {int(asked.sum())}"
 
     def extend(self, end_s: float, why: str) -> Stage:
         """Fit on a longer window, held loosely to the start."""
@@ -268,6 +294,7 @@ class _Search:
             stages=self.stages,
             why=why,
             runs=self.runs + window.runs,
+            narrowed=self.narrowed,
         )
 
     def _learn(self, window: Window, chi2: float) -> None:

@@ -190,6 +190,26 @@ def asked_along(experiment: Experiment, keys: Sequence[str]) -> dict[str, tuple[
     return nuisances_of(experiment, few, besides=keys)
 
 
+def check_begin(experiment: Experiment, to_s: float | None) -> None:
+    """Refuse a search through the impacts of a log that begins in the middle of a run.
+
+    Every simulation would have to run through the seconds before it, in which small errors of stiffness and unbalance
+    turn the motion away from the recorded one before the first impact: minutes of search that end in a wrong valley.
+
+    Args:
+        experiment: What was done.
+        to_s: Where the samples end [s]; None for the log's end.
+
+    Raises:
+        InputError: It is such a log, and the samples go beyond the first blow.
+    """
+    blow_s = first_command_s(experiment)
+    if experiment.first_s > 0.0 and blow_s > 0.0 and (to_s is None or to_s > blow_s):
+        must = "a log that begins with the run, at rest (lead_s = 0 in its mapping), to be fitted through impacts; of "
+        must += f"one from the middle of a run, only what is before the blow: --to {blow_s - _MARGIN_S:.3f}"
+        raise InputError("file", must, f"{experiment.first_s:g} s of the run are before its first sample")
+
+
 def shortly_before(experiment: Experiment) -> float | None:
     """Where the window of a search begins in an imported log [s]; None for its start."""
     first_s = first_command_s(experiment)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -17,7 +18,7 @@ from rig.channels import Channel
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN
 from rig.parameters import load_parameters
-from rig.scenes import HammerCommand
+from rig.scenes import COMMANDS, HammerCommand, Scene
 from rig.simulation import TICK_RATE_HZ
 from rig.wire import sensor_key
 
@@ -25,6 +26,8 @@ NOT_FITTED = ("keyphasor",)
 """Pulses say where an edge is, which a difference of samples does not."""
 MOST_ROWS = 20_000
 """A longer window is thinned out."""
+_SCENE_KEYS = ("drive.speed_hz", "initial.x_mm", "initial.y_mm")
+"""Of a scene, what was done to the rig; the rest is how it is simulated."""
 _QUIET_S = 0.5
 """The window begins this long before the first command: enough to see where the shaft runs."""
 _COMMAND_BOUNDS = {"force_n": (1.0, 1000.0), "duration_ms": (0.5, 50.0), "direction": (-360.0, 360.0)}
@@ -45,6 +48,7 @@ class Unknown:
         bounded: Whether these bounds were asked for, and are not only what the model takes.
         prior: Mean and standard deviation known from elsewhere, or None.
         rule: The rule that gave the start, if one did.
+        along: Whether it is only fitted along: nobody waits for it to be known finely.
     """
 
     key: str
@@ -56,6 +60,7 @@ class Unknown:
     bounded: bool
     prior: tuple[float, float] | None
     rule: str | None
+    along: bool = False
 
     @property
     def reach(self) -> float:
@@ -81,6 +86,7 @@ class Observation:
         noise_from: Where it is from, by channel: "table", or "measured" where the table tells none.
         parts: The same by group, with the recording's own calibration and filters.
         rows: Where in `times_s` the rows of each group are.
+        every: A long window is thinned out to one sample in so many.
     """
 
     names: tuple[str, ...]
@@ -91,6 +97,7 @@ class Observation:
     noise_from: tuple[Literal["table", "measured"], ...]
     parts: dict[str, Measured]
     rows: dict[str, np.ndarray]
+    every: int = 1
 
     def until(self, end_s: float) -> int:
         """Number of rows before a time."""
@@ -138,6 +145,7 @@ def ask(
     start: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, tuple[float, float]] | None = None,
+    along: Collection[str] = (),
     channels: Sequence[str] | None = None,
     window: tuple[float | None, float | None] = (None, None),
 ) -> Question:
@@ -150,6 +158,7 @@ def ask(
         start: Where the search begins, by key; else the experiment's own values.
         bounds: Least and largest value by key.
         priors: Mean and standard deviation by key.
+        along: Those of the keys that are only fitted along.
         channels: By which channels; None for all that it has, but for the keyphasor's pulses.
         window: Simulated times between which samples are used [s]; None: from shortly before the first command, to the
             end.
@@ -163,6 +172,8 @@ def ask(
         for key in given or {}:
             if key not in keys:
                 raise InputError(option, f"of a key that is fitted ({', '.join(keys)})", key)
+    for key in keys:
+        _check_key(experiment, key)
     rules = {key: experiment.scene.load_parameters().rule(key) for key in keys if key in load_parameters().entries}
     centres = {key: mean for key, (mean, _) in (priors or {}).items()} | dict(start or {})
     values = {key: centres.get(key, value_of(experiment, key)) for key in keys}
@@ -186,6 +197,7 @@ def ask(
                 bounded=key in (bounds or {}),
                 prior=prior,
                 rule=rules.get(key),
+                along=key in along,
             )
         )
     return Question(begun, tuple(unknowns), observe(recording, begun, channels=channels, window=window))
@@ -222,10 +234,12 @@ def observe(
     start_s = max(first_s, first_command_s(experiment) - _QUIET_S) if start_s is None else start_s
     end_s = math.inf if end_s is None else end_s
     period_s = max(1.0 / part.channels[0].rate_hz for part in whole.values())
-    parts = {}
+    parts, every = {}, 1
     for name, part in whole.items():
         kept = (part.times_s >= max(start_s, first_s) - 1e-9) & (part.times_s < min(end_s, last_s + period_s) - 1e-9)
-        parts[name] = part.chosen(np.flatnonzero(kept)[:: -(-int(kept.sum()) // MOST_ROWS) or 1])
+        step = -(-int(kept.sum()) // MOST_ROWS) or 1
+        parts[name] = part.chosen(np.flatnonzero(kept)[::step])
+        every = max(every, step)
     if min(len(part.times_s) for part in parts.values()) < 10:
         must = f"a window with samples in it; the recording goes from {first_s:.3f} to {last_s:.3f} s"
         raise InputError("window", must, [start_s, end_s])
@@ -243,6 +257,7 @@ def observe(
         noise_from=tuple("table" if _told(*own[name]) else "measured" for name in wanted),
         parts=parts,
         rows={name: np.searchsorted(union, held) for name, held in stamps.items()},
+        every=every,
     )
     values = observation.placed({name: part.values for name, part in parts.items()}, len(union))
     return replace(observation, values=values)
@@ -280,6 +295,26 @@ def first_command_s(experiment: Experiment) -> float:
     times = [timed.at_s for timed in experiment.scene.commands if isinstance(timed.request, HammerCommand)]
     times += [command.tick / TICK_RATE_HZ for command in experiment.commands if command.name == "hammer"]
     return min(times, default=0.0)
+
+
+def _check_key(experiment: Experiment, key: str) -> None:
+    """Refuse at once what is no number of the rig or of what was done to it."""
+    parameters = load_parameters().entries
+    own = [name for name, entry in parameters.items() if entry.unit != "count"]
+    own += [*_SCENE_KEYS, *CLOCK, ANGLE]
+    if key in own:
+        return
+    if len(key.split(".")) == 3 and key.split(".")[0] in COMMANDS:
+        value_of(experiment, key)
+        return
+    close = difflib.get_close_matches(key, own, n=3, cutoff=0.6)
+    must = "of a parameter, a number of the scene ("
+    must += f"{', '.join(_SCENE_KEYS)}) or of a command (hammer.1.force_n)"
+    if close:
+        must += f", such as {', '.join(close)}"
+    elif key in parameters or key.split(".")[0] in Scene.model_fields:
+        must += ", all properties of the rig or of what was done to it and none of the simulation"
+    raise InputError("fit", must, key)
 
 
 def _accepted(key: str) -> tuple[float, float]:

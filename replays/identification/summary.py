@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 HEADINGS = ("key", "start", "result", "95 % interval", "unit", "what the recording tells")
 _MARKS: dict[str, Mark] = {"identified": "good", "not seen": "open", "only together": "open", "at its bound": "bad"}
-_MOST_PANELS = 8
+_MOST_PANELS = 16
+_KICK = 0.02
+"""An impact begins where the samples bend by this part of the most they bend, ..."""
+_QUIET = 50.0
+"""... which must be so many times what is usual, or there is none."""
 
 
 def cells(finding: Finding) -> tuple[str, ...]:
@@ -37,9 +41,22 @@ def window_line(found: Identification) -> str:
     """Which samples were used, and why no more."""
     names = found.question.observation.names
     return (
-        f"window {found.from_s:.4f} to {found.window.end_s:.4f} s, {found.window.rows} rows of {len(names)} channels, "
-        f"grown in {len(found.stages)} stages; it ends there: {found.why}"
+        f"window {found.from_s:.4f} to {found.window.end_s:.4f} s, {found.window.rows} rows of {len(names)} channels"
+        f"{_thinned(found)}, grown in {len(found.stages)} stages; it ends there: {found.why}"
     )
+
+
+def spread_line(found: Identification) -> str:
+    """What the search began with where the usual spread was too wide; empty where it was not."""
+    if not found.narrowed:
+        return ""
+    told = ", ".join(f"{key} {part:.2g}" for key, part in found.narrowed.items())
+    return f"spread made smaller, as the first samples already bend with more (parts of each value's scale): {told}"
+
+
+def _thinned(found: Identification) -> str:
+    every = found.question.observation.every
+    return f" (thinned out: one sample in {every})" if every > 1 else ""
 
 
 def fit_line(found: Identification) -> str:
@@ -57,6 +74,8 @@ def report_of(found: Identification, *, recording: str) -> Report:
     """The report of a fit."""
     question, judgement = found.question, found.judgement
     report = Report(f"Identification from {recording}", f"{fit_line(found)}. {window_line(found)}.")
+    if found.narrowed:
+        report.text(f"The {spread_line(found)}.")
     report.heading("Values")
     rows = [Row(cells(finding), _MARKS[finding.standing]) for finding in judgement.findings]
     report.table(HEADINGS, rows, caption="Intervals of 95 %, of each value by itself, by the slopes at the optimum.")
@@ -89,8 +108,8 @@ def report_of(found: Identification, *, recording: str) -> Report:
             for channel, source in zip(judgement.channels, question.observation.noise_from, strict=True)
         ],
     )  # fmt: skip
-    report.picture(overlay(found), "Recorded samples (dots) and the fitted model (line); below each, their difference "
-                   "in units of the sensor's noise.")  # fmt: skip
+    report.picture(overlay(found), "Recorded samples (dots) and the fitted model (line); beside each, their difference "
+                   "in units of the sensor's noise, from shortly before the first impact on.")  # fmt: skip
     report.heading("How the window grew")
     report.table(
         ("to [s]", "chi2", *question.keys, "because"),
@@ -118,9 +137,10 @@ def overlay(found: Identification) -> Figure:
     residuals = window.residuals(found.z)
     moved = np.argsort(-np.ptp(predicted / observation.noise, axis=0), kind="stable")[:_MOST_PANELS]
     shown = sorted(int(place) for place in moved)
-    figure = new_figure((12.0, 1.9 * len(shown) + 0.6))
+    figure = new_figure((12.0, 1.5 * len(shown) + 0.6))
     panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
     times_s = observation.times_s[: window.rows]
+    panels[0][0].set_xlim(_shown_from_s(times_s, predicted / observation.noise), times_s[-1])
     for (left, right), place in zip(panels, shown, strict=True):
         left.plot(times_s, observation.values[: window.rows, place], ".", color=ORANGE, ms=2.5, label="recorded")
         left.plot(times_s, predicted[:, place], color=BLUE, lw=0.9, label="fitted")
@@ -132,6 +152,15 @@ def overlay(found: Identification) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel("simulated time [s]")
     return figure
+
+
+def _shown_from_s(times_s: np.ndarray, predicted: np.ndarray) -> float:
+    """A little before the first impact in what is predicted [s]; where there is none, the first sample."""
+    bends = np.nan_to_num(np.abs(np.diff(predicted, 2, axis=0))).max(axis=1)
+    if not len(bends) or bends.max() < _QUIET * max(float(np.median(bends[: len(bends) // 4 + 1])), 1e-12):
+        return float(times_s[0])
+    first_s = float(times_s[int(np.argmax(bends > _KICK * bends.max())) + 1])
+    return max(float(times_s[0]), first_s - 0.15 * (float(times_s[-1]) - first_s))
 
 
 def growth(found: Identification) -> Figure:
@@ -149,7 +178,8 @@ def growth(found: Identification) -> Figure:
     left.legend(fontsize=8)
     draw_grid(left)
     image = right.imshow(found.judgement.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
-    right.set_xticks(range(len(keys)), keys, rotation=30, ha="right", fontsize=8)
-    right.set_yticks(range(len(keys)), keys, fontsize=8)
+    # Names once, at the side: below the picture long ones would run off it.
+    right.set_xticks(range(len(keys)), [str(place + 1) for place in range(len(keys))], fontsize=8)
+    right.set_yticks(range(len(keys)), [f"{key}  {place + 1}" for place, key in enumerate(keys)], fontsize=8)
     figure.colorbar(image, ax=right, label="correlation")
     return figure

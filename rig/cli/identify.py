@@ -14,7 +14,7 @@ from rig.cli.options import (
     FromS,
     Json,
     Parameters,
-    RecordingFile,
+    RecordingFiles,
     ReportFile,
     ToS,
     names_of,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def identify(
-    file: RecordingFile,
+    files: RecordingFiles,
     *,
     fit: Annotated[
         list[str],
@@ -79,11 +79,11 @@ def identify(
     """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell."""
     import json
 
-    from recorder.reader import Recording
+    from recorder.reader import join
     from replays.identification import ask
     from replays.identification import identify as run
     from replays.identification.document import check_set, fitted_set, identification_document, write_set
-    from replays.identification.nuisance import asked_along, is_imported, shortly_before, turned
+    from replays.identification.nuisance import asked_along, check_begin, is_imported, shortly_before, turned
     from replays.identification.summary import report_of
     from replays.report import check_report
     from rig.kernels import COMPILE_NOTICE, compiled_before
@@ -93,11 +93,13 @@ def identify(
     if report is not None:
         check_report(report, force=force)
     keys = [key for part in fit for key in names_of(part)]
-    recording = Recording.open(file)
+    recording = join(files)
+    name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
     experiment = _experiment(recording, parameters=parameters, scene=scene, engine=engine)
     priors = {key: _two("prior", text, "+-") for key, text in pairs("--prior", prior, "KEY=VALUE+-SIGMA").items()}
     along: dict[str, tuple[float, float] | None] = {}
     if is_imported(recording) and not exact:
+        check_begin(experiment, to_s)
         experiment = turned(recording, experiment)
         along = asked_along(experiment, keys)
         keys += list(along)
@@ -110,6 +112,7 @@ def identify(
         start={key: _number("start", text) for key, text in pairs("--start", start, "KEY=VALUE").items()},
         bounds={key: _two("bounds", text, ":") for key, text in pairs("--bounds", bounds, "KEY=LOW:HIGH").items()},
         priors=priors,
+        along=along,
         channels=names_of(channels) or None,
         window=(from_s, to_s),
     )
@@ -118,13 +121,13 @@ def identify(
     with reporting() as reporter:
         found = run(question, precision=precision, spread=spread, robust=robust, whole=whole, progress=reporter.step)
     if output is not None:
-        write_set(fitted_set(found, recording=file.name), output)
+        write_set(fitted_set(found, recording=name), output)
     if report is not None:
-        report_of(found, recording=file.name).write(report)
+        report_of(found, recording=name).write(report)
     if json_output:
-        typer.echo(json.dumps(identification_document(found, recording=file.name), indent=2, allow_nan=False))
+        typer.echo(json.dumps(identification_document(found, recording=name), indent=2, allow_nan=False))
         return
-    _show(found, file.name)
+    _show(found, name)
     if along:
         typer.echo(f"fitted along, as an imported log does not tell it exactly: {', '.join(along)}")
     if output is not None:
@@ -164,7 +167,7 @@ def _two(option: str, text: str, between: str) -> tuple[float, float]:
 def _show(found: Identification, name: str) -> None:
     from rich.text import Text
 
-    from replays.identification.summary import HEADINGS, cells, fit_line, window_line
+    from replays.identification.summary import HEADINGS, cells, fit_line, spread_line, window_line
 
     console = table_console(width=200, highlight=False)
     table = new_table(f"{name}: what it tells")
@@ -186,3 +189,5 @@ def _show(found: Identification, name: str) -> None:
     console.print()
     console.print(Text(window_line(found)))
     console.print(Text(fit_line(found)))
+    if found.narrowed:
+        console.print(Text(spread_line(found)))

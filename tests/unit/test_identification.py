@@ -130,6 +130,9 @@ def test_the_horizon_is_nearer_where_less_is_known(file: Path) -> None:
     ("arguments", "message"),
     [
         (["--fit", "contact.frictionn"], "a parameter, a number of the scene"),
+        (["--fit", "contact.frictionn"], "such as contact.friction"),
+        (["--fit", "engine.step_us"], "none of the simulation"),
+        (["--fit", "sensors.rate_hz"], "none of the simulation"),
         (["--fit", "contact.friction,contact.friction"], "different keys"),
         (["--fit", "contact.friction", "--bounds", "contact.friction=0.3:0.2"], "ascending"),
         (["--fit", "contact.friction", "--bounds", "contact.friction"], "KEY="),
@@ -199,3 +202,51 @@ def test_samples_that_begin_after_the_impacts_are_refused(tmp_path: Path) -> Non
     question = ask(recording, Experiment.of(recording), ["contact.friction", "magnet.stiffness"], window=(0.25, 0.3))
     with pytest.raises(InputError, match="before the first contacts"):
         identify(question)
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("quiet") / "q.mcap"
+    simulation = Simulation(load_scene("stable-run", {"duration_s": 0.5, "sensors.rate_hz": 2000}))
+    with writer_for(path, simulation) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+    return path
+
+
+def test_a_late_begin_without_contact_needs_no_spread(quiet: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From 0.37 s on, 10 % of the stiffness turn the transient about: the search begins with less by itself."""
+    begun = ("--from", "0.37", "--start", "magnet.stiffness=1.65", "--json")
+    assert run(quiet, "--fit", "contact.friction,magnet.stiffness", *begun) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["spread_made_smaller"]["magnet.stiffness"] < 0.1
+    assert document["values"]["contact.friction"]["standing"] == "not seen"
+    stiffness = document["values"]["magnet.stiffness"]
+    assert abs(stiffness["value"] - 1.7) < 2.0 * stiffness["half_width_95"] < 1e-2
+
+
+def test_nobody_waits_for_what_is_fitted_along(quiet: Path) -> None:
+    """Friction is never seen without contact: asked for, the window grows to the end of the samples."""
+    recording = Recording.open(quiet)
+
+    def end_s(along: tuple[str, ...]) -> float:
+        keys = ["magnet.stiffness", "contact.friction"]
+        question = ask(recording, Experiment.of(recording), keys, window=(0.0, 0.3), along=along)
+        return identify(question, precision=1e-2).window.end_s
+
+    assert end_s(()) == pytest.approx(0.3, abs=1e-3)
+    assert end_s(("contact.friction",)) < 0.25
+
+
+def test_parts_of_a_recording_are_one(tmp_path: Path, file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for path, span in zip(parts, (("--to", "0.01"), ("--from", "0.01")), strict=True):
+        with pytest.raises(SystemExit):
+            main(["cut", str(file), "-o", str(path), *span])
+    capsys.readouterr()
+
+    def value(*files: Path) -> float:
+        assert run(*files, "--fit", "magnet.stiffness", "--from", "0", "--to", "0.018", "--json") == 0
+        return json.loads(capsys.readouterr().out)["values"]["magnet.stiffness"]["value"]
+
+    assert value(*reversed(parts)) == pytest.approx(value(file), rel=1e-9)

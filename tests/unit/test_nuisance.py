@@ -13,8 +13,9 @@ from replays.experiment import Experiment
 from replays.formats.conversion import convert
 from replays.formats.imported import write_recording
 from replays.formats.mapping import load_mapping
-from replays.identification.nuisance import is_imported, nuisances_of, tune
+from replays.identification.nuisance import check_begin, is_imported, nuisances_of, tune
 from replays.sensitivity import ANGLE, value_of, with_values
+from rig.errors import InputError
 from rig.offline import simulate
 from rig.scenes import load_scene
 
@@ -137,3 +138,12 @@ def test_nuisances_are_those_that_an_experiment_has() -> None:
     quiet = Experiment(load_scene("stable-run", {"duration_s": 0.1}))
     assert not any(key.startswith("hammer") for key in nuisances_of(quiet))
     assert "drive.speed_hz" not in nuisances_of(quiet, besides=["drive.speed_hz"])
+
+
+def test_impacts_of_a_log_from_the_middle_of_a_run_are_not_searched(log: Recording) -> None:
+    experiment = Experiment.of(log)
+    blow_s = value_of(experiment, "hammer.1.at_s")
+    with pytest.raises(InputError, match="a log that begins with the run"):
+        check_begin(experiment, None)
+    check_begin(experiment, blow_s - 0.01)
+    check_begin(Experiment(load_scene("hammer")), None)
