@@ -33,6 +33,8 @@ _SIGMAS = 6.0
 """Residuals are noise while their sum of squares is above its mean by less than so many standard deviations."""
 _DECIDES = 25.0
 """A sum of squares that is smaller by this (five standard deviations of one number) decides between two candidates."""
+_NEAR = 2.0
+"""Of the noise left, from which on a candidate is the nearest, and no explanation."""
 _STARTS = (0.0, *(sign * part for part in (0.005, 0.01, 0.02, 0.035, 0.06, 0.1, 0.2, 0.5) for sign in (1.0, -1.0)))
 """Where a fit may start on the first window, as parts of the farthest that it may go ..."""
 _TRIED = 3
@@ -516,9 +518,10 @@ def _conclude(
         equal = [one for one in alone if one.explained > single.explained - rules.equal]
     names = tuple(one.name for one in equal)
     part = f"{single.explained:.2%} of the difference, {single.left:.2f} of the noise left"
+    short = "" if single.left < _NEAR else "nothing alone explains it down to the noise; nearest is "
     if len(equal) == 1:
-        return f"{single.kind}: {single.name} {single.change} ({part})", names
-    return f"{_listed(equal)} explain it equally ({part}); this recording cannot tell them apart", names
+        return f"{short}{single.kind}: {single.name} {single.change} ({part})", names
+    return f"{short}{_listed(equal)} explain it equally ({part}); this recording cannot tell them apart", names
 
 
 def _listed(found: list[Explanation]) -> str:

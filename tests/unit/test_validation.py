@@ -15,7 +15,7 @@ from recorder.writer import RecordingWriter
 from replays.experiment import Experiment
 from replays.prediction import Measured, Prediction, bare, measured, predict
 from replays.validation import load_criteria, outcome, validate
-from replays.validation.attribution import Explained, attribute
+from replays.validation.attribution import Explained, Explanation, _conclude, attribute
 from replays.validation.criteria import DEFAULT
 from replays.validation.phases import View, find_phases, quantities, spectrum_distance
 from rig.errors import InputError
@@ -303,6 +303,14 @@ def test_two_that_explain_it_alike_are_both_named(tmp_path: Path) -> None:
     assert found.explained is not None
     assert "house.preload" in found.explained.best
     assert any(name.startswith("P_") for name in [one.name for one in found.explained.ranked])
+
+
+@pytest.mark.parametrize(("left", "nearest"), [(1.0, False), (31.0, True)])
+def test_the_nearest_candidate_is_no_explanation_where_more_than_noise_is_left(left: float, nearest: bool) -> None:
+    one = Explanation("model", "ring.clearance", "+2 %", 0.02, "", 0.97, left, 1e4 * left**2, 10_000, 0.3)
+    conclusion, names = _conclude([one], [], load_criteria().attribution, end_s=0.3)
+    assert conclusion.startswith("nothing alone explains it") == nearest
+    assert names == ("ring.clearance",)
 
 
 def test_a_document_is_json_throughout(hammer: Recording) -> None:
