@@ -6,6 +6,7 @@ Only sensor keys, the catalogue, the events and the rig's token are asked for: w
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,8 +17,8 @@ from rig.channels import ChannelTable, Group
 from rig.errors import InputError
 from rig.transport import Client
 
-GRACE_S = 1.0
-"""After an end that does not tell the number of rows, the last blocks have this time to come [s]."""
+GRACE_S = 2.0
+"""After an end that does not tell the number of rows, and after the last block: silence that ends the stream [s]."""
 RIG_GONE = "the rig has gone"
 
 
@@ -71,6 +72,8 @@ class RigStream:
         """Number of the row that comes next, by group."""
         self._ends: dict[str, tuple[int, str]] = {}
         """Groups of which the run's end was announced: number of rows in all, and the reason."""
+        self._heard_s = 0.0
+        """When the last block came [s, monotonic]."""
         self.malformed = 0
         """Payloads that were not what their key promises."""
         self.missed = 0
@@ -153,6 +156,7 @@ class RigStream:
                 # Another run.
                 self._ends.pop(group, None)
             self._next[group] = end
+            self._heard_s = time.monotonic()
             rows, reason = self._ends.get(group, (end + 1, ""))
             done = end >= rows
             if done:
@@ -174,9 +178,8 @@ class RigStream:
             return
         if rows is None:
             # A recording that does not tell what there was: whatever may still come has its time.
-            timer = threading.Timer(GRACE_S, lambda: self._end(list(self._subscribed), reason))
-            timer.daemon = True
-            timer.start()
+            self._heard_s = time.monotonic()
+            self._end_in_silence(GRACE_S, reason)
             return
         done = []
         with self._lock:
@@ -188,6 +191,20 @@ class RigStream:
                 else:
                     self._ends[group] = (total, reason)
         self._end(done, reason)
+
+    def _end_in_silence(self, wait_s: float, reason: str) -> None:
+        """End all groups once no block has come for so long; look again at the earliest time at which that can be."""
+
+        def look() -> None:
+            rest_s = GRACE_S - (time.monotonic() - self._heard_s)
+            if rest_s > 0.0:
+                self._end_in_silence(rest_s, reason)
+            else:
+                self._end(list(self._subscribed), reason)
+
+        timer = threading.Timer(wait_s, look)
+        timer.daemon = True
+        timer.start()
 
     def _on_alive(self, alive: bool) -> None:
         if alive:

@@ -236,6 +236,18 @@ def test_an_end_that_does_not_tell_its_rows_gives_the_last_blocks_time(monkeypat
             daq.read()
 
 
+@pytest.mark.wallclock
+def test_an_end_that_does_not_tell_its_rows_waits_for_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a machine is held up, the last blocks come later than the grace after the end, but not apart."""
+    monkeypatch.setattr(stream, "GRACE_S", 1.0)
+    with on_memory(channels=["P_N"]) as (rig, daq):
+        rig.server.publish(wire.EVENTS, b'{"event": "end", "reason": "completed"}')
+        for _ in range(2):
+            time.sleep(0.6)
+            rig.publish("forces")
+        assert sum(map(len, daq)) == 2 * BLOCK
+
+
 def test_a_rig_that_is_killed_ends_the_blocks() -> None:
     with on_memory(channels=["P_N"]) as (rig, daq):
         rig.publish("forces")
