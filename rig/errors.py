@@ -5,6 +5,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+from rig.text import printable, shown
+
 
 class InputError(ValueError):
     """A field has a value it must not have.
@@ -18,8 +20,7 @@ class InputError(ValueError):
         self.field = field
         self.must = must
         self.received = received
-        shown = "nothing" if received is None else repr(received)  # as for a field that is missing
-        super().__init__(f"{field} must be {must}; instead received {shown}")
+        super().__init__(printable(f"{field} must be {must}; instead received {shown(received)}"))
 
 
 class RefusedError(InputError):
@@ -28,7 +29,7 @@ class RefusedError(InputError):
     def __init__(self, line: str) -> None:
         """Keep the whole line."""
         self.field, self.must, self.received = "request", "one that the rig accepts", None
-        ValueError.__init__(self, line)
+        ValueError.__init__(self, printable(line))
 
 
 class SimulationError(RuntimeError):

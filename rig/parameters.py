@@ -7,7 +7,6 @@ names a `base` and the values in which it differs. A user's own file works the s
 from __future__ import annotations
 
 import math
-import re
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -20,11 +19,11 @@ from pydantic import (
     StrictFloat,
     StrictInt,
     StrictStr,
-    ValidationError,
     field_validator,
 )
 
 from rig.errors import InputError
+from rig.outside import check
 
 SETS = Path(__file__).with_name("sets")
 DEFAULT_SET = "corrected"
@@ -202,36 +201,8 @@ def _parse(name: str, data: dict[str, Any], path: Path, loading: tuple[str, ...]
                     raise InputError(f"{path.name}: {key}.{fixed}", "left as the model has it", given[fixed])
             if "unit" in given and known and given["unit"] != known["unit"]:
                 raise InputError(f"{path.name}: {key}.unit", known["unit"], given["unit"])
-            try:
-                entries[key] = Parameter(**{**known, **given})
-            except ValidationError as error:
-                raise input_error(error, f"{path.name}: {key}") from None
+            entries[key] = check(Parameter, {**known, **given}, field=f"{path.name}: {key}")
     return ParameterSet(name, title, entries)
-
-
-_NOT_IN_A_FILE = {"request", "float", "int", "str", "constrained-float"}
-
-
-def input_error(error: ValidationError, where: str) -> InputError:
-    """The first complaint of a validation as the one line that users see."""
-    first = error.errors()[0]
-    cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, InputError):  # a rule over several fields names its own
-        return cause
-    # Only what stands in the file: not the branches of a union, nor the part that holds a timed command's own fields.
-    place = ".".join(str(part) for part in first["loc"] if str(part) not in _NOT_IN_A_FILE and "[" not in str(part))
-    field = ".".join(part for part in (where, place) if part)
-    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
-    if first["type"] == "union_tag_invalid":
-        context = first.get("ctx", {})
-        name = str(context.get("discriminator")).strip("'")
-        return InputError(f"{field}.{name}", f"one of {context.get('expected_tags')}", context.get("tag"))
-    if first["type"] == "extra_forbidden":
-        message = "left out (there is no such field)"
-    elif first["type"] == "missing":
-        message = "given"
-    return InputError(field, message, None if first["type"] == "missing" else first["input"])
 
 
 def _accepts(entry: Parameter) -> str:

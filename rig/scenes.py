@@ -16,7 +16,6 @@ from pydantic import (
     ConfigDict,
     Field,
     FiniteFloat,
-    ValidationError,
     field_validator,
     model_validator,
 )
@@ -25,7 +24,8 @@ from rig.channels import default_table
 from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.levels import ModelLevels
-from rig.parameters import DEFAULT_SET, ParameterSet, input_error, load_parameters, read_toml
+from rig.outside import check
+from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters, read_toml
 
 SCENES = Path(__file__).with_name("scenes")
 _APART_S = 0.01
@@ -48,7 +48,12 @@ class _Part(BaseModel):
 _DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0), "-x": (-1.0, 0.0), "-y": (0.0, -1.0)}
 
 
-class HammerCommand(_Part):
+class _Command(_Part):
+    # `"100"` is no number, be it in a file or on a wire.
+    model_config = ConfigDict(strict=True)
+
+
+class HammerCommand(_Command):
     """A blow of the pendulum hammer at the disk: a half-sine pulse."""
 
     command: Literal["hammer"] = "hammer"
@@ -76,7 +81,7 @@ class HammerCommand(_Part):
         return math.cos(angle), math.sin(angle)
 
 
-class SpeedCommand(_Part):
+class SpeedCommand(_Command):
     """A new speed, approached at the drive's ramp rate."""
 
     command: Literal["speed"] = "speed"
@@ -84,7 +89,7 @@ class SpeedCommand(_Part):
     """Target [Hz]; the parameter drive.top_speed limits it further."""
 
 
-class ReleaseCommand(_Part):
+class ReleaseCommand(_Command):
     """The drop device: the magnets let go of the shaft."""
 
     command: Literal["release"] = "release"
@@ -102,12 +107,7 @@ def parse_command(name: str, request: dict[str, Any]) -> Command:
     """
     if name not in COMMANDS:
         raise InputError("command", f"one of {', '.join(COMMANDS)}", name)
-    try:
-        return COMMANDS[name](**{**request, "command": name})
-    except (ValidationError, TypeError) as error:
-        if isinstance(error, ValidationError):
-            raise input_error(error, name) from None
-        raise InputError(name, "a set of named fields", request) from None
+    return check(COMMANDS[name], request, field=name)
 
 
 class TimedCommand(_Part):
@@ -497,12 +497,7 @@ def parse_scene(data: dict[str, Any]) -> Scene:
     Raises:
         InputError: The first wrong field.
     """
-    try:
-        return Scene(**data)
-    except ValidationError as error:
-        raise input_error(error, "") from None
-    except TypeError:
-        raise InputError("scene", "a table of named fields", list(data)) from None
+    return check(Scene, data, field="")
 
 
 def _override(data: dict[str, Any], key: str, value: Any) -> None:

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from rig.outside import read_json
+
 ROOT = "rig"
 STATUS = f"{ROOT}/status"
 EVENTS = f"{ROOT}/events"
@@ -135,15 +137,9 @@ def decode_document(payload: bytes) -> dict[str, Any]:
     """The JSON document in a payload.
 
     Raises:
-        ValueError: The payload is not a JSON object.
+        InputError: The payload is no JSON object, or one out of bounds (`rig.outside`).
     """
-    try:
-        document = json.loads(payload)
-    except RecursionError:
-        raise ValueError("payload must be a JSON object; instead received one nested too deep") from None
-    if not isinstance(document, dict):
-        raise ValueError(f"payload must be a JSON object; instead received {type(document).__name__}")
-    return document
+    return read_json(payload)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, field_validator
 
 from rig.errors import InputError
-from rig.parameters import input_error, read_toml
+from rig.outside import check
+from rig.parameters import read_toml
 
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 
@@ -248,9 +249,8 @@ def load_mapping(path: Path) -> Mapping:
     """
     data = read_toml(path)
     try:
-        mapping = Mapping(**data)
-    except ValidationError as error:
-        first = input_error(error, "")
+        mapping = check(Mapping, data, field="")
+    except InputError as first:
         raise InputError(f"{path.name}: {first.field}", first.must, first.received) from None
     time = mapping.time
     if time.from_s is not None and time.to_s is not None and time.to_s <= time.from_s:

@@ -6,11 +6,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from replays.validation.phases import PHASES, QUANTITIES
-from rig.errors import InputError
-from rig.parameters import input_error, load_parameters, read_toml
+from rig.outside import check
+from rig.parameters import load_parameters, read_toml
 
 DEFAULT = Path(__file__).with_name("default.toml")
 
@@ -190,9 +190,4 @@ def load_criteria(path: Path | None = None) -> Criteria:
     """
     path = DEFAULT if path is None else path
     data = read_toml(path)
-    try:
-        return Criteria(**data)
-    except ValidationError as error:
-        raise input_error(error, path.name) from None
-    except TypeError:
-        raise InputError(path.name, "tables of named fields", list(data)) from None
+    return check(Criteria, data, field=path.name)

@@ -8,10 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from rig import wire
+from rig.outside import Count, Name, Outside, check
 from rig.transport import Server
 
 _MOST = 64
+_REPORT_BYTES = 2000
 _FORGOTTEN_S = 600.0
 _GONE_S = 3.0
 """A client that did not report for this long is not waited for; others report twice a second."""
@@ -19,8 +20,29 @@ _QUIET_S = 0.6
 """At the end of a run: for how long nobody must be behind before the cache may go; two heartbeats of the transport."""
 
 
+class Sender(Outside):
+    """Who reports: the last part of the key."""
+
+    name: Name
+
+
+class Report(Outside):
+    """What a client sends twice a second on `rig/clients/NAME`."""
+
+    name: Name | None = None
+    received_index: Count | None
+    """Number of the row that it gets next; None: it listens, and has nothing yet."""
+    lost: Count = 0
+    """Rows that it knows to be lost."""
+    room: Count | None = None
+    """Rows that it can hold."""
+    done: bool = False
+    """Whether it leaves."""
+    wall_s: float | None = None
+
+
 @dataclass(frozen=True, slots=True)
-class _Report:
+class _Heard:
     received_index: int | None
     """None: it listens, and has nothing yet."""
     lost: int
@@ -38,7 +60,7 @@ class Clients:
     def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
         self._lock = threading.Lock()
-        self._reports: dict[str, _Report] = {}
+        self._reports: dict[str, _Heard] = {}
         self._joined: dict[str, int] = {}
         """Row that was next when a client was first seen that had nothing yet: what it will be measured from."""
         self.malformed = 0
@@ -46,18 +68,17 @@ class Clients:
 
     def take(self, key: str, payload: bytes) -> None:
         """Take a report; on a thread of the transport."""
-        name = key.rpartition("/")[2]
         try:
-            document = wire.decode_document(payload)
-            index, room = _whole_or_none(document["received_index"]), _whole_or_none(document.get("room"))
-            row = _Report(index, int(document.get("lost", 0)), self._now_s(), room)
-        except (ValueError, KeyError, TypeError):
+            name = Sender(name=key.rpartition("/")[2]).name
+            report = check(Report, payload, field="report", most_bytes=_REPORT_BYTES)
+        except ValueError:
             self.malformed += 1
             return
+        row = _Heard(report.received_index, report.lost, self._now_s(), report.room)
         with self._lock:
             for old in [key for key, old in self._reports.items() if row.heard_s - old.heard_s > _FORGOTTEN_S]:
                 self._forget(old)
-            if document.get("done") is True:
+            if report.done:
                 self._forget(name)
             elif name in self._reports or len(self._reports) < _MOST:
                 self._reports[name] = row
@@ -102,12 +123,12 @@ class Clients:
             for name, report in self._live().items()
         )
 
-    def _lacks(self, name: str, report: _Report, published: int) -> int:
+    def _lacks(self, name: str, report: _Heard, published: int) -> int:
         """Rows that a client still has to get."""
         has = report.received_index
         return max(0, published - (self._joined.setdefault(name, published) if has is None else has))
 
-    def _live(self) -> dict[str, _Report]:
+    def _live(self) -> dict[str, _Heard]:
         now_s = self._now_s()
         with self._lock:
             return {name: report for name, report in self._reports.items() if now_s - report.heard_s < _GONE_S}
@@ -138,7 +159,3 @@ class Clients:
             if self.behind(published) or counts.get("stalled_links", 0):
                 quiet_since = now
             time.sleep(0.1)
-
-
-def _whole_or_none(value: Any) -> int | None:
-    return None if value is None else int(value)

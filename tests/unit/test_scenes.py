@@ -325,7 +325,8 @@ def test_good_commands(name: str, request_: dict[str, Any], command: object) -> 
 
 
 def test_a_request_cannot_become_another_command() -> None:
-    assert isinstance(parse_command("speed", {"speed_hz": 1.0, "command": "release"}), SpeedCommand)
+    with pytest.raises(InputError, match=r"speed\.command must be 'speed'; instead received 'release'"):
+        parse_command("speed", {"speed_hz": 1.0, "command": "release"})
 
 
 def test_scenes_are_frozen() -> None:

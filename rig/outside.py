@@ -1,0 +1,172 @@
+"""What comes from outside, a client, a file or a bus, is read and checked here, once, at the door it comes in by.
+
+A document has a bounded size and depth, plain numbers and each key once; a model that derives from `Outside` has typed
+fields with ranges and no others. What has passed is believed behind the door, and what has not raises `InputError`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from rig.errors import InputError
+from rig.text import printable
+
+DOCUMENT_BYTES = 16 << 20
+"""Largest document that a rig or a recording may hold."""
+DEPTH = 32
+"""Deepest nesting of a document."""
+LARGEST = 2**63 - 1
+"""Largest whole number: what a tick, a row number and a seed fit into."""
+
+Count = Annotated[int, Field(ge=0, lt=2**62)]
+"""A number of rows, messages or ticks; sums of two still fit into 64 bits."""
+
+
+class Outside(BaseModel):
+    """A document, or part of one, from outside: `"100"` and true are no numbers, and there are no further fields."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _a_line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("a line of printable characters")
+    return text
+
+
+Line = Annotated[str, AfterValidator(_a_line)]
+"""Text without line breaks and without anything that a terminal would act on."""
+Name = Annotated[Line, Field(min_length=1, max_length=100)]
+"""What a client calls itself."""
+
+
+def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUMENT_BYTES) -> dict[str, Any]:
+    """The JSON object in a payload.
+
+    Args:
+        payload: UTF-8.
+        field: What errors call it.
+        most_bytes: Largest payload.
+
+    Raises:
+        InputError: Too large, no UTF-8, no JSON object, nested too deep, a key twice, or a number that no double or
+            64-bit integer holds.
+    """
+    if len(payload) > most_bytes:
+        raise InputError(field, f"at most {most_bytes} bytes", len(payload))
+    try:
+        text = payload.decode("utf-8")
+        document = json.loads(
+            text, object_pairs_hook=_once, parse_int=_whole, parse_float=_finite, parse_constant=_finite
+        )
+        if "\\u" in text:
+            # An escaped half of a surrogate pair is a string that cannot be written anywhere.
+            json.dumps(document, ensure_ascii=False).encode("utf-8")
+    except RecursionError:
+        raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper") from None
+    except InputError as error:
+        raise InputError(field, error.must, error.received) from None
+    except ValueError as error:
+        raise InputError(field, "a JSON object in UTF-8", printable(str(error), 200)) from None
+    if not isinstance(document, dict):
+        raise InputError(field, "a JSON object", document)
+    if text.count("[") + text.count("{") > DEPTH:
+        check_depth(document, field=field)
+    return document
+
+
+def check_depth(document: Any, *, field: str) -> None:
+    """Refuse what is nested deeper than `DEPTH`, in whatever format it came.
+
+    Raises:
+        InputError: It is.
+    """
+    level = [document]
+    for _ in range(DEPTH + 1):
+        level = [
+            item
+            for each in level
+            if isinstance(each, dict | list)
+            for item in (each.values() if isinstance(each, dict) else each)
+        ]
+        if not level:
+            return
+    raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    document = dict(pairs)
+    if len(document) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise InputError("", "without a key that comes twice", next(name for name in names if names.count(name) > 1))
+    return document
+
+
+def _whole(digits: str) -> int:
+    # Long before Python's own limit of 4300 digits, beyond which it raises.
+    if len(digits) > len(str(-LARGEST)) or abs(number := int(digits)) > LARGEST:
+        raise InputError("", f"without whole numbers beyond +-{LARGEST}", printable(digits, 60))
+    return number
+
+
+def _finite(digits: str) -> float:
+    if not math.isfinite(number := float(digits)):
+        raise InputError("", "without numbers that are not finite", printable(digits, 60))
+    return number
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10_000) -> Model:
+    """A document as its model.
+
+    Args:
+        model: What it has to be.
+        document: Read already, or its payload.
+        field: What errors call it; fields in it are named behind a dot.
+        most_bytes: Largest payload.
+
+    Raises:
+        InputError: It is none; the message names the first field that is wrong.
+    """
+    if isinstance(document, bytes):
+        document = read_json(document, field=field, most_bytes=most_bytes)
+    if not isinstance(document, Mapping) or not all(isinstance(name, str) for name in document):
+        raise InputError(field or "document", "a set of named fields", document)
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        raise input_error(error, field) from None
+
+
+# What pydantic puts into the place of an error beside the names that stand in the file.
+_NOT_IN_A_FILE = {"request", "float", "int", "str", "constrained-float"}
+
+
+def input_error(error: ValidationError, where: str) -> InputError:
+    """The first complaint of a validation as the one line that users see."""
+    first = error.errors()[0]
+    cause = first.get("ctx", {}).get("error")
+    if isinstance(cause, InputError):  # a rule over several fields names its own
+        return cause
+    # Only what stands in the file: not the branches of a union, nor the part that holds a timed command's own fields.
+    place = ".".join(str(part) for part in first["loc"] if str(part) not in _NOT_IN_A_FILE and "[" not in str(part))
+    field = ".".join(part for part in (where, place) if part)
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
+    if first["type"] == "union_tag_invalid":
+        context = first.get("ctx", {})
+        name = str(context.get("discriminator")).strip("'")
+        return InputError(f"{field}.{name}", f"one of {context.get('expected_tags')}", context.get("tag"))
+    if first["type"] == "extra_forbidden":
+        message = "left out (there is no such field)"
+    elif first["type"] == "missing":
+        message = "given"
+    return InputError(field, message, None if first["type"] == "missing" else first["input"])
