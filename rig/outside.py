@@ -34,15 +34,18 @@ class Outside(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-def _a_line(text: str) -> str:
-    if not text.isprintable():
-        raise ValueError("a line of printable characters")
-    return text
+def a_line(most: int) -> AfterValidator:
+    """Text of 1 to so many characters, without line breaks and without anything that a terminal would act on."""
+
+    def check_line(text: str) -> str:
+        if not text.isprintable() or not 1 <= len(text) <= most:
+            raise ValueError(f"a line of 1 to {most} printable characters")
+        return text
+
+    return AfterValidator(check_line)
 
 
-Line = Annotated[str, AfterValidator(_a_line)]
-"""Text without line breaks and without anything that a terminal would act on."""
-Name = Annotated[Line, Field(min_length=1, max_length=100)]
+Name = Annotated[str, a_line(100)]
 """What a client calls itself."""
 
 

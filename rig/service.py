@@ -9,20 +9,18 @@ the gap also shows in the row numbers. An unpaced run waits for the publisher in
 from __future__ import annotations
 
 import math
-import re
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from rig import wire
-from rig.errors import InputError, RefusedError
+from rig.desk import Desk, Note, Pending, Step, finite, one_line
+from rig.errors import InputError
 from rig.pacing import Clock, Lockstep, RealTime, StepTimeoutError, short_collections
 from rig.transport import Server
-from rig.transport.clients import Clients
 
 SIMULATION_COMMANDS = ("hammer", "speed", "release")
 """Commands that the simulation itself checks and carries out."""
@@ -30,14 +28,10 @@ COMMANDS = (*SIMULATION_COMMANDS, "stop", "step", "note")
 REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
 """Commands that only a replayed recording takes (`replays.player`)."""
 
-_PENDING_COMMANDS = 256
-_REQUEST_BYTES = 10_000
 _STEP_S = 3600
 """Longest single step [s of simulated time]."""
-_NOTE_CHARACTERS, _TAGS, _TAG_CHARACTERS = 1000, 10, 40
-_TAKEN = 10_000
-"""Commands that are told to latecomers."""
-_FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
+_TAKEN_BYTES = 500_000
+"""What is told to latecomers of the commands so far; the oldest go first, and are counted."""
 
 
 class Frame(Protocol):
@@ -127,23 +121,13 @@ class Simulation(Protocol):
 
 
 @dataclass(slots=True)
-class Pending:
-    """A command on its way from a transport thread to the simulation thread."""
-
-    command: str
-    request: dict[str, Any]
-    sender: str
-    reply: Future[dict[str, Any]] = field(default_factory=Future)
-
-
-@dataclass(slots=True)
 class _Entry:
     """What the publisher sends in one go: events, a block of everything, events; then replies that waited for it."""
 
     before: list[dict[str, Any]]
     frame: Frame | None = None
     after: list[dict[str, Any]] = field(default_factory=list)
-    replies: list[tuple[Future[dict[str, Any]], dict[str, Any]]] = field(default_factory=list)
+    replies: list[tuple[Pending, dict[str, Any]]] = field(default_factory=list)
 
 
 class _Queue:
@@ -258,24 +242,32 @@ class Service:
         self._stop_requested = False
         self._health: dict[str, Any] = {}
         self._next_health_s = 0.0
-        self._known_warnings: set[str] = set()
         self._overflowing = False
 
-        self._pending: deque[Pending] = deque()
-        self._pending_lock = threading.Lock()
-        self._accepting = True
+        self._desk = Desk(
+            server,
+            commands=COMMANDS,
+            others={
+                name: f"{name} is for a recording that is replayed (rig replay); this is a simulator, which runs on"
+                for name in REPLAY_COMMANDS
+            },
+            running="the rig runs",
+            wake=clock.wake,
+            tell=self._warn,
+        )
         self._accepted = 0
         self._taken: tuple[dict[str, Any], ...] = ()
         """Commands that the simulation took: whoever comes later cannot run the scene again without them."""
-        self._steps: list[tuple[int, Future[dict[str, Any]], dict[str, Any]]] = []
+        self._taken_bytes = 0
+        self._forgotten = 0
+        """Of these, how many are no longer told."""
+        self._steps: list[tuple[int, Pending, dict[str, Any]]] = []
         self._step_target: int | None = None
 
         self._rows = wire.RowCount()
         self._samples_rate_hz = 0.0
         self._samples_published = 0
         self._congestion: dict[str, float] = {}
-        self._publisher_error: BaseException | None = None
-        self._clients = Clients()
 
     # ---- from any thread ----
 
@@ -290,8 +282,7 @@ class Service:
         warnings = list(health.get("warnings", []))
         if self._queue.dropped:
             warnings.append(f"{self._queue.dropped} blocks dropped: the publisher did not keep up")
-        if self._clients.malformed:
-            warnings.append(f"{self._clients.malformed} client reports could not be read")
+        warnings += self._desk.warnings()
         return finite(
             {
                 "scene": self._scene.get("name"),
@@ -310,7 +301,7 @@ class Service:
                     "dropped": self._queue.dropped,
                 },
                 "congestion": self._congestion,
-                "clients": self._clients.rows(self._samples_published, self._samples_rate_hz),
+                "clients": self._desk.clients.rows(self._samples_published, self._samples_rate_hz),
                 "spin_hz": health.get("spin_hz"),
                 "energy": health.get("energy", {}),
                 "engine": health.get("engine", {}),
@@ -320,41 +311,6 @@ class Service:
             }
         )
 
-    # ---- on transport threads ----
-
-    def _serve(self) -> None:
-        for key, document in (
-            (wire.CATALOGUE, self._simulation.catalogue()),
-            (wire.PARAMETERS, self._simulation.parameters_document()),
-        ):
-            payload = wire.encode_document(document)
-            self._server.answer(key, lambda _, payload=payload: payload)
-        self._server.answer(wire.SCENE, lambda _: wire.encode_document({**self._scene, "taken": self._taken}))
-        self._server.answer(wire.STATUS, lambda _: wire.encode_document(self.status()))
-        for name in COMMANDS:
-            self._server.answer(wire.command_key(name), lambda payload, name=name: self._on_command(name, payload))
-        for name in REPLAY_COMMANDS:
-            line = f"{name} is for a recording that is replayed (rig replay); this is a simulator, which runs on"
-            refused = wire.encode_document(refusal(RefusedError(line)))
-            self._server.answer(wire.command_key(name), lambda _, refused=refused: refused)
-        self._server.hear(f"{wire.CLIENTS}/*", self._clients.take)
-
-    def _on_command(self, name: str, payload: bytes) -> bytes:
-        """Hand a command to the simulation thread and wait for its answer."""
-        try:
-            pending = parse_command(name, payload)
-            with self._pending_lock:
-                if not self._accepting:
-                    raise InputError(name, "sent while the rig runs", "a run that has ended")
-                if len(self._pending) >= _PENDING_COMMANDS:
-                    raise InputError("commands", f"at most {_PENDING_COMMANDS} at a time", len(self._pending) + 1)
-                self._pending.append(pending)
-        except InputError as error:
-            return wire.encode_document(refusal(error))
-        self._clock.wake()
-        # Answered at the next block boundary, or when the run ends; a step, when it is done.
-        return wire.encode_document(pending.reply.result())
-
     # ---- on the simulation thread ----
 
     def prepare(self) -> None:
@@ -363,9 +319,20 @@ class Service:
             return
         self._simulation.warm_up()
         self._health = self._simulation.health()
-        self._serve()
-        self._server.announce()
+        catalogue, parameters = self._simulation.catalogue(), self._simulation.parameters_document()
+        self._desk.open(
+            {
+                wire.CATALOGUE: lambda: catalogue,
+                wire.PARAMETERS: lambda: parameters,
+                wire.SCENE: self._scene_now,
+                wire.STATUS: self.status,
+            }
+        )
         self._prepared = True
+
+    def _scene_now(self) -> dict[str, Any]:
+        forgotten = {"forgotten": self._forgotten} if self._forgotten else {}
+        return {**self._scene, "taken": self._taken, **forgotten}
 
     def run(self) -> dict[str, Any]:
         """Run to the end, to a stop, or to a failure, which is raised after the stream has been ended.
@@ -403,8 +370,6 @@ class Service:
             while (entry := self._queue.take(0.0)) is not None:
                 self._answer(entry)
             self._linger()
-        if self._publisher_error is not None:
-            raise self._publisher_error
         status = self.status()
         kept = ("scene", "pace", "tick", "time_s", "real_time_factor", "lateness_ms", "overruns", "queue", "congestion")
         return {
@@ -414,6 +379,7 @@ class Service:
             "samples_published": self._samples_published,
             "commands": self._accepted,
             "rows": dict(self._rows.next),
+            "troubled": self._desk.troubled,
         }
 
     def _advance_all(self) -> str:
@@ -425,8 +391,6 @@ class Service:
             if self._stop_requested or (end is not None and simulation.tick >= end):
                 queue.put(_Entry(events))
                 return "stopped" if self._stop_requested else "completed"
-            if self._publisher_error is not None:
-                raise RuntimeError("the publisher failed") from self._publisher_error
             want = self._block_ticks
             if end is not None:
                 rest = end - simulation.tick
@@ -445,8 +409,8 @@ class Service:
                 answered += self._take_commands()
             self._tick = simulation.tick
             after = [{**event, "wall_s": time.time()} for event in frame.events]
-            after += [*answered, *self._refresh_health()]
-            self._overflow(queue.put(_Entry(events, frame, after, self._finished_steps())))
+            self._overflow(queue.put(_Entry(events, frame, [*after, *answered], self._finished_steps())))
+            self._refresh_health()
 
     def _defer(self, events: list[dict[str, Any]]) -> None:
         """Publish events without a block, where the next block is not yet to be run."""
@@ -463,55 +427,59 @@ class Service:
     def _take_commands(self) -> list[dict[str, Any]]:
         """Carry out all commands that have arrived; returns their events."""
         events = []
-        while self._pending:
-            with self._pending_lock:
-                pending = self._pending.popleft()
+        for pending in self._desk.taken():
             try:
-                event = self._carry_out(pending)
+                events.append(self._carry_out(pending))
             except InputError as error:
-                pending.reply.set_result(refusal(error))
-            except (ValueError, TypeError, KeyError) as error:
+                pending.refuse(error)
+            except Exception as error:
                 # A request that the simulation's own checks let through must not end the run.
-                pending.reply.set_result(refusal(InputError(pending.command, "readable", one_line(error))))
-            else:
-                events.append(event)
+                pending.refuse(InputError(pending.command, "readable", one_line(error)))
+                self._desk.trouble(pending.command, error)
         return events
 
     def _carry_out(self, pending: Pending) -> dict[str, Any]:
         simulation = self._simulation
-        tick, done_tick, note = simulation.tick, None, None
+        tick, done_tick = simulation.tick, None
         if pending.command == "stop":
-            only_fields(pending.request, ())
             self._stop_requested = True
-        elif pending.command == "step":
-            done_tick = self._check_step(pending.request)
-        elif pending.command == "note":
-            note = _note(pending.request)
-        else:
+        elif isinstance(pending.asked, Step):
+            done_tick = self._check_step(pending.asked)
+        elif not isinstance(pending.asked, Note):
             tick = simulation.submit(pending.command, dict(pending.request))
-            taken = {"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request}
-            self._taken = (*self._taken, taken)[-_TAKEN:]  # a new one, as other threads read it
+            self._keep({"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request})
         self._accepted += 1
         reply = {"accepted": True, "id": self._accepted, "command": pending.command}
         if done_tick is None:
-            pending.reply.set_result({**reply, "tick": tick, "time_s": tick / self._rate})
+            pending.answer({**reply, "tick": tick, "time_s": tick / self._rate})
         else:
             reply |= {"tick": done_tick, "time_s": done_tick / self._rate}
-            self._steps.append((done_tick, pending.reply, reply))
-        if note is not None:
+            self._steps.append((done_tick, pending, reply))
+        if isinstance(pending.asked, Note):
             # An event of its own: it does nothing to the rig, so whoever repeats the commands can pass over it.
-            return {**self._event("note", id=self._accepted), **note, "from": pending.sender}
+            return {**self._event("note", id=self._accepted), **pending.asked.model_dump(), "from": pending.sender}
         detail = {"id": self._accepted, "command": pending.command, "request": pending.request, "from": pending.sender}
         return self._event("command", tick=tick, **detail)
 
-    def _check_step(self, request: dict[str, Any]) -> int:
+    def _keep(self, taken: dict[str, Any]) -> None:
+        """Remember a command for latecomers, within bounds."""
+        rows = (*self._taken, taken)
+        self._taken_bytes += _size(taken)
+        while self._taken_bytes > _TAKEN_BYTES:
+            self._taken_bytes -= _size(rows[0])
+            rows = rows[1:]
+            self._forgotten += 1
+        self._taken = rows  # a new one, as other threads read it
+
+    def _check_step(self, asked: Step) -> int:
         """Grant a step; returns the tick at which it is done."""
         if not isinstance(self._clock, Lockstep):
             raise InputError("step", "sent to a rig that runs with --pace lockstep", f"--pace {self._clock.pace}")
-        only_fields(request, ("ticks",))
-        ticks, unit = request.get("ticks"), self._simulation.block_ticks
+        ticks, unit = asked.ticks, self._simulation.block_ticks
         most = _STEP_S * self._rate
-        if not isinstance(ticks, int) or isinstance(ticks, bool) or not 0 < ticks <= most or ticks % unit:
+        if asked.blocks is not None:
+            raise InputError("step.blocks", "left out, but for a replay", asked.blocks)
+        if ticks is None or ticks > most or ticks % unit:
             raise InputError("ticks", f"a positive whole multiple of {unit}, at most {most}", ticks)
         start = self._step_target if self._step_target is not None else self._simulation.tick
         end = self._simulation.end_tick
@@ -521,7 +489,7 @@ class Service:
         self._clock.allow(ticks)
         return self._step_target
 
-    def _finished_steps(self) -> list[tuple[Future[dict[str, Any]], dict[str, Any]]]:
+    def _finished_steps(self) -> list[tuple[Pending, dict[str, Any]]]:
         """Steps that the last block completed; they are answered once that block is published."""
         if not self._steps:
             return []
@@ -531,21 +499,19 @@ class Service:
             self._step_target = None
         return done
 
-    def _refresh_health(self) -> list[dict[str, Any]]:
-        """Ask the simulation how it is, a few times a second; returns an event for each new kind of warning."""
+    def _refresh_health(self) -> None:
+        """Ask the simulation how it is, a few times a second; each new kind of warning becomes an event."""
         now = time.monotonic()
         if now < self._next_health_s:
-            return []
+            return
         self._next_health_s = now + self._status_period_s
         self._health = self._simulation.health()
-        events = []
         for text in self._health.get("warnings", []):
-            # A warning whose figures have moved on is not a new one; the status always shows the latest.
-            kind = _FIGURES.sub("#", text)
-            if kind not in self._known_warnings:
-                self._known_warnings.add(kind)
-                events.append(self._event("warning", text=text))
-        return events
+            self._desk.warn(text)
+
+    def _warn(self, text: str) -> None:
+        """Put a warning into the stream; on any thread."""
+        self._queue.put(_Entry([self._event("warning", text=text)]))
 
     def _event(self, name: str, *, tick: int | None = None, **fields: Any) -> dict[str, Any]:
         tick = self._simulation.tick if tick is None else tick
@@ -554,13 +520,7 @@ class Service:
     def _finish(self, reason: str) -> None:
         """Refuse what is still waiting, and put the end of the stream into the queue."""
         self._state = "ended"
-        with self._pending_lock:
-            self._accepting = False
-            waiting = [pending.reply for pending in self._pending]
-            self._pending.clear()
-        waiting += [reply for _, reply, _ in self._steps]
-        for reply in waiting:
-            reply.set_result(refusal(InputError("command", "sent while the rig runs", f"a run that ended: {reason}")))
+        self._desk.close(f"a run that ended: {reason}", [pending for _, pending, _ in self._steps])
         self._queue.put(_Entry([self._event("end", reason=reason)]))
         self._queue.close()
 
@@ -570,37 +530,44 @@ class Service:
         def see(counts: dict[str, float]) -> None:
             self._congestion = counts
 
-        self._clients.settle(self._server, self._samples_published, patience_s=self._linger_s, see=see)
+        self._desk.clients.settle(self._server, self._samples_published, patience_s=self._linger_s, see=see)
 
     # ---- on the publisher thread ----
 
     def _publish_all(self) -> None:
         next_status_s = time.monotonic()
+        while not self._queue.finished:
+            entry = self._queue.take(max(0.0, next_status_s - time.monotonic()))
+            if entry is not None:
+                self._publish_entry(entry)
+            now = time.monotonic()
+            if now >= next_status_s:
+                self._guarded("publishing the status", self._publish_status)
+                # Not one period after the last: a status that was held up is not followed by a burst.
+                next_status_s = now + self._status_period_s
+        self._guarded("publishing the status", self._publish_status)
+
+    def _guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:
+        """Do one thing of this thread, which fails alone: pacing and all other streams go on."""
         try:
-            while not self._queue.finished:
-                entry = self._queue.take(max(0.0, next_status_s - time.monotonic()))
-                if entry is not None:
-                    self._publish_entry(entry)
-                now = time.monotonic()
-                if now >= next_status_s:
-                    self._publish_status()
-                    # Not one period after the last: a status that was held up is not followed by a burst.
-                    next_status_s = now + self._status_period_s
-            self._publish_status()
-        except BaseException as error:
-            self._publisher_error = error
+            work(*arguments)
+        except Exception as error:
+            self._desk.trouble(what, error)
 
     def _publish_entry(self, entry: _Entry) -> None:
         for event in entry.before:
-            self._publish_event(event)
+            self._guarded("publishing events", self._publish_event, event)
         if entry.frame is not None:
             for key, block in blocks_of(entry.frame):
-                self._server.publish(key, wire.encode_block(block))
-                self._rows.follow(key, block)
+                self._guarded(f"publishing {key}", self._publish_block, key, block)
             self._count_samples(entry.frame)
         for event in entry.after:
-            self._publish_event(event)
+            self._guarded("publishing events", self._publish_event, event)
         self._answer(entry)
+
+    def _publish_block(self, key: str, block: wire.Block) -> None:
+        self._rows.follow(key, block)  # whoever does not get it learns from the end what is missing
+        self._server.publish(key, wire.encode_block(block))
 
     def _publish_event(self, event: dict[str, Any]) -> None:
         self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
@@ -618,8 +585,8 @@ class Service:
 
     @staticmethod
     def _answer(entry: _Entry) -> None:
-        for reply, document in entry.replies:
-            reply.set_result(document)
+        for pending, document in entry.replies:
+            pending.answer(document)
 
 
 def blocks_of(frame: Frame) -> Iterator[tuple[str, wire.Block]]:
@@ -632,65 +599,5 @@ def blocks_of(frame: Frame) -> Iterator[tuple[str, wire.Block]]:
         yield wire.truth_key(table), block
 
 
-def parse_command(name: str, payload: bytes) -> Pending:
-    """A command out of its payload.
-
-    Raises:
-        InputError: It is none.
-    """
-    if len(payload) > _REQUEST_BYTES:
-        raise InputError(name, f"a request of at most {_REQUEST_BYTES} bytes", len(payload))
-    try:
-        request = wire.decode_document(payload)
-    except (ValueError, RecursionError) as error:
-        raise InputError(name, "a JSON object", one_line(error)) from None
-    sender = request.pop("from", "unknown")
-    if not isinstance(sender, str) or not sender.isprintable() or not 1 <= len(sender) <= 100:
-        raise InputError("from", "a name of 1 to 100 printable characters", sender)
-    return Pending(name, request, sender)
-
-
-def only_fields(request: dict[str, Any], allowed: tuple[str, ...]) -> None:
-    """Refuse a request with other fields.
-
-    Raises:
-        InputError: It has one.
-    """
-    for name in request:
-        if name not in allowed:
-            raise InputError("request", f"without fields other than {', '.join(allowed) or 'from'}", name)
-
-
-def _note(request: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a note, checked."""
-    only_fields(request, ("text", "tags"))
-    text, tags = request.get("text"), request.get("tags", [])
-    if not isinstance(text, str) or not text.isprintable() or not 1 <= len(text) <= _NOTE_CHARACTERS:
-        raise InputError("text", f"a line of 1 to {_NOTE_CHARACTERS} printable characters", text)
-    if not isinstance(tags, list) or len(tags) > _TAGS:
-        raise InputError("tags", f"a list of at most {_TAGS}", tags)
-    for tag in tags:
-        if not isinstance(tag, str) or not tag.isprintable() or not 1 <= len(tag) <= _TAG_CHARACTERS or " " in tag:
-            raise InputError("tag", f"a word of at most {_TAG_CHARACTERS} printable characters", tag)
-    return {"text": text, "tags": tags}
-
-
-def refusal(error: Exception) -> dict[str, Any]:
-    """The reply to a command that was not taken."""
-    return {"accepted": False, "error": one_line(error)}
-
-
-def one_line(error: BaseException) -> str:
-    """What an error says, without line breaks."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def finite(value: Any) -> Any:
-    """The same document with None for numbers that JSON cannot carry: a diverged run must still be able to say so."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {name: finite(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    return value
+def _size(taken: dict[str, Any]) -> int:
+    return len(wire.encode_document(taken))

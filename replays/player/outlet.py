@@ -8,7 +8,7 @@ from typing import Any
 from replays.player.edit import Edit, Stamp
 from replays.player.timeline import Item
 from rig import wire
-from rig.service import finite
+from rig.desk import finite
 from rig.transport import Server
 
 

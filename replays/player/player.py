@@ -21,11 +21,11 @@ from replays.player.readahead import ReadAhead
 from replays.player.tape import Tape
 from replays.player.timeline import Batch, By, Item, Timeline
 from rig import wire
+from rig.desk import Desk, Pending, Rate, Seek, Step, finite, one_line
 from rig.errors import InputError, RefusedError
 from rig.pacing import FreeRun, RealTime, short_collections
-from rig.service import COMMANDS, REPLAY_COMMANDS, Pending, finite, one_line, only_fields, parse_command, refusal
+from rig.service import COMMANDS, REPLAY_COMMANDS
 from rig.transport import Server
-from rig.transport.clients import Clients
 
 _OWN = (*REPLAY_COMMANDS, "step", "stop")
 _AHEAD_S = 30.0
@@ -145,9 +145,20 @@ class Player:
         self._stop_requested = False
         self._step: _Step | None = None
         self._accepted = 0
-        self._pending: deque[Pending] = deque()
-        self._pending_lock = threading.Lock()
-        self._accepting = True
+        self._desk = Desk(
+            server,
+            commands=_OWN,
+            others={
+                name: f"this is a recording that is replayed, which takes no {name}; it takes {', '.join(_OWN)}"
+                for name in COMMANDS
+                if name not in _OWN
+            },
+            running="the recording plays",
+            wake=self._wake,
+            tell=lambda text: self._told.append(text),
+        )
+        self._told: deque[str] = deque()
+        """Warnings that wait for the playing thread."""
         self._woken = threading.Event()
         self._prepared = False
 
@@ -161,7 +172,6 @@ class Player:
         """Simulated time of the recording up to which everything has gone out [ns]."""
         self._pass = 1
         self._begun = False
-        self._clients = Clients()
 
     # ---- from any thread ----
 
@@ -202,7 +212,7 @@ class Player:
                     "dropped": 0,
                 },
                 "congestion": self._server.congestion(),
-                "clients": self._clients.rows(out.published, out.rate_hz),
+                "clients": self._desk.clients.rows(out.published, out.rate_hz),
                 "spin_hz": shown.get("spin_hz"),
                 "energy": shown.get("energy", {}),
                 "engine": shown.get("engine", {}),
@@ -236,30 +246,13 @@ class Player:
                 f"x{self._playhead.rate:g} is more than this machine and the clients keep up with: "
                 f"{self._behind_s:.1f} s behind"
             )
-        if self._clients.malformed:
-            warnings.append(f"{self._clients.malformed} client reports could not be read")
-        return warnings
+        return warnings + self._desk.warnings()
 
     @property
     def _behind_s(self) -> float:
         """How late the last payload was, where that is more than a passing hold-up [s]; else 0."""
         late_s = 0.0 if self._burst else self._clock.last_late_s
         return late_s if late_s > _BEHIND_S else 0.0
-
-    # ---- on transport threads ----
-
-    def _serve(self) -> None:
-        for key, document in (
-            (wire.CATALOGUE, self._edit.catalogue),
-            (wire.PARAMETERS, self._documents[wire.PARAMETERS]),
-        ):
-            payload = wire.encode_document(document)
-            self._server.answer(key, lambda _, payload=payload: payload)
-        self._server.answer(wire.SCENE, lambda _: wire.encode_document(self._scene()))
-        self._server.answer(wire.STATUS, lambda _: wire.encode_document(self.status()))
-        for name in dict.fromkeys((*COMMANDS, *REPLAY_COMMANDS)):
-            self._server.answer(wire.command_key(name), lambda payload, name=name: self._on_command(name, payload))
-        self._server.hear(f"{wire.CLIENTS}/*", self._clients.take)
 
     def _scene(self) -> dict[str, Any]:
         """The recorded document, with the commands that the rig had taken by now."""
@@ -270,22 +263,6 @@ class Player:
                 taken.setdefault(entry["id"], entry)
         return {**scene, "taken": list(taken.values())} if taken or "taken" in scene else scene
 
-    def _on_command(self, name: str, payload: bytes) -> bytes:
-        """Hand a command to the playing thread and wait for its answer."""
-        try:
-            pending = parse_command(name, payload)
-            if name not in _OWN:
-                line = f"this is a recording that is replayed, which takes no {name}; it takes {', '.join(_OWN)}"
-                raise RefusedError(line)
-            with self._pending_lock:
-                if not self._accepting:
-                    raise InputError(name, "sent while the recording plays", "one that has ended")
-                self._pending.append(pending)
-        except InputError as error:
-            return wire.encode_document(refusal(error))
-        self._wake()
-        return wire.encode_document(pending.reply.result())
-
     def _wake(self) -> None:
         self._woken.set()
         self._clock.wake()
@@ -295,9 +272,15 @@ class Player:
     def prepare(self) -> None:
         """Answer requests and show the token; `run` does it where it was not done before."""
         if not self._prepared:
-            self._serve()
             self._open(self._start_ns).ready(5.0)
-            self._server.announce()
+            self._desk.open(
+                {
+                    wire.CATALOGUE: lambda: self._edit.catalogue,
+                    wire.PARAMETERS: lambda: self._documents[wire.PARAMETERS],
+                    wire.SCENE: self._scene,
+                    wire.STATUS: self.status,
+                }
+            )
             self._prepared = True
 
     def run(self) -> dict[str, Any]:
@@ -328,7 +311,7 @@ class Player:
             if self._ahead is not None:
                 self._ahead.close()
             self._finish(reason)
-            self._clients.settle(self._server, self._outlet.published, patience_s=self._linger_s)
+            self._desk.clients.settle(self._server, self._outlet.published, patience_s=self._linger_s)
         status = self.status()
         kept = ("scene", "time_s", "lateness_ms", "overruns", "samples_published", "commands", "replay")
         return {
@@ -347,6 +330,8 @@ class Player:
         give_up_s = time.monotonic() + self._wait_s
         while True:
             self._take_commands()
+            while self._told:
+                self._outlet.tell("warning", self._tick, text=self._told.popleft())
             if self._stop_requested:
                 return "stopped"
             if self._awaited and self._step is None:
@@ -360,7 +345,7 @@ class Player:
                 elif self._ahead.ended:
                     return "completed"
             if isinstance(self._head, _Mark):
-                if self._burst and self._begun and self._clients.behind(self._outlet.published):
+                if self._burst and self._begun and self._desk.clients.behind(self._outlet.published):
                     # Row numbers may step back: clients must have said that they have what came before.
                     self._rest(_CROWDED_S)
                     continue
@@ -371,7 +356,7 @@ class Player:
 
     def _look_for_clients(self, give_up_s: float) -> None:
         """Go on once all are there that are waited for."""
-        present = self._clients.present
+        present = self._desk.clients.present
         if present >= self._awaited:
             self._resume()
         elif time.monotonic() > give_up_s:
@@ -407,7 +392,7 @@ class Player:
     def _crowded(self) -> bool:
         """Whether a client that reports has too much on its way."""
         rows = min(_AHEAD_S * self._outlet.rate_hz, _AHEAD_BLOCKS * self._outlet.block_rows)
-        return rows > 0 and self._clients.crowded(self._outlet.published, round(rows))
+        return rows > 0 and self._desk.clients.crowded(self._outlet.published, round(rows))
 
     # Passes through the recording.
 
@@ -476,14 +461,7 @@ class Player:
     def _finish(self, reason: str) -> None:
         """End the stream: as it was recorded, where that belongs to what was played."""
         self._state = "ended"
-        with self._pending_lock:
-            self._accepting = False
-            waiting = [pending.reply for pending in self._pending]
-            self._pending.clear()
-        if self._step is not None:
-            waiting.append(self._step.reply.reply)
-        for reply in waiting:
-            reply.set_result(refusal(InputError("command", "sent while the recording plays", f"its end: {reason}")))
+        self._desk.close(f"its end: {reason}", [] if self._step is None else [self._step.reply])
         completed = reason == "completed"
         if not (completed and self._outlet.end(as_recorded=self._as_recorded)):
             if completed:
@@ -497,30 +475,27 @@ class Player:
     # Commands.
 
     def _take_commands(self) -> None:
-        while self._pending:
-            with self._pending_lock:
-                pending = self._pending.popleft()
+        for pending in self._desk.taken():
             try:
                 self._carry_out(pending)
-            except InputError as error:
-                pending.reply.set_result(refusal(error))
+            except Exception as error:
+                pending.refuse(error)
+                if not isinstance(error, InputError):
+                    self._desk.trouble(pending.command, error)
 
     def _carry_out(self, pending: Pending) -> None:
-        request = pending.request
-        if pending.command == "step":
-            only_fields(request, ("ticks", "blocks"))
-            self._begin_step(pending)
+        asked = pending.asked
+        if isinstance(asked, Step):
+            self._begin_step(pending, asked)
             return
-        fields = {"seek": ("time_s",), "rate": ("rate",)}.get(pending.command, ())
-        only_fields(request, fields)
         if pending.command == "stop":
             self._stop_requested = True
-        elif pending.command == "seek":
-            self._seek(request.get("time_s"))
-        elif pending.command == "rate":
+        elif isinstance(asked, Seek):
+            self._seek(asked.time_s)
+        elif isinstance(asked, Rate):
             if self._burst:
                 raise InputError("rate", "sent to a replay with a rate of its own", "one that runs with --burst")
-            self._playhead.set_rate(request.get("rate"), self._now_ns())
+            self._playhead.set_rate(asked.rate, self._now_ns())
         elif pending.command == "pause":
             self._cancel_step("a pause")
             self._awaited = 0
@@ -534,12 +509,11 @@ class Player:
     def _accept(self, pending: Pending) -> None:
         self._accepted += 1
         reply = {"accepted": True, "id": self._accepted, "command": pending.command}
-        pending.reply.set_result({**reply, "tick": self._tick, "time_s": self._tick / self._tick_rate_hz})
+        pending.answer({**reply, "tick": self._tick, "time_s": self._tick / self._tick_rate_hz})
 
-    def _seek(self, time_s: Any) -> None:
+    def _seek(self, time_s: float) -> None:
         begin_s, end_s = self.reach_s
-        number = isinstance(time_s, float | int) and not isinstance(time_s, bool)
-        if not number or not begin_s <= time_s < end_s:
+        if not begin_s <= time_s < end_s:
             raise InputError("time_s", f"a position from {begin_s:g} to below {end_s:g} s", time_s)
         self._cancel_step("a seek")
         self._anchor_ns = self._now_ns()
@@ -548,19 +522,19 @@ class Player:
         self._open(self._position_ns)
         self._playhead.jump(self._anchor_ns)
 
-    def _begin_step(self, pending: Pending) -> None:
-        request = pending.request
+    def _begin_step(self, pending: Pending, asked: Step) -> None:
         if not self._paused or self._step is not None:
             raise InputError("step", "sent to a replay that is paused", "one that plays")
-        if len(request) != 1:
-            raise InputError("step", "of ticks or of blocks", sorted(request))
-        (name, value), most = next(iter(request.items())), 3600 * self._tick_rate_hz
-        if not isinstance(value, int) or isinstance(value, bool) or not 0 < value <= most:
-            raise InputError(name, f"a whole number of 1 to {most}", value)
-        if name == "blocks":
-            self._step = _Step(pending, blocks=value)
+        most = 3600 * self._tick_rate_hz
+        for name, value in asked:
+            if value is not None and value > most:
+                raise InputError(name, f"a whole number of 1 to {most}", value)
+        if asked.ticks is not None and asked.blocks is None:
+            self._step = _Step(pending, until_ns=self._now_ns() + asked.ticks * NS // self._tick_rate_hz)
+        elif asked.blocks is not None and asked.ticks is None:
+            self._step = _Step(pending, blocks=asked.blocks)
         else:
-            self._step = _Step(pending, until_ns=self._now_ns() + value * NS // self._tick_rate_hz)
+            raise InputError("step", "of ticks or of blocks", sorted(pending.request))
         self._playhead.start()
 
     def _end_step(self, step: _Step, at_ns: int) -> None:
@@ -571,7 +545,7 @@ class Player:
 
     def _cancel_step(self, by: str) -> None:
         if self._step is not None:
-            self._step.reply.reply.set_result(refusal(InputError("step", "done before anything else", by)))
+            self._step.reply.refuse(InputError("step", "done before anything else", by))
             self._playhead.hold(self._now_ns())
             self._step = None
 

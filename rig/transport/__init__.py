@@ -7,6 +7,7 @@ looks inside.
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future
 from typing import Protocol
 
 DEFAULT_ENDPOINT = "127.0.0.1:7460"
@@ -26,6 +27,14 @@ class Server(Protocol):
 
     def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
         """Answer requests on a key; the handler is called on the transport's threads."""
+        ...
+
+    def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
+        """Answer requests on all keys that match, told key and payload; an answer may come later."""
+        ...
+
+    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+        """Tell where and why something failed on the transport's threads, which go on."""
         ...
 
     def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:

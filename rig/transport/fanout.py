@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 
 from rig.transport import Server
 
@@ -28,6 +29,16 @@ class Fanout:
         """Answer requests on a key on all transports."""
         for server in self._servers:
             server.answer(key, handler)
+
+    def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
+        """Answer requests on all keys that match on all transports."""
+        for server in self._servers:
+            server.answer_all(expression, handler)
+
+    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+        """Tell what failed on the threads of all transports."""
+        for server in self._servers:
+            server.on_trouble(tell)
 
     def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Receive what clients of all transports report."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 from rig.transport import NoReplyError
@@ -42,7 +43,7 @@ class MemoryServer:
         self._cache: deque[tuple[str, bytes]] = deque(maxlen=cache)
         self._subscriptions: list[_Subscription] = []
         self._watchers: list[tuple[MemoryClient, Callable[[bool], None]]] = []
-        self._handlers: dict[str, Callable[[bytes], bytes]] = {}
+        self._handlers: dict[str, Callable[[str, bytes], bytes | Future[bytes]]] = {}
         self._listeners: list[tuple[str, Callable[[str, bytes], None]]] = []
         self._announced = False
         self._closed = False
@@ -59,8 +60,15 @@ class MemoryServer:
 
     def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
         """Answer requests on a key; the handler is called on the asking thread."""
+        self.answer_all(key, lambda _, payload: handler(payload))
+
+    def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
+        """Answer requests on all keys that match; the handler is called on the asking thread."""
         with self._lock:
-            self._handlers[key] = handler
+            self._handlers[expression] = handler
+
+    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+        """There are no threads here: whoever calls meets what fails."""
 
     def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Receive what clients report on matching keys."""
@@ -131,10 +139,11 @@ class MemoryClient:
             NoReplyError: Nobody answers on that key.
         """
         with self._server._lock:
-            handler = self._server._handlers.get(key)
-        if handler is None:
+            handlers = [take for expression, take in self._server._handlers.items() if key_matches(expression, key)]
+        if not handlers:
             raise NoReplyError(f"no rig answers {key} in this process")
-        return handler(payload)
+        reply = handlers[0](key, payload)
+        return reply.result() if isinstance(reply, Future) else reply
 
     def watch(self, key: str, callback: Callable[[bool], None]) -> None:
         """Call back with True / False when the rig's token appears / vanishes."""

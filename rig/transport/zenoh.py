@@ -13,7 +13,9 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 from rig import wire
@@ -106,28 +108,40 @@ class _Session:
         self._threads: list[threading.Thread] = []
         self._closing = threading.Lock()
         self._closed = False
+        self._printed: set[str] = set()
+        self.on_trouble: Callable[[str, BaseException], None] = self._print_trouble
+        """Told of what fails on a receiving thread, which goes on."""
         atexit.register(self.close)
+
+    def _print_trouble(self, where: str, error: BaseException) -> None:
+        if where not in self._printed:  # it may fail with each message
+            self._printed.add(where)
+            thread = threading.current_thread()
+            threading.excepthook(threading.ExceptHookArgs((type(error), error, error.__traceback__, thread)))
 
     def drain(
         self, channel: Any, take: Callable[[Any], None], name: str, *, first: Callable[[], None] | None = None
     ) -> None:
-        """Give all that arrives in a channel to `take`, on a thread of its own, after calling `first` there."""
+        """Give all that arrives in a channel to `take`, on a thread of its own, after calling `first` there.
+
+        What fails there fails alone: a channel that nobody empties would in the end block the whole link.
+        """
         import zenoh
 
-        def loop() -> None:
+        def guarded(work: Callable[..., None], *arguments: Any) -> None:
             try:
-                if first is not None:
-                    first()
+                work(*arguments)
+            except BaseException as error:
+                if not (self._closed and isinstance(error, zenoh.ZError)):
+                    self.on_trouble(f"zenoh {name}", error)
+
+        def loop() -> None:
+            if first is not None:
+                guarded(first)
+            with contextlib.suppress(zenoh.ZError):  # the channel ends with the session
                 for item in channel:
                     if not self._closed:
-                        take(item)
-            except BaseException as error:
-                if self._closed and isinstance(error, zenoh.ZError):
-                    return
-                # A channel that nobody empties would in the end block the whole link, and hide that the rig has ended.
-                threading.excepthook(threading.ExceptHookArgs((type(error), error, error.__traceback__, thread)))
-                for _ in channel:
-                    pass
+                        guarded(take, item)
 
         thread = threading.Thread(target=loop, name=f"zenoh {name}", daemon=True)
         self._threads.append(thread)
@@ -203,6 +217,8 @@ class ZenohServer:
         self._longest_put_s = 0.0
         self._stalls = 0
         self._stalled: set[int] = set()
+        self._replies: SimpleQueue[tuple[Any, str, bytes] | None] = SimpleQueue()
+        self._session.drain(iter(self._replies.get, None), lambda late: _reply(*late), "replies")
 
     def publish(self, key: str, payload: bytes) -> None:
         """Send one payload to all subscribers, and keep it for those who miss it. One thread only."""
@@ -231,20 +247,37 @@ class ZenohServer:
 
     def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
         """Answer requests on a key, one after another, on a thread of that key."""
-        queryable = self._session.session.declare_queryable(key, _fifo())
+        self.answer_all(key, lambda _, payload: handler(payload))
+
+    def answer_all(self, expression: str, handler: Callable[[str, bytes], bytes | Future[bytes]]) -> None:
+        """Answer requests on all keys that match, on a thread of this expression; what comes later, on one for that."""
+        queryable = self._session.session.declare_queryable(expression, _fifo())
         self._declared.append(queryable)
+        own = None if "*" in expression else expression
 
         def take(query: Any) -> None:
-            # An error here would end the thread, and with it this key, for good.
-            with query:
-                try:
-                    payload = handler(query.payload.to_bytes() if query.payload is not None else b"")
-                except Exception as error:
+            key = own or str(query.key_expr)
+            try:
+                if "*" in key:
+                    raise InputError("key", "one key, without *", key)
+                answer = handler(key, b"" if query.payload is None else query.payload.to_bytes())
+            except Exception as error:
+                with query:
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
+                if not isinstance(error, InputError):
+                    raise
+            else:
+                if isinstance(answer, Future):
+                    # Completed on a thread that must not wait for a link.
+                    answer.add_done_callback(lambda done: self._replies.put((query, key, done.result())))
                 else:
-                    query.reply(query.key_expr, payload, encoding="application/json")
+                    _reply(query, key, answer)
 
-        self._session.drain(queryable, take, f"answers {key}")
+        self._session.drain(queryable, take, f"answers {expression}")
+
+    def on_trouble(self, tell: Callable[[str, BaseException], None]) -> None:
+        """Tell where and why something failed on a receiving thread."""
+        self._session.on_trouble = tell
 
     def hear(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Receive what clients report on matching keys."""
@@ -289,7 +322,8 @@ class ZenohServer:
         }
 
     def close(self) -> None:
-        """Close the session and with it all that was declared."""
+        """Send the last replies, and close the session and with it all that was declared."""
+        self._replies.put(None)
         self._session.close()
 
     def __enter__(self) -> ZenohServer:
@@ -297,6 +331,11 @@ class ZenohServer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _reply(query: Any, key: str, payload: bytes) -> None:
+    with query:
+        query.reply(key, payload, encoding="application/json")
 
 
 def _backlog(port: int) -> dict[int, int]:

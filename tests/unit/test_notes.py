@@ -45,8 +45,8 @@ def test_a_note_is_recorded_with_its_time_and_is_no_command(tmp_path: Path) -> N
         ("", [], "text must be a line"),
         ("two\nlines", [], "text must be a line"),
         ("x" * 1001, [], "text must be a line"),
-        ("x", ["two words"], "tag must be a word"),
-        ("x", ["t"] * 11, "tags must be a list of at most 10"),
+        ("x", ["two words"], r"tags\.0 must be a word"),
+        ("x", ["t"] * 11, "tags must be a value of at most 10 items"),
     ):
         with pytest.raises(RefusedError, match=must):
             console.note(text, tags=tags)

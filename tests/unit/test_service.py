@@ -168,21 +168,34 @@ def test_a_command_is_answered_with_its_tick_and_becomes_an_event() -> None:
         ("hammer", b"{", "hammer must be a JSON object"),
         ("hammer", b"[1]", "hammer must be a JSON object"),
         ("hammer", b"\xff\xfe", "hammer must be a JSON object"),
-        ("hammer", b"[" * 9_999, "hammer must be a JSON object"),
+        ("hammer", b"[" * 9_999, "hammer must be nested at most 32 deep"),
+        ("hammer", b'{"force_n": ' + b"[" * 980 + b"]" * 980 + b"}", "hammer must be nested at most 32 deep"),
+        ("hammer", b'{"force_n": 1' + b"0" * 400 + b"}", "hammer must be without whole numbers beyond"),
+        ("hammer", b'{"force_n": Infinity}', "hammer must be without numbers that are not finite"),
+        ("hammer", b'{"force_n": 1e999}', "hammer must be without numbers that are not finite"),
+        ("hammer", b'{"force_n": 1, "force_n": 2}', "hammer must be without a key that comes twice"),
+        ("hammer", '{"from": "a"}'.encode("utf-16"), "hammer must be a JSON object in UTF-8"),
+        ("hammer", b'{"from": "\\ud800", "force_n": 1}', "hammer must be a JSON object in UTF-8"),
+        ("note", b'{"text": ' + b"[" * 980 + b"]" * 980 + b"}", "note must be nested at most 32 deep"),
+        ("note", b'{"text": [[[["a"]]]]}', "note.text must be a valid string"),
+        ("note", b'{"text": "a\\u001b[2Jb"}', "note.text must be a line of 1 to 1000 printable characters"),
+        ("note", b'{"text": "a", "tags": ["b c"]}', "note.tags.0 must be a word"),
         ("hammer", b" " * 10_001, "at most 10000 bytes"),
         ("hammer", b'{"force_n": 1e6}', "force_n must be above 0 and at most 1000; instead received 1000000.0"),
         ("hammer", b"{}", "hammer must be readable"),
         ("hammer", b'{"force_n": "much"}', "hammer must be readable"),
-        ("hammer", b'{"from": 7, "force_n": 1}', "from must be a name"),
-        ("hammer", b'{"from": "a\\nb", "force_n": 1}', "from must be a name"),
-        ("stop", b'{"now": 1}', "request must be without fields other than from"),
-        ("step", b'{"ticks": 0}', "ticks must be a positive whole multiple of 1000"),
+        ("hammer", b'{"from": 7, "force_n": 1}', "from must be a valid string"),
+        ("hammer", b'{"from": "a\\nb", "force_n": 1}', "from must be a line of 1 to 100 printable characters"),
+        ("stop", b'{"now": 1}', "stop.now must be left out"),
+        ("step", b'{"ticks": 0}', "step.ticks must be greater than 0"),
         ("step", b'{"ticks": 1500}', "ticks must be a positive whole multiple of 1000"),
-        ("step", b'{"ticks": true}', "ticks must be a positive whole multiple of 1000"),
-        ("step", b'{"ticks": 1000.0}', "ticks must be a positive whole multiple of 1000"),
+        ("step", b'{"ticks": true}', "step.ticks must be a valid integer"),
+        ("step", b'{"ticks": 1000.0}', "step.ticks must be a valid integer"),
+        ("step", b'{"ticks": "1000"}', "step.ticks must be a valid integer"),
+        ("step", b'{"blocks": 1}', "step.blocks must be left out"),
         ("step", b'{"ticks": 1000000000000000}', "ticks must be a positive whole multiple of 1000"),
         ("step", b"{}", "ticks must be a positive whole multiple of 1000"),
-        ("step", b'{"ticks": 1000, "x": 1}', "request must be without fields other than ticks"),
+        ("step", b'{"ticks": 1000, "x": 1}', "step.x must be left out"),
         ("step", b'{"ticks": 2000000}', "at most 1000000, the rest of the scene"),
     ],
 )
@@ -277,15 +290,60 @@ def test_a_failing_simulation_ends_the_stream_and_raises() -> None:
     assert listener.events[-1]["rows"][wire.sensor_key("probes")] == 600
 
 
-def test_a_failing_publisher_ends_the_run() -> None:
+def test_a_stream_that_cannot_be_published_is_told_and_ends_neither_the_run_nor_the_other_streams() -> None:
     class Broken(MemoryServer):
         def publish(self, key: str, payload: bytes) -> None:
             if key == wire.sensor_key("forces"):
                 raise OSError("the link is gone")
             super().publish(key, payload)
 
-    with pytest.raises(RuntimeError, match="the publisher failed"):
-        Service(FakeSimulation(duration_s=None), Broken(), FreeRun(), block_ticks=BLOCK).run()
+    server = Broken()
+    listener = Listener(server)
+    summary = Service(FakeSimulation(duration_s=0.5), server, FreeRun(), block_ticks=BLOCK).run()
+    line = "publishing rig/sensors/forces failed: OSError: the link is gone"
+    assert summary["reason"] == "completed"
+    assert summary["troubled"] is True
+    assert [event["text"] for event in listener.named("warning")] == [line]
+    assert line in listener.statuses[-1]["warnings"]
+    assert sum(len(block.values) for block in listener.blocks[wire.sensor_key("probes")]) == 10_000
+    assert listener.events[-1]["rows"][wire.sensor_key("forces")] == 10_000, "whoever lacks them learns it"
+
+
+def test_a_status_that_cannot_be_made_is_told_and_the_run_goes_on() -> None:
+    class Unwell(FakeSimulation):
+        def health(self) -> dict[str, Any]:
+            return {**super().health(), "engine": {"name": object()}}
+
+    summary, listener = run(Unwell(duration_s=0.2), status_period_s=0.0)
+    assert summary["reason"] == "completed"
+    assert any("publishing the status failed: TypeError" in event["text"] for event in listener.named("warning"))
+
+
+def test_an_unknown_command_is_refused_with_those_that_are_known() -> None:
+    with Running(FakeSimulation(duration_s=None), Lockstep()) as rig:
+        for name in ("explode", "Hammer", "%s", "x" * 5000):
+            reply = wire.decode_document(rig.listener.client.request(wire.command_key(name), b"{}"))
+            assert reply["accepted"] is False
+            assert reply["error"].startswith("command must be one of hammer, speed, release, stop, step, note")
+            assert len(reply["error"]) < 1000
+
+
+def test_a_refusal_names_the_field_and_what_it_must_be_for_programs_too() -> None:
+    with Running(FakeSimulation(duration_s=1.0), Lockstep()) as rig:
+        reply = wire.decode_document(rig.listener.client.request(wire.command_key("step"), b'{"ticks": 0}'))
+        assert (reply["field"], reply["must"]) == ("step.ticks", "greater than 0")
+
+
+def test_what_latecomers_are_told_of_the_commands_is_bounded_in_bytes() -> None:
+    simulation = FakeSimulation(duration_s=None)
+    with Running(simulation, Lockstep()) as rig:
+        for _ in range(60):
+            rig.console._command("hammer", force_n=1.0, padding="x" * 9_900)
+        payload = rig.listener.client.request(wire.SCENE)
+        scene = wire.decode_document(payload)
+        assert len(payload) < 600_000
+        assert len(scene["taken"]) + scene["forgotten"] == 60
+        assert scene["taken"][-1]["id"] == 60, "the newest are kept"
 
 
 def test_each_kind_of_warning_becomes_one_event() -> None:

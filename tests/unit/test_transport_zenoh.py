@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -104,14 +105,39 @@ def test_requests_are_answered_and_a_failing_handler_answers_the_next_one(server
             raise RuntimeError("no reply for this")
         return payload[::-1]
 
+    told: list[tuple[str, str]] = []
+    server.on_trouble(lambda where, error: told.append((where, str(error))))
     server.answer("rig/status", handler)
     with ZenohClient(server.endpoint) as client:
         assert client.request("rig/status", b"abc") == b"cba"
         with pytest.raises(NoReplyError, match="no reply for this"):
             client.request("rig/status", b"bad")
         assert client.request("rig/status") == b""
+        assert told == [("zenoh answers rig/status", "no reply for this")]
         with pytest.raises(NoReplyError, match=server.endpoint):
             client.request("rig/nothing", timeout_s=0.1)
+
+
+def test_an_answer_may_come_later_and_holds_up_no_other(server: ZenohServer) -> None:
+    later: list[Future[bytes]] = []
+
+    def handler(key: str, _: bytes) -> bytes | Future[bytes]:
+        if key.endswith("/slow"):
+            later.append(Future())
+            return later[-1]
+        return key.encode()
+
+    server.answer_all("rig/command/*", handler)
+    with ZenohClient(server.endpoint) as client, ThreadPoolExecutor(20) as pool:
+        slow = [pool.submit(client.request, "rig/command/slow", timeout_s=20.0) for _ in range(20)]
+        until(lambda: len(later) == 20)
+        assert client.request("rig/command/quick") == b"rig/command/quick"
+        assert not any(reply.done() for reply in slow)
+        for number, reply in enumerate(later):
+            reply.set_result(str(number).encode())
+        assert sorted(int(reply.result(20.0)) for reply in slow) == list(range(20))
+        with pytest.raises(NoReplyError, match="one key, without"):
+            client.request("rig/command/*")
 
 
 def test_every_first_request_is_answered(server: ZenohServer) -> None:

@@ -1,0 +1,256 @@
+"""Where a run is asked, commanded and reported to, be it a simulation that is served or a recording that is played.
+
+All that clients say comes in here and is checked here: requests for documents are answered on the transport's threads,
+commands wait for the thread that runs, which takes them between two blocks.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
+
+from rig import wire
+from rig.errors import InputError, RefusedError
+from rig.outside import LARGEST, Name, Outside, a_line, check, read_json
+from rig.text import printable
+from rig.transport import Server
+from rig.transport.clients import Clients
+
+REQUEST_BYTES = 10_000
+_PENDING_COMMANDS = 256
+_KINDS = 100
+"""Kinds of warnings that become events; the status shows the latest of the others too."""
+_FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
+
+
+class Nothing(Outside):
+    """A command without fields: `stop`, `pause`, `resume`."""
+
+
+class Step(Outside):
+    """How far a run in lockstep, or a replay that is paused, goes on."""
+
+    ticks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
+    blocks: Annotated[int, Field(gt=0, le=LARGEST)] | None = None
+
+
+def _a_word(text: str) -> str:
+    if " " in text:
+        raise ValueError("a word")
+    return text
+
+
+class Note(Outside):
+    """A line into every recording that is being made."""
+
+    text: Annotated[str, a_line(1000)]
+    tags: list[Annotated[str, a_line(40), AfterValidator(_a_word)]] = Field(default=[], max_length=10)
+
+
+class Seek(Outside):
+    """Another position of a replay."""
+
+    time_s: float
+
+
+class Rate(Outside):
+    """Recorded seconds that a replay plays a second."""
+
+    rate: float
+
+
+REQUESTS: dict[str, type[Outside]] = {
+    "stop": Nothing,
+    "step": Step,
+    "note": Note,
+    "pause": Nothing,
+    "resume": Nothing,
+    "seek": Seek,
+    "rate": Rate,
+}
+"""Commands that are about the run itself; what is done to the rig, the simulation checks (`rig.scenes`)."""
+
+
+@dataclass(slots=True)
+class Pending:
+    """A command on its way from a transport's thread to the one that runs.
+
+    Attributes:
+        command: Its name.
+        request: Its fields as they came, within the bounds of every document.
+        asked: The same, checked, of those in `REQUESTS`.
+        sender: What the sender calls itself.
+        reply: Takes the payload of the answer.
+    """
+
+    command: str
+    request: dict[str, Any]
+    asked: Any
+    sender: str
+    reply: Future[bytes] = field(default_factory=Future)
+
+    def answer(self, document: Mapping[str, Any]) -> None:
+        """Reply with a document."""
+        self.reply.set_result(wire.encode_document(dict(document)))
+
+    def refuse(self, error: Exception) -> None:
+        """Reply that the command was not taken, and why."""
+        self.answer(refusal(error))
+
+
+class Desk:
+    """Answers what is asked of one run, until it is closed.
+
+    Args:
+        server: Transport; stays open.
+        commands: Names of those that are taken.
+        others: Commands that are known and refused here, each with the line that says so.
+        running: What a command that comes too late should have been sent while, such as "the rig runs".
+        wake: Makes the thread that runs look for commands.
+        tell: Takes each new kind of trouble, on any thread, for an event.
+    """
+
+    def __init__(
+        self,
+        server: Server,
+        *,
+        commands: tuple[str, ...],
+        others: Mapping[str, str],
+        running: str,
+        wake: Callable[[], None],
+        tell: Callable[[str], None],
+    ) -> None:
+        self._server = server
+        self._commands = commands
+        self._others = others
+        self._running = running
+        self._wake = wake
+        self._tell = tell
+        self._pending: deque[Pending] = deque()
+        self._lock = threading.Lock()
+        self._ended = ""
+        self._kinds: set[str] = set()
+        self._troubles: dict[str, str] = {}
+        self.clients = Clients()
+
+    def open(self, documents: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
+        """Begin to answer, with these documents by key, and show the token."""
+        self._server.on_trouble(self.trouble)
+        for key, make in documents.items():
+            self._server.answer(key, lambda _, make=make: wire.encode_document(make()))
+        self._server.answer_all(wire.command_key("*"), self._on_command)
+        self._server.hear(f"{wire.CLIENTS}/*", self.clients.take)
+        self._server.announce()
+
+    def _on_command(self, key: str, payload: bytes) -> bytes | Future[bytes]:
+        """Hand a command to the thread that runs; answered there, or when the run ends."""
+        name = key.removeprefix(wire.command_key(""))
+        try:
+            pending = self._parse(name, payload)
+            with self._lock:
+                if self._ended:
+                    raise InputError(name, f"sent while {self._running}", self._ended)
+                if len(self._pending) >= _PENDING_COMMANDS:
+                    raise InputError("commands", f"at most {_PENDING_COMMANDS} at a time", len(self._pending) + 1)
+                self._pending.append(pending)
+        except InputError as error:
+            return wire.encode_document(refusal(error))
+        self._wake()
+        return pending.reply
+
+    def _parse(self, name: str, payload: bytes) -> Pending:
+        if name in self._others:
+            raise RefusedError(self._others[name])
+        if name not in self._commands:
+            raise InputError("command", f"one of {', '.join(self._commands)}", name)
+        request = read_json(payload, field=name, most_bytes=REQUEST_BYTES)
+        sender = check(_Signed, {"from": request.pop("from", "unknown")}, field="").sender
+        model = REQUESTS.get(name)
+        return Pending(name, request, None if model is None else check(model, request, field=name), sender)
+
+    def taken(self) -> Iterator[Pending]:
+        """The commands that have come, oldest first; what must never happen to one is that it is not answered."""
+        while self._pending:
+            with self._lock:
+                pending = self._pending.popleft()
+            yield pending
+
+    def close(self, ended: str, also: list[Pending]) -> None:
+        """Refuse what is still waiting, and what comes later.
+
+        Args:
+            ended: What the command met instead of a run.
+            also: Commands that were taken and cannot be done any more.
+        """
+        with self._lock:
+            self._ended = ended
+            waiting = [*self._pending, *also]
+            self._pending.clear()
+        for pending in waiting:
+            pending.refuse(InputError("command", f"sent while {self._running}", ended))
+
+    def trouble(self, where: str, error: BaseException) -> None:
+        """Something failed that must not end the run, on any thread: a warning, and an event for each new kind."""
+        text = f"{where} failed: {type(error).__name__}: {one_line(error)}"
+        with self._lock:
+            known = where in self._troubles
+            if known or len(self._troubles) < _KINDS:
+                self._troubles[where] = text
+        if not known:
+            self.warn(text)
+
+    def warn(self, text: str) -> None:
+        """Tell a warning whose kind is new: one whose figures have moved on is not, and the status shows the latest."""
+        kind = _FIGURES.sub("#", text)
+        with self._lock:
+            new = kind not in self._kinds and len(self._kinds) < _KINDS
+            if new:
+                self._kinds.add(kind)
+        if new:
+            self._tell(text)
+
+    def warnings(self) -> list[str]:
+        """What went wrong here, for the status."""
+        warnings = list(self._troubles.values())
+        if self.clients.malformed:
+            warnings.append(f"{self.clients.malformed} client reports could not be read")
+        return warnings
+
+    @property
+    def troubled(self) -> bool:
+        """Whether anything failed."""
+        return bool(self._troubles)
+
+
+class _Signed(Outside):
+    sender: Name = Field(alias="from")
+
+
+def refusal(error: Exception) -> dict[str, Any]:
+    """The reply to a command that was not taken: the line, and its parts where it names a field."""
+    parts = {"field": error.field, "must": error.must} if type(error) is InputError else {}
+    return {"accepted": False, "error": one_line(error), **parts}
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, without line breaks."""
+    return " ".join(printable(str(error), 2000).split()) or type(error).__name__
+
+
+def finite(value: Any) -> Any:
+    """The same document with None for numbers that JSON cannot carry: a diverged run must still be able to say so."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {name: finite(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return value
