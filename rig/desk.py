@@ -219,15 +219,17 @@ class Desk:
 
     def warnings(self) -> list[str]:
         """What went wrong here, for the status."""
-        warnings = list(self._troubles.values())
+        warnings = self.troubles
         if self.clients.malformed:
             warnings.append(f"{self.clients.malformed} client reports could not be read")
+        if self.clients.hidden:
+            warnings.append(f"{self.clients.hidden} more clients report than are shown")
         return warnings
 
     @property
-    def troubled(self) -> bool:
-        """Whether anything failed."""
-        return bool(self._troubles)
+    def troubles(self) -> list[str]:
+        """What failed, the latest of each place."""
+        return list(self._troubles.values())
 
 
 class _Signed(Outside):

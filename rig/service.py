@@ -379,7 +379,7 @@ class Service:
             "samples_published": self._samples_published,
             "commands": self._accepted,
             "rows": dict(self._rows.next),
-            "troubled": self._desk.troubled,
+            "troubles": self._desk.troubles,
         }
 
     def _advance_all(self) -> str:

@@ -11,20 +11,22 @@ from typing import Any
 
 import typer
 
+from rig.cli.main import ENDING
+
 Status = Callable[[], dict[str, Any]]
 Line = Callable[[dict[str, Any]], list[str]]
 
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], object]) -> Iterator[None]:
-    """SIGINT and SIGTERM end the work in good order; a second SIGINT interrupts at once."""
+    """SIGINT, SIGTERM and SIGHUP end the work in good order; a second SIGINT interrupts at once."""
 
     def handle(number: int, _: object) -> None:
         if number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         stop()
 
-    former = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    former = {number: signal.signal(number, handle) for number in ENDING if signal.getsignal(number) != signal.SIG_IGN}
     try:
         yield
     finally:

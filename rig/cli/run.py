@@ -71,8 +71,9 @@ def run(
         from rig.scenes import load_scene
         from rig.service import Service
         from rig.simulation import Simulation
-        from rig.transport.zenoh import ZenohServer
+        from rig.transport.zenoh import ZenohServer, check_free
 
+        check_free(listen)
         loaded = load_scene(scene, overrides)
         bus = can_output(
             can,
@@ -85,17 +86,19 @@ def run(
             slcan=can_slcan,
             expose=expose,
         )
+        notice = "preparing" if compiled_before() else COMPILE_NOTICE
+        typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
+        simulation = Simulation(loaded)
+        block_ticks = _block_ticks(block_ms, simulation)
+        # Before anybody can connect: whoever does is answered at once.
+        simulation.warm_up()
     paced = pace is Pace.REAL_TIME
     with ZenohServer(listen, expose=expose, wait=not paced) as server, ExitStack() as stack:
         if bus is not None:
             stack.enter_context(bus)
         with rare_collections():
-            simulation = Simulation(loaded)
-            block_ticks = _block_ticks(block_ms, simulation)
             everywhere = server if bus is None else bus.beside(server)
             service = Service(simulation, everywhere, _clock(pace), block_ticks=block_ticks)
-            notice = "preparing" if compiled_before() else COMPILE_NOTICE
-            typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
             if loaded.fidelity_line:
                 typer.echo(f"rig: {loaded.fidelity_line}", err=True)
             service.prepare()
@@ -108,6 +111,8 @@ def run(
     _print_summary(summary)
     if bus is not None:
         typer.echo(bus.summary())
+    if summary["troubles"]:
+        raise typer.Exit(1)
 
 
 def scene_overrides(
@@ -169,3 +174,5 @@ def _print_summary(summary: dict[str, Any]) -> None:
         f"{summary['samples_published']} samples a channel published, blocks dropped {queue['dropped']},"
         f" commands taken {summary['commands']}"
     )
+    for text in summary["troubles"]:
+        typer.echo(f"rig: {text}", err=True)

@@ -11,13 +11,21 @@ from typing import Any
 from rig.outside import Count, Name, Outside, check
 from rig.transport import Server
 
-_MOST = 64
+_SHOWN = 64
+"""Clients in the status."""
+_MOST = 4096
+"""Names that are remembered: so many made-up ones cannot crowd out those that get on."""
 _REPORT_BYTES = 2000
 _FORGOTTEN_S = 600.0
 _GONE_S = 3.0
 """A client that did not report for this long is not waited for; others report twice a second."""
 _QUIET_S = 0.6
 """At the end of a run: for how long nobody must be behind before the cache may go; two heartbeats of the transport."""
+_STUCK_S = 60.0
+"""Who reports but has got nothing for this long is not waited for, in the middle of a run."""
+_STUCK_AT_END_S = 3.0
+_STRANGERS_S = 0.4
+"""At the end of a run: how much longer a link is waited for that is stalled, while all who report have everything."""
 
 
 class Sender(Outside):
@@ -48,6 +56,10 @@ class _Heard:
     lost: int
     heard_s: float
     room: int | None
+    moved_s: float
+    """When it was last heard to have got on."""
+    moves: int
+    """How often."""
 
 
 class Clients:
@@ -63,6 +75,7 @@ class Clients:
         self._reports: dict[str, _Heard] = {}
         self._joined: dict[str, int] = {}
         """Row that was next when a client was first seen that had nothing yet: what it will be measured from."""
+        self._swept_s = now_s()
         self.malformed = 0
         """Reports that could not be read."""
 
@@ -74,14 +87,30 @@ class Clients:
         except ValueError:
             self.malformed += 1
             return
-        row = _Heard(report.received_index, report.lost, self._now_s(), report.room)
+        now_s = self._now_s()
         with self._lock:
-            for old in [key for key, old in self._reports.items() if row.heard_s - old.heard_s > _FORGOTTEN_S]:
-                self._forget(old)
             if report.done:
                 self._forget(name)
-            elif name in self._reports or len(self._reports) < _MOST:
-                self._reports[name] = row
+                return
+            before = self._reports.get(name)
+            if before is None:
+                self._make_room(now_s)
+            if before is None or before.received_index == report.received_index:
+                moved_s, moves = (now_s, 0) if before is None else (before.moved_s, before.moves)
+            else:
+                moved_s, moves = now_s, before.moves + 1
+            self._reports[name] = _Heard(report.received_index, report.lost, now_s, report.room, moved_s, moves)
+
+    def _make_room(self, now_s: float) -> None:
+        """For other names: forget those that are long silent, or where none is, a quarter, of those that did not get on."""
+        if len(self._reports) < _MOST and now_s - self._swept_s < _FORGOTTEN_S:
+            return
+        self._swept_s = now_s
+        for name in [name for name, row in self._reports.items() if now_s - row.heard_s > _FORGOTTEN_S]:
+            self._forget(name)
+        if len(self._reports) >= _MOST:
+            for name in sorted(self._reports, key=lambda name: self._reports[name].moves)[: _MOST // 4]:
+                self._forget(name)
 
     def _forget(self, name: str) -> None:
         self._reports.pop(name, None)
@@ -101,7 +130,8 @@ class Clients:
         """
         now_s = self._now_s()
         with self._lock:
-            reports = dict(self._reports)
+            # Those that get on first: names can be made up by the thousand.
+            first = sorted(self._reports.items(), key=lambda row: -row[1].moves)
         return {
             name: {
                 "received_index": report.received_index,
@@ -109,12 +139,24 @@ class Clients:
                 "last_heard_s": round(now_s - report.heard_s, 3),
                 "lost": report.lost,
             }
-            for name, report in reports.items()
+            for name, report in first[:_SHOWN]
         }
 
-    def behind(self, published: int) -> int:
-        """Rows that the slowest client still lacks, of those that are there; 0 where nobody reports."""
-        return max((self._lacks(name, report, published) for name, report in self._live().items()), default=0)
+    @property
+    def hidden(self) -> int:
+        """How many more there are than the status shows."""
+        return max(0, len(self._reports) - _SHOWN)
+
+    def behind(self, published: int, *, silent: bool = False, stuck_s: float = _STUCK_S) -> int:
+        """Rows that the slowest client still lacks, of those that are there; 0 where nobody reports.
+
+        Args:
+            published: Number of the row after the last one published.
+            silent: Also of those that no longer report.
+            stuck_s: Without those that have got nothing for so long [s].
+        """
+        live = self._live(silent=silent, stuck_s=stuck_s)
+        return max((self._lacks(name, report, published) for name, report in live.items()), default=0)
 
     def crowded(self, published: int, most: int) -> bool:
         """Whether a client that is there has more on its way than so many rows, or than half of its own room."""
@@ -128,10 +170,16 @@ class Clients:
         has = report.received_index
         return max(0, published - (self._joined.setdefault(name, published) if has is None else has))
 
-    def _live(self) -> dict[str, _Heard]:
+    def _live(self, *, silent: bool = False, stuck_s: float = _STUCK_S) -> dict[str, _Heard]:
         now_s = self._now_s()
         with self._lock:
-            return {name: report for name, report in self._reports.items() if now_s - report.heard_s < _GONE_S}
+            return {
+                name: row
+                for name, row in self._reports.items()
+                # Whoever is silent has been stopped, not stuck: it may be about to go on.
+                if (row.heard_s - row.moved_s < stuck_s and now_s - row.heard_s < _GONE_S)
+                or (silent and now_s - row.heard_s >= _GONE_S)
+            }
 
     def settle(
         self,
@@ -150,12 +198,15 @@ class Clients:
             see: Takes each count of the links.
         """
         deadline = time.monotonic() + patience_s
-        quiet_since = time.monotonic()
+        quiet_since = strangers_since = time.monotonic()
         while (now := time.monotonic()) < deadline:
             counts = server.congestion()
             see(counts)
             if not counts.get("links", 0) or now - quiet_since >= _QUIET_S:
                 return
-            if self.behind(published) or counts.get("stalled_links", 0):
+            stalled = counts.get("stalled_links", 0) > 0
+            if self.behind(published, silent=stalled, stuck_s=_STUCK_AT_END_S):
+                quiet_since = strangers_since = now
+            elif stalled and now - strangers_since < _STRANGERS_S:
                 quiet_since = now
             time.sleep(0.1)

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import errno
 import json
 import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -57,6 +59,26 @@ def parse_endpoint(text: str, *, field: str = "endpoint") -> tuple[str, int]:
     if not colon or not host or "/" in host or not port.isdecimal() or not 1 <= int(port) <= 65535:
         raise InputError(field, f"HOST:PORT with a port of 1 to 65535, such as {DEFAULT_ENDPOINT}", text)
     return host, int(port)
+
+
+def check_free(endpoint: str, *, field: str = "listen") -> None:
+    """Find out early whether an address can be listened on; what takes it meanwhile is found when it is.
+
+    Raises:
+        InputError: It is malformed, in use, or none of this machine.
+    """
+    host, port = parse_endpoint(endpoint, field=field)
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise _not_free(field, endpoint, in_use=error.errno == errno.EADDRINUSE) from None
+
+
+def _not_free(field: str, endpoint: str, *, in_use: bool) -> InputError:
+    must = "a free address (another rig runs there, or another program)"
+    return InputError(field, must if in_use else "an address of this machine that can be listened on", endpoint)
 
 
 def _locator(host: str, port: int) -> str:
@@ -111,7 +133,7 @@ class _Session:
         self._printed: set[str] = set()
         self.on_trouble: Callable[[str, BaseException], None] = self._print_trouble
         """Told of what fails on a receiving thread, which goes on."""
-        atexit.register(self.close)
+        atexit.register(self._close_at_exit)
 
     def _print_trouble(self, where: str, error: BaseException) -> None:
         if where not in self._printed:  # it may fail with each message
@@ -147,23 +169,27 @@ class _Session:
         self._threads.append(thread)
         thread.start()
 
-    def close(self) -> None:
+    def _close_at_exit(self) -> None:
+        self.close(wait_s=None)
+
+    def close(self, *, wait_s: float | None = 2.0) -> None:
         import zenoh
 
         with self._closing:
             if self._closed:
                 return
             self._closed = True
-        atexit.unregister(self.close)
+        atexit.unregister(self._close_at_exit)
 
         def close() -> None:
             with contextlib.suppress(zenoh.ZError):
                 self.session.close()
 
-        # Takes 10 s and fails where a callback never returns; the link ends with the process then.
-        closing = threading.Thread(target=close, name="zenoh closes", daemon=True)
+        # Takes 10 s and fails where a callback never returns. A daemon would be ended in the middle of it where the
+        # process ends meanwhile, which aborts the process.
+        closing = threading.Thread(target=close, name="zenoh closes")
         closing.start()
-        closing.join(timeout=2.0)
+        closing.join(timeout=wait_s)
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(timeout=1.0)
@@ -204,10 +230,7 @@ class ZenohServer:
         try:
             self._session = _Session(_config(listen__endpoints=[_locator(host, port)], connect__endpoints=[]))
         except zenoh.ZError as error:
-            must = "an address of this machine that can be listened on"
-            if "in use" in str(error):
-                must = "a free address (another rig runs there, or another program)"
-            raise InputError("listen", must, endpoint) from None
+            raise _not_free("listen", endpoint, in_use="in use" in str(error)) from None
         self.endpoint = endpoint
         self._port = port
         self._congestion_control = zenoh.CongestionControl.BLOCK if wait else zenoh.CongestionControl.DROP
@@ -324,6 +347,8 @@ class ZenohServer:
     def close(self) -> None:
         """Send the last replies, and close the session and with it all that was declared."""
         self._replies.put(None)
+        # zenoh waits for some seconds until a stalled link takes the farewell.
+        _hang_up(self._port, {port for port, size in _backlog(self._port).items() if size > _STALLED_BYTES})
         self._session.close()
 
     def __enter__(self) -> ZenohServer:
@@ -357,6 +382,15 @@ def _backlog(port: int) -> dict[int, int]:
                 elif remote == port:
                     found[local] = found.get(local, 0) + unread
     return found
+
+
+def _hang_up(port: int, peers: set[int]) -> None:
+    """End the links of a listening port with some other sides' ports (Linux): what is on its way still arrives."""
+    for file in Path("/proc/self/fd").iterdir() if peers else ():
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(file.name))) as link:
+            ends = link.getsockname(), link.getpeername()
+            if all(isinstance(end, tuple) for end in ends) and ends[0][1] == port and ends[1][1] in peers:
+                link.shutdown(socket.SHUT_RDWR)
 
 
 class _Stream:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from drivers.can import dbc
 from drivers.can.signals import CLASSIC_HZ, FD_HZ, Command, Kind, command_frame, default_messages, parse_command
 from rig.channels import default_table
-from rig.cli.main import app
+from rig.cli.app import app
 
 TABLE = default_messages()
 DATABASE = dbc.database()

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import rig
-from rig.cli.main import app
+from rig.cli.app import app
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("rig", "drivers", "recorder", "replays")

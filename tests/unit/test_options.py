@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import typer
 
-from rig.cli.main import app
+from rig.cli.app import app
 from rig.cli.options import names_of, pairs
 from rig.errors import InputError
 

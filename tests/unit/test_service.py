@@ -302,7 +302,7 @@ def test_a_stream_that_cannot_be_published_is_told_and_ends_neither_the_run_nor_
     summary = Service(FakeSimulation(duration_s=0.5), server, FreeRun(), block_ticks=BLOCK).run()
     line = "publishing rig/sensors/forces failed: OSError: the link is gone"
     assert summary["reason"] == "completed"
-    assert summary["troubled"] is True
+    assert summary["troubles"] == [line]
     assert [event["text"] for event in listener.named("warning")] == [line]
     assert line in listener.statuses[-1]["warnings"]
     assert sum(len(block.values) for block in listener.blocks[wire.sensor_key("probes")]) == 10_000

@@ -1,0 +1,171 @@
+"""Composition of the `rig` command: which subcommands there are, and how errors reach the user."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from rig.cli import (
+    bench,
+    can,
+    can_messages,
+    chart,
+    cut,
+    demo,
+    export,
+    hammer,
+    identify,
+    import_,
+    info,
+    keys,
+    ladder,
+    laws,
+    magnets,
+    note,
+    paper,
+    params,
+    pause,
+    rate,
+    record,
+    recover,
+    release,
+    replay,
+    resume,
+    run,
+    scenes,
+    seek,
+    sessions,
+    simulate,
+    speed,
+    stability,
+    status,
+    step,
+    stop,
+    twins,
+    validate,
+    view,
+)
+from rig.errors import DiskError, InputError, SimulationError
+
+# Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
+_UsageError: Any = typer.BadParameter.__base__
+
+_INTERRUPTED = 130
+"""What typer makes of Ctrl-C, and shells expect."""
+
+app = typer.Typer(
+    name="rig",
+    help="A virtual rotor-stator test rig: simulate, serve, hit, record, view and judge it.",
+    invoke_without_command=True,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+_PANELS: dict[str, dict[str, Any]] = {
+    "Start here": {
+        "demo": demo.demo,
+        "scenes": scenes.scenes,
+        "params": params.params,
+        "laws": laws.laws,
+        "magnets": magnets.magnets,
+        "keys": keys.keys,
+    },
+    "The rig as a service": {
+        "run": run.run,
+        "hammer": hammer.hammer,
+        "speed": speed.speed,
+        "release": release.release,
+        "step": step.step,
+        "note": note.note,
+        "status": status.status,
+        "stop": stop.stop,
+        "twins": twins.twins,
+    },
+    "A recording as the rig": {
+        "replay": replay.replay,
+        "pause": pause.pause,
+        "resume": resume.resume,
+        "seek": seek.seek,
+        "rate": rate.rate,
+    },
+    "Recordings": {
+        "record": record.record,
+        "view": view.view,
+        "info": info.info,
+        "cut": cut.cut,
+        "recover": recover.recover,
+        "import": import_.import_,
+        "export": export.export,
+    },
+    "Recordings against the model": {
+        "validate": validate.validate,
+        "identify": identify.identify,
+        "sessions": sessions.sessions,
+    },
+    "Without a clock": {
+        "simulate": simulate.simulate,
+        "bench": bench.bench,
+        "ladder": ladder.ladder,
+        "chart": chart.chart,
+        "stability": stability.stability,
+        "paper": paper.paper,
+    },
+}
+
+
+@app.callback()
+def _rig(
+    context: typer.Context,
+    *,
+    version: Annotated[bool, typer.Option("--version", is_eager=True, help="Show the version and end.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(f"rig {installed('rotor-stator-rig')}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+for _panel, _commands in _PANELS.items():
+    for _name, _function in _commands.items():
+        # A negative value such as `rig speed -1` is a value, not an option: the rig explains what is wrong with it.
+        _settings = {"ignore_unknown_options": True} if _name in ("speed", "rate", "seek", "step") else {}
+        app.command(_name, rich_help_panel=_panel, context_settings=_settings)(_function)
+
+can.app.command()(can_messages.dbc)
+can.app.command()(can_messages.load)
+app.add_typer(can.app, name="can", rich_help_panel="The rig as a service")
+
+
+def start(arguments: list[str] | None = None) -> None:
+    """Run the command and end the process with its exit status."""
+    try:
+        code = app(args=arguments, standalone_mode=False)
+    except InputError as error:
+        _fail(str(error))
+    except (SimulationError, DiskError) as error:
+        _fail(str(error), status=1)
+    except _UsageError as error:
+        command = error.ctx.command_path if error.ctx is not None else "rig"
+        _fail(f"{error.format_message()} (see `{command} --help`)")
+    except (typer.Abort, KeyboardInterrupt):
+        _fail("interrupted", status=_INTERRUPTED)
+    except BrokenPipeError:
+        # The reader of our output has gone (`rig params | head`): nothing is wrong.
+        sys.stderr.close()
+        sys.exit(141)
+    except OSError as error:
+        # A disk that is full, a file system that refuses: not a fault of the program.
+        _fail(f"{error.filename or 'the system'}: {error.strerror or error}", status=1)
+    if code == _INTERRUPTED:
+        print("rig: interrupted", file=sys.stderr)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str, *, status: int = 2) -> NoReturn:
+    print("rig: " + " ".join(message.split()), file=sys.stderr)
+    sys.exit(status)

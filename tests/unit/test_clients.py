@@ -1,0 +1,158 @@
+"""What clients report: nothing of it is believed unchecked, and nothing of it holds up a run for long."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from rig.transport.clients import _MOST, _SHOWN, Clients
+
+
+class Time:
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def time_() -> Time:
+    return Time()
+
+
+@pytest.fixture
+def clients(time_: Time) -> Clients:
+    return Clients(now_s=time_)
+
+
+def report(clients: Clients, name: str, **document: Any) -> None:
+    clients.take(f"rig/clients/{name}", json.dumps(document).encode())
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b'{"received_index":-1' + b"0" * 400 + b"}",
+        b'{"received_index":1' + b"0" * 400 + b"}",
+        b'{"received_index": Infinity}',
+        b'{"received_index": 1e999}',
+        b'{"received_index": NaN}',
+        b'{"received_index": -1}',
+        b'{"received_index": 4611686018427387904}',
+        b'{"received_index": "100"}',
+        b'{"received_index": 1.0}',
+        b'{"received_index": true}',
+        b'{"received_index": 1, "received_index": 2}',
+        b'{"received_index": 1, "lost": -1}',
+        b'{"received_index": 1, "room": -5}',
+        b'{"received_index": 1, "done": 1}',
+        b'{"received_index": 1, "x": 1}',
+        b'{"received_index": ' + b"[" * 980 + b"]" * 980 + b"}",
+        b'{"received_index": 1, "name": "\\u001b[2J"}',
+        b'{"received_index": 1}' + b" " * 3000,
+        '{"received_index": 1}'.encode("utf-16"),
+        b"{}",
+        b"[]",
+        b"null",
+        b"",
+        b"\xff",
+    ],
+)
+def test_a_report_out_of_bounds_is_counted_and_not_believed(clients: Clients, payload: bytes) -> None:
+    clients.take("rig/clients/x", payload)
+    assert clients.malformed == 1
+    assert clients.rows(1000, 20_000.0) == {}
+
+
+@pytest.mark.parametrize("name", ["", "x" * 101, "a\x1b[2Jb", "a\nb", "\u202eexe"])
+def test_a_name_that_a_terminal_would_act_on_is_no_name(clients: Clients, name: str) -> None:
+    report(clients, name, received_index=1)
+    assert clients.malformed == 1
+    assert clients.present == 0
+
+
+def test_made_up_names_hide_none_that_gets_on(clients: Clients, time_: Time) -> None:
+    made_up = 0
+    for second in range(60):
+        time_.now_s = float(second)
+        report(clients, "recorder", received_index=20_000 * second, lost=0)
+        for _ in range(200):
+            report(clients, f"made up {made_up}", received_index=0)
+            made_up += 1
+        rows = clients.rows(20_000 * second, 20_000.0)
+        assert "recorder" in rows or second < 2
+        assert len(rows) <= _SHOWN
+    assert len(clients._reports) <= _MOST
+    assert clients.hidden > 0
+
+
+def test_a_recorder_that_comes_after_thousands_of_made_up_names_is_shown(clients: Clients, time_: Time) -> None:
+    for number in range(3 * _MOST):
+        report(clients, f"made up {number}", received_index=5)
+    for half_second in range(4):
+        time_.now_s = 0.5 * half_second
+        report(clients, "recorder", received_index=10_000 * half_second)
+    assert "recorder" in clients.rows(30_000, 20_000.0)
+
+
+def test_who_reports_but_gets_nothing_is_not_waited_for_for_ever(clients: Clients, time_: Time) -> None:
+    for second in range(70):
+        time_.now_s = float(second)
+        report(clients, "stuck", received_index=0, room=0)
+        if second in (2, 40):
+            assert clients.behind(1000) == 1000
+            assert clients.crowded(1000, 500)
+    assert clients.behind(1000) == 0
+    assert not clients.crowded(1000, 500)
+    report(clients, "stuck", received_index=10)
+    assert clients.behind(1000) == 990, "it goes on"
+
+
+class Links:
+    """A server of which only the links are looked at."""
+
+    def __init__(self, clients: Clients, time_: Time, **counts: float) -> None:
+        self.clients, self.time_, self.counts = clients, time_, counts
+
+    def congestion(self) -> dict[str, float]:
+        return self.counts
+
+
+def settle_s(
+    monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time, beat: Any = None, **counts: float
+) -> float:
+    """How long the end of a run is held up, in simulated wall time."""
+
+    def sleep(seconds: float) -> None:
+        time_.now_s += seconds
+        if beat is not None:
+            beat()
+
+    monkeypatch.setattr("rig.transport.clients.time.sleep", sleep)
+    monkeypatch.setattr("rig.transport.clients.time.monotonic", time_)
+    begin = time_.now_s
+    clients.settle(Links(clients, time_, **counts), 1000, patience_s=10.0)  # pyright: ignore[reportArgumentType]
+    return time_.now_s - begin
+
+
+def test_the_end_waits_for_a_recorder_that_gets_on_and_not_for_one_that_is_stuck(
+    monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time
+) -> None:
+    has = iter(range(0, 10_000, 20))
+    held = settle_s(monkeypatch, clients, time_, lambda: report(clients, "r", received_index=next(has)), links=1)
+    assert 5.0 < held < 7.0
+    clients = Clients(now_s=time_)
+    held = settle_s(monkeypatch, clients, time_, lambda: report(clients, "r", received_index=0), links=1)
+    assert 3.0 < held < 5.0
+
+
+def test_the_end_waits_for_a_recorder_that_is_stopped_but_hardly_for_a_slow_stranger(
+    monkeypatch: pytest.MonkeyPatch, clients: Clients, time_: Time
+) -> None:
+    assert settle_s(monkeypatch, clients, time_, links=1, stalled_links=1) < 1.5
+    report(clients, "stopped", received_index=10)
+    assert settle_s(monkeypatch, clients, time_, links=1, stalled_links=1) > 9.5
+    assert settle_s(monkeypatch, clients, time_, links=0) == 0.0
