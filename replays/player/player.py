@@ -322,6 +322,7 @@ class Player:
             "blocks": self._outlet.blocks,
             "rows": self._outlet.rows,
             "left_out": self._outlet.left_out,
+            "troubles": self._desk.troubles,
         }
 
     def _play(self) -> str:
@@ -375,7 +376,10 @@ class Player:
         if not self._clock.release(instant_ns):
             return
         for item in batch:
-            self._outlet.send(item)
+            try:
+                self._outlet.send(item)
+            except Exception as error:
+                self._desk.trouble(f"publishing {item.key}", error)
         self._head = None
         self._playhead.play_ns = instant_ns
         self._position_ns = max(self._position_ns, *(item.position_ns for item in batch))

@@ -81,6 +81,14 @@ def _line(status: dict[str, Any], words: Line) -> str:
     return "  ".join(parts)
 
 
+def end_with(troubles: list[str]) -> None:
+    """Exit status 1 where something failed that did not end the run, told in a line each."""
+    for text in troubles:
+        typer.echo(f"rig: {text}", err=True)
+    if troubles:
+        raise typer.Exit(1)
+
+
 def lateness(status: dict[str, Any]) -> str:
     """How late it was so far, in a few words."""
     late = status["lateness_ms"]

@@ -19,7 +19,7 @@ from rig.cli.can_output import (
     CanSocketcand,
     can_output,
 )
-from rig.cli.display import all_lateness, lateness, showing, stopping_on_signals
+from rig.cli.display import all_lateness, end_with, lateness, showing, stopping_on_signals
 from rig.cli.options import Channels, Expose, FromS, Listen, RecordingFiles, ToS, names_of, pairs
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
@@ -187,6 +187,7 @@ def replay(
     _tell(summary)
     if bus is not None:
         typer.echo(bus.summary())
+    end_with(summary["troubles"])
 
 
 def _clients(count: int) -> str:

@@ -19,7 +19,7 @@ from rig.cli.can_output import (
     CanSocketcand,
     can_output,
 )
-from rig.cli.display import all_lateness, lateness, showing, stopping_on_signals
+from rig.cli.display import all_lateness, end_with, lateness, showing, stopping_on_signals
 from rig.cli.options import Changes, DurationS, Engine, Expose, Listen, Parameters, SceneName, Seed, pairs
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
@@ -111,8 +111,7 @@ def run(
     _print_summary(summary)
     if bus is not None:
         typer.echo(bus.summary())
-    if summary["troubles"]:
-        raise typer.Exit(1)
+    end_with(summary["troubles"])
 
 
 def scene_overrides(
@@ -174,5 +173,3 @@ def _print_summary(summary: dict[str, Any]) -> None:
         f"{summary['samples_published']} samples a channel published, blocks dropped {queue['dropped']},"
         f" commands taken {summary['commands']}"
     )
-    for text in summary["troubles"]:
-        typer.echo(f"rig: {text}", err=True)

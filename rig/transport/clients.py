@@ -102,7 +102,7 @@ class Clients:
             self._reports[name] = _Heard(report.received_index, report.lost, now_s, report.room, moved_s, moves)
 
     def _make_room(self, now_s: float) -> None:
-        """For other names: forget those that are long silent, or where none is, a quarter, of those that did not get on."""
+        """For other names: forget those long silent, or where none is, a quarter, of those that did not get on."""
         if len(self._reports) < _MOST and now_s - self._swept_s < _FORGOTTEN_S:
             return
         self._swept_s = now_s
