@@ -23,10 +23,11 @@ _DOCUMENTS = {
     ),
     wire.CATALOGUE: "on request: the channel table with calibration, truth tables with units",
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",
-    wire.SCENE: "on request: the scene as it runs, with its seed, and as `taken` the commands sent to it so far",
+    wire.SCENE: "on request: the scene as it runs, with its seed, and as `taken` the commands sent to it so far "
+    "(the newest 500 kB; `forgotten` counts those before)",
     f"{wire.CLIENTS}/NAME": "sent by clients twice a second, and with `done` when they leave; shown in the status: "
     "how far they have come, null where nothing came yet; `room`: rows that one can hold, which a replay in a burst "
-    "does not exceed",
+    "does not exceed. The status shows 64, first those that get on; who gets on no more is not waited for",
 }
 _OTHER_COMMANDS = {
     "stop": "no fields; ends the run",
@@ -116,8 +117,10 @@ def page() -> str:
         "",
         "Requests are JSON objects on their key; "
         'the reply is `{"accepted": true, "id", "command", "tick", "time_s"}` with the simulated time at which the '
-        'command takes effect, or `{"accepted": false, "error"}` with the limit in the text. '
-        "`from` may name the sender.",
+        'command takes effect, or `{"accepted": false, "error"}` with the limit in the text, where one field is wrong also in `field` and '
+        "`must`. `from` may name the sender. "
+        "Requests, and what clients report, are UTF-8 of at most 10 000 bytes, with the fields named here and no "
+        "others, each once, numbers as finite numbers; a command that is not in this table is refused as well.",
         "",
         "| key | fields |",
         "|---|---|",

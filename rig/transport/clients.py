@@ -15,7 +15,6 @@ _SHOWN = 64
 """Clients in the status."""
 _MOST = 4096
 """Names that are remembered: so many made-up ones cannot crowd out those that get on."""
-_REPORT_BYTES = 2000
 _FORGOTTEN_S = 600.0
 _GONE_S = 3.0
 """A client that did not report for this long is not waited for; others report twice a second."""
@@ -83,7 +82,7 @@ class Clients:
         """Take a report; on a thread of the transport."""
         try:
             name = Sender(name=key.rpartition("/")[2]).name
-            report = check(Report, payload, field="report", most_bytes=_REPORT_BYTES)
+            report = check(Report, payload, field="report")
         except ValueError:
             self.malformed += 1
             return

@@ -52,7 +52,7 @@ def report(clients: Clients, name: str, **document: Any) -> None:
         b'{"received_index": 1, "x": 1}',
         b'{"received_index": ' + b"[" * 980 + b"]" * 980 + b"}",
         b'{"received_index": 1, "name": "\\u001b[2J"}',
-        b'{"received_index": 1}' + b" " * 3000,
+        b'{"received_index": 1}' + b" " * 10_000,
         '{"received_index": 1}'.encode("utf-16"),
         b"{}",
         b"[]",
