@@ -234,15 +234,11 @@ def _word(message: Message) -> int:
 
 def _shape(message: Message) -> frames.Frame:
     """A frame like those of the message, whatever their data."""
-    return frames.check(
-        frames.Frame(
-            message.identifier,
-            bytes(message.length),
-            extended=message.extended,
-            fd=message.fd,
-            brs=message.brs,
-        )
+    shape = frames.Frame(
+        message.identifier, bytes(message.length), extended=message.extended, fd=message.fd, brs=message.brs
     )
+    frames.record_of(shape)
+    return shape
 
 
 def _transmission_ps(message: Message, timing: Speed) -> int:
@@ -264,7 +260,7 @@ def _worst_bits(shape: frames.Frame) -> tuple[int, int]:
         return g + 8 * n + 13 + (g + 8 * n - 1) // 4, 0
     from drivers.can import kernels
 
-    record = np.frombuffer(frames.pack(shape), frames.RECORD)[0]
+    record = frames.records([shape])[0]
     raw = np.zeros(kernels.LONGEST, np.uint8)
     count, switch = kernels.header_and_data(
         int(record["identifier"]), int(record["length"]), int(record["flags"]), record["data"], raw

@@ -304,7 +304,8 @@ class BusModel:
         if frame.fd and not self.speed.fd:
             raise InputError("frame", f"classic on a bus of {self.speed}", frame)
         time_ns = self.now_ns if at_ns is None else max(at_ns, self._start_ns)
-        self._offers += frames.pack(frame, node=node, time_ns=time_ns, one_shot=one_shot)
+        record = frames.record_of(frame, node=node, time_ns=time_ns)
+        self.take(frames.pack(record._replace(flags=record.flags | frames.ONE_SHOT) if one_shot else record))
 
     def offer_records(self, offers: np.ndarray) -> None:
         """`offer` for many frames.
@@ -312,20 +313,21 @@ class BusModel:
         Args:
             offers: Array of `drivers.can.frame.RECORD`, best in the order of its times; `node` by whom, `time_ns` when.
         """
-        offers = frames.check_records(offers)
-        if not len(offers):
-            return
-        bus = self._bus
-        nodes = offers["node"]
-        highest = int(nodes.max())
-        if highest >= len(self._names):
-            raise InputError("node", "the number of a node of this bus", highest)
-        allowed = (bus.nodes[:, kernels.ATTACHED] != 0) & (bus.nodes[:, kernels.LISTENING] == 0)
-        if not allowed[nodes].all():
-            raise InputError("node", "attached and not listen only", int(nodes[~allowed[nodes]][0]))
         if not self.speed.fd and (offers["flags"] & frames.FD).any():
             raise InputError("frame", f"classic on a bus of {self.speed}", "a CAN FD frame")
-        self._offers += offers.tobytes()
+        offers = frames.check_records(offers)
+        nodes = offers["node"]
+        highest = int(nodes.max()) if len(nodes) else -1
+        if highest >= len(self._names):
+            raise InputError("node", "the number of a node of this bus", highest)
+        allowed = (self._bus.nodes[:, kernels.ATTACHED] != 0) & (self._bus.nodes[:, kernels.LISTENING] == 0)
+        if not allowed[nodes].all():
+            raise InputError("node", "attached and not listen only", int(nodes[~allowed[nodes]][0]))
+        self.take(offers.tobytes())
+
+    def take(self, offers: bytes) -> None:
+        """`offer` for frames of which it is known that their node can send them: records as bytes."""
+        self._offers += offers
 
     def advance(self, until_ns: int) -> list[Delivery]:
         """Let time pass.
@@ -408,7 +410,7 @@ class BusModel:
             row[kernels.QUIET] = max(self.now_ns, int(self._bus.cells[kernels.FREE]))
 
     def node(self, node: int) -> NodeState:
-        """A node's counters."""
+        """A node's counters, also when it has gone."""
         row = self._row(node, gone=True)
         return NodeState(
             state=STATES[row[kernels.STATE]],
@@ -446,7 +448,7 @@ class BusModel:
         table = self._bus.latencies
         result: dict[tuple[int, bool], Latency] = {}
         for word, count, total, worst in table[table[:, kernels.LATENCY_COUNT] > 0].tolist():
-            key = (word & 0x1FFFFFFF, word & frames.EXTENDED != 0)
+            key = (word & frames.EXTENDED_MASK, word & frames.EXTENDED != 0)
             if key in result:  # A remote frame beside a data frame with the same identifier.
                 other = result[key]
                 total += round(other.mean_s * other.count * 1e9)

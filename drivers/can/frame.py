@@ -1,4 +1,4 @@
-"""One frame, and how many bits it has on the bus.
+"""One frame: its record, whether a controller can send it, and how many bits it has on the bus.
 
 Bits follow ISO 11898-1:2015, 10.4 and 10.5: classic and CAN FD (ISO, with the stuff count), base and extended format,
 stuffing by the frame's own content. The compiled part is loaded at the first count, so that a client that only sends
@@ -8,41 +8,114 @@ and receives does not wait for it.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rig.errors import InputError
 
+# Flags in the identifier's word, as SocketCAN has them.
 EXTENDED = 1 << 31
 REMOTE = 1 << 30
+ERROR = 1 << 29
+STANDARD_MASK = (1 << 11) - 1
+EXTENDED_MASK = (1 << 29) - 1
+# Flags in the byte of flags; ONE_SHOT is the bus model's own.
 FD = 1
 BRS = 2
 ESI = 4
 ONE_SHOT = 16
 
+CLASSIC_WIDTH = 8
+FD_WIDTH = 64
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 """Bytes of data of each data length code in a CAN FD frame (ISO 11898-1:2015, table 5)."""
 
 INTERMISSION = 3
 """Recessive bits after each frame, counted with it."""
 
-RECORD = np.dtype(
-    [
-        ("time_ns", "<u8"),
-        ("identifier", "<u4"),
-        ("length", "u1"),
-        ("flags", "u1"),
-        ("node", "<u2"),
-        ("data", "u1", (64,)),
-    ]
-)
-"""A frame in an array: `identifier` with EXTENDED and REMOTE as SocketCAN has them, `length` [bytes], `flags` FD, BRS,
-ESI, ONE_SHOT added up, `time_ns` and `node` when and by which node it is offered; data beyond the length are zero."""
 
-_PACKING = struct.Struct("<QIBBH64s")
-_FD_LENGTHS = frozenset(FD_LENGTHS)
+def _layout(data: Any) -> np.dtype:
+    head = [("time_ns", "<u8"), ("identifier", "<u4"), ("length", "u1"), ("flags", "u1"), ("node", "<u2")]
+    return np.dtype([*head, ("data", *data)])
+
+
+WIDTHS = (CLASSIC_WIDTH, FD_WIDTH)
+RECORDS = {width: _layout((f"V{width}",)) for width in WIDTHS}
+"""A frame in an array, by width of its data field: `time_ns` when [ns]; `identifier` with EXTENDED, REMOTE, ERROR;
+`length` of the data, or the one asked for [bytes]; `flags` FD, BRS, ESI added up; `node` by which node; data beyond the
+length are zero."""
+OCTETS = {width: _layout(("u1", (width,))) for width in WIDTHS}
+"""The same with single bytes of data."""
+RECORD = OCTETS[FD_WIDTH]
+"""The layout that the bus model and compiled code take."""
+PACKINGS = {width: struct.Struct(f"<QIBBH{width}s") for width in WIDTHS}
+
+_IS_NO_FD_LENGTH = np.isin(np.arange(256), FD_LENGTHS, invert=True)
+
+
+class Record(NamedTuple):
+    """One frame as its record; the fields are those of `RECORDS`, the data without its padding."""
+
+    time_ns: int
+    identifier: int
+    length: int
+    flags: int
+    node: int
+    data: bytes
+
+
+def _faults(word: Any, length: Any, flags: Any, room: Any, *, fd: bool) -> Iterator[tuple[Any, str]]:
+    """What keeps a controller from sending frames: where it is so, and how to say it. Numbers or arrays alike."""
+    base, data, is_fd, classic = word & EXTENDED == 0, word & REMOTE == 0, flags & FD != 0, flags & FD == 0
+    yield word & ERROR != 0, "an error frame: controllers send those by themselves"
+    yield data & (length > room), "{length} bytes of data in a field of {room}"
+    yield (
+        base & (word & EXTENDED_MASK > STANDARD_MASK),
+        "identifier {number:#x} has more than 11 bits, and the frame is not extended",
+    )
+    yield flags & (0xFF ^ FD ^ BRS ^ ESI) != 0, "unknown flags {flags:#x}"
+    if not fd:
+        yield is_fd, "a CAN FD frame, on a bus for classic CAN"
+    yield is_fd & (word & REMOTE != 0), "a remote frame, which CAN FD does not have"
+    yield is_fd & _IS_NO_FD_LENGTH[length], "{length} bytes, which is no length of a CAN FD frame"
+    yield (
+        classic & (flags & (BRS | ESI) != 0),
+        "a bit rate switch or error state indicator, which classic CAN does not have",
+    )
+    yield classic & (length > CLASSIC_WIDTH), "{length} bytes in a classic frame"
+
+
+def fault_of(record: Record, *, fd: bool = True) -> str | None:
+    """Why no controller could send such a frame; None if one could.
+
+    Args:
+        record: A frame that somebody wants to send.
+        fd: Whether the bus takes CAN FD frames.
+    """
+    word, length, flags, room = record.identifier, record.length, record.flags, len(record.data)
+    if not 0 <= word < 1 << 32 or not 0 <= length < 256:
+        return f"identifier {word:#x} or length {length}, for which a frame has no room"
+    for wrong, text in _faults(word, length, flags, room, fd=fd):
+        if wrong:
+            return text.format(length=length, room=room, flags=flags, number=word & EXTENDED_MASK)
+    return None
+
+
+def sendable(records: np.ndarray, *, fd: bool = True) -> np.ndarray:
+    """Of which frames `fault_of` finds no fault, shape of `records`.
+
+    Args:
+        records: Array of one of the `RECORDS` layouts.
+        fd: Whether the bus takes CAN FD frames.
+    """
+    wrong = np.zeros(len(records), bool)
+    for found, _ in _faults(
+        records["identifier"], records["length"], records["flags"], records.dtype["data"].itemsize, fd=fd
+    ):
+        wrong |= found
+    return ~wrong
 
 
 class Frame(NamedTuple):
@@ -100,56 +173,46 @@ def pad(data: bytes, *, fill: int = 0) -> bytes:
     raise InputError("data", "at most 64 bytes long", len(data))
 
 
-def check(frame: Frame) -> Frame:
-    """The same frame, if a controller can send it; else an InputError that says why not."""
-    bits = 29 if frame.extended else 11
-    if not 0 <= frame.identifier < 1 << bits:
-        raise InputError("identifier", f"a number of {bits} bits", frame.identifier)
-    if frame.fd:
-        if frame.remote:
-            raise InputError("remote", "false in CAN FD, which has no remote frames", True)
-        if len(frame.data) not in _FD_LENGTHS:
-            raise InputError("data", f"of a CAN FD length ({', '.join(map(str, FD_LENGTHS))} bytes)", len(frame.data))
-        return frame
-    if len(frame.data) > 8:
-        raise InputError("data", "at most 8 bytes long in a classic frame", len(frame.data))
-    if frame.brs or frame.esi:
-        raise InputError("brs" if frame.brs else "esi", "false in a classic frame", True)
-    return frame
-
-
-def pack(frame: Frame, *, node: int = 0, time_ns: int = 0, one_shot: bool = False) -> bytes:
-    """A frame as the bytes of one record.
+def record_of(frame: Frame, *, node: int = 0, time_ns: int = 0) -> Record:
+    """A frame as its record.
 
     Args:
-        frame: The frame; it is checked.
+        frame: The frame.
         node: Number of the node that offers it.
         time_ns: When [ns].
-        one_shot: Whether it is given up after one attempt.
+
+    Raises:
+        InputError: No controller can send it; it says why.
     """
-    check(frame)
-    word = frame.identifier | (EXTENDED if frame.extended else 0) | (REMOTE if frame.remote else 0)
-    flags = (FD if frame.fd else 0) | (BRS if frame.brs else 0) | (ESI if frame.esi else 0)
-    if one_shot:
-        flags |= ONE_SHOT
-    return _PACKING.pack(time_ns, word, len(frame.data), flags, node, b"" if frame.remote else frame.data)
+    # An identifier that would run into the flags has to stay wrong.
+    fits = 0 <= frame.identifier <= EXTENDED_MASK
+    word = frame.identifier | EXTENDED * frame.extended | REMOTE * frame.remote if fits else -1
+    flags = FD * frame.fd | BRS * frame.brs | ESI * frame.esi
+    record = Record(time_ns, word, len(frame.data), flags, node, frame.data)
+    if (fault := fault_of(record)) is not None:
+        raise InputError("frame", "one that a controller can send", fault if fits else frame.identifier)
+    return record._replace(data=b"") if frame.remote else record
+
+
+def pack(record: Record, width: int = FD_WIDTH) -> bytes:
+    """A record as bytes."""
+    return PACKINGS[width].pack(*record)
 
 
 def records(frames: Iterable[Frame]) -> np.ndarray:
     """Frames as an array of `RECORD`, shape (frames,)."""
-    return np.frombuffer(bytearray(b"".join([pack(frame) for frame in frames])), RECORD)
+    return np.frombuffer(bytearray(b"".join([pack(record_of(frame)) for frame in frames])), RECORD)
 
 
 def frames(array: np.ndarray) -> list[Frame]:
     """The frames of an array of `RECORD`."""
-    return [unpack(*fields) for fields in _PACKING.iter_unpack(np.ascontiguousarray(array).tobytes())]
+    return [_unpack(*fields) for fields in PACKINGS[FD_WIDTH].iter_unpack(np.ascontiguousarray(array).tobytes())]
 
 
-def unpack(time_ns: int, word: int, length: int, flags: int, node: int, data: bytes) -> Frame:
-    """The frame in the fields of one record."""
+def _unpack(_: int, word: int, length: int, flags: int, __: int, data: bytes) -> Frame:
     extended = word & EXTENDED != 0
     return Frame(
-        word & (0x1FFFFFFF if extended else 0x7FF),
+        word & (EXTENDED_MASK if extended else STANDARD_MASK),
         data[:length],
         extended,
         word & REMOTE != 0,
@@ -159,33 +222,37 @@ def unpack(time_ns: int, word: int, length: int, flags: int, node: int, data: by
     )
 
 
-def check_records(array: np.ndarray) -> np.ndarray:
+def check_records(array: np.ndarray, *, fd: bool = True) -> np.ndarray:
     """The same array, if a controller can send all its frames; else an InputError that names the first bad one."""
-    if array.dtype != RECORD:
-        if array.dtype.itemsize != RECORD.itemsize or array.dtype.names != RECORD.names:
-            raise InputError("frames", "an array of drivers.can.frame.RECORD", array.dtype)
-        array = np.ascontiguousarray(array).view(RECORD)
-    word, length, flags = array["identifier"], array["length"], array["flags"]
-    fd = flags & FD != 0
-    extended = word & EXTENDED != 0
-    remote = word & REMOTE != 0
-    number = word & 0x1FFFFFFF
-    fault = np.where(fd, remote | ~_IS_FD_LENGTH[length], (length > 8) | (flags & (BRS | ESI) != 0))
-    fault |= ~extended & (number > 0x7FF)
-    if fault.any():
-        check(frames(array[fault][:1])[0])
-        raise InputError("frames", "frames that a controller can send", array[fault][0])
+    if array.dtype.itemsize != RECORD.itemsize or array.dtype.names != RECORD.names:
+        raise InputError("frames", "an array of drivers.can.frame.RECORD", array.dtype)
+    array = np.ascontiguousarray(array).view(RECORD)
+    if not (good := sendable(array, fd=fd)).all():
+        (bad,) = PACKINGS[FD_WIDTH].iter_unpack(array[~good][:1].tobytes())
+        raise InputError("frames", "frames that a controller can send", fault_of(Record(*bad), fd=fd))
     return array
 
 
-_IS_FD_LENGTH = np.isin(np.arange(256), FD_LENGTHS)
+def octets(array: np.ndarray) -> np.ndarray:
+    """The data fields of an array of a `RECORDS` layout as bytes, shape (frames, width); a view."""
+    return array.view(OCTETS[array.dtype["data"].itemsize])["data"]
+
+
+def resized(array: np.ndarray, width: int = FD_WIDTH) -> np.ndarray:
+    """A copy of frames in the layout of another width: zeros behind their data, or what is beyond it left out."""
+    found = np.zeros(len(array), RECORDS[width])
+    for name in ("time_ns", "identifier", "length", "flags", "node"):
+        found[name] = array[name]
+    narrowest = min(width, array.dtype["data"].itemsize)
+    octets(found)[:, :narrowest] = octets(array)[:, :narrowest]
+    return found
 
 
 def encode(frame: Frame) -> Encoded:
     """All bits of a frame on the bus."""
     from drivers.can import kernels
 
-    record = np.frombuffer(pack(frame), RECORD)[0]
+    record = records([frame])[0]
     bits = np.zeros(kernels.LONGEST, np.uint8)
     kinds = np.zeros(kernels.LONGEST, np.uint8)
     count, crc = kernels.encode(
@@ -203,7 +270,7 @@ def encode(frame: Frame) -> Encoded:
 
 def frame_bits(frame: Frame) -> tuple[int, int]:
     """Bits of a frame on the bus, with stuffing and intermission: at the nominal rate, and at the data rate."""
-    nominal, fast = bits_of(np.frombuffer(pack(frame), RECORD))
+    nominal, fast = bits_of(records([frame]))
     return int(nominal[0]), int(fast[0])
 
 

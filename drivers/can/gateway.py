@@ -725,7 +725,7 @@ def _records(message: Message, data: np.ndarray) -> np.ndarray:
     records = np.zeros(len(data), _RECORD)
     records["identifier"] = message.identifier
     records["length"] = message.length
-    records["flags"] = medium.FD | medium.BIT_RATE_SWITCH if message.fd else 0
+    records["flags"] = medium.FD | medium.BRS if message.fd else 0
     start = _RECORD.itemsize - medium.FD_WIDTH
     records.view(np.uint8).reshape(len(data), -1)[:, start : start + message.length] = data
     return records
@@ -740,7 +740,7 @@ def _messages(records: np.ndarray) -> list[can.Message]:
             is_extended_id=False,
             data=data[:length],
             is_fd=bool(flags & medium.FD),
-            bitrate_switch=bool(flags & medium.BIT_RATE_SWITCH),
+            bitrate_switch=bool(flags & medium.BRS),
         )
         for _, identifier, length, flags, _, data in records.tolist()
     ]

@@ -3,26 +3,34 @@
 Endpoints offer frames at any time; the model decides which is on the wire when. A frame is handed to all endpoints
 when the model says that its last bit has passed, at once where the bus is idle afterwards, else together with others
 once a tick. An endpoint that is slow or dead loses messages of its own and holds up nobody.
+
+A name belongs to whoever has joined under it for as long as it is there: only with the secret of that join does anybody
+offer, set, flush or join again. What goes over the network does so in clear, so this keeps apart those who cannot
+read each other's messages, which access control sees to.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import json
+import secrets
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from drivers.can import medium
 from drivers.can.bus import OUTCOMES, STATES, BusModel, warm_up
-from drivers.can.frame import RECORD, Frame
+from drivers.can.frame import CLASSIC_WIDTH, FD_WIDTH, Record, fault_of, pack, resized, sendable
+from rig import wire
 from rig.errors import InputError
+from rig.outside import check
+from rig.text import printable
 
 if TYPE_CHECKING:
     from rig.transport.zenoh import ZenohServer
@@ -30,6 +38,9 @@ if TYPE_CHECKING:
 WINDOW = 512
 """Frames that one endpoint may have waiting; what it offers beyond is dropped and counted."""
 MAX_ENDPOINTS = 64
+"""Of other processes; those of this one always get in."""
+MAX_TOKENLESS = 16
+"""Those of them that have shown no token; the oldest makes room for the next."""
 
 _TICK_NS = 1_000_000
 """How long frames of a busy bus wait for others to travel with."""
@@ -48,7 +59,12 @@ _PARTING_S = 1.0
 """How long frames of an endpoint that has gone may wait for the bus."""
 _TOKENLESS_S = 10.0
 """How long an endpoint may be without a token; it comes before the request to join, but on another way."""
-_LARGEST = 8 + medium.MAX_RECORDS * medium.RECORDS[medium.FD_WIDTH].itemsize
+_MOST_TOKENS = 16 * MAX_ENDPOINTS
+_LARGEST = 8 + medium.MAX_RECORDS * medium.RECORDS[FD_WIDTH].itemsize
+_FAILED_S = 0.05
+"""How long the bus rests where its model has failed."""
+_CONTENDED_S = 10.0
+"""How long the status warns of what was tried under others' names."""
 _FEW = 8
 """Frames that are offered one by one; arrays would cost more than they save."""
 
@@ -73,6 +89,7 @@ class _Endpoint:
     listen_only: bool
     token: bool
     """Whether its token has been seen, or it needs none."""
+    secret: str
     offered: int = 0
     done: int = 0
     dropped: int = 0
@@ -81,6 +98,15 @@ class _Endpoint:
     reported: medium.Report | None = None
     bus_offs: int = 0
     """How often it had been bus-off when last reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Local:
+    """An endpoint of this process."""
+
+    take: Callable[[bytes], None]
+    lost: Callable[[], None]
+    secret: str
 
 
 class Hub:
@@ -122,8 +148,12 @@ class Hub:
         self._by_node: dict[int, _Endpoint] = {}
         self._numbers = np.full(256, medium.NO_NODE, np.uint16)
         """Number on the medium by number in the model."""
-        self._locals: dict[str, tuple[Callable[[bytes], None], Callable[[], None]]] = {}
-        self._tokens: set[str] = set()
+        self._locals: dict[str, _Local] = {}
+        self._tokens: dict[str, None] = {}
+        """The newest last."""
+        self._failure = ""
+        """What went wrong in here last."""
+        self._contended_s = -_CONTENDED_S
         self._outbox: list[np.ndarray] = []
         self._waiting = 0
         """Frames that the model is not done with."""
@@ -146,10 +176,10 @@ class Hub:
         """Take endpoints, and let the bus run on a thread of its own."""
         warm_up()
         if self._server is not None:
-            for name in ("join", "set", "flush", "status"):
-                self._server.answer(medium.request_key(self.channel, name), self._answerer(name))
-            self._server.watch(medium.node_key(self.channel, "*"), self._watch)
-            self._server.hear(medium.offer_key(self.channel, "*"), self._hear)
+            for name in medium.REQUESTS:
+                self._server.answer(medium.request_key(self.channel, name), partial(self._reply, name))
+            self._server.watch(medium.node_key(self.channel, "*"), partial(self._safely, self._watch))
+            self._server.hear(medium.offer_key(self.channel, "*"), partial(self._safely, self._hear))
         self._thread.start()
         if self._server is not None:
             self._server.announce(medium.alive_key(self.channel))
@@ -164,8 +194,8 @@ class Hub:
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join(timeout=2.0)
-        for _, lost in locals_:
-            lost()
+        for local in locals_:
+            self._safely(local.lost)
 
     def __enter__(self) -> Hub:
         self.start()
@@ -176,16 +206,21 @@ class Hub:
 
     # Endpoints.
 
-    def connect(self, name: str, take: Callable[[bytes], None], lost: Callable[[], None]) -> None:
+    def connect(self, name: str, take: Callable[[bytes], None], lost: Callable[[], None]) -> str:
         """Make an endpoint of this process known, before it joins.
 
         Args:
             name: Its name.
             take: Called with each message of the bus, on the hub's thread; must return at once.
             lost: Called when the hub ends.
+
+        Returns:
+            Its secret.
         """
+        secret = _new_secret()
         with self._lock:
-            self._locals[name] = (take, lost)
+            self._locals[name] = _Local(take, lost, secret)
+        return secret
 
     def disconnect(self, name: str) -> None:
         """Forget an endpoint of this process; what it has offered is still sent."""
@@ -194,40 +229,39 @@ class Hub:
             self._leave(name)
 
     def offer(self, name: str, payload: bytes) -> None:
-        """Take a message of frames from an endpoint."""
+        """Take a message of frames from an endpoint: its secret, then the message."""
         with self._lock:
             endpoint = self._endpoints.get(name)
             if endpoint is None or endpoint.left_s is not None:
                 self._counts["strange"] += 1
                 return
+            if not _same(endpoint.secret, payload[: medium.SECRET_BYTES].hex()):
+                self._contend()
+                return
             try:
-                if len(payload) > _LARGEST:
+                if len(payload) > medium.SECRET_BYTES + _LARGEST:
                     raise medium.MediumError("too long")
-                self._offer(endpoint, payload)
+                self._offer(endpoint, payload[medium.SECRET_BYTES :])
             except medium.MediumError:
                 self._counts["malformed"] += 1
         self._wake.set()
 
     def _offer(self, endpoint: _Endpoint, payload: bytes) -> None:
         records = medium.decode_array(payload)
-        endpoint.offered += len(records)
-        fd = self._model.speed.fd
-        room = 0 if endpoint.listen_only else WINDOW - (endpoint.offered - len(records) - endpoint.done)
-        fit = len(records) if len(records) > _FEW else 0
-        if fit:
-            good = medium.sendable(records, fd=fd)
-            invalid = fit - int(np.count_nonzero(good))
-            taken = _for_model(records[good][: max(room, 0)], endpoint.node, self._now())
-            self._model.offer_records(taken)
-            count = len(taken)
+        fd, node, now = self._model.speed.fd, endpoint.node, self._now()
+        room = 0 if endpoint.listen_only else max(0, WINDOW - (endpoint.offered - endpoint.done))
+        if len(records) > _FEW:
+            good = records[sendable(records, fd=fd)]
+            invalid, count = len(records) - len(good), min(room, len(good))
+            taken = resized(good[:count])
+            taken["node"], taken["time_ns"] = node, now
+            self._model.take(taken.tobytes())
         else:
-            invalid = count = 0
-            for record in medium.decode(payload):
-                if medium.fault_of(record, fd=fd) is not None:
-                    invalid += 1
-                elif count < room:
-                    self._model.offer(endpoint.node, _frame_of(record), self._now())
-                    count += 1
+            rows = [row for row in medium.decode(payload) if fault_of(row, fd=fd) is None]
+            invalid, count = len(records) - len(rows), min(room, len(rows))
+            for row in rows[:count]:
+                self._model.take(pack(row._replace(node=node, time_ns=now)))
+        endpoint.offered += len(records)
         self._waiting += count
         if count < len(records):
             self._counts["invalid"] += invalid
@@ -236,31 +270,29 @@ class Hub:
             endpoint.dropped += len(records) - count
             self._report_due = True
 
-    def answer(self, name: str, document: dict[str, Any]) -> dict[str, Any]:
+    def answer(self, name: str, document: dict[str, Any] | bytes) -> dict[str, Any]:
         """Answer a request: `join`, `set`, `flush`, `status`.
 
         Args:
             name: Which.
-            document: Its arguments; `endpoint` is the name of the asking endpoint.
+            document: Its arguments, as in `drivers.can.medium`, or what came.
 
-        Returns:
-            The answer, or a document with the one entry `error`.
+        Raises:
+            InputError: It is none, or not from the endpoint that it names.
         """
-        if name == "status":
+        request = check(medium.REQUESTS[name], document, field=name)
+        if isinstance(request, medium.Joining):
+            with self._lock:
+                return self._join(request)
+        if not isinstance(request, medium.Flushing):
             return self.status()
-        asker = document.get("endpoint")
-        if not isinstance(asker, str) or not medium.is_name(asker):
-            return {"error": "a request names its endpoint"}
         with self._lock:
-            if name == "join":
-                return self._join(asker, listen_only=document.get("listen_only") is True)
-            endpoint = self._endpoints.get(asker)
+            endpoint = self._endpoints.get(request.endpoint)
             if endpoint is None:
-                return {"error": f"no endpoint {asker} has joined"}
-            if name == "set":
-                endpoint.listen_only = document.get("listen_only") is True
-            elif name != "flush":
-                return {"error": f"no request {name}"}
+                raise InputError("endpoint", "one that has joined", request.endpoint)
+            self._check_owner(endpoint.name, endpoint.secret, request.secret)
+            if isinstance(request, medium.Setting):
+                endpoint.listen_only = request.listen_only
             # Both restart the controller, as real ones must be for the one and mostly are for the other.
             self._detach(endpoint)
             self._attach(endpoint)
@@ -268,40 +300,58 @@ class Hub:
         self._wake.set()
         return {}
 
-    def _answerer(self, name: str) -> Callable[[bytes], bytes]:
-        def answer(payload: bytes) -> bytes:
-            document: Any = None
-            if len(payload) <= 4096:
-                with contextlib.suppress(ValueError, RecursionError):
-                    document = json.loads(payload or b"{}")
-            if not isinstance(document, dict):
-                with self._lock:
-                    self._counts["malformed"] += 1
-                return b'{"error": "a request is a JSON object"}'
-            return json.dumps(self.answer(name, document)).encode()
+    def _reply(self, name: str, payload: bytes) -> bytes:
+        try:
+            return wire.encode_document(self.answer(name, payload or b"{}"))
+        except InputError as error:
+            with self._lock:
+                self._counts["refused"] += 1
+            return wire.encode_document({"error": str(error), "field": error.field, "must": error.must})
 
-        return answer
-
-    def _join(self, name: str, *, listen_only: bool) -> dict[str, Any]:
-        if (known := self._endpoints.get(name)) is not None:
+    def _join(self, request: medium.Joining) -> dict[str, Any]:
+        name = request.endpoint
+        local, known = self._locals.get(name), self._endpoints.get(name)
+        if local is not None:
+            self._check_owner(name, local.secret, request.secret)
+        elif known is not None and known.left_s is None:
+            self._check_owner(name, known.secret, request.secret)
+        if known is not None:
             self._remove(known)
-        if len(self._endpoints) >= MAX_ENDPOINTS:
-            return {"error": f"{MAX_ENDPOINTS} endpoints are there already"}
+        token = local is not None or name in self._tokens or (known is not None and known.token)
+        if local is None:
+            self._make_room(token=token)
         number = self._next_number
         # Numbers are used again only after all others: a late frame must not be taken for one's own.
         while True:
             self._next_number = self._next_number % (medium.NO_NODE - 1) + 1
             if all(self._next_number != endpoint.number for endpoint in self._endpoints.values()):
                 break
-        token = name in self._tokens or name in self._locals
-        endpoint = self._endpoints[name] = _Endpoint(name, number, -1, time.monotonic(), listen_only, token)
+        secret = _new_secret() if local is None else local.secret
+        endpoint = _Endpoint(name, number, -1, time.monotonic(), request.listen_only, token, secret)
+        self._endpoints[name] = endpoint
         self._attach(endpoint)
-        return {
-            "node": number,
-            "window": WINDOW,
-            **self._bus(),
-            "epoch_ns": self.epoch_ns,
-        }
+        return {"node": number, "secret": secret, "window": WINDOW, **self._bus(), "epoch_ns": self.epoch_ns}
+
+    def _make_room(self, *, token: bool) -> None:
+        """Room for one more endpoint of another process, where need be that of one that has shown no token."""
+        others = [endpoint for endpoint in self._endpoints.values() if endpoint.name not in self._locals]
+        tokenless = [endpoint for endpoint in others if not endpoint.token]
+        if len(others) < MAX_ENDPOINTS and (token or len(tokenless) < MAX_TOKENLESS):
+            return
+        if not tokenless:
+            raise InputError("endpoint", f"one of at most {MAX_ENDPOINTS}", f"{len(others)} that are there already")
+        self._counts["evicted"] += 1
+        self._remove(tokenless[0])
+
+    def _check_owner(self, name: str, secret: str, given: str | None) -> None:
+        if not _same(secret, given or ""):
+            self._contend()
+            raise InputError("endpoint", "one's own (another has joined under that name, and is there)", name)
+
+    def _contend(self) -> None:
+        """Somebody has tried to speak under another's name."""
+        self._counts["forged"] += 1
+        self._contended_s = time.monotonic()
 
     def _hear(self, key: str, payload: bytes) -> None:
         self.offer(key.rpartition("/")[2], payload)
@@ -309,18 +359,21 @@ class Hub:
     def _watch(self, key: str, there: bool) -> None:
         name = key.rpartition("/")[2]
         with self._lock:
-            if not there:
-                self._tokens.discard(name)
-                self._leave(name)
-            elif len(self._tokens) < 16 * MAX_ENDPOINTS:
-                self._tokens.add(name)
+            self._tokens.pop(name, None)
+            if there:
+                self._tokens[name] = None
+                while len(self._tokens) > _MOST_TOKENS:
+                    del self._tokens[next(iter(self._tokens))]
                 if (endpoint := self._endpoints.get(name)) is not None:
                     endpoint.token = True
+            elif name not in self._locals:
+                self._leave(name)
         self._wake.set()
 
     def _leave(self, name: str) -> None:
         if (endpoint := self._endpoints.get(name)) is not None and endpoint.left_s is None:
             endpoint.left_s = time.monotonic()
+            endpoint.token = False
 
     def _remove(self, endpoint: _Endpoint) -> None:
         del self._endpoints[endpoint.name]
@@ -332,13 +385,16 @@ class Hub:
         self._numbers[node] = endpoint.number
 
     def _detach(self, endpoint: _Endpoint) -> None:
-        """Take its controller off the bus: what waits there is lost; a frame on the wire is still sent."""
-        lost = endpoint.offered - endpoint.done
+        """Take its controller off the bus: what waits there is lost; a frame on the wire is still sent.
+
+        What was offered a moment ago is found to be lost only when the model comes to it.
+        """
+        waiting = self._model.node(endpoint.node).queued
+        self._model.detach(endpoint.node)
+        lost = waiting - self._model.node(endpoint.node).queued
         endpoint.done += lost
         endpoint.dropped += lost
         self._waiting -= lost
-        del self._by_node[endpoint.node]
-        self._model.detach(endpoint.node)
         endpoint.bus_offs = 0
 
     def _bus(self) -> dict[str, Any]:
@@ -353,20 +409,34 @@ class Hub:
     def _run(self) -> None:
         _sharpen_sleep()
         while not self._stopping:
-            self._wake.clear()
-            with self._lock:
-                now = self._now()
-                payloads, wake_ns, busy = self._step(now)
-            for payload in payloads:
-                self._publish(payload)
-            left_s = (wake_ns - self._now()) * 1e-9
-            if left_s <= 0:
-                continue
+            if self._safely(self._turn) is None:
+                time.sleep(_FAILED_S)
+
+    def _turn(self) -> bool:
+        """One step of the bus, and the wait for the next."""
+        self._wake.clear()
+        with self._lock:
+            now = self._now()
+            payloads, wake_ns, busy = self._step(now)
+        for payload in payloads:
+            self._publish(payload)
+        left_s = (wake_ns - self._now()) * 1e-9
+        if left_s > 0:
             if busy:
                 # Nothing that is offered meanwhile can end earlier.
                 time.sleep(left_s)
             else:
                 self._wake.wait(left_s)
+        return True
+
+    def _safely(self, do: Callable[..., Any], *arguments: Any) -> Any:
+        """What it returns, or None where it fails: no thread ends for it, and the status tells."""
+        try:
+            return do(*arguments)
+        except Exception as error:
+            self._counts["failures"] += 1
+            self._failure = printable(f"{type(error).__name__}: {error}", 200)
+            return None
 
     def _step(self, now: int) -> tuple[list[bytes], int, bool]:
         """Let the bus run until now: messages to send, when to come back, and whether only then."""
@@ -407,16 +477,14 @@ class Hub:
         finals = results if results["final"].all() else results[results["final"] != 0]
         for node, outcome in zip(finals["node"].tolist(), finals["outcome"].tolist(), strict=True):
             endpoint = self._by_node.get(node)
-            # Where the controller has been taken off meanwhile, it is accounted for.
+            self._waiting -= 1
             if endpoint is not None:
                 endpoint.done += 1
-                self._waiting -= 1
-                if outcome:
-                    endpoint.dropped += 1
-        records = results["frame"].view(medium.RECORDS[medium.FD_WIDTH])
+                endpoint.dropped += outcome != 0
+        records = results["frame"].view(medium.RECORDS[FD_WIDTH])
         records["time_ns"] += np.uint64(self.epoch_ns)
         records["node"] = self._numbers[results["node"]]
-        records["flags"] &= medium.FD | medium.BIT_RATE_SWITCH | medium.ERROR_STATE
+        records["flags"] &= medium.FD | medium.BRS | medium.ESI
         if results["outcome"].any():
             records = self._with_errors(records, results)
         self._counts["frames"] += len(results) - int(np.count_nonzero(results["outcome"]))
@@ -436,7 +504,7 @@ class Hub:
                 kind, data = _ON_WIRE[text]
                 number = int(records["node"][row])
                 error = medium.error_record(self.epoch_ns + end_ns, kind, data=data + bytes(4), node=number)
-                records[row] = medium.widen([error])[0]
+                records[row] = _array(error)[0]
             else:
                 self._counts["unsent"] += 1
         return records[kept]
@@ -455,8 +523,8 @@ class Hub:
             return []
         records = self._outbox[0] if len(self._outbox) == 1 else np.concatenate(self._outbox)
         self._outbox.clear()
-        if records["length"].max() <= medium.CLASSIC_WIDTH:
-            records = medium.narrow(records)
+        if records["length"].max() <= CLASSIC_WIDTH:
+            records = resized(records, CLASSIC_WIDTH)
         size = medium.MAX_RECORDS
         return [medium.encode_array(records[first : first + size]) for first in range(0, len(records), size)]
 
@@ -494,7 +562,7 @@ class Hub:
         counters = (min(report.transmit_errors, 255), min(report.receive_errors, 255))
         data = bytes((0, detail, 0, 0, 0, 0, *counters))
         change = medium.error_record(self.epoch_ns + now, kind | medium.COUNTERS, data=data, node=report.node)
-        self._outbox.append(medium.widen([change]))
+        self._outbox.append(_array(change))
 
     def _report(self, endpoint: _Endpoint) -> medium.Report:
         node = self._model.node(endpoint.node)
@@ -503,9 +571,9 @@ class Hub:
 
     def _publish(self, payload: bytes) -> None:
         if self._server is not None:
-            self._server.publish(medium.bus_key(self.channel), payload)
-        for take, _ in list(self._locals.values()):
-            take(payload)
+            self._safely(self._server.publish, medium.bus_key(self.channel), payload)
+        for local in list(self._locals.values()):
+            self._safely(local.take, payload)
 
     def status(self) -> dict[str, Any]:
         """What goes on: endpoints, counts."""
@@ -520,32 +588,36 @@ class Hub:
                     {"name": endpoint.name, "listen_only": endpoint.listen_only, **self._report(endpoint)._asdict()}
                     for endpoint in self._endpoints.values()
                 ],
+                "warnings": self.warnings(),
             }
 
-
-def _frame_of(record: medium.Record) -> Frame:
-    word, flags = record.identifier, record.flags
-    extended, remote = word & medium.EXTENDED != 0, word & medium.REMOTE != 0
-    return Frame(
-        word & medium.EXTENDED_MASK,
-        bytes(record.length) if remote else record.data,
-        extended,
-        remote,
-        flags & medium.FD != 0,
-        flags & medium.BIT_RATE_SWITCH != 0,
-        flags & medium.ERROR_STATE != 0,
-    )
+    def warnings(self) -> list[str]:
+        """What a person should know of, while it is so."""
+        found = []
+        if self._counts["failures"]:
+            found.append(f"CAN {self.channel}: the hub failed {self._counts['failures']} times ({self._failure})")
+        if time.monotonic() - self._contended_s < _CONTENDED_S:
+            count = self._counts["forged"]
+            found.append(f"CAN {self.channel}: {count} times somebody spoke under the name of another endpoint")
+        return found
 
 
-def _for_model(records: np.ndarray, node: int, now: int) -> np.ndarray:
-    """Offered frames as the model takes them."""
-    found = medium.widen(records)
-    found["node"] = node
-    found["time_ns"] = now
-    return found.view(RECORD)
+def _array(record: Record) -> np.ndarray:
+    return np.frombuffer(bytearray(pack(record)), medium.RECORDS[FD_WIDTH])
 
 
-_COUNTS = ("frames", "errors", "unsent", "malformed", "invalid", "surplus", "strange")
+def _new_secret() -> str:
+    return secrets.token_hex(medium.SECRET_BYTES)
+
+
+def _same(secret: str, given: str) -> bool:
+    return secrets.compare_digest(secret, given)
+
+
+_COUNTS = (
+    "frames", "errors", "unsent", "malformed", "invalid", "surplus", "strange", "refused", "forged", "evicted",
+    "failures",
+)  # fmt: skip
 
 
 def _sharpen_sleep() -> None:

@@ -20,7 +20,9 @@ import numpy as np
 from can.bus import BusState  # noqa: TID253
 
 from drivers.can import medium
-from rig.errors import InputError
+from drivers.link import parse_loopback
+from rig.errors import InputError, RefusedError
+from rig.outside import check, read_json
 
 if TYPE_CHECKING:
     from can.typechecking import AutoDetectedConfig, CanFilters
@@ -90,6 +92,8 @@ class _MediumBus(can.BusABC):
         self._overflowed = False
         """Whether frames were lost of which the reader has not been told."""
         self._node = medium.NO_NODE
+        self._secret: str | None = None
+        """What shows the hub that this node's name is its own."""
         self._fd = False
         self._window = 0
         self._offered = 0
@@ -118,6 +122,7 @@ class _MediumBus(can.BusABC):
         raise NotImplementedError
 
     def _ask(self, name: str, document: dict[str, Any]) -> dict[str, Any]:
+        """The hub's answer; raises InputError where it refuses."""
         raise NotImplementedError
 
     def _put(self, payload: bytes) -> None:
@@ -137,21 +142,23 @@ class _MediumBus(can.BusABC):
         Raises:
             CanInitializationError: The hub refuses, or has another bus than was asked for.
         """
-        answer = self._ask("join", {"listen_only": self._listen_only, "pid": os.getpid()})
-        if "error" in answer:
-            raise can.CanInitializationError(f"{self._where()} refuses another node: {answer['error']}")
-        rates = {"bitrate": answer["nominal_bit_s"], "data_bitrate": answer["data_bit_s"]}
+        again = {} if self._secret is None else {"secret": self._secret}
+        try:
+            answer = check(medium.Joined, self._ask("join", {"listen_only": self._listen_only, **again}), field="hub")
+        except InputError as error:
+            raise can.CanInitializationError(f"{self._where()} refuses another node: {error}") from None
+        rates = {"bitrate": answer.nominal_bit_s, "data_bitrate": answer.data_bit_s}
         for name, asked in self._rates.items():
             if asked is not None and rates[name] is not None and asked != rates[name]:
                 raise can.CanInitializationError(
                     f"{name} must be that of {self._where()}, {rates[name]}; instead received {asked}"
                 )
-        if self._fd_asked and not answer["fd"]:
+        if self._fd_asked and not answer.fd:
             raise can.CanInitializationError(f"{self._where()} has a bus for classic CAN only; fd=True asks for CAN FD")
         with self._lock:
-            self._node = int(answer["node"])
-            self._fd = bool(answer["fd"]) and self._fd_asked is not False
-            self._window = int(answer["window"])
+            self._node, self._secret = answer.node, answer.secret
+            self._fd = answer.fd and self._fd_asked is not False
+            self._window = answer.window
             self._offered = self._done = 0
             self._report = medium.Report(self._node, 0, 0, 0, 0, 0)
             self._there = True
@@ -296,13 +303,11 @@ class _MediumBus(can.BusABC):
         """
         self._check_open()
         try:
-            record = medium.record_of(msg)
+            record = medium.offered(msg, fd=self._fd)
         except medium.MediumError as error:
-            raise can.CanOperationError(str(error)) from None
-        if (fault := medium.fault_of(record, fd=self._fd)) is not None:
-            raise can.CanOperationError(f"{self.channel} cannot send {fault}")
+            raise can.CanOperationError(f"{self.channel} cannot send {error}") from None
         self._reserve(1, timeout)
-        self._put(medium.encode([record]))
+        self._offer(medium.encode([record]))
 
     def send_records(self, records: np.ndarray, timeout: float | None = None) -> None:
         """Hand many frames to the hub at once.
@@ -319,7 +324,10 @@ class _MediumBus(can.BusABC):
         for first in range(0, len(records), portion):
             part = records[first : first + portion]
             self._reserve(len(part), timeout)
-            self._put(medium.encode_array(part))
+            self._offer(medium.encode_array(part))
+
+    def _offer(self, message: bytes) -> None:
+        self._put(bytes.fromhex(self._secret or "") + message)
 
     def _reserve(self, count: int, timeout: float | None) -> None:
         """Wait for room for some frames in the transmit queue, and take it."""
@@ -346,7 +354,13 @@ class _MediumBus(can.BusABC):
     def flush_tx_buffer(self) -> None:
         """Withdraw what waits to be sent; the frame that is on the wire is finished."""
         self._check_open()
-        self._ask("flush", {})
+        self._set("flush", {})
+
+    def _set(self, name: str, document: dict[str, Any]) -> None:
+        try:
+            self._ask(name, {"secret": self._secret, **document})
+        except InputError as error:
+            raise can.CanOperationError(f"{self._where()} refuses: {error}") from None
 
     # State and end.
 
@@ -366,7 +380,7 @@ class _MediumBus(can.BusABC):
             raise can.CanOperationError(f"state must be ACTIVE or PASSIVE; instead received {new_state}")
         self._check_open()
         listen_only = _SETTINGS[new_state]
-        self._ask("set", {"listen_only": listen_only})
+        self._set("set", {"listen_only": listen_only})
         self._listen_only = listen_only
 
     @property
@@ -395,8 +409,7 @@ class ZenohBus(_MediumBus):
 
     Args:
         channel: Name of the bus.
-        endpoint: HOST:PORT of the hub. A host other than 127.0.0.1 must be asked for by `expose`.
-        expose: Allow such a host.
+        endpoint: HOST:PORT of the hub, on 127.0.0.1; one of another machine is reached by `ssh -L`.
         connect_s: How long to wait for the hub to be there [s].
         **settings: Those of every bus here: can_filters, receive_own_messages, fd, listen_only, rx_queue_size, bitrate,
             data_bitrate, timing.
@@ -410,11 +423,10 @@ class ZenohBus(_MediumBus):
         channel: Any = "can0",
         *,
         endpoint: str = medium.DEFAULT_ENDPOINT,
-        expose: bool = False,
         connect_s: float = 1.0,
         **settings: Any,
     ) -> None:
-        self._address, self._expose, self._connect_s = str(endpoint), expose, connect_s
+        self._address, self._connect_s = str(endpoint), connect_s
         super().__init__(channel, **settings)
         # Only now: a hub that comes back is joined anew, which must not meet the first time.
         self._client.watch(medium.alive_key(self.channel), self._watch)
@@ -422,12 +434,10 @@ class ZenohBus(_MediumBus):
 
     def _connect(self) -> None:
         from rig.transport import NoReplyError
-        from rig.transport.zenoh import LOOPBACK_HOSTS, ZenohClient, parse_endpoint
+        from rig.transport.zenoh import ZenohClient
 
         try:
-            host, _ = parse_endpoint(self._address)
-            if host not in LOOPBACK_HOSTS and not self._expose:
-                raise InputError("endpoint", "on 127.0.0.1 unless expose=True is given as well", self._address)
+            parse_loopback(self._address, field="endpoint")
             if not medium.is_name(self.channel):
                 raise InputError("channel", "letters, digits, - and _, such as can0", self.channel)
         except InputError as error:
@@ -464,7 +474,10 @@ class ZenohBus(_MediumBus):
             others = [key.split("/")[2] for key in self._client.tokens(medium.ALIVE)]
             also = f" (channels there: {', '.join(others)})" if others else ""
             raise can.CanInitializationError(self._nobody() + also) from None
-        return json.loads(answer)
+        document = read_json(answer, field="hub")
+        if "error" in document:
+            raise RefusedError(str(document["error"]))
+        return document
 
     def _put(self, payload: bytes) -> None:
         self._client.report(medium.offer_key(self.channel, self._name), payload)
@@ -511,7 +524,7 @@ class HubBus(_MediumBus):
         self.channel_info = f"{hub.channel} of this process"
 
     def _connect(self) -> None:
-        self._hub.connect(self._name, self._take, self._lost)
+        self._secret = self._hub.connect(self._name, self._take, self._lost)
 
     def _where(self) -> str:
         return f"the hub of CAN channel {self.channel} in this process"

@@ -1,7 +1,8 @@
 """Compiled part of the bus: bits of frames, arbitration, queues, faults and error counters.
 
 All compiled code of the package is in this one file: numba's cache looks only at the file of the function it loads, so
-that a kernel calling another file's kernel could be served stale. Nothing is imported but numba and numpy.
+that a kernel calling another file's kernel could be served stale. What is imported from `drivers.can.frame` are numbers
+of the standard, which do not change.
 
 Bits of frames follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and extended format). Levels: 0 dominant,
 1 recessive. Time is an integer [ns]; bit times are integers [ps].
@@ -14,13 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-# Flags in the identifier's word, as SocketCAN has them, and in the byte of flags.
-EXTENDED = 1 << 31
-REMOTE = 1 << 30
-FD = 1
-BRS = 2
-ESI = 4
-ONE_SHOT = 16
+from drivers.can.frame import BRS, ESI, EXTENDED, FD, FD_LENGTHS, FD_WIDTH, INTERMISSION, ONE_SHOT, REMOTE
 
 # Kinds of an encoded bit, added up.
 FAST = 1
@@ -30,7 +25,6 @@ FIXED = 4
 LONGEST = 800
 """Room for the bits of any frame, stuffed (the longest has fewer than 740)."""
 
-INTERMISSION = 3
 TAIL = 10
 """CRC delimiter 1, ACK 1, ACK delimiter 1, end of frame 7."""
 
@@ -129,16 +123,9 @@ def _stuffing_of_bytes() -> tuple[np.ndarray, np.ndarray]:
 _AFTER, _ADDED = _stuffing_of_bytes()
 
 
-@njit(cache=True, error_model="numpy")
-def code_of(length):
-    """Data length code of a number of bytes: 0 to 8, then 12, 16, 20, 24, 32, 48, 64 (ISO 11898-1, table 5)."""
-    if length <= 8:
-        return length
-    if length <= 24:
-        return 9 + (length - 12) // 4
-    if length == 32:
-        return 13
-    return 14 if length == 48 else 15
+_CODES = np.zeros(FD_WIDTH + 1, np.int64)
+_CODES[list(FD_LENGTHS)] = range(len(FD_LENGTHS))
+"""Data length code by number of bytes."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -187,7 +174,7 @@ def header_and_data(identifier, length, flags, data, raw):
         if extended:
             raw[n] = 0  # r0
             n += 1
-    code = code_of(length)
+    code = _CODES[length]
     for k in range(3, -1, -1):
         raw[n] = (code >> k) & 1
         n += 1
@@ -232,7 +219,7 @@ def count_bits(identifier, length, flags, data, raw):
     whole = max(length - 1, 0) if fd else 0
     n, switch = header_and_data(identifier, 0 if whole > 0 else length, flags, data, raw)
     if whole > 0:
-        code = code_of(length)
+        code = _CODES[length]
         for k in range(4):
             raw[n - 4 + k] = (code >> (3 - k)) & 1
     stop = n if whole > 0 else n - 1

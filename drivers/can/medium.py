@@ -2,7 +2,8 @@
 
 A message is a header and records of one width. Endpoints offer messages of frames to the hub of their channel; the
 hub sends all endpoints messages of frames, in the order of the bus and with its time stamps, and of node reports. The
-identifier word carries its flags as a SocketCAN frame does.
+identifier word carries its flags as a SocketCAN frame does. Requests to the hub are JSON objects, of the models here.
+Whoever joins gets a secret; with it in front of its offers and in its requests it shows that the name is its own.
 """
 
 from __future__ import annotations
@@ -10,9 +11,28 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
+
+from drivers.can.frame import (
+    BRS,
+    CLASSIC_WIDTH,
+    ERROR,
+    ESI,
+    EXTENDED,
+    EXTENDED_MASK,
+    FD,
+    FD_WIDTH,
+    PACKINGS,
+    RECORDS,
+    REMOTE,
+    Record,
+    fault_of,
+    pack,
+)
+from rig.outside import Count, Outside
 
 if TYPE_CHECKING:
     import can
@@ -22,12 +42,6 @@ DEFAULT_ENDPOINT = "127.0.0.1:7461"
 
 ROOT = "rig/can"
 ALIVE = f"{ROOT}/*/alive"
-
-EXTENDED = 1 << 31
-REMOTE = 1 << 30
-ERROR = 1 << 29
-STANDARD_MASK = (1 << 11) - 1
-EXTENDED_MASK = (1 << 29) - 1
 
 # Error classes and details, as in SocketCAN's linux/can/error.h.
 CONTROLLER = 0x004
@@ -42,17 +56,8 @@ RECEIVE_PASSIVE = 0x10
 TRANSMIT_PASSIVE = 0x20
 ACTIVE_AGAIN = 0x40
 
-FD = 1
-BIT_RATE_SWITCH = 2
-ERROR_STATE = 4
-
 NO_NODE = 0xFFFF
 """Where a frame has no sender: an offer, or an error frame of the whole bus."""
-
-CLASSIC_WIDTH = 8
-FD_WIDTH = 64
-FD_LENGTHS = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
-"""Data lengths that a CAN FD frame can have [bytes]."""
 
 MAX_RECORDS = 512
 """Records a message may have: at most 41 kB, which one send takes and no receiver has to allocate much for."""
@@ -61,43 +66,58 @@ FRAMES = 0
 REPORTS = 1
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_IS_FD_LENGTH = np.isin(np.arange(256), list(FD_LENGTHS))
 _MAGIC = b"RCB1"
 _HEADER = struct.Struct("<4sBBH")
-_RECORDS = {width: struct.Struct(f"<QIBBH{width}s") for width in (CLASSIC_WIDTH, FD_WIDTH)}
 _REPORT = struct.Struct("<HBBHHQQ")
 
-RECORDS = {
-    width: np.dtype(
-        [
-            ("time_ns", "<u8"),
-            ("identifier", "<u4"),
-            ("length", "u1"),
-            ("flags", "u1"),
-            ("node", "<u2"),
-            ("data", f"V{width}"),
-        ]
-    )
-    for width in (CLASSIC_WIDTH, FD_WIDTH)
-}
-"""Layout of a frame's record by width of its data field: `time_ns` since the Unix epoch [ns], at the end of the frame
-(0 in an offer); `identifier` with EXTENDED, REMOTE, ERROR; `length` of the data, or the one asked for [bytes]; `flags`
-FD, BIT_RATE_SWITCH, ERROR_STATE; `node` number of the sender."""
+SECRET_BYTES = 16
+"""Length of what an endpoint gets when it joins."""
+Endpoint = Annotated[str, Field(pattern=rf"\A{_NAME.pattern}\z")]
+Secret = Annotated[str, Field(pattern=rf"\A[0-9a-f]{{{2 * SECRET_BYTES}}}\z")]
+
+
+class Joining(Outside):
+    """A request to join; with its secret an endpoint joins again under its name."""
+
+    endpoint: Endpoint
+    listen_only: bool = False
+    secret: Secret | None = None
+
+
+class Flushing(Outside):
+    """A request to withdraw what waits to be sent."""
+
+    endpoint: Endpoint
+    secret: Secret
+
+
+class Setting(Flushing):
+    """A request to take part, or only to listen."""
+
+    listen_only: bool
+
+
+class Asking(Outside):
+    """A request for the status."""
+
+
+REQUESTS: dict[str, type[Outside]] = {"join": Joining, "set": Setting, "flush": Flushing, "status": Asking}
+
+
+class Joined(Outside):
+    """The answer to one who joins."""
+
+    node: Annotated[int, Field(ge=1, lt=NO_NODE)]
+    secret: Secret
+    window: Annotated[int, Field(ge=1, le=1 << 16)]
+    fd: bool
+    nominal_bit_s: float
+    data_bit_s: float
+    epoch_ns: Count
 
 
 class MediumError(ValueError):
     """A payload is not a message of this medium."""
-
-
-class Record(NamedTuple):
-    """One frame as it travels; the fields are those of `RECORDS`, the data without its padding."""
-
-    time_ns: int
-    identifier: int
-    length: int
-    flags: int
-    node: int
-    data: bytes
 
 
 class Report(NamedTuple):
@@ -167,89 +187,16 @@ def overflow(time_ns: int) -> Record:
     return error_record(time_ns, CONTROLLER, data=bytes((0, RECEIVE_OVERFLOW, 0, 0, 0, 0, 0, 0)))
 
 
-def fault_of(record: Record, *, fd: bool = True) -> str | None:
-    """Why no controller could send such a frame; None if one could.
-
-    Args:
-        record: A frame that somebody wants to send.
-        fd: Whether the bus takes CAN FD frames.
-    """
-    word, length, flags = record.identifier, record.length, record.flags
-    if word & ERROR:
-        return "an error frame: controllers send those by themselves"
-    if not word & REMOTE and length != len(record.data):
-        return f"{length} bytes of data in a field of {len(record.data)}"
-    if word & EXTENDED_MASK > (EXTENDED_MASK if word & EXTENDED else STANDARD_MASK):
-        return f"identifier {word & EXTENDED_MASK:#x} has more than 11 bits, and the frame is not extended"
-    if flags & ~(FD | BIT_RATE_SWITCH | ERROR_STATE):
-        return f"unknown flags {flags:#x}"
-    if flags & FD:
-        if not fd:
-            return "a CAN FD frame, on a bus for classic CAN"
-        if word & REMOTE:
-            return "a remote frame, which CAN FD does not have"
-        if length not in FD_LENGTHS:
-            return f"{length} bytes, which is no length of a CAN FD frame"
-    elif flags:
-        return "a bit rate switch or error state indicator, which classic CAN does not have"
-    elif length > CLASSIC_WIDTH:
-        return f"{length} bytes in a classic frame"
-    return None
-
-
-def sendable(records: np.ndarray, *, fd: bool = True) -> np.ndarray:
-    """Of which frames `fault_of` finds no fault, shape of `records`.
-
-    Args:
-        records: Array of one of the `RECORDS` layouts.
-        fd: Whether the bus takes CAN FD frames.
-    """
-    word, length, flags = records["identifier"], records["length"], records["flags"]
-    extended, remote, is_fd = word & EXTENDED != 0, word & REMOTE != 0, flags & FD != 0
-    good = (word & ERROR == 0) & (extended | (word & EXTENDED_MASK <= STANDARD_MASK))
-    good &= remote | (length <= records.dtype["data"].itemsize)
-    if not fd:
-        good &= ~is_fd
-    good &= np.where(is_fd, ~remote & _IS_FD_LENGTH[length], (length <= CLASSIC_WIDTH) & (flags == 0))
-    return good & (flags & ~np.uint8(FD | BIT_RATE_SWITCH | ERROR_STATE) == 0)
-
-
-def widen(records: np.ndarray | Iterable[Record]) -> np.ndarray:
-    """A copy of frames in the widest layout, zeros behind their data."""
-    if not isinstance(records, np.ndarray):
-        pack = _RECORDS[FD_WIDTH].pack
-        return np.frombuffer(bytearray(b"".join([pack(*row) for row in records])), RECORDS[FD_WIDTH])
-    found = np.zeros(len(records), RECORDS[FD_WIDTH])
-    for name in ("time_ns", "identifier", "length", "flags", "node"):
-        found[name] = records[name]
-    width = records.dtype["data"].itemsize
-    _bytes_of(found)[:, :width] = _bytes_of(records)
-    return found
-
-
-def narrow(records: np.ndarray) -> np.ndarray:
-    """A copy of frames of at most 8 bytes in the narrow layout."""
-    found = np.zeros(len(records), RECORDS[CLASSIC_WIDTH])
-    for name in ("time_ns", "identifier", "length", "flags", "node"):
-        found[name] = records[name]
-    _bytes_of(found)[:] = _bytes_of(records)[:, :CLASSIC_WIDTH]
-    return found
-
-
-def _bytes_of(records: np.ndarray) -> np.ndarray:
-    """The data fields as bytes, shape (frames, width); a view."""
-    width = records.dtype["data"].itemsize
-    names = ["time_ns", "identifier", "length", "flags", "node", "data"]
-    formats = ["<u8", "<u4", "u1", "u1", "<u2", ("u1", (width,))]
-    return records.view(np.dtype({"names": names, "formats": formats}))["data"]
-
-
 def encode(records: Iterable[Record]) -> bytes:
     """One message of at most MAX_RECORDS frames, as narrow as they allow."""
+    return encode_array(_packed(records))
+
+
+def _packed(records: Iterable[Record]) -> np.ndarray:
+    """Frames as an array, as narrow as they allow."""
     rows = list(records)
     width = FD_WIDTH if any(len(row.data) > CLASSIC_WIDTH for row in rows) else CLASSIC_WIDTH
-    pack = _RECORDS[width].pack
-    return _HEADER.pack(_MAGIC, FRAMES, width, len(rows)) + b"".join([pack(*row) for row in rows])
+    return np.frombuffer(b"".join([pack(row, width) for row in rows]), RECORDS[width])
 
 
 def encode_array(records: np.ndarray) -> bytes:
@@ -275,7 +222,7 @@ def kind_of(payload: bytes) -> int:
     magic, kind, width, count = _HEADER.unpack_from(payload)
     if magic != _MAGIC or kind not in (FRAMES, REPORTS):
         raise MediumError("no header of this medium")
-    size = _REPORT.size if kind == REPORTS else _RECORDS[width].size if width in _RECORDS else 0
+    size = _REPORT.size if kind == REPORTS else PACKINGS[width].size if width in PACKINGS else 0
     if not size or (kind == REPORTS and width != size):
         raise MediumError(f"records of unknown width {width}")
     if count > MAX_RECORDS or len(payload) != _HEADER.size + count * size:
@@ -291,7 +238,7 @@ def decode(payload: bytes) -> Iterator[Record]:
     """
     if kind_of(payload) != FRAMES:
         raise MediumError("reports where frames were expected")
-    layout = _RECORDS[payload[5]]
+    layout = PACKINGS[payload[5]]
     for time_ns, word, length, flags, node, data in layout.iter_unpack(memoryview(payload)[_HEADER.size :]):
         yield Record(time_ns, word, length, flags, node, b"" if word & REMOTE else data[:length])
 
@@ -336,17 +283,30 @@ def record_of(message: can.Message) -> Record:
     if message.is_error_frame:
         word |= ERROR
     if message.is_fd:
-        flags = FD | message.bitrate_switch * BIT_RATE_SWITCH | message.error_state_indicator * ERROR_STATE
+        flags = FD | message.bitrate_switch * BRS | message.error_state_indicator * ESI
     data = b"" if message.is_remote_frame else bytes(message.data)
     return Record(0, word, message.dlc if message.is_remote_frame else len(data), flags, NO_NODE, data)
 
 
+def offered(message: can.Message, *, fd: bool = True) -> Record:
+    """`record_of`, if a controller can send it.
+
+    Args:
+        message: The frame.
+        fd: Whether the bus takes CAN FD frames.
+
+    Raises:
+        MediumError: None can; it says why.
+    """
+    record = record_of(message)
+    if (fault := fault_of(record, fd=fd)) is not None:
+        raise MediumError(fault)
+    return record
+
+
 def records_of(messages: Iterable[can.Message]) -> np.ndarray:
     """Python-can messages as an array of offered frames, shape (messages,)."""
-    rows = [record_of(message) for message in messages]
-    width = FD_WIDTH if any(len(row.data) > CLASSIC_WIDTH for row in rows) else CLASSIC_WIDTH
-    pack = _RECORDS[width].pack
-    return np.frombuffer(b"".join([pack(*row) for row in rows]), RECORDS[width])
+    return _packed(record_of(message) for message in messages)
 
 
 def messages_of(records: np.ndarray, *, channel: Any = None, node: int = NO_NODE) -> list[can.Message]:
@@ -377,6 +337,6 @@ def message_of(record: Record, *, channel: Any = None, node: int = NO_NODE) -> c
         data=None if remote else bytearray(data[:length]),
         is_fd=flags & FD != 0,
         is_rx=error or sender != node,
-        bitrate_switch=flags & BIT_RATE_SWITCH != 0,
-        error_state_indicator=flags & ERROR_STATE != 0,
+        bitrate_switch=flags & BRS != 0,
+        error_state_indicator=flags & ESI != 0,
     )

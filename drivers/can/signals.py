@@ -25,6 +25,7 @@ from functools import cache
 
 import numpy as np
 
+from drivers.can.frame import FD_LENGTHS
 from rig.channels import Channel, ChannelTable, default_table
 
 CLASSIC_HZ = 1_000
@@ -472,7 +473,7 @@ def _fd_messages(table: ChannelTable) -> list[Message]:
             "what lies above half the slower rate folds back"
         )
         index = "Number of the first instant in the recording, modulo 2^32; the others follow by Rates.fd_step"
-        length = next(size for size in (8, 12, 16, 20, 24, 32, 48, 64) if size >= 4 + 3 * rows * len(group.channels))
+        length = next(size for size in FD_LENGTHS[8:] if size >= 4 + 3 * rows * len(group.channels))
         found.append(
             Message(
                 group.name.capitalize(), 0x100 + 0x10 * position, length, True, rows / FD_HZ, True, RIG, label,

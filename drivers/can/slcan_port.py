@@ -98,12 +98,10 @@ def parse(line: str) -> can.Message:
     identifier = int(match[1] or match[2], 16)
     code, data = int(match[3], 16), bytes.fromhex(match[4])
     fd, remote = kind in "db", kind == "r"
-    if identifier > (medium.EXTENDED_MASK if extended else medium.STANDARD_MASK) or (code > 8 and not fd):
-        raise FrameError("identifier or length too large")
     length = FD_LENGTHS[code]
     if len(data) != (0 if remote else length):
         raise FrameError("not as long as it says")
-    return can.Message(
+    message = can.Message(
         arbitration_id=identifier,
         is_extended_id=extended,
         is_remote_frame=remote,
@@ -112,6 +110,11 @@ def parse(line: str) -> can.Message:
         dlc=length,
         data=None if remote else data,
     )
+    try:
+        medium.offered(message)
+    except medium.MediumError as error:
+        raise FrameError(str(error)) from None
+    return message
 
 
 def show(message: can.Message, *, stamped: bool = False) -> bytes | None:

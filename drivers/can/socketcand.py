@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 from drivers.can import medium
 from drivers.can.backlog import PATIENCE_S, ROOM, OpenBus, Outlet, Tap
+from drivers.link import parse_loopback
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -101,13 +102,18 @@ def parse_frame(words: list[str], *, remote: bool = False) -> can.Message:
         raise CommandError("data must be bytes of one or two hexadecimal digits")
     if len(given) != (0 if remote else length):
         raise CommandError(f"{len(given)} bytes of data for a length of {length}")
-    return can.Message(
+    message = can.Message(
         arbitration_id=identifier,
         is_extended_id=extended,
         is_remote_frame=remote,
         dlc=length,
         data=None if remote else bytes(int(byte, 16) for byte in given),
     )
+    try:
+        medium.offered(message)
+    except medium.MediumError as error:
+        raise CommandError(str(error)) from None
+    return message
 
 
 def parse_identifier(text: str) -> tuple[int, bool]:
@@ -119,10 +125,7 @@ def parse_identifier(text: str) -> tuple[int, bool]:
     extended = len(text) == 8
     if not _HEX.fullmatch(text) or not (extended or len(text) <= 3):
         raise CommandError("an identifier must have 1 to 3 or 8 hexadecimal digits")
-    identifier = int(text, 16)
-    if identifier > (medium.EXTENDED_MASK if extended else medium.STANDARD_MASK):
-        raise CommandError("an identifier must have 11 bits, or 29 where it has 8 digits")
-    return identifier, extended
+    return int(text, 16), extended
 
 
 def show(message: can.Message) -> bytes | None:
@@ -320,7 +323,6 @@ class SocketcandServer:
         buses: By name, what makes a node on the bus: one for each connection.
         host: Where to listen.
         port: Likewise; 0 takes a free one.
-        expose: Allow a host other than 127.0.0.1: there is no password, and all can send.
         room: Bytes that may wait for one client.
         patience_s: How long a client may take nothing of what waits before it is disconnected [s].
 
@@ -334,14 +336,10 @@ class SocketcandServer:
         *,
         host: str = "127.0.0.1",
         port: int = PORT,
-        expose: bool = False,
         room: int = ROOM,
         patience_s: float = PATIENCE_S,
     ) -> None:
-        from rig.transport.zenoh import LOOPBACK_HOSTS
-
-        if host not in LOOPBACK_HOSTS and not expose:
-            raise InputError("socketcand", "on 127.0.0.1 unless --expose is given as well", f"{host}:{port}")
+        parse_loopback(f"{host}:{port or PORT}", field="socketcand")
         self._buses = dict(buses)
         self._room = room
         self._patience_s = patience_s

@@ -21,7 +21,6 @@ class CanOutlets:
         speed: Bit rates of the buses.
         socketcand: HOST:PORT of a server for all of them, or none.
         slcan: Whether each has a port with an adapter.
-        expose: Allow a host other than 127.0.0.1.
 
     Raises:
         InputError: There can be no such server.
@@ -34,7 +33,6 @@ class CanOutlets:
         *,
         socketcand: str | None = None,
         slcan: bool = False,
-        expose: bool = False,
     ) -> None:
         self._server: SocketcandServer | None = None
         self._ports: dict[str, SlcanPort] = {}
@@ -42,10 +40,10 @@ class CanOutlets:
         with ExitStack() as stack:
             if socketcand is not None:
                 from drivers.can.socketcand import SocketcandServer
-                from rig.transport.zenoh import parse_endpoint
+                from drivers.link import parse_loopback
 
-                host, port = parse_endpoint(socketcand, field="socketcand")
-                self._server = stack.enter_context(SocketcandServer(buses, host=host, port=port, expose=expose))
+                host, port = parse_loopback(socketcand, field="socketcand")
+                self._server = stack.enter_context(SocketcandServer(buses, host=host, port=port))
             if slcan:
                 from drivers.can.slcan_port import SlcanPort
 

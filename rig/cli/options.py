@@ -38,9 +38,7 @@ ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="FILE", help="Write a report with pictures, .html or .pdf.")
 ]
 Listen = Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where to listen.")]
-Expose = Annotated[
-    bool, typer.Option("--expose", help="Allow --listen and --can-socketcand on a host other than 127.0.0.1.")
-]
+Expose = Annotated[bool, typer.Option("--expose", help="Allow --listen on a host other than 127.0.0.1.")]
 
 
 def names_of(text: str | None) -> list[str]:

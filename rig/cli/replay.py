@@ -151,7 +151,6 @@ def replay(
             overload=can_overload,
             socketcand=can_socketcand,
             slcan=can_slcan,
-            expose=expose,
         )
     # What the transport keeps for those who miss it lasts shorter when it goes faster, so there it waits for them.
     with ZenohServer(listen, expose=expose, wait=burst or rate > 1.0) as server, ExitStack() as stack:

@@ -84,7 +84,6 @@ def run(
             overload=can_overload,
             socketcand=can_socketcand,
             slcan=can_slcan,
-            expose=expose,
         )
         notice = "preparing" if compiled_before() else COMPILE_NOTICE
         typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)

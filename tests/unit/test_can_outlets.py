@@ -30,10 +30,12 @@ from drivers.can.interface import HubBus
 from drivers.can.slcan_port import Lines, SlcanPort
 from drivers.can.socketcand import CommandError, SocketcandServer, Splitter
 from drivers.can.timing import speed
+from drivers.twins import Twins
 from rig.cli.can_outlets import CanOutlets
 from rig.cli.can_output import CanOutput
 from rig.cli.run import run
 from rig.errors import InputError
+from rig.transport.memory import MemoryClient, MemoryServer
 from tests.unit.test_transport_zenoh import free_endpoint, until
 
 pytestmark = pytest.mark.wallclock
@@ -415,13 +417,33 @@ def test_random_bytes_do_no_harm() -> None:
         until(lambda: any(same(CLASSIC[0], found) for found in iter(lambda: other.recv(0), None)))
 
 
-def test_a_server_keeps_to_this_machine_unless_asked() -> None:
-    with pytest.raises(InputError, match=r"socketcand must be on 127\.0\.0\.1 unless --expose .*'0\.0\.0\.0:0'"):
+def test_a_server_keeps_to_this_machine() -> None:
+    with pytest.raises(InputError, match=r"socketcand must be on 127\.0\.0\.1, .*ssh -L 29536:127.*'0\.0\.0\.0:29536'"):
         SocketcandServer({}, host="0.0.0.0", port=0)
-    with SocketcandServer({}, host="0.0.0.0", port=0, expose=True) as server, pytest.raises(InputError, match="free"):
-        SocketcandServer({}, host="127.0.0.1", port=server.port)
     with SocketcandServer({}, port=0) as server:
         assert server.host == "127.0.0.1"
+        with pytest.raises(InputError, match="free"):
+            SocketcandServer({}, port=server.port)
+
+
+@pytest.mark.parametrize("place", ["0.0.0.0:29536", "192.0.2.1:29536", "[::]:29536", "example.org:29536"])
+def test_no_door_of_the_bus_is_open_to_other_machines_whatever_is_asked(place: str) -> None:
+    from rig.cli.can import hub
+
+    loopback = (
+        r"must be on 127\.0\.0\.1, since there is no password; from another machine: ssh -L 29536:127.0.0.1:29536 "
+    )
+    for opening in (
+        lambda: run("hammer", can="virtual:x", can_socketcand=place, expose=True, listen=free_endpoint()),
+        lambda: CanOutput("virtual:x", socketcand=place),
+        lambda: CanOutlets({}, speed("1M"), socketcand=place),
+        lambda: run("hammer", can=f"zenoh:can0?endpoint={place}", expose=True, listen=free_endpoint()),
+        lambda: hub(["can0"], socketcand=place),
+        lambda: hub(["can0"], listen=place),
+        lambda: Twins(MemoryClient(MemoryServer())).serve_zenoh(place),
+    ):
+        with pytest.raises(InputError, match=loopback):
+            opening()
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 1000])
@@ -752,5 +774,3 @@ def test_outlets_of_the_command_line() -> None:
         CanOutput("slcan:/dev/pts/99", slcan=True)
     with pytest.raises(InputError, match="--can must be given"):
         run("hammer", can_slcan=True)
-    with pytest.raises(InputError, match="unless --expose"):
-        CanOutlets({}, speed("1M"), socketcand="0.0.0.0:29536")
