@@ -20,13 +20,14 @@ import contextlib
 import os
 import re
 import termios
+import threading
 import tty
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from drivers.can import medium
-from drivers.can.backlog import PATIENCE_S, ROOM, OpenBus, Outlet, Tap
 from drivers.can.frame import FD_LENGTHS
+from drivers.can.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
 from drivers.can.timing import Speed
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ class SlcanPort(Outlet):
     Args:
         open_bus: Makes the adapter's node on the bus, each time its channel is opened.
         speed: Bit rates of the bus; None takes any that is asked for.
-        room: Bytes that may wait for the program.
+        room: Messages that may wait for the program.
         patience_s: How long it may take nothing of what waits before the channel is closed [s].
     """
 
@@ -161,15 +162,13 @@ class SlcanPort(Outlet):
         self._open_bus = open_bus
         self._speed = speed
         self._lines = Lines()
-        self._tap: Tap | None = None
         self._listen_only = False
         self._stamped = False
         self._flags = 0
-        self._dropped = 0
-        """Frames dropped while the channel was open before."""
+        self._thread = threading.Thread(target=self.serve, name=f"slcan {self.path}", daemon=True)
 
     def __enter__(self) -> SlcanPort:
-        self.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -177,17 +176,17 @@ class SlcanPort(Outlet):
 
     def close(self) -> None:
         """Take the adapter away."""
-        super().close()
+        self.stop()
+        if self._thread.is_alive():
+            self._thread.join(timeout=6.0)
         for descriptor in (self._master, self._slave):
             with contextlib.suppress(OSError):
                 os.close(descriptor)
 
     def figures(self) -> dict[str, int]:
         """What has happened: `open` channels, `dropped` frames, `bells`, frames `refused` by the bus, `given_up`."""
-        tap = self._tap
-        dropped = self._dropped + (tap.dropped if tap is not None else 0)
-        names = ("bells", "refused", "given_up")
-        return {"open": int(tap is not None), "dropped": dropped, **{name: self.counts[name] for name in names}}
+        names = ("dropped", "bells", "refused", "given_up")
+        return {"open": int(self._bus is not None), **{name: self.counts[name] for name in names}}
 
     # From the program.
 
@@ -206,8 +205,8 @@ class SlcanPort(Outlet):
         """The answer to a line; None where it is no command, or not one for now."""
         command, rest = line[:1], line[1:]
         if command and command in "tTrRdDbB":
-            return self._send(line)
-        is_open = self._tap is not None
+            return self._transmit(line)
+        is_open = self._bus is not None
         match command:
             case "":
                 return OK
@@ -252,16 +251,16 @@ class SlcanPort(Outlet):
             return False
         return given is None or abs(asked - given) < 1e-3 * given
 
-    def _send(self, line: str) -> bytes | None:
+    def _transmit(self, line: str) -> bytes | None:
         import can
 
-        if self._tap is None or self._listen_only:
+        if self._bus is None or self._listen_only:
             return None
         try:
             message = parse(line)
             if message.is_fd and self._speed is not None and not self._speed.fd:
                 return None
-            self._tap.send(message)
+            self._send(message)
         except FrameError:
             return None
         except can.CanError:
@@ -284,32 +283,21 @@ class SlcanPort(Outlet):
                 bus.state = can.BusState.PASSIVE
         self._listen_only = listen_only
         self._flags = 0
-        self._tap = Tap(
-            bus,
-            self._backlog,
-            show=self._show,
-            overflow=self._overflow,
-            on_lost=self._lose,
-            name=f"slcan {self.path} bus",
-        )
+        self._enter(bus)
         return OK
 
     def _close(self) -> None:
-        if self._tap is None:
-            return
-        self._tap.close()
-        self._dropped += self._tap.dropped
-        self._tap = None
-        if self._backlog.waiting:
+        self._leave()
+        if self._messages or self._rest:
             # Of a program that reads no more: the next one must not take it for its own.
             self._forget()
 
     def _forget(self) -> None:
-        self._backlog.clear()
+        super()._forget()
         with contextlib.suppress(termios.error):
             termios.tcflush(self._slave, termios.TCIFLUSH)
 
-    # To the program, on the tap's thread.
+    # To the program, on the thread that hears the bus.
 
     def _show(self, message: can.Message) -> bytes | None:
         if message.is_error_frame:
@@ -324,15 +312,10 @@ class SlcanPort(Outlet):
         # Frames are refused from now on; opened anew, the bus may be there again.
         self._flags |= ERROR_PASSIVE | BUS_ERROR
 
-    # End.
-
     def _give_up(self) -> None:
-        self._close()
+        # The program can begin again.
+        self._leave()
         self._forget()
-        self.counts["given_up"] += 1
-
-    def _finish(self) -> None:
-        self._close()
 
 
 def flags_of(message: can.Message) -> int:

@@ -16,14 +16,17 @@ from __future__ import annotations
 import contextlib
 import re
 import socket
+import socketserver
+import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drivers.can import medium
-from drivers.can.backlog import PATIENCE_S, ROOM, OpenBus, Outlet, Tap
+from drivers.can.health import Guard
+from drivers.can.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
 from drivers.link import parse_loopback
 from rig.errors import InputError
 
@@ -37,9 +40,11 @@ MAX_CLIENTS = 16
 _LONGEST = 512
 """Characters that a command may have."""
 _SENDING = 1 << 16
-"""Bytes that the system may hold for a client beyond our backlog."""
+"""Bytes that the system may hold for a client beyond those that wait here."""
 _HOLD_S = 0.05
 """How long frames wait after rawmode's answer: clients read that answer by itself and would lose what comes with it."""
+_POLL_S = 0.1
+_ENDING_S = 6.0
 _SHORTEST_MS = 10
 _LONGEST_MS = 3_600_000
 _MAX_SUBSCRIPTIONS = 4096
@@ -155,9 +160,7 @@ class _Client(Outlet):
         super().__init__(connection.fileno(), name=f"socketcand {number}", room=room, patience_s=patience_s)
         self._connection = connection
         self._buses = buses
-        self._number = number
         self._splitter = Splitter()
-        self._tap: Tap | None = None
         self._raw = False
         self._held_until_s = 0.0
         self._subscribed: dict[tuple[int, bool], list[float]] = {}
@@ -167,10 +170,6 @@ class _Client(Outlet):
         self._traffic = [0, 0, 0, 0]
         """Bytes and frames received, bytes and frames sent."""
         self._answer(b"< hi >")
-
-    @property
-    def dropped(self) -> int:
-        return self._tap.dropped if self._tap is not None else 0
 
     # From the client.
 
@@ -194,12 +193,12 @@ class _Client(Outlet):
             self._answer(b"< echo >")
         elif word == "open":
             self._open(rest)
-        elif self._tap is None:
+        elif self._bus is None:
             raise CommandError("a bus must be opened first")
         elif word in ("send", "sendrtr"):
             message = parse_frame(rest, remote=word == "sendrtr")
             try:
-                self._tap.send(message)
+                self._send(message)
             except can.CanError as error:
                 self.counts["refused"] += 1
                 # Brackets would end the text early.
@@ -212,7 +211,6 @@ class _Client(Outlet):
             # In this order: no frame before the answer, none lost after it.
             self._answer(b"< ok >")
             self._raw = word == "rawmode"
-            self._backlog.flush()
         elif word == "statistics":
             self._every_s = self._number_of(rest, 1)[0] / 1000
             if self._every_s and not _SHORTEST_MS <= self._every_s * 1000 <= _LONGEST_MS:
@@ -232,7 +230,7 @@ class _Client(Outlet):
     def _open(self, words: list[str]) -> None:
         import can
 
-        if self._tap is not None:
+        if self._bus is not None:
             raise CommandError("a bus is open already")
         open_bus = self._buses.get(words[0]) if len(words) == 1 else None
         try:
@@ -245,16 +243,8 @@ class _Client(Outlet):
             self._answer(b"< error could not open bus >")
             self._ending = True
             return
-        self._tap = Tap(
-            bus,
-            self._backlog,
-            show=self._show,
-            overflow=self._overflow,
-            tick=self._tick,
-            on_lost=self._lose,
-            name=f"socketcand {self._number} bus",
-        )
         self._answer(b"< ok >")
+        self._enter(bus)
 
     @staticmethod
     def _number_of(words: list[str], count: int) -> list[int]:
@@ -262,7 +252,7 @@ class _Client(Outlet):
             raise CommandError(f"{count} whole numbers must follow")
         return [int(word) for word in words]
 
-    # To the client, on the tap's thread.
+    # To the client, on the thread that hears the bus.
 
     def _show(self, message: can.Message) -> bytes | None:
         text = show(message)
@@ -289,31 +279,31 @@ class _Client(Outlet):
         now = time.monotonic()
         if self._every_s and now >= self._next_s:
             self._next_s = now + self._every_s
-            self._backlog.put(f"< stat {' '.join(map(str, self._traffic))} >".encode())
+            self._put(f"< stat {' '.join(map(str, self._traffic))} >".encode())
 
     def _lose(self) -> None:
         self.counts["bus_lost"] += 1
         self._ending = True
 
-    # End.
 
-    def stop(self) -> None:
-        """Begin to end, without waiting."""
-        self._ending = True
-        with contextlib.suppress(OSError):
-            self._connection.shutdown(socket.SHUT_RD)
+class _Listener(socketserver.ThreadingTCPServer):
+    """Gives each connection a thread."""
 
-    def _give_up(self) -> None:
-        self.counts["given_up"] += 1
-        self._ending = True
+    allow_reuse_address = True
+    daemon_threads = True
 
-    def _finish(self) -> None:
-        if self._tap is not None:
-            self._tap.close()
-        self._backlog.flush()
-        with contextlib.suppress(OSError):
-            self._connection.shutdown(socket.SHUT_RDWR)
-        self._connection.close()
+    def __init__(self, address: tuple[str, int], owner: SocketcandServer) -> None:
+        super().__init__(address, socketserver.BaseRequestHandler)
+        self._owner = owner
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        return self._owner._let_in(request)
+
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        self._owner._serve(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        self._owner._guard.tell("a connection", sys.exception() or RuntimeError())
 
 
 class SocketcandServer:
@@ -323,7 +313,7 @@ class SocketcandServer:
         buses: By name, what makes a node on the bus: one for each connection.
         host: Where to listen.
         port: Likewise; 0 takes a free one.
-        room: Bytes that may wait for one client.
+        room: Messages that may wait for one client.
         patience_s: How long a client may take nothing of what waits before it is disconnected [s].
 
     Raises:
@@ -341,20 +331,21 @@ class SocketcandServer:
     ) -> None:
         parse_loopback(f"{host}:{port or PORT}", field="socketcand")
         self._buses = dict(buses)
-        self._room = room
-        self._patience_s = patience_s
+        self._settings: dict[str, Any] = {"room": room, "patience_s": patience_s}
         try:
-            self._listener = socket.create_server(("127.0.0.1" if host == "localhost" else host, port))
+            self._listener = _Listener(("127.0.0.1" if host == "localhost" else host, port), self)
         except OSError as error:
             raise InputError("socketcand", f"a free HOST:PORT ({error.strerror})", f"{host}:{port}") from None
-        self._listener.settimeout(0.2)
-        self.host, self.port = self._listener.getsockname()[:2]
+        self.host, self.port = self._listener.server_address[:2]
         self._ended: Counter[str] = Counter()
         """Counts of connections that have ended."""
         self._clients: list[_Client] = []
         self._lock = threading.Lock()
-        self._closed = False
-        self._thread = threading.Thread(target=self._accept, name="socketcand", daemon=True)
+        self._number = 0
+        self._guard = Guard("socketcand")
+        self._thread = threading.Thread(
+            target=self._listener.serve_forever, args=(_POLL_S,), name="socketcand", daemon=True
+        )
 
     def start(self) -> None:
         """Take clients from now on."""
@@ -362,19 +353,16 @@ class SocketcandServer:
 
     def close(self) -> None:
         """End all connections."""
-        self._closed = True
-        with contextlib.suppress(OSError):
-            # Wakes who waits there, on Linux; elsewhere the time-out does.
-            self._listener.shutdown(socket.SHUT_RDWR)
         if self._thread.is_alive():
-            self._thread.join(timeout=2.0)
-        self._listener.close()
+            self._listener.shutdown()
+        self._listener.server_close()
         with self._lock:
             clients = list(self._clients)
         for client in clients:
             client.stop()
-        for client in clients:
-            client.close()
+        deadline = time.monotonic() + _ENDING_S
+        while self._clients and time.monotonic() < deadline:
+            time.sleep(0.01)
 
     def __enter__(self) -> SocketcandServer:
         self.start()
@@ -386,50 +374,36 @@ class SocketcandServer:
     def counts(self) -> dict[str, int]:
         """What has happened: `clients` now, `dropped` frames, `fd_left_out`, `malformed`, `refused`, `given_up`."""
         with self._lock:
-            self._sweep()
-            total = Counter(self._ended)
-            for client in self._clients:
-                total.update(client.counts)
-                total["dropped"] += client.dropped
+            total = sum((client.counts for client in self._clients), self._ended)
             names = ("dropped", "fd_left_out", "malformed", "refused", "given_up", "turned_away")
             return {"clients": len(self._clients), **{name: total[name] for name in names}}
 
-    def _sweep(self) -> None:
-        """Add up connections that have ended; the lock is held."""
-        for client in [client for client in self._clients if not client.alive]:
-            self._clients.remove(client)
-            self._ended.update(client.counts)
-            self._ended["dropped"] += client.dropped
+    def warnings(self) -> list[str]:
+        """What a person should know of, while it is so."""
+        with self._lock:
+            return [*self._guard.warnings(), *(text for client in self._clients for text in client.warnings())]
 
-    def _accept(self) -> None:
-        number = 0
-        while not self._closed:
-            try:
-                connection, _ = self._listener.accept()
-            except TimeoutError:
-                continue
-            except OSError:
-                if self._closed:
-                    return
-                # For instance too many open files: others may end.
-                time.sleep(0.2)
-                continue
+    def _let_in(self, connection: socket.socket) -> bool:
+        with self._lock:
+            full = len(self._clients) >= MAX_CLIENTS
+            self._ended["turned_away"] += full
+        if full:
+            with contextlib.suppress(OSError):
+                connection.send(b"< error too many clients >")
+        return not full
+
+    def _serve(self, connection: socket.socket) -> None:
+        """Serve a connection to its end, on a thread of its own."""
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SENDING)
+        with self._lock:
+            self._number += 1
+            client = _Client(connection, self._buses, number=self._number, **self._settings)
+            self._clients.append(client)
+        try:
+            client.serve()
+        finally:
             with self._lock:
-                self._sweep()
-                full = len(self._clients) >= MAX_CLIENTS
-                if full:
-                    self._ended["turned_away"] += 1
-            connection.setblocking(False)
-            if full:
-                with contextlib.suppress(OSError):
-                    connection.send(b"< error too many clients >")
-                connection.close()
-                continue
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SENDING)
-            number += 1
-            client = _Client(connection, self._buses, number=number, room=self._room, patience_s=self._patience_s)
-            client._backlog.flush()
-            client.start()
-            with self._lock:
-                self._clients.append(client)
+                self._clients.remove(client)
+                self._ended.update(client.counts)

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drivers.can.backlog import OpenBus
+    from drivers.can.outlet import OpenBus
     from drivers.can.slcan_port import SlcanPort
     from drivers.can.socketcand import SocketcandServer
     from drivers.can.timing import Speed

@@ -14,8 +14,8 @@ from rig.errors import InputError
 if TYPE_CHECKING:
     import can
 
-    from drivers.can.backlog import OpenBus
     from drivers.can.gateway import Gateway
+    from drivers.can.outlet import OpenBus
     from drivers.can.schedule import Schedule
     from drivers.can.timing import Speed
     from rig.cli.can_outlets import CanOutlets

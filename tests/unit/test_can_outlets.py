@@ -23,10 +23,10 @@ from can.interfaces.slcan import slcanBus  # noqa: TID253
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus  # noqa: TID253
 
 from drivers.can import medium, slcan_port, socketcand
-from drivers.can.backlog import Backlog
 from drivers.can.bus import BusModel
 from drivers.can.hub import Hub
 from drivers.can.interface import HubBus
+from drivers.can.outlet import Outlet
 from drivers.can.slcan_port import Lines, SlcanPort
 from drivers.can.socketcand import CommandError, SocketcandServer, Splitter
 from drivers.can.timing import speed
@@ -334,9 +334,8 @@ def test_fd_frames_are_left_out_and_counted(bench: Bench) -> None:
 def test_error_frames_reach_the_client(hub_bench: Bench) -> None:
     other, server = hub_bench.bus(), hub_bench.serve()
     client = hub_bench.socketcand(server)
-    (tap,) = [each._tap for each in server._clients]
-    assert tap is not None
-    tap._put(medium.message_of(medium.error_record(10**9, medium.BUS_OFF)))
+    (outlet,) = server._clients
+    outlet._put(outlet._show(medium.message_of(medium.error_record(10**9, medium.BUS_OFF))) or b"")
     other.send(CLASSIC[0])
     first, second = read(client, 2)
     assert first.is_error_frame
@@ -348,7 +347,7 @@ def test_error_frames_reach_the_client(hub_bench: Bench) -> None:
 def test_a_stalled_client_loses_frames_and_is_given_up_while_others_hear_all() -> None:
     bench = Bench("virtual")
     with bench.stack:
-        other, server = bench.bus(), bench.serve(room=4096, patience_s=0.3)
+        other, server = bench.bus(), bench.serve(room=100, patience_s=0.3)
         stalled, good = bench.raw(server), bench.socketcand(server)
         stalled.next()
         assert stalled.ask("< open can0 >") == "< ok >"
@@ -372,7 +371,7 @@ def test_a_stalled_client_loses_frames_and_is_given_up_while_others_hear_all() -
 def test_a_client_that_takes_no_answers_is_asked_no_more() -> None:
     bench = Bench("virtual")
     with bench.stack:
-        server = bench.serve(room=4096, patience_s=0.3)
+        server = bench.serve(room=100, patience_s=0.3)
         client = bench.raw(server)
         client.socket.settimeout(10.0)
         with contextlib.suppress(ConnectionError):
@@ -574,10 +573,9 @@ def test_listening_only_sends_nothing(bench: Bench) -> None:
     other, port = bench.bus(), bench.port()
     with Terminal(port) as terminal:
         assert [terminal.ask("L"), terminal.ask("t1230")] == [b"\r", b"\a"]
-        tap = port._tap
-        assert tap is not None
         if hasattr(bench, "hub"):
-            assert tap.bus.state is BusState.PASSIVE
+            assert port._bus is not None
+            assert port._bus.state is BusState.PASSIVE
         other.send(CLASSIC[0])
         assert terminal.next() == b"t1233616263\r"
         assert other.recv(0.05) is None
@@ -587,21 +585,19 @@ def test_status_flags_tell_what_error_frames_say(bench: Bench) -> None:
     port = bench.port()
     with Terminal(port) as terminal:
         terminal.ask("O")
-        tap = port._tap
-        assert tap is not None
         for record, flags in [
             (medium.overflow(0), 0x09),
             (medium.error_record(0, medium.CONTROLLER, data=bytes((0, 0x20, 0, 0, 0, 0, 0, 0))), 0x20),
             (medium.error_record(0, medium.BUS_ERROR | medium.PROTOCOL), 0x80),
             (medium.error_record(0, medium.BUS_OFF), 0xA0),
         ]:
-            tap._put(medium.message_of(record))
+            assert port._show(medium.message_of(record)) is None
             assert terminal.ask("F") == b"F%02X\r" % flags
             assert terminal.ask("F") == b"F00\r"
 
 
 def test_a_program_that_stops_reading_loses_frames_and_its_channel(hub_bench: Bench) -> None:
-    other, port = hub_bench.bus(), hub_bench.port(room=2048, patience_s=0.3)
+    other, port = hub_bench.bus(), hub_bench.port(room=50, patience_s=0.3)
     with Terminal(port) as terminal:
         terminal.ask("O")
         deadline = time.monotonic() + 20
@@ -622,7 +618,7 @@ def test_a_program_that_stops_reading_loses_frames_and_its_channel(hub_bench: Be
 def test_dropped_frames_set_flags_when_there_is_room_again() -> None:
     bench = Bench("virtual")
     with bench.stack:
-        other, port = bench.bus(), bench.port(room=2048)
+        other, port = bench.bus(), bench.port(room=50)
         with Terminal(port) as terminal:
             terminal.ask("O")
             for _ in range(2000):
@@ -723,34 +719,59 @@ def test_a_bus_that_fails_ends_the_connection_and_can_be_opened_anew() -> None:
         assert [terminal.ask("C"), terminal.ask("O")] == [b"\r", b"\r"]
 
 
-def test_a_backlog_is_bounded_and_never_tears_text() -> None:
-    taken: list[bytes] = []
-    room, now = 0, 0.0
+class Echo(Outlet):
+    """Answers what comes, and knows no bus."""
 
-    def write(data: memoryview) -> int:
-        nonlocal room
-        count = min(room, len(data))
-        if not count:
-            raise BlockingIOError
-        room -= count
-        taken.append(bytes(data[:count]))
-        return count
+    def _take(self, data: bytes) -> None:
+        self._answer(data)
 
-    backlog = Backlog(write, room=10, clock=lambda: now)
-    assert [backlog.put(b"abcd") for _ in range(3)] == [True, True, False]
-    assert backlog.put(b"!" * 9, always=True)
-    assert backlog.crowded
-    now = 3.0
-    assert backlog.stalled_s == 3.0
-    room = 5
-    backlog.flush()
-    assert b"".join(taken) == b"abcda"
-    assert backlog.stalled_s == 0.0
-    room = 100
-    backlog.flush()
-    assert b"".join(taken) == b"abcdabcd" + b"!" * 9
-    now = 99.0
-    assert (backlog.waiting, backlog.stalled_s) == (0, 0.0)
+
+def test_messages_are_bounded_and_never_torn_however_little_is_taken_at_once() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        ours.setblocking(False)
+        outlet = Echo(ours.fileno(), name="echo", room=50)
+        messages = [b"<%d %s>" % (number, b"x" * (number % 700)) for number in range(400)]
+        thread = threading.Thread(target=outlet.serve)
+        thread.start()
+        kept, seen, turn = [], b"", random.Random(3)
+        for each in messages:
+            if outlet._put(each):
+                kept.append(each)
+            if turn.random() < 0.3:
+                with contextlib.suppress(BlockingIOError):
+                    seen += theirs.recv(turn.randrange(1, 600), socket.MSG_DONTWAIT)
+        assert 50 <= len(kept) < 400
+        theirs.settimeout(5.0)
+        while len(seen) < len(b"".join(kept)):
+            seen += theirs.recv(333)
+        assert seen == b"".join(kept)
+        theirs.sendall(b"<end>")
+        assert theirs.recv(100) == b"<end>"
+        theirs.close()
+        thread.join(5.0)
+        assert not thread.is_alive()
+
+
+def test_what_fails_inside_a_door_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench("virtual")
+    with bench.stack:
+        other, server = bench.bus(), bench.serve()
+        client = bench.raw(server)
+        client.next()
+        client.ask("< open can0 >")
+        client.ask("< rawmode >")
+        for name in ("show", "parse_frame"):
+            monkeypatch.setattr(socketcand, name, lambda *_, **__: 1 / 0)
+        other.send(message(1))
+        client.send("< send 1 0 >")
+        until(lambda: any("socketcand 1 failed 2 times" in text for text in server.warnings()))
+        monkeypatch.undo()
+        other.send(message(2))
+        assert client.next().startswith("< frame 002 ")
+        client.send("< send 3 0 >")
+        assert read(other, 1)[0].arbitration_id == 3
 
 
 def test_outlets_of_the_command_line() -> None:
