@@ -139,6 +139,8 @@ class Desk:
         self._ended = ""
         self._kinds: set[str] = set()
         self._troubles: dict[str, str] = {}
+        self._passing: set[str] = set()
+        """Kinds of warnings of the transports, which come and go."""
         self.clients = Clients()
 
     def open(self, documents: Mapping[str, Callable[[], dict[str, Any]]]) -> None:
@@ -219,7 +221,15 @@ class Desk:
 
     def warnings(self) -> list[str]:
         """What went wrong here, for the status."""
-        warnings = self.troubles
+        told = getattr(self._server, "warnings", list)()
+        kinds = {_FIGURES.sub("#", text) for text in told}
+        with self._lock:
+            # What has passed is told anew when it comes again.
+            self._kinds -= self._passing - kinds
+            self._passing = kinds
+        for text in told:
+            self.warn(text)
+        warnings = [*self.troubles, *told]
         if self.clients.malformed:
             warnings.append(f"{self.clients.malformed} client reports could not be read")
         if self.clients.hidden:

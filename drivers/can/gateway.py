@@ -16,12 +16,16 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import pydantic
 
 from drivers.can import medium
+from drivers.can.frame import STANDARD_MASK, octets
+from drivers.can.health import Guard, Rising
 from drivers.can.schedule import SLOT_S, Schedule
 from drivers.can.signals import (
     ABSENT,
@@ -39,6 +43,7 @@ from drivers.can.signals import (
 from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
+from rig.outside import Outside, check
 from rig.transport import Client, NoReplyError
 
 if TYPE_CHECKING:
@@ -166,6 +171,15 @@ class _Asked:
     answered: bool = False
 
 
+class _Reply(Outside, extra="ignore"):
+    """The rig's answer to a command: when it takes effect, or the field that is wrong and what it must be."""
+
+    accepted: bool
+    time_s: Annotated[float, pydantic.Field(ge=0.0, le=1e9)] = 0.0
+    field: str = ""
+    must: str = ""
+
+
 @dataclass(slots=True)
 class Counts:
     """What a gateway has done.
@@ -232,6 +246,7 @@ class Gateway:
         self._by_name = self._messages.by_name
         self._rate_hz, self._steps = _steps(table, schedule)
         self._streams = _streams(table, self._steps)
+        self._commands = {self._by_name[name].identifier for name in ("Stop", "Command")}
         self._groups = tuple(table.groups)
         self._queue: deque[tuple[str, bytes]] = deque()
         self._queue_seconds = queue_seconds
@@ -258,6 +273,9 @@ class Gateway:
         self._work = threading.Condition()
         self._refusal_credit = _REFUSALS_AT_ONCE
         self._refusal_s = now()
+        self._guard = Guard("the CAN gateway")
+        self._dropping = Rising("CAN: {} frames were dropped: the bus does not take them in time")
+        self._falling_behind = Rising("CAN: {} blocks were dropped: the gateway does not keep up")
         self._send_records = getattr(bus, "send_records", None)
         self._urgent: deque[np.ndarray] = deque()
         self._waiting: deque[np.ndarray] = deque()
@@ -273,9 +291,8 @@ class Gateway:
 
     def start(self) -> None:
         """Begin: from now on the gateway is a node of the bus."""
-        names = ("Stop", "Command")
         self._bus.set_filters(
-            [{"can_id": self._by_name[name].identifier, "can_mask": 0x7FF, "extended": False} for name in names]
+            [{"can_id": each, "can_mask": STANDARD_MASK, "extended": False} for each in self._commands]
         )
         for group in self._groups:
             self._client.subscribe(wire.sensor_key(group), self._take)
@@ -313,10 +330,19 @@ class Gateway:
             "can_load": round(self._load, 4),
             "can_frames": counts.frames,
             "can_dropped": self._dropped(),
+            "can_blocks_dropped": counts.blocks_dropped,
             "can_accepted": counts.accepted,
             "can_refused": counts.refused.total(),
             **{f"can_refused_{reason}": count for reason, count in list(counts.refused.items())},
         }
+
+    def warnings(self) -> list[str]:
+        """What a person should know of, while it is so."""
+        return [
+            *self._guard.warnings(),
+            *self._dropping.warnings(self._dropped()),
+            *self._falling_behind.warnings(self.counts.blocks_dropped),
+        ]
 
     def _dropped(self) -> int:
         return self.counts.dropped + sum(stream.skipped for stream in self._streams)
@@ -338,38 +364,46 @@ class Gateway:
     # On the sender's thread.
 
     def _send_all(self) -> None:
-        while True:
-            with self._changed:
-                entries = list(self._queue)
-                self._queue.clear()
-                if not self._paced:
-                    self._changed.notify_all()
-            for key, payload in entries:
-                self._unpack(key, payload)
-            now = self._now()
-            self._send_due(now)
-            self._send_waiting()
-            if self._ended and self._state != State.ENDED and not self._slots and not self._waiting:
-                # Only now: who hears it must not expect samples any more.
-                self._state = State.ENDED
-                self._next_status_s = self._next_heartbeat_s = now
-            self._send_periodic(now)
-            self._time_out(now)
-            with self._changed:
-                if self._queue and not self._paced:
-                    continue
-                if self._stopping and not self._queue and not self._slots:
-                    self._end_s = min(self._end_s, now + _FAREWELL_S)
-                    if now >= self._end_s or not (self._waiting or self._urgent):
-                        self.counts.dropped += self._waiting_frames + len(self._urgent)
-                        return
-                if self._paced:
-                    # On a grid of slots: a block that comes in between waits for the next one.
-                    busy = self._slots or self._queue or self._waiting or self._urgent
-                    rest = SLOT_S - self._now() % SLOT_S if busy else _IDLE_S
-                else:
-                    rest = _IDLE_S
-                self._changed.wait(rest)
+        while not (done := self._guard(self._send_some)):
+            if done is None:
+                if self._stopping:
+                    return
+                time.sleep(_IDLE_S)
+
+    def _send_some(self) -> bool:
+        """What is due now, and the wait for more; whether that was all."""
+        with self._changed:
+            entries = list(self._queue)
+            self._queue.clear()
+            if not self._paced:
+                self._changed.notify_all()
+        for key, payload in entries:
+            self._guard(self._unpack, key, payload)
+        now = self._now()
+        self._send_due(now)
+        self._send_waiting()
+        if self._ended and self._state != State.ENDED and not self._slots and not self._waiting:
+            # Only now: who hears it must not expect samples any more.
+            self._state = State.ENDED
+            self._next_status_s = self._next_heartbeat_s = now
+        self._send_periodic(now)
+        self._time_out(now)
+        with self._changed:
+            if self._queue and not self._paced:
+                return False
+            if self._stopping and not self._queue and not self._slots:
+                self._end_s = min(self._end_s, now + _FAREWELL_S)
+                if now >= self._end_s or not (self._waiting or self._urgent):
+                    self.counts.dropped += self._waiting_frames + len(self._urgent)
+                    return True
+            if self._paced:
+                # On a grid of slots: a block that comes in between waits for the next one.
+                busy = self._slots or self._queue or self._waiting or self._urgent
+                rest = SLOT_S - self._now() % SLOT_S if busy else _IDLE_S
+            else:
+                rest = _IDLE_S
+            self._changed.wait(rest)
+        return False
 
     def _unpack(self, key: str, payload: bytes) -> None:
         if key == wire.EVENTS:
@@ -546,7 +580,7 @@ class Gateway:
                 self._send_records(records, timeout)
                 given = len(records)
             else:
-                for message in _messages(records):
+                for message in medium.messages_of(records):
                     self._bus.send(message, timeout)
                     given += 1
         except (can.CanError, OSError):
@@ -563,7 +597,6 @@ class Gateway:
     def _receive(self) -> None:
         import can
 
-        identifiers = {self._by_name[name].identifier for name in ("Stop", "Command")}
         while not self._stopping:
             try:
                 message = self._bus.recv(0.2)
@@ -572,10 +605,14 @@ class Gateway:
                 self.counts.errors += 1
                 time.sleep(0.1)
                 continue
-            if message is None or message.is_error_frame or message.is_remote_frame or message.is_extended_id:
-                continue
-            if message.arbitration_id in identifiers and message.is_rx:
-                self._on_command(message.arbitration_id, bytes(message.data))
+            if message is not None:
+                self._guard(self._take_message, message)
+
+    def _take_message(self, message: can.Message) -> None:
+        if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
+            return
+        if message.is_rx and message.arbitration_id in self._commands:
+            self._on_command(message.arbitration_id, bytes(message.data))
 
     def _on_command(self, identifier: int, data: bytes) -> None:
         command = parse_command(identifier, data, self._counter)
@@ -594,7 +631,8 @@ class Gateway:
                 self._work.notify_all()
         if command.kind is Kind.STOP:
             # A stop does not wait behind others.
-            threading.Thread(target=self._ask, args=(asked,), name="can gateway stops", daemon=True).start()
+            stop = partial(self._guard, self._ask, asked)
+            threading.Thread(target=stop, name="can gateway stops", daemon=True).start()
 
     def _ask_all(self) -> None:
         while True:
@@ -605,25 +643,25 @@ class Gateway:
                         return
                     self._work.wait(0.2)
                     continue
-            self._ask(waiting[0])
+            self._guard(self._ask, waiting[0])
 
     def _ask(self, asked: _Asked) -> None:
         command = asked.command
         request = wire.encode_document({"from": "CAN", **command.values})
         try:
             key = wire.command_key(command.kind.name.lower())
-            reply = wire.decode_document(self._client.request(key, request, timeout_s=self._timeout_s))
+            reply = check(_Reply, self._client.request(key, request, timeout_s=self._timeout_s), field="reply")
         except (NoReplyError, ValueError):
             reply = None
         if not self._settle(asked):
             return
         if reply is None:
             self._refuse(Result.TIMED_OUT, command.counter)
-        elif reply.get("accepted"):
+        elif reply.accepted:
             self.counts.accepted += 1
-            self._acknowledge(Result.ACCEPTED, command.counter, time_us=round(1e6 * reply["time_s"]))
+            self._acknowledge(Result.ACCEPTED, command.counter, time_us=round(1e6 * reply.time_s))
         else:
-            self._refuse_for(str(reply.get("error", "")), command)
+            self._refuse_for(reply, command)
 
     def _settle(self, asked: _Asked) -> bool:
         """Take a command off the list; False where it had been answered before."""
@@ -644,17 +682,15 @@ class Gateway:
             if self._settle(row):
                 self._refuse(Result.TIMED_OUT, row.command.counter)
 
-    def _refuse_for(self, text: str, command: Command) -> None:
+    def _refuse_for(self, reply: _Reply, command: Command) -> None:
         """Tell the bus what the rig's own check says: which field, and which limit it passed."""
-        name, _, rest = text.partition(" must be ")
-        place = FIELDS.get(name.rpartition(".")[2])
-        if place is None:
+        name = reply.field.rpartition(".")[2]
+        if name not in FIELDS or name not in command.values:
             self._refuse(Result.REFUSED, command.counter)
             return
-        value = command.values.get(name.rpartition(".")[2], 0.0)
-        limits = [float(found) for found in _NUMBER.findall(rest.partition("; instead received")[0])]
-        limit = min(limits, key=lambda each: abs(each - value), default=0.0)
-        self._refuse(Result.OUT_OF_RANGE, command.counter, place=place, limit=limit)
+        value = command.values[name]
+        limit = min(map(float, _NUMBER.findall(reply.must)), key=lambda each: abs(each - value), default=0.0)
+        self._refuse(Result.OUT_OF_RANGE, command.counter, place=FIELDS[name], limit=limit)
 
     def _refuse(self, result: Result, counter: int, *, place: Field = Field.NONE, limit: float = 0.0) -> None:
         self.counts.refused[result.name.lower()] += 1
@@ -726,21 +762,5 @@ def _records(message: Message, data: np.ndarray) -> np.ndarray:
     records["identifier"] = message.identifier
     records["length"] = message.length
     records["flags"] = medium.FD | medium.BRS if message.fd else 0
-    start = _RECORD.itemsize - medium.FD_WIDTH
-    records.view(np.uint8).reshape(len(data), -1)[:, start : start + message.length] = data
+    octets(records)[:, : message.length] = data
     return records
-
-
-def _messages(records: np.ndarray) -> list[can.Message]:
-    from can import Message as Frame
-
-    return [
-        Frame(
-            arbitration_id=identifier,
-            is_extended_id=False,
-            data=data[:length],
-            is_fd=bool(flags & medium.FD),
-            bitrate_switch=bool(flags & medium.BRS),
-        )
-        for _, identifier, length, flags, _, data in records.tolist()
-    ]

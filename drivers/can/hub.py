@@ -27,10 +27,10 @@ import numpy as np
 from drivers.can import medium
 from drivers.can.bus import OUTCOMES, STATES, BusModel, warm_up
 from drivers.can.frame import CLASSIC_WIDTH, FD_WIDTH, Record, fault_of, pack, resized, sendable
+from drivers.can.health import Guard, Rising
 from rig import wire
 from rig.errors import InputError
 from rig.outside import check
-from rig.text import printable
 
 if TYPE_CHECKING:
     from rig.transport.zenoh import ZenohServer
@@ -63,8 +63,6 @@ _MOST_TOKENS = 16 * MAX_ENDPOINTS
 _LARGEST = 8 + medium.MAX_RECORDS * medium.RECORDS[FD_WIDTH].itemsize
 _FAILED_S = 0.05
 """How long the bus rests where its model has failed."""
-_CONTENDED_S = 10.0
-"""How long the status warns of what was tried under others' names."""
 _FEW = 8
 """Frames that are offered one by one; arrays would cost more than they save."""
 
@@ -151,9 +149,9 @@ class Hub:
         self._locals: dict[str, _Local] = {}
         self._tokens: dict[str, None] = {}
         """The newest last."""
-        self._failure = ""
-        """What went wrong in here last."""
-        self._contended_s = -_CONTENDED_S
+        self._guard = Guard(f"CAN {channel}: the hub")
+        self._forging = Rising(f"CAN {channel}: " + "{} times somebody spoke under the name of another endpoint")
+        self._losing = Rising(f"CAN {channel}: " + "{} frames were not sent: more than the bus or a node takes")
         self._outbox: list[np.ndarray] = []
         self._waiting = 0
         """Frames that the model is not done with."""
@@ -178,8 +176,9 @@ class Hub:
         if self._server is not None:
             for name in medium.REQUESTS:
                 self._server.answer(medium.request_key(self.channel, name), partial(self._reply, name))
-            self._server.watch(medium.node_key(self.channel, "*"), partial(self._safely, self._watch))
-            self._server.hear(medium.offer_key(self.channel, "*"), partial(self._safely, self._hear))
+            self._server.on_trouble(self._guard.tell)
+            self._server.watch(medium.node_key(self.channel, "*"), self._watch)
+            self._server.hear(medium.offer_key(self.channel, "*"), self._hear)
         self._thread.start()
         if self._server is not None:
             self._server.announce(medium.alive_key(self.channel))
@@ -195,7 +194,7 @@ class Hub:
         if self._thread.is_alive():
             self._thread.join(timeout=2.0)
         for local in locals_:
-            self._safely(local.lost)
+            self._guard(local.lost)
 
     def __enter__(self) -> Hub:
         self.start()
@@ -236,7 +235,7 @@ class Hub:
                 self._counts["strange"] += 1
                 return
             if not _same(endpoint.secret, payload[: medium.SECRET_BYTES].hex()):
-                self._contend()
+                self._counts["forged"] += 1
                 return
             try:
                 if len(payload) > medium.SECRET_BYTES + _LARGEST:
@@ -345,13 +344,8 @@ class Hub:
 
     def _check_owner(self, name: str, secret: str, given: str | None) -> None:
         if not _same(secret, given or ""):
-            self._contend()
+            self._counts["forged"] += 1
             raise InputError("endpoint", "one's own (another has joined under that name, and is there)", name)
-
-    def _contend(self) -> None:
-        """Somebody has tried to speak under another's name."""
-        self._counts["forged"] += 1
-        self._contended_s = time.monotonic()
 
     def _hear(self, key: str, payload: bytes) -> None:
         self.offer(key.rpartition("/")[2], payload)
@@ -409,7 +403,7 @@ class Hub:
     def _run(self) -> None:
         _sharpen_sleep()
         while not self._stopping:
-            if self._safely(self._turn) is None:
+            if self._guard(self._turn) is None:
                 time.sleep(_FAILED_S)
 
     def _turn(self) -> bool:
@@ -428,15 +422,6 @@ class Hub:
             else:
                 self._wake.wait(left_s)
         return True
-
-    def _safely(self, do: Callable[..., Any], *arguments: Any) -> Any:
-        """What it returns, or None where it fails: no thread ends for it, and the status tells."""
-        try:
-            return do(*arguments)
-        except Exception as error:
-            self._counts["failures"] += 1
-            self._failure = printable(f"{type(error).__name__}: {error}", 200)
-            return None
 
     def _step(self, now: int) -> tuple[list[bytes], int, bool]:
         """Let the bus run until now: messages to send, when to come back, and whether only then."""
@@ -571,9 +556,9 @@ class Hub:
 
     def _publish(self, payload: bytes) -> None:
         if self._server is not None:
-            self._safely(self._server.publish, medium.bus_key(self.channel), payload)
+            self._guard(self._server.publish, medium.bus_key(self.channel), payload)
         for local in list(self._locals.values()):
-            self._safely(local.take, payload)
+            self._guard(local.take, payload)
 
     def status(self) -> dict[str, Any]:
         """What goes on: endpoints, counts."""
@@ -593,13 +578,15 @@ class Hub:
 
     def warnings(self) -> list[str]:
         """What a person should know of, while it is so."""
-        found = []
-        if self._counts["failures"]:
-            found.append(f"CAN {self.channel}: the hub failed {self._counts['failures']} times ({self._failure})")
-        if time.monotonic() - self._contended_s < _CONTENDED_S:
-            count = self._counts["forged"]
-            found.append(f"CAN {self.channel}: {count} times somebody spoke under the name of another endpoint")
-        return found
+        return [
+            *self._guard.warnings(),
+            *self._forging.warnings(self._counts["forged"]),
+            *self._losing.warnings(self._counts["unsent"] + self._counts["surplus"]),
+        ]
+
+    def figures(self) -> dict[str, int]:
+        """Frames that were not sent, and what was tried under others' names."""
+        return {"unsent": self._counts["unsent"] + self._counts["surplus"], "forged": self._counts["forged"]}
 
 
 def _array(record: Record) -> np.ndarray:
@@ -616,7 +603,6 @@ def _same(secret: str, given: str) -> bool:
 
 _COUNTS = (
     "frames", "errors", "unsent", "malformed", "invalid", "surplus", "strange", "refused", "forged", "evicted",
-    "failures",
 )  # fmt: skip
 
 

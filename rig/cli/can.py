@@ -78,6 +78,8 @@ def hub(
             while not stopped.wait(5.0):
                 for one in hubs:
                     typer.echo(_line(one.status()), err=True)
+                for text in (text for part in (*hubs, outlets) for text in part.warnings()):
+                    typer.echo(f"rig: warning: {text}", err=True)
         for line in (*(_line(one.status()) for one in hubs), *outlets.summary()):
             typer.echo(line)
 

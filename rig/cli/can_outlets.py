@@ -64,6 +64,16 @@ class CanOutlets:
             found.append(f"CAN by socketcand on {self._server.host}:{self._server.port}, classic frames only")
         return found
 
+    def warnings(self) -> list[str]:
+        """What a person should know of, while it is so."""
+        doors = [*self._ports.values(), *([] if self._server is None else [self._server])]
+        return [text for door in doors for text in door.warnings()]
+
+    def dropped(self) -> int:
+        """Frames that clients did not read in time."""
+        ports = sum(port.counts["dropped"] for port in self._ports.values())
+        return ports + (0 if self._server is None else self._server.counts()["dropped"])
+
     def summary(self) -> list[str]:
         """What became of each, in a line."""
         found = {f"slcan {port.path}": port.figures() for port in self._ports.values()}

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import can
 
     from drivers.can.gateway import Gateway
+    from drivers.can.hub import Hub
     from drivers.can.outlet import OpenBus
     from drivers.can.schedule import Schedule
     from drivers.can.timing import Speed
@@ -131,6 +132,7 @@ class CanOutput:
         self._open_more: OpenBus | None = None
         self._memory = MemoryServer(cache=0)
         self._gateway: Gateway | None = None
+        self._hub: Hub | None = None
         self._stack = ExitStack()
         self._bus: can.BusABC | None = None
 
@@ -154,7 +156,7 @@ class CanOutput:
         """The rig's server together with the bus."""
         from rig.transport.fanout import Fanout
 
-        return Fanout([server, self._memory], figures=self._figures)
+        return Fanout([server, self._memory], figures=self._figures, warnings=self._warnings)
 
     def start(self, *, paced: bool) -> None:
         """Begin, once the rig can be asked.
@@ -192,7 +194,16 @@ class CanOutput:
         ) + "".join(f"\nrig: {line}" for line in (self._outlets.lines() if self._outlets is not None else []))
 
     def _figures(self) -> dict[str, float]:
-        return self._gateway.figures() if self._gateway is not None else {}
+        if self._gateway is None:
+            return {}
+        hub = {} if self._hub is None else {f"can_{name}": count for name, count in self._hub.figures().items()}
+        outlets = {} if self._outlets is None else {"can_clients_dropped": self._outlets.dropped()}
+        return {**self._gateway.figures(), **hub, **outlets}
+
+    def _warnings(self) -> list[str]:
+        return [
+            text for part in (self._gateway, self._hub, self._outlets) if part is not None for text in part.warnings()
+        ]
 
     @contextmanager
     def _open(self) -> Iterator[can.BusABC]:
@@ -233,7 +244,7 @@ class CanOutput:
             Hub(BusModel(self.speed), self.channel, server) as hub,
             HubBus(hub) as bus,
         ):
-            self._open_more = partial(HubBus, hub)
+            self._hub, self._open_more = hub, partial(HubBus, hub)
             yield bus
 
 

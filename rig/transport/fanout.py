@@ -14,10 +14,18 @@ class Fanout:
     Args:
         servers: The transports, in the order in which they are given each payload; each stays its owner's to close.
         figures: Further counts for the status, named as `congestion` names its own.
+        warnings: What else a person should know of, while it is so.
     """
 
-    def __init__(self, servers: Sequence[Server], *, figures: Callable[[], dict[str, float]] | None = None) -> None:
+    def __init__(
+        self,
+        servers: Sequence[Server],
+        *,
+        figures: Callable[[], dict[str, float]] | None = None,
+        warnings: Callable[[], list[str]] = list,
+    ) -> None:
         self._servers = tuple(servers)
+        self.warnings = warnings
         self._figures = figures
 
     def publish(self, key: str, payload: bytes) -> None:
