@@ -717,7 +717,7 @@ class Gateway:
             result=result,
             field=place,
             time=(self._time_us if time_us is None else time_us) & _WORD_32,
-            limit=min(max(round(10 * limit), 0), 0xFFFF),
+            limit=round(min(max(10 * limit, 0), 0xFFFF)),
         )
 
 

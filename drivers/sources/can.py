@@ -202,7 +202,7 @@ class CanSource:
         while not self._closed:
             try:
                 message = self._bus.recv(_PORTION_S)
-            except can.CanError:
+            except (can.CanError, OSError, ValueError):
                 break
             now = time.monotonic()
             if message is not None:

@@ -18,6 +18,7 @@ import pytest
 
 from drivers.can import dbc
 from drivers.can.gateway import Gateway
+from drivers.can.health import Rising
 from drivers.can.schedule import Schedule
 from drivers.can.signals import ABSENT, Kind, Result, State, command_frame, default_messages
 from rig import wire
@@ -101,9 +102,13 @@ class Setup:
     ) -> None:
         self.server = MemoryServer(cache=0)
         self.tap = tap
-        self.service = Service(simulation, Fanout([self.server]), clock, block_ticks=block_ticks)
+        everywhere = Fanout(
+            [self.server], figures=lambda: self.gateway.figures(), warnings=lambda: self.gateway.warnings()
+        )
+        self.service = Service(simulation, everywhere, clock, block_ticks=block_ticks)
+        self.client = MemoryClient(self.server)
         self.service.prepare()
-        self.gateway = Gateway(MemoryClient(self.server), bus, schedule, **options)
+        self.gateway = Gateway(self.client, bus, schedule, **options)
         self.summary: dict[str, Any] = {}
         self._thread = threading.Thread(target=self._run)
 
@@ -295,6 +300,33 @@ def test_what_finds_no_room_for_a_moment_is_sent_afterwards_in_its_order() -> No
     assert numbers == list(range(0, 10_000, 10))
     # Answers do not wait behind samples, nor does the status.
     assert bus.taken[0][0] >= 0x700
+
+
+def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_happen() -> None:
+    bus = Stubborn()
+    now = 0.0
+    with rig(Fake(duration_s=None), paced=True, bus=bus) as setup:
+        setup.gateway._dropping = Rising("CAN: {} frames were dropped", clock=lambda: now)
+        told = []
+        setup.client.subscribe(wire.EVENTS, lambda _, payload: told.append(wire.decode_document(payload)))
+        setup.start()
+
+        def warned() -> list[str]:
+            return [text for text in setup.service.status()["warnings"] if "dropped" in text]
+
+        until(lambda: len(bus.taken) > 100)
+        for round_ in range(2):
+            assert warned() == []
+            bus.refuse = True
+            until(lambda: bool(warned()))
+            before = setup.gateway.counts.dropped
+            until(lambda: setup.service.status()["congestion"].get("can_dropped", 0) > before)  # noqa: B023
+            bus.refuse = False
+            until(lambda: setup.gateway._waiting_frames == 0)
+            warned()
+            now += 10.0
+            until(lambda: not warned())
+            assert len([row for row in told if "dropped" in row.get("text", "")]) == round_ + 1
 
 
 def test_a_run_without_the_clock_waits_for_the_bus() -> None:
