@@ -141,6 +141,14 @@ def page() -> str:
         "what they carry is described in drivers/instrument/protocol.py and drivers/can/medium.py, the CAN frames in "
         "drivers/can/rig.dbc.",
         "",
+        "On a bus a name belongs to whoever has joined under it for as long as it is there: `join` hands out a secret, "
+        "and offers, `set`, `flush` and another `join` are taken with it only; what is tried without is counted and "
+        "warned of. On the loopback that is no authentication: zenoh does not vouch for who sends, the secret travels "
+        "in clear, every program of the machine may join, send what has a higher priority, and take up all "
+        "places for other processes (never those of the rig and its own clients). None of these ports, nor "
+        "`--can-socketcand`, listens on other hosts than 127.0.0.1, whatever is asked, as none knows a password; from "
+        "another machine they are reached by `ssh -L PORT:127.0.0.1:PORT USER@HOST`.",
+        "",
     ]
     return "\n".join(lines)
 

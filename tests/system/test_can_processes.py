@@ -296,7 +296,7 @@ with can.Bus("can0", interface="zenoh", endpoint=sys.argv[1]) as bus:
         (("can 0",), "channel must be letters"),
         (("can0", "can0"), "CHANNEL must be named once each"),
         (("can0", "--speed", "fast"), "bit rate must be"),
-        (("can0", "--listen", "0.0.0.0:7999"), "--expose"),
+        (("can0", "--listen", "0.0.0.0:7999"), "ssh -L 7999:127.0.0.1:7999"),
     ],
 )
 def test_wrong_options_of_the_hub_are_one_line(arguments: tuple[str, ...], line: str) -> None:

@@ -754,6 +754,26 @@ def test_messages_are_bounded_and_never_torn_however_little_is_taken_at_once() -
         assert not thread.is_alive()
 
 
+def test_each_write_holds_whole_messages() -> None:
+    # Here what is read is what was written at once.
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        ours.setblocking(False)
+        outlet = Echo(ours.fileno(), name="echo")
+        messages = [b"< frame %03X 1.000000 %s >" % (number, b"AB" * (number % 9)) for number in range(1000)]
+        for each in messages:
+            assert outlet._put(each)
+        thread = threading.Thread(target=outlet.serve)
+        thread.start()
+        seen: list[bytes] = []
+        while len(b"".join(seen)) < len(b"".join(messages)):
+            seen.append(theirs.recv(1 << 16))
+        assert all(each.startswith(b"< ") and each.endswith(b" >") and len(each) <= 1024 for each in seen)
+        assert b"".join(seen) == b"".join(messages)
+        outlet.stop()
+        thread.join(5.0)
+
+
 def test_what_fails_inside_a_door_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench("virtual")
     with bench.stack:
