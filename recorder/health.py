@@ -277,7 +277,7 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth], misplace
     clock = recording.clock if _has_clock(recording) else np.empty((0, 2))
     span_s = float(np.ptp(clock[:, 1])) if len(clock) else 0.0
     pace, jitter_ms, jitter_max_ms, strays = _pace(clock)
-    last = recording.statuses[-1] if recording.statuses else {}
+    last = recording.last_status or {}
     kept = ("pace", "real_time_factor", "lateness_ms", "overruns", "queue", "energy", "engine")
     warnings = dict.fromkeys(
         [str(event.get("text", "")) for event in recording.events if event.get("event") == "warning"]
@@ -289,8 +289,6 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth], misplace
     dropped = last.get("queue", {}).get("dropped", 0)
     if dropped:
         findings.append(f"the rig dropped {dropped} blocks before they were published")
-    if recording.damaged:
-        findings.append(f"{recording.damaged} damaged chunks are passed over")
     return Health(
         channels=channels,
         pace=pace,
