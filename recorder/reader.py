@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-
 from pydantic import BaseModel
 
 from recorder import documents, schemas
@@ -218,8 +217,8 @@ class Recording:
     def last_status(self) -> dict[str, Any] | None:
         """The last of the rig's status documents; None without one."""
         last = None
-        for _, last in self._documents(STATUS, documents.Status):
-            pass
+        for _, document in self._documents(STATUS, documents.Status):
+            last = document
         return last
 
     @cached_property

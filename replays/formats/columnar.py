@@ -167,6 +167,7 @@ class Writer:
     """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata."""
 
     merged = True
+    sparse = True
     rows: Callable[[Path, Any], RowsFile] = Rows
     """What takes the rows."""
 

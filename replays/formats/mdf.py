@@ -151,6 +151,7 @@ class Writer:
     """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion."""
 
     merged = False
+    sparse = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
         asammdf = library("asammdf")

@@ -122,6 +122,7 @@ class Writer:
     """A TDMS file: a group a sensor group; counts with a linear scale, which LabVIEW applies on reading."""
 
     merged = False
+    sparse = False
 
     def __init__(self, path: Path, selection: Selection) -> None:
         nptdms = library("npTDMS", "nptdms")

@@ -118,6 +118,7 @@ class Writer:
     """A universal file: a binary dataset 58 a channel, in float64."""
 
     merged = False
+    sparse = False
 
     def __init__(self, path: Path, selection: Selection) -> None:
         self._file = path.open("wb")

@@ -89,6 +89,7 @@ class Writer:
     """A WAV file. Counts as 32-bit integers, all else as floating point from -1 to 1."""
 
     merged = True
+    sparse = False
     sidecar = True
 
     def __init__(self, path: Path, selection: Selection) -> None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.options import Json, RecordingFiles
+from rig.cli.tables import echo
+from rig.text import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,7 +34,7 @@ def info(
     recording = join(files)
     document = describe(recording, quick=quick)
     if as_json:
-        typer.echo(json.dumps(document, indent=1))
+        echo(json.dumps(document, indent=1))
     else:
         _print(recording, document)
 
@@ -42,7 +44,6 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
     from dataclasses import asdict
 
     from recorder.health import examine
-    from recorder.schemas import GAPS
 
     about = recording.metadata["rig"]
     parts = [
@@ -51,7 +52,7 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
             "size_bytes": part.path.stat().st_size,
             "complete": part.complete,
             "ended": part.end_reason,
-            "damaged_chunks": part.damaged,
+            "unchecked": part.unchecked,
             **{
                 name: part.metadata[name] for name in ("series", "trigger", "cut", "recovered") if name in part.metadata
             },
@@ -66,10 +67,7 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
         **{name: about.get(name, "") for name in ("scene", "seed", "parameter_set", "created", "view_rate_hz")},
         "span_s": recording.span_s,
         "messages": recording.messages,
-        "gaps": [
-            {**asdict(gap), "time_s": time_ns / 1e9}
-            for gap, (time_ns, _) in zip(recording.gaps, recording.payloads(GAPS), strict=True)
-        ],
+        "gaps": [{**asdict(gap), "time_s": time_s} for time_s, gap in recording.timed_gaps],
         "events": recording.events,
     }
     if not quick:
@@ -109,10 +107,11 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
             if name in part:
                 rows.append((name, ", ".join(f"{key} {value}" for key, value in part[name].items() if value)))
     rows.append(("ended", document["ended"]))
+    rows.append(("checked", "every byte" + "".join(f" but {text}" for text in recording.unchecked)))
     if "health" in document:
         rows += _verdict(document)
     for name, value in rows:
-        console.print(Text.assemble((f"{name:10}", "bold"), value), soft_wrap=True)
+        console.print(Text.assemble((f"{name:10}", "bold"), printable(value)), soft_wrap=True)
     if len(document["parts"]) > 1:
         _print_parts(console, document["parts"])
     if streams:
@@ -126,12 +125,12 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
         time_s = event.get("time_s")
         stamp = f"{time_s:9.4f} s  " if isinstance(time_s, float | int) else " " * 13
         style = "bold" if event.get("event") == "note" else ""
-        console.print(Text(stamp + event_text(event)[1], style=style), soft_wrap=True)
+        console.print(Text(stamp + printable(event_text(event)[1]), style=style), soft_wrap=True)
     gaps = document["gaps"]
     console.print(f"gaps noted by the recorder: {len(gaps) or 'none'}")
     for gap in gaps[:_MOST_GAPS]:
         what = f"{gap['size']} messages" if gap["index"] < 0 else f"{gap['size']} rows from {gap['index']} on"
-        console.print(f"  {gap['time_s']:9.4f} s  {gap['key']}: {what}", soft_wrap=True)
+        console.print(f"  {gap['time_s']:9.4f} s  {printable(gap['key'])}: {what}", soft_wrap=True)
     if len(gaps) > _MOST_GAPS:
         console.print(f"  and {len(gaps) - _MOST_GAPS} more")
 
@@ -242,7 +241,7 @@ def _print_health(console: Console, health: dict[str, Any]) -> None:
     for line in lines:
         console.print(Text.assemble((f"{'clock':10}", "bold"), line), soft_wrap=True)
     for text in [*health["findings"], *(f"the rig warned: {text}" for text in health["warnings"])]:
-        console.print(Text.assemble((f"{'doubt':10}", "bold yellow"), text), soft_wrap=True)
+        console.print(Text.assemble((f"{'doubt':10}", "bold yellow"), printable(text)), soft_wrap=True)
 
 
 def _without_nan(value: Any) -> Any:
