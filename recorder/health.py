@@ -225,6 +225,8 @@ class _Watch:
             return 0.0
         power = self._power[:, column] / self._windows
         middle, reach = round(mains_hz * WINDOW_S), round(10.0 * WINDOW_S)
+        if len(power) <= middle + reach:  # the rate is too low to show it
+            return 0.0
         around = power[middle - reach : middle + reach + 1]
         near = np.abs(np.arange(-reach, reach + 1)) <= 2
         if around.argmax() != reach or power[middle] < _HUM * np.median(around[~near]):
