@@ -61,7 +61,7 @@ class Parameters(_Document):
     """The parameters that the rig ran with."""
 
     set: str = ""
-    values: dict[str, _Value] = {}
+    values: dict[str, _Value]
 
 
 class Taken(_Document):
@@ -155,9 +155,9 @@ class Rig(_Text):
     format: Literal["rig-recording"]
     created: datetime
     view_rate_hz: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
-    scene: str = ""
-    seed: str = ""
-    parameter_set: str = ""
+    scene: str
+    seed: str
+    parameter_set: str
 
 
 class End(_Text):

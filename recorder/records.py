@@ -352,6 +352,8 @@ def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]
     position = 0
     while position + _RECORD.size <= len(data):
         opcode, length = _RECORD.unpack_from(data, position)
+        if opcode == 0:  # no record: zeros
+            break
         start = position + _RECORD.size
         position = start + length
         if position <= len(data):

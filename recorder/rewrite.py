@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from recorder import schemas
+from recorder import documents, schemas
 from recorder.payload import block_in, tick_in
 from recorder.reader import Recording
 from recorder.records import COPY
@@ -240,9 +240,10 @@ def _write(
             if key.startswith(schemas.VIEW + "/") or key == schemas.CLOCK:
                 continue
             if key == schemas.GAPS:
-                gap = decode_document(payload)
-                if gap.get("kind") == "messages":
-                    writer.write_missed(str(gap["key"]), int(gap["size"]), wall_ns)
+                with contextlib.suppress(InputError):
+                    gap, _ = documents.read(documents.Gap, payload, field=key)
+                    if gap.get("kind") == "messages":
+                        writer.write_missed(gap["key"], gap["size"], wall_ns)
                 continue
             changed = change(key, payload)
             if changed is not None:

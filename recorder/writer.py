@@ -529,11 +529,6 @@ class RecordingWriter:
     ) -> None:
         assert self._mcap is not None
         now = self._wall_ns()
-        attachments: dict[str, Any] = {
-            "catalogue.json": catalogue,
-            "parameters.json": parameters,
-            "scene.json": scene,
-        }
         about = {
             "format": schemas.FORMAT,
             "version": schemas.VERSION,
@@ -550,7 +545,12 @@ class RecordingWriter:
         metadata = {**metadata, "rig": about}
         for name in dict.fromkeys(["rig", *metadata]):
             self._mcap.add_metadata(name, metadata[name])
-        attachments[COPY] = metadata
+        attachments = {
+            COPY: metadata,
+            "catalogue.json": catalogue,
+            "parameters.json": parameters,
+            "scene.json": scene,
+        }
         self._mcap.add_attachment(now, 0, "README.txt", "text/plain", self._readme(catalogue).encode())
         for name, document in attachments.items():
             text = json.dumps(document, indent=1, allow_nan=False)

@@ -2,9 +2,50 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import time
+import traceback
+from collections.abc import Iterator
+from typing import Any
+
+from rig.errors import DiskError, InputError
+
+LONGEST_S = 20.0
 
 
 def inputs(default: int) -> int:
     """Number of inputs of a test: short in the suite, as many as RIG_FUZZ_INPUTS says in a long run."""
     return int(os.environ.get("RIG_FUZZ_INPUTS", default))
+
+
+class Door:
+    """Counts what becomes of inputs: taken, refused in one line, or else a fault, each kept once with its place."""
+
+    def __init__(self) -> None:
+        self.taken = self.refused = 0
+        self.faults: dict[str, Any] = {}
+
+    @contextlib.contextmanager
+    def tried(self, what: object, *also: type[Exception]) -> Iterator[None]:
+        """Try one input; `what` shows it where it is a fault."""
+        begin = time.monotonic()
+        try:
+            yield
+            self.taken += 1
+        except (InputError, DiskError, *also) as error:
+            self.refused += 1
+            line = str(error)
+            if not line.isprintable() or len(line) > 6000:
+                self.faults[f"a line of {len(line)} characters"] = line[:300]
+        except Exception as error:
+            frames = traceback.extract_tb(error.__traceback__)
+            place = " < ".join(f"{frame.filename.rsplit('/', 1)[-1]}:{frame.lineno}" for frame in frames[:-4:-1])
+            self.faults.setdefault(f"{type(error).__name__} at {place}", (str(error)[:200], what))
+        if time.monotonic() - begin > LONGEST_S:
+            self.faults["too long"] = what
+
+    def tell(self, name: str) -> None:
+        """Print the counts, and fail where there is a fault."""
+        print(f"{name}: {self.taken} taken, {self.refused} refused, {len(self.faults)} kinds of faults")
+        assert not self.faults, "\n".join(f"{place}: {what}" for place, what in self.faults.items())

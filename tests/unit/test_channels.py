@@ -16,6 +16,7 @@ from rig.channels import TABLE, Channel, ChannelTable, default_table, parse_tabl
 from rig.errors import InputError
 from rig.kernels.signals import ROW
 from rig.scenes import HammerCommand
+from rig.sensors.conditioning import Conditioner
 
 TABLE_TEXT = TABLE.read_text()
 CHANNELS = list(default_table().channels.values())
@@ -152,7 +153,7 @@ def test_a_channel_without_a_sensitivity_and_one_of_no_signal_are_one_line() -> 
         parse_table(one_channel().replace("sensitivity_v", "# "))
     table = parse_table(one_channel().replace('"disk_x"', '"endx"'))
     with pytest.raises(InputError, match=r"channel c: signal must be one of .*received 'endx'"):
-        SignalConditioning(list(table.groups.values()), row_rate_hz=20_000, seed=1, noise=True)
+        Conditioner(list(table.groups.values()), row_rate_hz=20_000, seed=1, noise=True)
 
 
 @given(names=st.permutations(list(default_table().groups)), n=st.integers(0, 5), rate=st.none() | st.integers(1, 10**6))
