@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.options import Json, RecordingFiles
-from rig.cli.tables import echo
-from rig.text import printable
+from rig.cli.tables import echo, shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,7 +35,7 @@ def info(
     if as_json:
         echo(json.dumps(document, indent=1))
     else:
-        _print(recording, document)
+        _print(recording, shown(document))
 
 
 def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
@@ -111,7 +110,7 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
     if "health" in document:
         rows += _verdict(document)
     for name, value in rows:
-        console.print(Text.assemble((f"{name:10}", "bold"), printable(value)), soft_wrap=True)
+        console.print(Text.assemble((f"{name:10}", "bold"), value), soft_wrap=True)
     if len(document["parts"]) > 1:
         _print_parts(console, document["parts"])
     if streams:
@@ -121,16 +120,16 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
     _print_channels(console, recording, document.get("health"))
     if "health" in document:
         _print_health(console, document["health"])
-    for event in recording.events:
+    for event in document["events"]:
         time_s = event.get("time_s")
         stamp = f"{time_s:9.4f} s  " if isinstance(time_s, float | int) else " " * 13
         style = "bold" if event.get("event") == "note" else ""
-        console.print(Text(stamp + printable(event_text(event)[1]), style=style), soft_wrap=True)
+        console.print(Text(stamp + event_text(event)[1], style=style), soft_wrap=True)
     gaps = document["gaps"]
     console.print(f"gaps noted by the recorder: {len(gaps) or 'none'}")
     for gap in gaps[:_MOST_GAPS]:
         what = f"{gap['size']} messages" if gap["index"] < 0 else f"{gap['size']} rows from {gap['index']} on"
-        console.print(f"  {gap['time_s']:9.4f} s  {printable(gap['key'])}: {what}", soft_wrap=True)
+        console.print(f"  {gap['time_s']:9.4f} s  {gap['key']}: {what}", soft_wrap=True)
     if len(gaps) > _MOST_GAPS:
         console.print(f"  and {len(gaps) - _MOST_GAPS} more")
 
@@ -204,15 +203,15 @@ def _print_channels(console: Console, recording: Recording, health: dict[str, An
             # Of an imported channel, the ends of its counts are no range.
             known = not channel.kind.startswith("imported") or channel.range_v != (-channel.adc_v, channel.adc_v)
             row = [
-                channel.name,
-                channel.unit,
+                shown(channel.name),
+                shown(channel.unit),
                 f"{ends[0]:.4g} to {ends[1]:.4g}" if known else "not known",
                 f"{abs(channel.scale):.2g}",
                 f"{group.rate_hz} Hz",
             ]
-            seen = found.get(channel.name)
+            seen = found.get(shown(channel.name))
             if seen is None:
-                table.add_row(*row, *([""] * 5 if found else []), "" if found else channel.label)
+                table.add_row(*row, *([""] * 5 if found else []), "" if found else shown(channel.label))
                 continue
             numbers = [_number(seen[name], seen["noise"] or channel.scale) for name in ("mean", "low", "high")]
             numbers += [f"{seen[name]:.2g}" if seen[name] is not None else "" for name in ("noise", "noise_calibrated")]
@@ -241,7 +240,7 @@ def _print_health(console: Console, health: dict[str, Any]) -> None:
     for line in lines:
         console.print(Text.assemble((f"{'clock':10}", "bold"), line), soft_wrap=True)
     for text in [*health["findings"], *(f"the rig warned: {text}" for text in health["warnings"])]:
-        console.print(Text.assemble((f"{'doubt':10}", "bold yellow"), printable(text)), soft_wrap=True)
+        console.print(Text.assemble((f"{'doubt':10}", "bold yellow"), text), soft_wrap=True)
 
 
 def _without_nan(value: Any) -> Any:

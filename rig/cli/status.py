@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.connection import Connect, console
-from rig.cli.tables import echo, plain, table_console
+from rig.cli.tables import echo, shown, table_console
 from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
@@ -79,6 +79,7 @@ def status_table(document: dict[str, Any]) -> Table:
     """A status document as a table of two columns."""
     from rich.table import Table
 
+    document = shown(document)
     late, queue, energy = document["lateness_ms"], document["queue"], document["energy"]
     table = Table(title=f"rig: {document['scene']}, {document['state']}", show_header=False, title_justify="left")
     end = "" if document["end_s"] is None else f" of {document['end_s']:g} s"
@@ -128,7 +129,7 @@ def status_table(document: dict[str, Any]) -> Table:
         text = f"lag {client['lag_s']:.3f} s, heard {client['last_heard_s']:.1f} s ago, lost {client['lost']}"
         table.add_row(f"client {name}", text)
     for text in document["warnings"]:
-        table.add_row("warning", plain(text), style="yellow")
+        table.add_row("warning", text, style="yellow")
     return table
 
 

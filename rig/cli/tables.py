@@ -28,6 +28,15 @@ def echo(text: object = "", *, err: bool = False, nl: bool = True) -> None:
     typer.echo("\n".join(map(printable, str(text).split("\n"))), err=err, nl=nl)
 
 
+def shown(document: Any) -> Any:
+    """A document as it may be shown: each text in it on one line, as one with line breaks could pass for lines of ours."""
+    if isinstance(document, str):
+        return printable(document)
+    if isinstance(document, dict):
+        return {shown(name): shown(value) for name, value in document.items()}
+    return [shown(value) for value in document] if isinstance(document, list | tuple) else document
+
+
 def new_table(title: str) -> Table:
     """A table without lines, under a title."""
     from rich.table import Table

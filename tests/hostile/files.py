@@ -16,7 +16,7 @@ import numpy as np
 import replays
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from rig.wire import CATALOGUE, EDGES, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
+from rig.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
 from tests.unit.recorder_stream import documents, stream
 
 SESSIONS = Path(replays.__file__).with_name("sessions")
@@ -314,6 +314,3 @@ def uses() -> dict[str, Use]:
         "play": played,
         "experiment": lambda path, _: Experiment.of(join([path])),
     }
-
-
-__all__ = ["EDGES", "PROBES"]
