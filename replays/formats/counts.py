@@ -16,6 +16,9 @@ from rig.channels import Channel, ChannelTable, Group, default_table
 from rig.errors import InputError
 from rig.outside import check
 
+_LEAST, _MOST = 1e-30, 1e30
+"""Values that a measurement can have, in any unit."""
+
 
 @dataclass(frozen=True)
 class ImportedChannel:

@@ -29,7 +29,7 @@ def echo(text: object = "", *, err: bool = False, nl: bool = True) -> None:
 
 
 def shown(document: Any) -> Any:
-    """A document as it may be shown: each text in it on one line, as one with line breaks could pass for lines of ours."""
+    """A document as it may be shown: each text on one line, as one with line breaks could pass for ours."""
     if isinstance(document, str):
         return printable(document)
     if isinstance(document, dict):
