@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import time
 import traceback
 from collections.abc import Iterator
@@ -47,5 +48,7 @@ class Door:
 
     def tell(self, name: str) -> None:
         """Print the counts, and fail where there is a fault."""
-        print(f"{name}: {self.taken} taken, {self.refused} refused, {len(self.faults)} kinds of faults")
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        counts = f"{self.taken} taken, {self.refused} refused, {len(self.faults)} kinds of faults"
+        print(f"{name}: {counts}; largest memory so far {peak_mb:.0f} MB")
         assert not self.faults, "\n".join(f"{place}: {what}" for place, what in self.faults.items())
