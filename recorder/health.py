@@ -225,6 +225,8 @@ class _Watch:
             return 0.0
         power = self._power[:, column] / self._windows
         middle, reach = round(mains_hz * WINDOW_S), round(10.0 * WINDOW_S)
+        if len(power) <= middle + reach:  # the rate is too low to show it
+            return 0.0
         around = power[middle - reach : middle + reach + 1]
         near = np.abs(np.arange(-reach, reach + 1)) <= 2
         if around.argmax() != reach or power[middle] < _HUM * np.median(around[~near]):
@@ -277,7 +279,7 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth], misplace
     clock = recording.clock if _has_clock(recording) else np.empty((0, 2))
     span_s = float(np.ptp(clock[:, 1])) if len(clock) else 0.0
     pace, jitter_ms, jitter_max_ms, strays = _pace(clock)
-    last = recording.statuses[-1] if recording.statuses else {}
+    last = recording.last_status or {}
     kept = ("pace", "real_time_factor", "lateness_ms", "overruns", "queue", "energy", "engine")
     warnings = dict.fromkeys(
         [str(event.get("text", "")) for event in recording.events if event.get("event") == "warning"]
@@ -289,8 +291,6 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth], misplace
     dropped = last.get("queue", {}).get("dropped", 0)
     if dropped:
         findings.append(f"the rig dropped {dropped} blocks before they were published")
-    if recording.damaged:
-        findings.append(f"{recording.damaged} damaged chunks are passed over")
     return Health(
         channels=channels,
         pace=pace,

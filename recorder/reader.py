@@ -7,17 +7,18 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self
+from typing import Any, Self
 
 import numpy as np
+from pydantic import BaseModel
 
-from recorder import schemas
+from recorder import documents, schemas
 from recorder.payload import block_in
-from rig.channels import ChannelTable
+from recorder.records import COPY, MAGIC, Chunk, DamagedError, messages, read_contents, unpack
 from rig.errors import InputError
+from rig.outside import read_json
 from rig.wire import (
     EDGES,
     EVENTS,
@@ -25,21 +26,13 @@ from rig.wire import (
     Block,
     Continuity,
     Gap,
-    decode_document,
     schema_of,
     sensor_key,
     truth_key,
 )
 
-if TYPE_CHECKING:
-    from mcap.records import Channel
-
-_MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQII")
-_PIECE = 4096
-_DOCUMENTS = ("catalogue", "parameters", "scene")
+_MOST_KEPT = 64 << 20
+"""Documents of one kind that are kept in memory [bytes]."""
 _OURS = "a recording made by `rig record`"
 
 
@@ -95,29 +88,6 @@ class Stream:
     last_time_s: float
 
 
-@dataclass(frozen=True)
-class Chunk:
-    """Messages in a row that were packed together; see `Recording.chunks`.
-
-    Attributes:
-        offset: Where its record begins in its file [bytes].
-        length: Length of the record's body [bytes].
-        begin_ns: Least simulated time of its messages [ns].
-        end_ns: Greatest simulated time of its messages [ns].
-        channels: Channels with messages in it, where the file says so.
-        cut: The file ends in it.
-        part: Number of the file that it is in, of `Recording.parts`.
-    """
-
-    offset: int
-    length: int
-    begin_ns: int = 0
-    end_ns: int = 0
-    channels: frozenset[int] | None = None
-    cut: bool = False
-    part: int = 0
-
-
 class Recording:
     """One recording, read topic by topic from the disk; nothing but documents is kept in memory.
 
@@ -125,7 +95,8 @@ class Recording:
         path: The file.
         complete: The file was finished; False for a .part file or one that was cut off, of which everything up to the
             last whole message is read.
-        damaged: Chunks of a file that was not finished that could not be read, and are passed over.
+        damaged: Records that are not what was written, and are passed over by whoever salvages; else 0.
+        unchecked: What of it no checksum covers.
         catalogue: The rig's catalogue document.
         table: The channel table in it.
         parameters: The rig's parameter document.
@@ -142,36 +113,54 @@ class Recording:
             salvage: Take what can be read of a finished file, too, where it is damaged.
         """
         self.path = path
-        self.complete = False
-        self.damaged = 0
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.messages: dict[str, int] = {}
-        self._attachments: dict[str, bytes] = {}
-        self._chunks: list[Chunk] = []
-        self._channels: dict[int, Channel] = {}
         try:
             with path.open("rb") as file, self._intact():
-                self._scan(file, salvage=salvage)
+                if file.read(len(MAGIC)) != MAGIC:
+                    raise InputError("file", _OURS, f"{path}, which is no MCAP file")
+                found = read_contents(file, path.stat().st_size, salvage=salvage)
+                self._take_metadata(found.metadata, found.attachments.get(COPY), salvage=salvage)
         except OSError as error:
             raise _unreadable(path, error) from None
+        self.complete = found.complete
+        self.damaged += found.damaged
+        self.unchecked = found.unchecked
+        self._attachments, self._chunks, self._topics = found.attachments, found.chunks, found.topics
+        self.messages = {self._topics[number]: count for number, count in sorted(found.counts.items())}
+        if len(set(self._topics.values())) < len(self._topics):
+            raise InputError("file", "a recording with each channel once", str(path))
         about = self.metadata.get("rig", {})
         if about.get("format") != schemas.FORMAT:
             raise InputError("file", _OURS, str(path))
-        if about.get("version") != schemas.VERSION:
-            raise InputError("file", f"a recording of format version {schemas.VERSION}", about.get("version"))
-        try:
-            documents = {
-                name: decode_document(self._attachments[f"{name}.json"])
-                for name in ("catalogue", "parameters", "scene")
-            }
-            self.table = ChannelTable.model_validate(documents["catalogue"]["table"])
-        except (KeyError, ValueError):
-            raise InputError(
-                "file", "a recording with its calibration; this one was cut off in it", str(path)
-            ) from None
-        self.catalogue: dict[str, Any] = documents["catalogue"]
-        self.parameters: dict[str, Any] = documents["parameters"]
-        self.scene: dict[str, Any] = documents["scene"]
+        documents.check_version(about)
+        for name, model in documents.METADATA.items():
+            if name in self.metadata:
+                documents.told(model, self.metadata[name], field=f"{path.name}: {name}")
+        payloads = {name: self._attachments.get(f"{name}.json") for name in documents.ATTACHED}
+        if None in payloads.values():
+            # Where it is damaged it is not there either.
+            must = "a recording with its calibration; this one was cut off in it, or damaged"
+            raise InputError("file", must, str(path))
+        read = {
+            name: documents.read(model, payloads[name] or b"", field=f"{path.name}: {name}.json")
+            for name, model in documents.ATTACHED.items()
+        }
+        if self.damaged and not salvage:
+            must = "an intact recording (`rig recover` passes over what is damaged)"
+            raise InputError("file", must, f"{path}, with {self.damaged} damaged records")
+        self.catalogue, self.parameters, self.scene = (read[name][0] for name in ("catalogue", "parameters", "scene"))
+        catalogue = read["catalogue"][1]
+        assert isinstance(catalogue, documents.Catalogue)
+        self.table = catalogue.table
+
+    def _take_metadata(self, found: dict[str, dict[str, str]], copy: bytes | None, *, salvage: bool) -> None:
+        """Believe the copy that has a checksum, where a file has one."""
+        self.damaged, self.metadata = 0, found
+        if copy is None:
+            return
+        told = read_json(copy, field=COPY)
+        if {name: found.get(name) for name in told} != told:
+            self.damaged = 1
+        self.metadata = {**({"end": found["end"]} if "end" in found and not salvage else {}), **told}
 
     @classmethod
     def open(cls, path: Path | str) -> Self:
@@ -222,24 +211,32 @@ class Recording:
     @cached_property
     def events(self) -> list[dict[str, Any]]:
         """The rig's events, in order of arrival."""
-        return self._documents(EVENTS)
+        return [event for _, event in self._documents(EVENTS, documents.Event)]
 
     @cached_property
-    def statuses(self) -> list[dict[str, Any]]:
-        """The rig's status documents, in order of arrival."""
-        return self._documents(STATUS)
+    def last_status(self) -> dict[str, Any] | None:
+        """The last of the rig's status documents; None without one."""
+        last = None
+        for _, document in self._documents(STATUS, documents.Status):
+            last = document
+        return last
 
     @cached_property
     def gaps(self) -> list[Gap]:
         """Losses that the recorder noted; index -1 where it is messages that are counted, not rows."""
-        found = self._documents(schemas.GAPS)
-        return [Gap(key=gap["key"], index=gap["index"], size=gap["size"]) for gap in found]
+        return [gap for _, gap in self.timed_gaps]
+
+    @cached_property
+    def timed_gaps(self) -> list[tuple[float, Gap]]:
+        """The same with the simulated time at which each was noted [s]."""
+        found = self._documents(schemas.GAPS, documents.Gap)
+        return [(time_ns / 1e9, Gap(gap["key"], gap["index"], gap["size"])) for time_ns, gap in found]
 
     @cached_property
     def clock(self) -> np.ndarray:
         """Pairs of simulated time and wall time of arrival [s, unix s], shape (n, 2)."""
-        pairs = [(pair["time_s"], pair["wall_s"]) for pair in self._documents(schemas.CLOCK)]
-        return np.array(pairs, dtype=float).reshape(-1, 2)
+        found = self._documents(schemas.CLOCK, documents.ClockPair)
+        return np.array([(pair["time_s"], pair["wall_s"]) for _, pair in found], dtype=float).reshape(-1, 2)
 
     @cached_property
     def streams(self) -> dict[str, Stream]:
@@ -343,7 +340,7 @@ class Recording:
             InputError: The file has changed, or cannot be read any more.
         """
         part = self.parts[chunk.part]
-        yield from part._read([chunk], {number: channel.topic for number, channel in part._channels.items()})
+        yield from part._read([chunk], part._topics)
 
     def payloads(self, key: str) -> Iterator[tuple[int, bytes]]:
         """The payloads of one key, byte for byte as they came: pairs of simulated time [ns] and bytes."""
@@ -361,7 +358,7 @@ class Recording:
         scales: np.ndarray | None = None,
         offsets: np.ndarray | None = None,
     ) -> Samples:
-        blocks = [block for block in self.blocks(key) if block.values.shape[1] == len(names)]
+        blocks = list(self.blocks(key))
         sizes = [len(block.values) for block in blocks]
         values = np.empty((sum(sizes), len(names)))
         times_s = np.empty(len(values))
@@ -391,136 +388,52 @@ class Recording:
             return (block.tick + block.values[:, 0]) / block.tick_rate_hz
         return block.times_s
 
+    @cached_property
+    def _widths(self) -> dict[str, int]:
+        """Columns of each stream that the catalogue knows."""
+        widths = {sensor_key(name): len(group.channels) for name, group in self.table.groups.items()}
+        truth = self.catalogue.get("truth", {})
+        return {**widths, **{truth_key(name): len(table["columns"]) for name, table in truth.items()}, EDGES: 1}
+
     def _block(self, key: str, payload: bytes) -> Block | None:
         if schema_of(key) is None:
             raise InputError("key", "a key of blocks (sensors or truth)", key)
         try:
-            return block_in(key, payload)
+            block = block_in(key, payload)
         except ValueError:
             return None
+        columns = block.values.shape[1]
+        fits = columns == self._widths.get(key, columns) and block.tick_rate_hz == self.catalogue["tick_rate_hz"]
+        return block if fits else None
 
-    def _documents(self, topic: str) -> list[dict[str, Any]]:
-        found = []
-        for _, payload in self.payloads(topic):
+    def _documents(self, topic: str, model: type[BaseModel]) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Simulated time [ns] and document of each message that is what its key promises."""
+        kept = 0
+        for time_ns, payload in self.payloads(topic):
             try:
-                found.append(decode_document(payload))
-            except ValueError:
+                document, told = documents.read(model, payload, field=topic)
+                if isinstance(told, documents.Event) and told.event == "command":
+                    documents.read(documents.Command, payload, field=topic)
+            except InputError:
                 continue
-        return found
+            if topic in (EVENTS, schemas.GAPS) and (kept := kept + len(payload)) > _MOST_KEPT:
+                raise InputError("file", f"a recording with at most {_MOST_KEPT} bytes of {topic}", str(self.path))
+            yield time_ns, document
 
     @contextlib.contextmanager
     def _intact(self) -> Iterator[None]:
         """Whatever a damaged file makes the parsers raise becomes one clear error."""
-        import zstandard
         from mcap.exceptions import McapError
 
         try:
             yield
         except InputError:
             raise
-        except (McapError, struct.error, zstandard.ZstdError, ValueError, MemoryError, OverflowError) as error:
+        except DamagedError as error:
+            must = "an intact recording (`rig recover` passes over what is damaged)"
+            raise InputError("file", must, f"{self.path} ({error})") from None
+        except (McapError, struct.error, ValueError, MemoryError, OverflowError) as error:
             raise InputError("file", "an intact recording", f"{self.path} ({error})") from None
-
-    def _scan(self, file: BinaryIO, *, salvage: bool) -> None:
-        """Walk over the top-level records: where the chunks are, and everything that is not in a chunk.
-
-        A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through.
-        """
-        from mcap.data_stream import ReadDataStream
-        from mcap.exceptions import McapError
-        from mcap.opcode import Opcode
-        from mcap.records import Attachment, Channel, MessageIndex, Metadata, Statistics
-
-        size = self.path.stat().st_size
-        if file.read(len(_MAGIC)) != _MAGIC:
-            raise InputError("file", _OURS, f"{self.path}, which is no MCAP file")
-        indexed: dict[int, set[int]] = {}
-        counts: dict[int, int] = {}
-        footer = False
-        position = len(_MAGIC)
-        last_chunk = -1
-        while not footer and position + _RECORD.size <= size:
-            file.seek(position)
-            opcode, length = _RECORD.unpack(file.read(_RECORD.size))
-            end = position + _RECORD.size + length
-            if end > size and opcode == Opcode.CHUNK:
-                self._chunks.append(Chunk(offset=position, length=size - position - _RECORD.size, cut=True))
-            if end > size or opcode == 0:  # cut off, or zeros where a power cut left unwritten pages
-                break
-            if opcode == Opcode.CHUNK:
-                last_chunk = position
-                head = file.read(_CHUNK.size) if length >= _CHUNK.size else bytes(_CHUNK.size)
-                begin_ns, end_ns, *_ = _CHUNK.unpack(head)
-                self._chunks.append(Chunk(offset=position, length=length, begin_ns=begin_ns, end_ns=end_ns))
-            elif opcode in (
-                Opcode.METADATA,
-                Opcode.ATTACHMENT,
-                Opcode.CHANNEL,
-                Opcode.STATISTICS,
-                Opcode.MESSAGE_INDEX,
-            ):
-                try:
-                    stream = ReadDataStream(BytesIO(file.read(length)))
-                    if opcode == Opcode.METADATA:
-                        metadata = Metadata.read(stream)
-                        self.metadata[metadata.name] = metadata.metadata
-                    elif opcode == Opcode.ATTACHMENT:
-                        attachment = Attachment.read(stream)
-                        self._attachments[attachment.name] = attachment.data
-                    elif opcode == Opcode.CHANNEL:
-                        channel = Channel.read(stream)
-                        self._channels[channel.id] = channel
-                    elif opcode == Opcode.STATISTICS:
-                        counts = dict(Statistics.read(stream).channel_message_counts)
-                    else:
-                        indexed.setdefault(last_chunk, set()).add(MessageIndex.read(stream).channel_id)
-                except (McapError, struct.error, ValueError):
-                    # Indexes and counts can be made anew, and if it is the calibration it will be missed.
-                    if not salvage:
-                        raise
-            elif opcode == Opcode.FOOTER:
-                footer = True
-            position = end
-        if footer:
-            file.seek(position)
-            self.complete = file.read(len(_MAGIC)) == _MAGIC and not salvage
-        if self.complete:
-            # One without an index has no messages.
-            chunks = [replace(chunk, channels=frozenset(indexed.get(chunk.offset, ()))) for chunk in self._chunks]
-            self._chunks = [chunk for chunk in chunks if chunk.channels]
-        else:
-            counts = self._scan_chunks(file)
-        self.messages = {self._channels[number].topic: count for number, count in sorted(counts.items())}
-
-    def _scan_chunks(self, file: BinaryIO) -> dict[int, int]:
-        """Find channels and counts of a cut file in its chunks; a chunk that does not unpack is passed over."""
-        import zstandard
-        from mcap.data_stream import ReadDataStream
-        from mcap.exceptions import McapError
-        from mcap.opcode import Opcode
-        from mcap.records import Channel
-
-        counts: dict[int, int] = {}
-        good = []
-        for chunk in self._chunks:
-            try:
-                data = _unpack(file, chunk)
-            except (McapError, struct.error, zstandard.ZstdError, ValueError):
-                self.damaged += 1
-                continue
-            times_ns = []
-            for opcode, start, end in _records(data):
-                if opcode == Opcode.MESSAGE:
-                    number, _, time_ns, _ = _MESSAGE.unpack_from(data, start)
-                    counts[number] = counts.get(number, 0) + 1
-                    times_ns.append(time_ns)
-                elif opcode == Opcode.CHANNEL:
-                    channel = Channel.read(ReadDataStream(BytesIO(data[start:end])))
-                    self._channels[channel.id] = channel
-            if times_ns:
-                good.append(replace(chunk, begin_ns=min(times_ns), end_ns=max(times_ns)))
-        self._chunks = good
-        return {number: count for number, count in counts.items() if number in self._channels}
 
     def _messages(self, topics: set[str]) -> Iterator[tuple[str, int, bytes]]:
         """Topic, log time and payload of every message on some topics, in file order."""
@@ -529,14 +442,12 @@ class Recording:
 
     def _stamped(self, topics: set[str]) -> Iterator[tuple[str, int, int, bytes]]:
         """Topic, log time, publish time and payload of every message on some topics, in file order."""
-        wanted = {number: channel.topic for number, channel in self._channels.items() if channel.topic in topics}
+        wanted = {number: topic for number, topic in self._topics.items() if topic in topics}
         if wanted:
             yield from self._read(self._chunks, wanted)
 
     def _read(self, chunks: list[Chunk], wanted: dict[int, str]) -> Iterator[tuple[str, int, int, bytes]]:
         """The messages on some channels, of some chunks of this file."""
-        from mcap.opcode import Opcode
-
         try:
             file = self.path.open("rb")
         except OSError as error:
@@ -545,63 +456,13 @@ class Recording:
             for chunk in chunks:
                 if chunk.channels is not None and chunk.channels.isdisjoint(wanted):
                     continue
-                data = _unpack(file, chunk)
-                for opcode, start, end in _records(data):
-                    if opcode == Opcode.MESSAGE:
-                        number, _, log_time, publish_time = _MESSAGE.unpack_from(data, start)
-                        if number in wanted:
-                            yield wanted[number], log_time, publish_time, data[start + _MESSAGE.size : end]
-
-
-def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and end of the body of each whole record of a chunk."""
-    position = 0
-    while position + _RECORD.size <= len(data):
-        opcode, length = _RECORD.unpack_from(data, position)
-        start = position + _RECORD.size
-        position = start + length
-        if position <= len(data):
-            yield opcode, start, position
+                for number, log_time, publish_time, payload in messages(unpack(file, chunk), cut=chunk.cut):
+                    if number in wanted:
+                        yield wanted[number], log_time, publish_time, payload
 
 
 def _unreadable(path: Path, error: OSError) -> InputError:
     return InputError("file", "a file that can be read", f"{path} ({error.strerror})")
-
-
-def _unpack(file: BinaryIO, chunk: Chunk) -> bytes:
-    """Records of a chunk, unpacked and checked against their sum."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import Chunk
-    from mcap.stream_reader import get_chunk_data_stream
-
-    file.seek(chunk.offset + _RECORD.size)
-    if chunk.cut:
-        return _unpack_cut(file.read(chunk.length))
-    record = Chunk.read(ReadDataStream(BytesIO(file.read(chunk.length))))
-    stream, length = get_chunk_data_stream(record, validate_crc=True)
-    return stream.read(length)
-
-
-def _unpack_cut(data: bytes) -> bytes:
-    """What can be unpacked of a chunk that the file ends in; the last record in it may be cut."""
-    import zstandard
-
-    if len(data) < _CHUNK.size:
-        return b""
-    *_, name_length = _CHUNK.unpack_from(data)
-    start = _CHUNK.size + name_length + 8
-    compression, packed = data[_CHUNK.size : _CHUNK.size + name_length], data[start:]
-    if compression == b"":
-        return packed
-    if compression != b"zstd":
-        return b""
-    unpacker = zstandard.ZstdDecompressor().decompressobj()
-    found = []
-    # In small pieces: where it ends in zeros or in nothing, the blocks before that are good.
-    with contextlib.suppress(zstandard.ZstdError):
-        for at in range(0, len(packed), _PIECE):
-            found.append(unpacker.decompress(packed[at : at + _PIECE]))
-    return b"".join(found)
 
 
 class Joined(Recording):
@@ -614,6 +475,7 @@ class Joined(Recording):
         self.path = first.path
         self.complete = all(part.complete for part in parts)
         self.damaged = sum(part.damaged for part in parts)
+        self.unchecked = tuple(dict.fromkeys(text for part in parts for text in part.unchecked))
         self.metadata = {**last.metadata, **first.metadata, "end": last.metadata.get("end", {})}
         self.messages = {}
         for part in parts:

@@ -16,9 +16,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from recorder import schemas
+from recorder import documents, schemas
 from recorder.payload import block_in, tick_in
 from recorder.reader import Recording
+from recorder.records import COPY
 from recorder.series import Commands
 from recorder.writer import Counts, RecordingWriter, check_destination, part_of
 from rig.errors import InputError
@@ -26,7 +27,7 @@ from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_document, enco
 
 _TELL_EVERY = 5000
 """Messages between two reports of progress."""
-_HEAD = ("README.txt", "catalogue.json", "parameters.json", "scene.json")
+_HEAD = ("README.txt", "catalogue.json", "parameters.json", "scene.json", COPY)
 
 
 @dataclass(frozen=True)
@@ -36,12 +37,14 @@ class Rewritten:
     Attributes:
         path: The new file.
         counts: What stands in it.
-        damaged: Chunks of the source that could not be read.
+        damaged: Records of the source that are not what was written, and are left out.
+        unchecked: What of the source no checksum covers.
     """
 
     path: Path
     counts: Counts
     damaged: int
+    unchecked: tuple[str, ...] = ()
 
 
 def recovered_path(source: Path) -> Path:
@@ -101,7 +104,8 @@ def recover(
         about = {
             "source": source.name,
             "source_bytes": str(source.stat().st_size),
-            "damaged_chunks": str(recording.damaged),
+            "damaged_records": str(recording.damaged),
+            "unchecked": "; ".join(recording.unchecked),
         }
         counts = _write(
             recording,
@@ -114,7 +118,7 @@ def recover(
             change=lambda _, payload: payload,
             on_progress=on_progress,
         )
-    return Rewritten(output, counts, recording.damaged)
+    return Rewritten(output, counts, recording.damaged, recording.unchecked)
 
 
 def cut(
@@ -236,9 +240,10 @@ def _write(
             if key.startswith(schemas.VIEW + "/") or key == schemas.CLOCK:
                 continue
             if key == schemas.GAPS:
-                gap = decode_document(payload)
-                if gap.get("kind") == "messages":
-                    writer.write_missed(str(gap["key"]), int(gap["size"]), wall_ns)
+                with contextlib.suppress(InputError):
+                    gap, _ = documents.read(documents.Gap, payload, field=key)
+                    if gap.get("kind") == "messages":
+                        writer.write_missed(gap["key"], gap["size"], wall_ns)
                 continue
             changed = change(key, payload)
             if changed is not None:

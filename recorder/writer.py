@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 from recorder import schemas
 from recorder.payload import block_in, tick_in
+from recorder.records import COPY
 from recorder.views import Messages, View, Views
 from rig.channels import ChannelTable, Group
 from rig.errors import DiskError, InputError, check_new_file
@@ -288,7 +289,7 @@ class RecordingWriter:
             raise InputError("output", "a file that can be written", f"{self.part} ({error.strerror})") from None
         from mcap.writer import Writer as McapWriter
 
-        mcap = McapWriter(self._file, chunk_size=_CHUNK_BYTES)
+        mcap = McapWriter(self._file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         self._mcap: Writer | None = mcap
         with self._guard():
             mcap.start(profile="ros2", library="rotor-stator-rig recorder")
@@ -528,26 +529,28 @@ class RecordingWriter:
     ) -> None:
         assert self._mcap is not None
         now = self._wall_ns()
-        attachments = {"catalogue.json": catalogue, "parameters.json": parameters, "scene.json": scene}
-        self._mcap.add_metadata(
-            "rig",
-            {
-                "format": schemas.FORMAT,
-                "version": schemas.VERSION,
-                "created": datetime.fromtimestamp(now / NS, tz=UTC).isoformat(),
-                "log_time": "simulated time [ns]",
-                "publish_time": "wall time of arrival [unix ns]",
-                "tick_rate_hz": str(self.tick_rate_hz),
-                "scene": str(scene.get("name", "")),
-                "seed": str(scene.get("seed", "")),
-                "parameter_set": str(parameters.get("set", "")),
-                "view_rate_hz": f"{self.view_rate_hz:g}",
-                **metadata.get("rig", {}),
-            },
-        )
-        for name, entries in metadata.items():
-            if name != "rig":
-                self._mcap.add_metadata(name, entries)
+        about = {
+            "format": schemas.FORMAT,
+            "version": schemas.VERSION,
+            "created": datetime.fromtimestamp(now / NS, tz=UTC).isoformat(),
+            "log_time": "simulated time [ns]",
+            "publish_time": "wall time of arrival [unix ns]",
+            "tick_rate_hz": str(self.tick_rate_hz),
+            "scene": str(scene.get("name", "")),
+            "seed": str(scene.get("seed", "")),
+            "parameter_set": str(parameters.get("set", "")),
+            "view_rate_hz": f"{self.view_rate_hz:g}",
+            **metadata.get("rig", {}),
+        }
+        metadata = {**metadata, "rig": about}
+        for name in dict.fromkeys(["rig", *metadata]):
+            self._mcap.add_metadata(name, metadata[name])
+        attachments = {
+            COPY: metadata,
+            "catalogue.json": catalogue,
+            "parameters.json": parameters,
+            "scene.json": scene,
+        }
         self._mcap.add_attachment(now, 0, "README.txt", "text/plain", self._readme(catalogue).encode())
         for name, document in attachments.items():
             text = json.dumps(document, indent=1, allow_nan=False)
@@ -746,7 +749,8 @@ view/GROUP+GROUP: sensor_msgs/msg/JointState in engineering units at the viewing
     for plots only. Lengths stand in `position`, forces in `effort`, all else in `velocity`; nan elsewhere.
 view/events: rcl_interfaces/msg/Log of rig/events.
 
-Attachments: catalogue.json (channel table with calibration), parameters.json, scene.json.
+Attachments: catalogue.json (channel table with calibration), parameters.json, scene.json; metadata.json repeats the
+    metadata at the start, which have no checksum of their own. The whole has one too (`data_section_crc`).
 Metadata "rig" opens the file; metadata "end" closes it with the end reason and the counts.
 Metadata "series": one of several files in a row; its number, the file before it, and the row due of each stream.
 Metadata "trigger": recorded around a trigger only; what ended it stands in "end".

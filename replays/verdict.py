@@ -85,8 +85,8 @@ def stream_rows(recording: Recording) -> list[Row]:
         _asked("samples lost", f"{lost} of {count} rows", "0", lost == 0 and not recording.gaps),
         _asked("recording", recording.end_reason, "complete", recording.complete),
     ]
-    if recording.statuses:
-        rows += _status_rows(recording.statuses[-1])
+    if recording.last_status is not None:
+        rows += _status_rows(recording.last_status)
     return rows
 
 

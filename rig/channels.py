@@ -5,13 +5,17 @@ Everything outside the physics (wire, drivers, recorder, viewer, exports) knows 
 
 from __future__ import annotations
 
+import math
 import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+
+from rig.errors import InputError
+from rig.outside import input_error, parse_toml
 
 TABLE = Path(__file__).with_name("channels.toml")
 
@@ -19,9 +23,9 @@ TABLE = Path(__file__).with_name("channels.toml")
 class Channel(BaseModel):
     """One measured channel with its complete calibration; half a scale is refused on load."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    name: str
+    name: Annotated[str, Field(min_length=1)]
     label: str
     group: str
     signal: str
@@ -56,6 +60,8 @@ class Channel(BaseModel):
         low, high = self.range_v
         if not -self.adc_v <= low < high <= self.adc_v:
             raise ValueError(f"channel {self.name}: range_v must lie inside +-adc_v and be ascending")
+        if not (math.isfinite(self.scale) and self.scale and math.isfinite(self.offset)):
+            raise ValueError(f"channel {self.name}: sensitivity_v must give a scale that is finite")
         return self
 
     @property
@@ -81,8 +87,8 @@ class Group(BaseModel):
 
     name: str
     title: str
-    rate_hz: PositiveInt
-    channels: tuple[Channel, ...]
+    rate_hz: Annotated[int, Field(ge=1, le=1_000_000_000)]
+    channels: Annotated[tuple[Channel, ...], Field(min_length=1)]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -110,6 +116,15 @@ class ChannelTable(BaseModel):
 
     groups: dict[str, Group]
 
+    @model_validator(mode="after")
+    def _names_once(self) -> ChannelTable:
+        names = [channel.name for group in self.groups.values() for channel in group.channels]
+        if len(set(names)) < len(names):
+            raise ValueError(f"channel {next(n for n in names if names.count(n) > 1)} stands twice")
+        if any(name != group.name or not name for name, group in self.groups.items()):
+            raise ValueError("each group must stand under its own name")
+        return self
+
     @property
     def channels(self) -> dict[str, Channel]:
         """All channels by name, in table order."""
@@ -134,18 +149,26 @@ class ChannelTable(BaseModel):
 
 
 def parse_table(text: str) -> ChannelTable:
-    """Parse a channel table from TOML text (group defaults merged into each row)."""
-    groups = {}
-    names: set[str] = set()
-    for group_name, body in tomllib.loads(text)["groups"].items():
-        shared = {**body.get("defaults", {}), "group": group_name, "rate_hz": body["rate_hz"], "kind": body["kind"]}
-        rows = tuple(Channel(**{**shared, **row}) for row in body["channels"])
-        for row in rows:
-            if row.name in names:
-                raise ValueError(f"channel {row.name} stands twice in the channel table")
-            names.add(row.name)
-        groups[group_name] = Group(name=group_name, title=body["title"], rate_hz=body["rate_hz"], channels=rows)
-    return ChannelTable(groups=groups)
+    """Parse a channel table from TOML text (group defaults merged into each row).
+
+    Raises:
+        InputError: It is no TOML, or the first thing that is missing or wrong in it.
+    """
+    try:
+        groups = {}
+        for name, body in parse_toml(text, field="channel table")["groups"].items():
+            shared = {**body.get("defaults", {}), "group": name, "rate_hz": body["rate_hz"], "kind": body["kind"]}
+            rows = [{**shared, **row} for row in body["channels"]]
+            groups[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": rows}
+        return ChannelTable.model_validate({"groups": groups})
+    except ValidationError as error:
+        raise input_error(error, "channel table") from None
+    except KeyError as error:
+        raise InputError(f"channel table: {error.args[0]}", "given", None) from None
+    except (TypeError, AttributeError):
+        raise InputError("channel table", "[groups.NAME] with title, rate_hz, kind and channels", text[:80]) from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError("channel table", "a TOML file", str(error)) from None
 
 
 @cache

@@ -117,8 +117,8 @@ def page() -> str:
         "",
         "Requests are JSON objects on their key; "
         'the reply is `{"accepted": true, "id", "command", "tick", "time_s"}` with the simulated time at which the '
-        'command takes effect, or `{"accepted": false, "error"}` with the limit in the text, where one field is wrong also in `field` and '
-        "`must`. `from` may name the sender. "
+        'command takes effect, or `{"accepted": false, "error"}` with the limit in the text, '
+        "where one field is wrong also in `field` and `must`. `from` may name the sender. "
         "Requests, and what clients report, are UTF-8 of at most 10 000 bytes, with the fields named here and no "
         "others, each once, numbers as finite numbers; a command that is not in this table is refused as well.",
         "",

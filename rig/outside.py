@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import math
 import re
+import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
@@ -19,6 +21,8 @@ from rig.text import printable
 
 DOCUMENT_BYTES = 16 << 20
 """Largest document that a rig or a recording may hold."""
+TOML_BYTES = 1 << 20
+"""Largest file that a person writes."""
 DEPTH = 32
 """Deepest nesting of a document."""
 LARGEST = 2**63 - 1
@@ -84,14 +88,61 @@ def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUM
     return document
 
 
-def check_depth(document: Any, *, field: str) -> None:
-    """Refuse what is nested deeper than `DEPTH`, in whatever format it came.
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file that somebody wrote: a scene, a set, a mapping, criteria, a channel table.
 
     Raises:
-        InputError: It is.
+        InputError: The file cannot be read, is not TOML, or is out of bounds (see `parse_toml`).
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(TOML_BYTES + 1)
+        return parse_toml(data.decode("utf-8"), field=str(path))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(str(path), "a TOML file", printable(str(error), 200)) from None
+    except OSError as error:
+        raise InputError(str(path), "a readable file", error.strerror) from None
+
+
+def parse_toml(text: str, *, field: str) -> dict[str, Any]:
+    """The document in a TOML text.
+
+    Args:
+        text: The text.
+        field: What errors call it.
+
+    Raises:
+        tomllib.TOMLDecodeError: It is not TOML.
+        InputError: It is too large, nested too deep, or has a whole number that 64 bits do not hold.
+    """
+    if len(text) > TOML_BYTES:
+        raise InputError(field, f"at most {TOML_BYTES} bytes", "a longer text")
+    # The parser takes the square of the parts of a dotted key.
+    if max(map(len, map(_DOTTED.findall, re.split(r"[,=\n]", text)))) > DEPTH:
+        raise InputError(field, f"keys of at most {DEPTH} parts", "a longer one")
+    try:
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper") from None
+    except tomllib.TOMLDecodeError:
+        raise
+    except ValueError as error:  # digits beyond Python's own limit
+        raise InputError(field, f"without whole numbers beyond +-{LARGEST}", printable(str(error), 100)) from None
+    check_depth(document, field=field)
+    return document
+
+
+def check_depth(document: Any, *, field: str) -> None:
+    """Refuse what is nested deeper than `DEPTH`, or has a whole number beyond `LARGEST`, in whatever format it came.
+
+    Raises:
+        InputError: It is, or has.
     """
     level = [document]
     for _ in range(DEPTH + 1):
+        for item in level:
+            if isinstance(item, int) and abs(item) > LARGEST:
+                raise InputError(field, f"without whole numbers beyond +-{LARGEST}", item)
         level = [
             item
             for each in level
@@ -101,6 +152,9 @@ def check_depth(document: Any, *, field: str) -> None:
         if not level:
             return
     raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper")
+
+
+_DOTTED = re.compile(r"\.[ \t]*[\w\"'-]")
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

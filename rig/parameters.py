@@ -7,7 +7,6 @@ names a `base` and the values in which it differs. A user's own file works the s
 from __future__ import annotations
 
 import math
-import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,7 +22,7 @@ from pydantic import (
 )
 
 from rig.errors import InputError
-from rig.outside import check
+from rig.outside import check, read_toml
 
 SETS = Path(__file__).with_name("sets")
 DEFAULT_SET = "corrected"
@@ -160,20 +159,6 @@ def _load(name: Any, field: str, loading: tuple[str, ...]) -> ParameterSet:
 def _own_set(name: str) -> ParameterSet:
     path = SETS / f"{name}.toml"
     return _parse(name, read_toml(path), path, ())
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file, a syntax error told in one line.
-
-    Raises:
-        InputError: The file cannot be read, or is not TOML.
-    """
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(str(path), "a TOML file", str(error)) from None
-    except OSError as error:
-        raise InputError(str(path), "a readable file", error.strerror) from None
 
 
 def _parse(name: str, data: dict[str, Any], path: Path, loading: tuple[str, ...]) -> ParameterSet:

@@ -24,8 +24,9 @@ from rig.channels import default_table
 from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.levels import ModelLevels
-from rig.outside import check
-from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters, read_toml
+from rig.outside import check, parse_toml, read_toml
+from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
+from rig.text import printable
 
 SCENES = Path(__file__).with_name("scenes")
 _APART_S = 0.01
@@ -542,7 +543,7 @@ def _scene_keys() -> list[str]:
 def read_value(text: str) -> Any:
     """A value from the command line: TOML where it is such, else the text itself."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return parse_toml(f"value = {text}", field=printable(text, 60))["value"]
     except tomllib.TOMLDecodeError:
         return text
 

@@ -66,6 +66,10 @@ Keyphasor edges travel as TruthBlock rows of one column: ticks from `tick`.
 _DTYPES = {SAMPLE_SCHEMA: np.dtype("<i4"), TRUTH_SCHEMA: np.dtype("<f8")}
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _HEAD = struct.Struct("<qqddII")
+_MOST = 1 << 53
+"""Ticks and row numbers up to here are exact in every number that they become: 285 years of microseconds."""
+_MOST_RATE_HZ = 1e12
+_MOST_BLOCK_S = 1e6
 
 
 def schema_of(key: str) -> str | None:
@@ -113,7 +117,8 @@ def decode_block(payload: bytes, schema: str) -> Block:
     """The block in a CDR message.
 
     Raises:
-        ValueError: The payload is not a whole message of that schema.
+        ValueError: The payload is not a whole message of that schema, or names a time, a number or a rate that no
+            stream can have. A rate of 0 is that of edges, which have none.
     """
     dtype = _DTYPES[schema]
     start = len(_ENCAPSULATION) + _HEAD.size
@@ -123,6 +128,18 @@ def decode_block(payload: bytes, schema: str) -> Block:
     if columns == 0 or size % columns or len(payload) != start + size * dtype.itemsize:
         raise ValueError(
             f"payload must hold whole rows of {columns} values, {size} in all; instead received {len(payload)} bytes"
+        )
+    rows = size // columns
+    if not (
+        0 <= tick <= _MOST
+        and 0 <= index <= _MOST - rows
+        and 1.0 <= tick_rate_hz <= _MOST_RATE_HZ
+        and (1e-6 <= rate_hz <= tick_rate_hz or (rate_hz == 0.0 and schema == TRUTH_SCHEMA))
+        and (rate_hz == 0.0 or rows <= _MOST_BLOCK_S * rate_hz)
+    ):
+        raise ValueError(
+            "payload must have times and numbers that a clock can have; "
+            f"instead received {rows} rows from {index} on at tick {tick}, {rate_hz} Hz of {tick_rate_hz} Hz"
         )
     values = np.frombuffer(payload, dtype, offset=start).reshape(-1, columns)
     return Block(tick=tick, index=index, rate_hz=rate_hz, tick_rate_hz=tick_rate_hz, values=values)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from replays.formats.dialect import parse_heading, time_column
-from replays.formats.source import Entry, Signal, Source, damaged, even_rate_hz
+from replays.formats.source import Entry, Signal, Source, even_rate_hz
 
 if TYPE_CHECKING:
     from replays.formats.mapping import FileOptions
@@ -26,11 +26,8 @@ def open_file(path: Path, options: FileOptions) -> Source:
     """
     from pyarrow import parquet
 
-    try:
-        file = parquet.ParquetFile(path)
-        schema = file.schema_arrow
-    except Exception as error:
-        raise damaged(path, "Parquet", error) from None
+    file = parquet.ParquetFile(path)
+    schema = file.schema_arrow
     headings = [parse_heading(field.name) for field in schema]
     names = [name for name, _ in headings]
     stamps = time_column(names, options.time_column, path=path)
@@ -38,10 +35,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
         stamps = next((c for c in range(len(names)) if _is_clock(schema.field(c).type)), None)
 
     def column(c: int) -> np.ndarray:
-        try:
-            return numbers(file.read(columns=[schema.field(c).name]).column(0))
-        except Exception as error:
-            raise damaged(path, f"Parquet (column {names[c]})", error) from None
+        return numbers(file.read(columns=[schema.field(c).name]).column(0))
 
     times_s, start = None, None
     if stamps is not None:
@@ -167,6 +161,7 @@ class Writer:
     """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata."""
 
     merged = True
+    sparse = True
     rows: Callable[[Path, Any], RowsFile] = Rows
     """What takes the rows."""
 

@@ -14,6 +14,10 @@ from replays.formats.placement import PlacedGroup, whole_rate
 from replays.formats.selection import NO_VOLTS
 from rig.channels import Channel, ChannelTable, Group, default_table
 from rig.errors import InputError
+from rig.outside import check
+
+_LEAST, _MOST = 1e-30, 1e30
+"""Values that a measurement can have, in any unit."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +90,12 @@ def _counts(
         # Counts of a voltage count from 0 V, as a converter's do.
         offset = 0.0 if volts_per_unit is None else -entry.gain * entry.bias
         largest = float(np.nanmax(np.abs(values - offset), initial=0.0))
+        if largest and not _LEAST <= largest <= _MOST:
+            raise InputError(f"channels.{entry.name}", f"of values from {_LEAST:g} to {_MOST:g}", largest)
         scale = math.ldexp(1.0, math.frexp(largest)[1] - 30) if largest else math.ldexp(1.0, -30)
         scale = math.copysign(scale, 1.0 if volts_per_unit is None else volts_per_unit)
+    if not (_LEAST * 1e-10 <= abs(scale) <= _MOST and abs(offset) <= _MOST):
+        raise InputError(f"channels.{entry.name}", f"of counts from {_LEAST * 1e-10:g} to {_MOST:g}", scale)
     # Where nothing is known of volts, a unit is told as one volt.
     sensitivity = volts_per_unit if volts_per_unit is not None else math.copysign(1.0, scale)
     lsb_v = abs(scale * sensitivity)
@@ -112,7 +120,7 @@ def _counts(
             "kind": NO_VOLTS if volts_per_unit is None else "imported",
         }
     )  # fmt: skip
-    channel = Channel.model_validate(channel.model_dump())
+    channel = check(Channel, channel.model_dump(), field=f"channels.{entry.name}")
     if keeps and raw is not None:
         return channel, raw.astype(np.int32), f"the source's own integers, {abs(channel.scale):.6g} {channel.unit} each"
     found = np.rint((np.nan_to_num(values) - channel.offset) / channel.scale)

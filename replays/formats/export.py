@@ -24,10 +24,18 @@ SUFFIXES = tuple(_WRITERS)
 Method = Literal["polyphase", "linear"]
 
 
+_MOST_MISSING = 1_000_000
+"""Missing rows that a format with a start and a step fills in, besides as many as there are."""
+
+
 class Writer(Protocol):
-    """Writes the tables of a selection; `merged` formats take one table, with all channels of one rate."""
+    """Writes the tables of a selection.
+
+    `merged` formats take one table, with all channels of one rate; `sparse` ones leave out the rows that no stream has.
+    """
 
     merged: bool
+    sparse: bool
 
     def write(self, table: Table, chunk: Chunk) -> None:
         """Take rows."""
@@ -115,6 +123,9 @@ def export(
             names = [column.name for column in table.columns]
             if len(set(names)) < len(names):
                 raise InputError("channel", "given once", names)
+            if not kind.sparse and (missing := part.missing[table.name]) > table.rows // 2 + _MOST_MISSING:
+                must = f"one of which a {path.suffix} file can hold the gaps (--from and --to choose)"
+                raise InputError("range", must, f"{missing} rows missing in {table.name}")
     done = 0
     written = []
     finished: list[tuple[Path, Path]] = []
@@ -126,10 +137,10 @@ def export(
             whole = False
             try:
                 for table in part.tables:
-                    for chunk in part.chunks(table):
+                    for chunk in part.chunks(table, sparse=kind.sparse):
                         writer.write(table, chunk)
-                        done += len(chunk.times_s)
-                        progress(done / total)
+                        progress((done + chunk.index) / total)
+                    done += table.rows
                 writer.close()
                 whole = True
             finally:
@@ -178,7 +189,7 @@ class _Resampled(Selection):
         """None."""
         return {table.name: 0 for table in self.tables}
 
-    def chunks(self, table: Table, rows: int = ROWS) -> Iterator[Chunk]:
+    def chunks(self, table: Table, rows: int = ROWS, *, sparse: bool = False) -> Iterator[Chunk]:
         """Rows, in order."""
         for start in range(0, table.rows, rows):
             values = self.held[start : start + rows]

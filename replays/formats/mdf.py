@@ -44,19 +44,13 @@ def open_file(path: Path, options: FileOptions) -> Source:
         InputError: It is none, or asammdf is missing.
     """
     mdf = _open(path)
-    try:
-        with _quiet():
-            entries, texts = _entries(mdf)
-    except Exception as error:
-        raise damaged(path, "MDF", error) from None
+    with _quiet():
+        entries, texts = _entries(mdf)
 
     def read(entry: Entry) -> Signal:
         group, index = entry.place
-        try:
-            with _quiet():
-                return _signal(mdf, group, index)
-        except Exception as error:
-            raise damaged(path, f"MDF (channel {entry.name})", error) from None
+        with _quiet():
+            return _signal(mdf, group, index)
 
     remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
     about = {"version": str(mdf.version), "comment": str(mdf.header.description or "")}
@@ -151,6 +145,7 @@ class Writer:
     """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion."""
 
     merged = False
+    sparse = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
         asammdf = library("asammdf")

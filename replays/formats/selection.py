@@ -186,25 +186,35 @@ class Selection:
     @cached_property
     def missing(self) -> dict[str, int]:
         """Rows that a stream of a table lacks, between the table's first and last, by the table's name."""
-        lacking = {}
-        for table in self.tables:
-            lacking[table.name] = 0
-            for part in table.parts:
-                present = np.zeros(table.rows, dtype=bool)
-                for block in self.recording.blocks(part.key):
-                    first = block.index - table.shift
-                    present[max(0, first) : max(0, first + len(block.values))] = True
-                lacking[table.name] += table.rows - int(present.sum())
-        return lacking
+        return {
+            table.name: sum(table.rows - self._held(part.key, table.shift, table.rows) for part in table.parts)
+            for table in self.tables
+        }
+
+    def _held(self, key: str, first: int, rows: int) -> int:
+        """Rows that a stream has out of so many, each counted once: what a table claims to span is not allocated."""
+        held, reached = 0, first
+        for start, length in sorted((block.index, len(block.values)) for block in self.recording.blocks(key)):
+            end = min(start + length, first + rows)
+            held += max(0, end - max(start, reached))
+            reached = max(reached, end)
+        return held
 
     def whole(self, table: Table) -> bool:
         """Whether every stream of a table has all its rows."""
         return not self.missing[table.name]
 
-    def chunks(self, table: Table, rows: int = ROWS) -> Iterator[Chunk]:
-        """Rows of a table, in order; blocks that came later than a chunk are in it all the same."""
+    def chunks(self, table: Table, rows: int = ROWS, *, sparse: bool = False) -> Iterator[Chunk]:
+        """Rows of a table, in order; blocks that came later than a chunk are in it all the same.
+
+        Args:
+            table: The table.
+            rows: Rows of a chunk.
+            sparse: Pass over chunks of which no stream has a row.
+        """
         cursors = [_Cursor(self.recording, part, table) for part in table.parts]
-        for start in range(0, table.rows, rows):
+        start = 0
+        while start < table.rows:
             n = min(rows, table.rows - start)
             values = np.full((n, len(table.columns)), np.nan)
             present = np.zeros(n, dtype=bool)
@@ -215,6 +225,9 @@ class Selection:
                 first += width
             times_s = table.first_s + np.arange(start, start + n) / table.rate_hz
             yield Chunk(index=start, times_s=times_s, values=values, present=present)
+            start += n
+            if sparse:
+                start = max(start, min((cursor.next_row for cursor in cursors), default=start))
 
 
 class _Cursor:
@@ -224,9 +237,14 @@ class _Cursor:
         self.part = part
         self._shift = table.shift
         self._columns = list(part.columns)
-        self._blocks = (b for b in recording.blocks(part.key) if b.values.shape[1] == part.width)
+        self._blocks = recording.blocks(part.key)
         self._ahead: list[Block] = []
         self._over = False
+
+    @property
+    def next_row(self) -> int:
+        """First row that it may still have; beyond the table's end where there is none."""
+        return min((block.index - self._shift for block in self._ahead), default=1 << 62)
 
     def fill(self, start: int, values: np.ndarray) -> np.ndarray:
         """Put rows from `start` on into `values`; gives which were there."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +23,13 @@ _READERS = {
     ".txt": "delimited", ".asc": "delimited", ".tsv": "delimited", ".lvm": "delimited", ".parquet": "columnar",
     ".wav": "wav",
 }  # fmt: skip
+
+
+_FORMATS = {
+    "mdf": "MDF", "tdms": "TDMS", "uff": "universal (UFF)", "delimited": "text", "columnar": "Parquet", "wav": "WAV",
+}  # fmt: skip
+_MOST_HZ = 1e9
+_MOST_S = 1e12
 
 
 @dataclass(frozen=True)
@@ -122,10 +131,55 @@ def open_source(path: Path, options: FileOptions) -> Source:
         raise InputError("file", "a file with something in it", str(path))
     if name != "delimited":
         options.only_for_text(path)
-    source: Source = importlib.import_module(f"replays.formats.{name}").open_file(path, options)
+    what = _FORMATS[name]
+    module = importlib.import_module(f"replays.formats.{name}")
+    with _parsing(path, what):
+        source: Source = module.open_file(path, options)
     if not source.entries:
         raise InputError("file", "a file with signals in it", str(path))
-    return replace(source, entries=_distinct(source.entries))
+
+    def read(entry: Entry) -> Signal:
+        where = f"{what} (signal {entry.name})"
+        with _parsing(path, where):
+            signal = source.read(entry)
+            _check(signal)
+        return signal
+
+    entries = tuple(
+        entry if entry.rate_hz is None or 0.0 < entry.rate_hz <= _MOST_HZ else replace(entry, rate_hz=None)
+        for entry in source.entries
+    )
+    return replace(source, entries=_distinct(entries), read=read)
+
+
+@contextmanager
+def _parsing(path: Path, what: str) -> Iterator[None]:
+    """Whatever a library raises on a file that it cannot read, for want of memory too, becomes the one line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise damaged(path, what, error) from None
+
+
+def _check(signal: Signal) -> None:
+    """See that the numbers of a signal are such that a measurement can have.
+
+    Raises:
+        ValueError: They are not.
+    """
+    values, times_s = signal.values, signal.times_s
+    if values.ndim != 1 or values.dtype.kind not in "iufb":
+        raise ValueError(f"values of {values.dtype} in {values.ndim} dimensions")
+    if signal.rate_hz is not None and not 0.0 < signal.rate_hz <= _MOST_HZ:
+        raise ValueError(f"a rate of {signal.rate_hz} Hz")
+    if not (math.isfinite(signal.scale) and signal.scale and math.isfinite(signal.offset)):
+        raise ValueError(f"a scale of {signal.scale}, an offset of {signal.offset}")
+    if not abs(signal.first_s) <= _MOST_S:
+        raise ValueError(f"a beginning at {signal.first_s} s")
+    if times_s is not None and not (times_s.shape == values.shape and bool((np.abs(times_s) <= _MOST_S).all())):
+        raise ValueError("time stamps that are none")
 
 
 def _distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:

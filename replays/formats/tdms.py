@@ -43,19 +43,16 @@ def open_file(path: Path, options: FileOptions) -> Source:
         InputError: It is none, it is cut off, or npTDMS is missing.
     """
     nptdms = library("npTDMS", "nptdms")
-    try:
-        with _quiet():
-            file = nptdms.TdmsFile.read_metadata(path)
-        groups = [(group.name, group.channels()) for group in file.groups()]
-        starts = [
-            channel.properties["wf_start_time"]
-            for _, channels in groups
-            for channel in channels
-            if len(channel) and "wf_start_time" in channel.properties
-        ]
-        start = min(starts) if starts else None
-    except Exception as error:
-        raise damaged(path, "TDMS", error) from None
+    with _quiet():
+        file = nptdms.TdmsFile.read_metadata(path)
+    groups = [(group.name, group.channels()) for group in file.groups()]
+    starts = [
+        channel.properties["wf_start_time"]
+        for _, channels in groups
+        for channel in channels
+        if len(channel) and "wf_start_time" in channel.properties
+    ]
+    start = min(starts) if starts else None
     if file.file_status.incomplete_final_segment:
         raise damaged(path, "TDMS", "it is cut off")
     entries, texts = [], 0
@@ -71,11 +68,8 @@ def open_file(path: Path, options: FileOptions) -> Source:
             entries.append(Entry(channel.name, name, unit, len(channel), rate, (name, channel.name), label, number))
 
     def read(entry: Entry) -> Signal:
-        try:
-            with nptdms.TdmsFile.open(path) as opened:
-                return _signal(opened[entry.place[0]], entry.place[1], start)
-        except Exception as error:
-            raise damaged(path, f"TDMS (channel {entry.name})", error) from None
+        with nptdms.TdmsFile.open(path) as opened:
+            return _signal(opened[entry.place[0]], entry.place[1], start)
 
     remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
     about = {key: str(value) for key, value in file.properties.items() if isinstance(value, str | int | float)}
@@ -122,6 +116,7 @@ class Writer:
     """A TDMS file: a group a sensor group; counts with a linear scale, which LabVIEW applies on reading."""
 
     merged = False
+    sparse = False
 
     def __init__(self, path: Path, selection: Selection) -> None:
         nptdms = library("npTDMS", "nptdms")

@@ -50,12 +50,9 @@ def open_file(path: Path, options: FileOptions) -> Source:
     pyuff = library("pyuff")
     if not _ends(path):
         raise damaged(path, "universal (UFF)", "it is cut off")
-    try:
-        file = pyuff.UFF(str(path))
-        kinds = list(np.atleast_1d(file.get_set_types()).astype(int))
-        heads = {n: file.read_sets(n, header_only=True) for n, kind in enumerate(kinds) if kind == 58}
-    except Exception as error:
-        raise damaged(path, "universal (UFF)", error) from None
+    file = pyuff.UFF(str(path))
+    kinds = list(np.atleast_1d(file.get_set_types()).astype(int))
+    heads = {n: file.read_sets(n, header_only=True) for n, kind in enumerate(kinds) if kind == 58}
     entries: list[Entry] = []
     for n, head in heads.items():
         if head["func_type"] not in _TIME_RESPONSE or head["ord_data_type"] not in _REAL:
@@ -70,15 +67,12 @@ def open_file(path: Path, options: FileOptions) -> Source:
         raise InputError("file", "a universal file with time histories (dataset 58, real)", str(path))
 
     def read(entry: Entry) -> Signal:
-        try:
-            data = file.read_sets(entry.place)
-            values = np.array(data["data"], dtype=float)[: entry.rows]
-            if len(values) < entry.rows:
-                raise ValueError(f"{len(values)} of {entry.rows} values")
-            if int(data["abscissa_spacing"]) == 0:
-                return Signal(values=values, times_s=np.array(data["x"], dtype=float)[: entry.rows])
-        except Exception as error:
-            raise damaged(path, f"universal (UFF; function {entry.name})", error) from None
+        data = file.read_sets(entry.place)
+        values = np.array(data["data"], dtype=float)[: entry.rows]
+        if len(values) < entry.rows:
+            raise ValueError(f"{len(values)} of {entry.rows} values")
+        if int(data["abscissa_spacing"]) == 0:
+            return Signal(values=values, times_s=np.array(data["x"], dtype=float)[: entry.rows])
         return Signal(values=values, rate_hz=_rate_hz(data), first_s=float(data["abscissa_min"]))
 
     others = len(kinds) - len(entries)
@@ -118,6 +112,7 @@ class Writer:
     """A universal file: a binary dataset 58 a channel, in float64."""
 
     merged = False
+    sparse = False
 
     def __init__(self, path: Path, selection: Selection) -> None:
         self._file = path.open("wb")

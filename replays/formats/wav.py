@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import BaseModel, Field, FiniteFloat
 
-from replays.formats.source import Entry, Signal, Source, damaged, library
+from replays.formats.source import Entry, Signal, Source, library
 from rig.errors import InputError
+from rig.outside import DOCUMENT_BYTES, check
 
 if TYPE_CHECKING:
     from replays.formats.mapping import FileOptions
@@ -32,36 +33,26 @@ def open_file(path: Path, options: FileOptions) -> Source:
         InputError: It is none, or soundfile is missing.
     """
     soundfile = library("soundfile")
-    try:
-        with soundfile.SoundFile(path) as file:
-            rate, channels, rows, subtype = file.samplerate, file.channels, file.frames, file.subtype
-            comment = file.copy_metadata().get("comment", "")
-    except Exception as error:
-        raise damaged(path, "WAV", error) from None
+    with soundfile.SoundFile(path) as file:
+        rate, channels, rows, subtype = file.samplerate, file.channels, file.frames, file.subtype
+        comment = file.copy_metadata().get("comment", "")
     bits = _PCM.get(subtype)
-    columns, start = _beside(path, channels)
+    columns, first_s, start = _beside(path, channels)
     about = {"samples": subtype, **({"comment": comment} if comment else {})}
     entries = tuple(
-        Entry(
-            str(columns[c].get("name", f"channel {c + 1}")), "", str(columns[c].get("unit", "")), rows, float(rate), c,
-            str(columns[c].get("label", "")),
-        )
-        for c in range(channels)
-    )  # fmt: skip
+        Entry(column.name or f"channel {c + 1}", "", column.unit, rows, float(rate), c, column.label)
+        for c, column in enumerate(columns)
+    )
 
     def read(entry: Entry) -> Signal:
-        try:
-            with soundfile.SoundFile(path) as file:
-                parts = [
-                    block[:, entry.place].copy()
-                    for block in file.blocks(1 << 16, dtype="float64" if bits is None else "int32", always_2d=True)
-                ]
-        except Exception as error:
-            raise damaged(path, "WAV", error) from None
+        with soundfile.SoundFile(path) as file:
+            parts = [
+                block[:, entry.place].copy()
+                for block in file.blocks(1 << 16, dtype="float64" if bits is None else "int32", always_2d=True)
+            ]
         values = np.concatenate(parts) if parts else np.empty(0)
         column = columns[entry.place]
-        full, offset = float(column.get("full_scale", 1.0)), float(column.get("offset_exported", 0.0))
-        first_s = float(column.get("first_s", 0.0))
+        full, offset = column.full_scale, column.offset_exported
         rails = None
         if bits is not None:
             shift = 32 - bits
@@ -73,22 +64,47 @@ def open_file(path: Path, options: FileOptions) -> Source:
     return Source(path=path, format=f"WAV {subtype}", entries=entries, read=read, about=about, start=start)
 
 
-def _beside(path: Path, channels: int) -> tuple[list[dict], datetime | None]:
-    """What a document beside the file says of its channels and its start; nothing if there is none of ours."""
-    nothing = [{} for _ in range(channels)], None
-    try:
-        document = json.loads(path.with_name(path.name + ".json").read_text(encoding="utf-8"))
-        table = document["tables"][0]
-        found = [{**column, "first_s": table["first_s"]} for column in table["columns"]]
-        return (found, datetime.fromisoformat(document["start"])) if len(found) == channels else nothing
-    except (OSError, ValueError, KeyError, IndexError, TypeError):
-        return nothing
+class _Column(BaseModel):
+    """What the document beside the file says of a channel."""
+
+    name: str = ""
+    unit: str = ""
+    label: str = ""
+    full_scale: FiniteFloat = 1.0
+    offset_exported: FiniteFloat = 0.0
+
+
+class _Table(BaseModel):
+    first_s: FiniteFloat
+    columns: Annotated[tuple[_Column, ...], Field(min_length=1)]
+
+
+class _Beside(BaseModel):
+    start: datetime
+    tables: Annotated[tuple[_Table, ...], Field(min_length=1, max_length=1)]
+
+
+def _beside(path: Path, channels: int) -> tuple[tuple[_Column, ...], float, datetime | None]:
+    """What a document beside the file says of its channels and its start [s]; nothing if there is none.
+
+    Raises:
+        InputError: There is one, and it is none of ours, or of another file.
+    """
+    beside = path.with_name(path.name + ".json")
+    if not beside.is_file():
+        return (_Column(),) * channels, 0.0, None
+    found = check(_Beside, beside.read_bytes(), field=beside.name, most_bytes=DOCUMENT_BYTES)
+    table = found.tables[0]
+    if len(table.columns) != channels:
+        raise InputError(beside.name, f"of a file with {channels} channels", len(table.columns))
+    return table.columns, table.first_s, found.start
 
 
 class Writer:
     """A WAV file. Counts as 32-bit integers, all else as floating point from -1 to 1."""
 
     merged = True
+    sparse = False
     sidecar = True
 
     def __init__(self, path: Path, selection: Selection) -> None:

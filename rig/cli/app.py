@@ -48,6 +48,7 @@ from rig.cli import (
     view,
 )
 from rig.errors import DiskError, InputError, SimulationError
+from rig.text import printable
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
@@ -167,5 +168,5 @@ def start(arguments: list[str] | None = None) -> None:
 
 
 def _fail(message: str, *, status: int = 2) -> NoReturn:
-    print("rig: " + " ".join(message.split()), file=sys.stderr)
+    print("rig: " + printable(" ".join(message.split())), file=sys.stderr)
     sys.exit(status)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.options import Json
-from rig.cli.tables import new_table
+from rig.cli.tables import echo, new_table, table_console
 
 
 def bench(
@@ -21,18 +21,15 @@ def bench(
 ) -> None:
     """Measure simulated over processor time with the error beside it; medians of several runs, compile time apart."""
     import json
-    import sys
-
-    from rich.console import Console
 
     from replays.bench import measure
 
     def progress(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
+        echo(text, err=True)
 
     report = measure(runs=runs, peers=peers, frames=frames, progress=progress)
     if json_output:
-        typer.echo(json.dumps(report, indent=2))
+        echo(json.dumps(report, indent=2))
         return
     table = new_table(f"times real time, {runs} runs")
     table.add_column("case")
@@ -53,10 +50,10 @@ def bench(
             peer["name"], f"{peer['median']:.1f}", f"{peer['min']:.1f}", f"{peer['max']:.1f}", f"{peer['ratio']:.2f}",
             f"{peer['error']:.1e}", "", "",
         )  # fmt: skip
-    console = Console()
+    console = table_console()
     console.print(table)
     if report["missing_peers"]:
-        console.print(f"not timed: {', '.join(report['missing_peers'])} (pip install 'rotor-stator-rig\\[peers]')")
+        console.print(f"not timed: {', '.join(report['missing_peers'])} (pip install 'rotor-stator-rig[peers]')")
     known = report["reference"]
     doubt = "" if known["error"] is None else f", which agree to {known['error']:.0e}"
     console.print(f"error: RMS of 7 scaled states over 1 s against exact Coulomb by {known['of']}{doubt}")

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from rig.cli.display import stopping_on_signals
+from rig.cli.tables import echo
 
 app = typer.Typer(help="The virtual CAN bus.", no_args_is_help=True)
 
@@ -73,15 +74,15 @@ def hub(
             buses = {one.channel: partial(HubBus, one) for one in hubs}
             outlets = stack.enter_context(CanOutlets(buses, rates, socketcand=socketcand, slcan=slcan))
             for line in outlets.lines():
-                typer.echo(f"rig: {line}", err=True)
-            typer.echo(f"rig: CAN {', '.join(channels)} at {rates} on {listen}; Ctrl-C ends it", err=True)
+                echo(f"rig: {line}", err=True)
+            echo(f"rig: CAN {', '.join(channels)} at {rates} on {listen}; Ctrl-C ends it", err=True)
             while not stopped.wait(5.0):
                 for one in hubs:
-                    typer.echo(_line(one.status()), err=True)
+                    echo(_line(one.status()), err=True)
                 for text in (text for part in (*hubs, outlets) for text in part.warnings()):
-                    typer.echo(f"rig: warning: {text}", err=True)
+                    echo(f"rig: warning: {text}", err=True)
         for line in (*(_line(one.status()) for one in hubs), *outlets.summary()):
-            typer.echo(line)
+            echo(line)
 
 
 def _line(status: dict[str, Any]) -> str:

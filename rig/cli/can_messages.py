@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.can_output import CanBitrate, CanClassic, CanFd, CanRate, plan
+from rig.cli.tables import echo
 
 
 def dbc(
@@ -18,10 +19,10 @@ def dbc(
     from drivers.can.dbc import text
 
     if out is None:
-        typer.echo(text(), nl=False)
+        echo(text(), nl=False)
         return
     out.write_text(text(), encoding="utf-8")
-    typer.echo(f"{out} written")
+    echo(f"{out} written")
 
 
 def load(

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.progress import reporting
+from rig.cli.tables import echo, table_console
 
 
 def chart(
@@ -28,10 +29,6 @@ def chart(
     fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of going on where a run ended.")] = False,
 ) -> None:
     """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
-    import sys
-
-    from rich.console import Console
-
     from replays.chart.session import Progress, make_chart
     from rig.errors import InputError
     from rig.kernels import COMPILE_NOTICE, compiled_before
@@ -40,8 +37,8 @@ def chart(
         raise InputError("--quick, --full", "one of the two", "both")
     mode = "full" if full else "quick"
     if not compiled_before():
-        print(COMPILE_NOTICE, file=sys.stderr, flush=True)
-    console = Console(stderr=True)
+        echo(COMPILE_NOTICE, err=True)
+    console = table_console(stderr=True)
     with reporting() as reporter:
         reporter.say("references")
         outcome = make_chart(
@@ -56,7 +53,7 @@ def chart(
         )
     if outcome.missing:
         console.print(
-            f"not installed: {', '.join(outcome.missing)} (pip install 'rotor-stator-rig\\[peers]'); charted without",
+            f"not installed: {', '.join(outcome.missing)} (pip install 'rotor-stator-rig[peers]'); charted without",
             highlight=False,
         )
     if outcome.outdated:
@@ -67,7 +64,7 @@ def chart(
         highlight=False,
     )
     for path in outcome.files:
-        typer.echo(str(path))
+        echo(str(path))
     if outcome.interrupted:
         console.print("stopped; the same command goes on from here", highlight=False)
         raise typer.Exit(130)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import typer
+from rig.cli.tables import echo
 
 Subject = TypeVar("Subject")
 
@@ -36,8 +36,8 @@ def answer(
         draw(subject, plot)
     document = compare(subject)
     if as_json:
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        echo(json.dumps(document, indent=2, allow_nan=False))
         return
     show(document)
     if plot is not None:
-        typer.echo(f"\npicture  {plot}")
+        echo(f"\npicture  {plot}")

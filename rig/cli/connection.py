@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rig.cli.tables import echo
 from rig.errors import RefusedError
 
 if TYPE_CHECKING:
@@ -41,4 +42,4 @@ def console(connect: str, command: str) -> Iterator[Console]:
 
 def show(accepted: Accepted, what: str) -> None:
     """One line for a command that the rig took."""
-    typer.echo(f"{what} accepted: number {accepted.id}, at {accepted.time_s:.6f} s (tick {accepted.tick})")
+    echo(f"{what} accepted: number {accepted.id}, at {accepted.time_s:.6f} s (tick {accepted.tick})")

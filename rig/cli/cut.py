@@ -11,6 +11,7 @@ import typer
 
 from rig.cli.options import Channels, Force, FromS, RecordingFiles, ToS, names_of
 from rig.cli.progress import reporting
+from rig.cli.tables import echo
 
 
 class Only(StrEnum):
@@ -48,7 +49,7 @@ def cut(
             on_progress=lambda done: report.part(done, f"writing {output}"),
         )
     counts = made.counts
-    typer.echo(
+    echo(
         f"{output}: {(counts.first_time_ns or 0) / 1e9:.4f} s to {counts.last_time_ns / 1e9:.4f} s, "
         f"{sum(counts.rows.values())} rows in {len(counts.rows)} streams, {output.stat().st_size / 1e6:.1f} MB"
     )

@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.tables import table_console
+from rig.cli.tables import echo, table_console
 
 if TYPE_CHECKING:
     import subprocess
@@ -49,7 +49,7 @@ def demo(
     begin = time.perf_counter()
 
     def say(text: str) -> None:
-        typer.echo(f"[{time.perf_counter() - begin:5.1f} s] {text}")
+        echo(f"[{time.perf_counter() - begin:5.1f} s] {text}")
 
     file, picture = folder / "demo.mcap", folder / "demo.png"
     _record_session(file, speed_hz=speed_hz, whirl_s=whirl_s, say=say)
@@ -64,7 +64,7 @@ def demo(
     draw(recording, picture)
     _show(verdict)
     say(f"verdict: {'good' if verdict.good else 'NOT GOOD'}")
-    typer.echo(f"\nrecording   {file}\npicture     {picture}\nlook at it  rig view {file}   (or: rerun {file})")
+    echo(f"\nrecording   {file}\npicture     {picture}\nlook at it  rig view {file}   (or: rerun {file})")
     if not verdict.good:
         raise typer.Exit(1)
 
@@ -156,7 +156,7 @@ def _wait_until_up(endpoint: str, service: Process) -> None:
 
 
 def _complain(log: Path | None, text: str) -> int:
-    typer.echo(f"rig: {text}" + (f"; see {log}" if log else ""), err=True)
+    echo(f"rig: {text}" + (f"; see {log}" if log else ""), err=True)
     return 1
 
 
@@ -170,11 +170,12 @@ def _free_port() -> int:
 
 def _show(verdict: Verdict) -> None:
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title="Verdict, from the recorded samples", title_justify="left", header_style="bold")
     for heading in ("quantity", "measured", "expected", ""):
         table.add_column(heading)
-    marks = {True: "[green]good[/]", False: "[bold red]NOT GOOD[/]", None: ""}
+    marks = {True: Text("good", "green"), False: Text("NOT GOOD", "bold red"), None: ""}
     for row in verdict.rows:
         table.add_row(row.quantity, row.measured, row.expected, marks[row.good])
     table_console(width=150).print(table)

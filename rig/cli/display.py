@@ -12,6 +12,7 @@ from typing import Any
 import typer
 
 from rig.cli.main import ENDING
+from rig.cli.tables import echo, progress_bar
 
 Status = Callable[[], dict[str, Any]]
 Line = Callable[[dict[str, Any]], list[str]]
@@ -55,14 +56,12 @@ def showing(status: Status, words: Line) -> Iterator[None]:
 
 
 def _show_live(status: Status, words: Line, done: threading.Event) -> None:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
+    from rich.progress import BarColumn
 
     now = status()
     begin_s, end_s = now.get("replay", {}).get("from_s", 0.0), now["end_s"]
-    columns: list[ProgressColumn] = [] if end_s is None else [BarColumn(24)]
-    columns.append(TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), auto_refresh=False, transient=True) as bar:
+    columns = [] if end_s is None else [BarColumn(24)]
+    with progress_bar(*columns, auto_refresh=False, transient=True) as bar:
         task = bar.add_task("", total=None if end_s is None else max(end_s - begin_s, 1e-9))
         while not done.wait(0.5):
             now = status()
@@ -71,7 +70,7 @@ def _show_live(status: Status, words: Line, done: threading.Event) -> None:
 
 def _show_lines(status: Status, words: Line, done: threading.Event) -> None:
     while not done.wait(5.0):
-        typer.echo(_line(status(), words), err=True)
+        echo(_line(status(), words), err=True)
 
 
 def _line(status: dict[str, Any], words: Line) -> str:
@@ -84,7 +83,7 @@ def _line(status: dict[str, Any], words: Line) -> str:
 def end_with(troubles: list[str]) -> None:
     """Exit status 1 where something failed that did not end the run, told in a line each."""
     for text in troubles:
-        typer.echo(f"rig: {text}", err=True)
+        echo(f"rig: {text}", err=True)
     if troubles:
         raise typer.Exit(1)
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.options import Force, FromS, RecordingFiles, ToS, names_of
+from rig.cli.tables import echo
 from rig.errors import InputError
 
 
@@ -57,7 +58,7 @@ def export(
         written = write(selection, output, rate_hz=rate_hz, method=method, force=force, progress=tell)
     for made in written:
         size = made.path.stat().st_size / 1e6
-        typer.echo(f"{made.path}: {made.columns} columns, {size:.1f} MB, {unit}")
+        echo(f"{made.path}: {made.columns} columns, {size:.1f} MB, {unit}")
         for name, rate, rows, missing in made.tables:
             lost = f", {missing} missing" if missing else ""
-            typer.echo(f"  {name}: {rows} rows at {rate:g} Hz{lost}")
+            echo(f"  {name}: {rows} rows at {rate:g} Hz{lost}")

@@ -21,7 +21,7 @@ from rig.cli.options import (
     pairs,
 )
 from rig.cli.progress import reporting
-from rig.cli.tables import new_table, table_console
+from rig.cli.tables import echo, new_table, table_console
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
@@ -117,7 +117,7 @@ def identify(
         window=(from_s, to_s),
     )
     if not compiled_before():
-        typer.echo(COMPILE_NOTICE, err=True)
+        echo(COMPILE_NOTICE, err=True)
     with reporting() as reporter:
         found = run(question, precision=precision, spread=spread, robust=robust, whole=whole, progress=reporter.step)
     if output is not None:
@@ -125,15 +125,15 @@ def identify(
     if report is not None:
         report_of(found, recording=name).write(report)
     if json_output:
-        typer.echo(json.dumps(identification_document(found, recording=name), indent=2, allow_nan=False))
+        echo(json.dumps(identification_document(found, recording=name), indent=2, allow_nan=False))
         return
     _show(found, name)
     if along:
-        typer.echo(f"fitted along, as an imported log does not tell it exactly: {', '.join(along)}")
+        echo(f"fitted along, as an imported log does not tell it exactly: {', '.join(along)}")
     if output is not None:
-        typer.echo(f"written  {output}: a parameter set, as in `rig run hammer --parameters {output}`")
+        echo(f"written  {output}: a parameter set, as in `rig run hammer --parameters {output}`")
     if report is not None:
-        typer.echo(f"written  {report}")
+        echo(f"written  {report}")
 
 
 def _experiment(recording: Recording, *, parameters: str | None, scene: str | None, engine: str | None) -> Experiment:

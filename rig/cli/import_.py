@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.options import Force
+from rig.cli.tables import echo
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
     guesses = text.count(CHECK)
     told = "a mapping to start from" if files else "an example with every option"
     told += f"; {guesses} {'line' if guesses == 1 else 'lines'} with {CHECK}" if guesses else ""
-    typer.echo(f"{path}: {told}")
+    echo(f"{path}: {told}")
 
 
 _JITTER_US, _DRIFT_PPM, _DUST = 1e-3, 1e-2, 1e-6
@@ -94,15 +95,13 @@ _JITTER_US, _DRIFT_PPM, _DUST = 1e-3, 1e-2, 1e-6
 
 
 def _tell(conversion: Conversion, output: Path) -> None:
-    from rich.text import Text
-
     from rig.cli.tables import new_table, table_console
 
     console = table_console(width=100, highlight=False)
     size = output.stat().st_size / 1e6
     seconds = conversion.end_tick / 1e6
     console.print(f"{output}: {len(conversion.channels)} channels, {seconds:.6g} s, {size:.1f} MB, from "
-                  f"{conversion.start.isoformat()}", soft_wrap=True, markup=False)  # fmt: skip
+                  f"{conversion.start.isoformat()}", soft_wrap=True)  # fmt: skip
     columns = _columns(conversion)
     table = new_table("")
     for heading in columns:
@@ -110,15 +109,14 @@ def _tell(conversion: Conversion, output: Path) -> None:
         table.add_column(heading, justify="left" if text else "right", no_wrap=True, overflow="ellipsis")
     for row, channel in zip(zip(*columns.values(), strict=True), conversion.channels, strict=True):
         trouble = channel.missing or channel.overrange
-        # Names in brackets are names, not rich's markup.
-        table.add_row(*(Text(cell) for cell in row), style="yellow" if trouble else None)
+        table.add_row(*row, style="yellow" if trouble else None)
     console.print(table)
     for line in _in_common(conversion):
-        console.print(line, markup=False)
+        console.print(line)
     for remark in conversion.remarks:
-        console.print(remark, markup=False)
+        console.print(remark)
     if conversion.experiment is None:
-        console.print("no scene: it cannot be simulated again until the mapping has an [experiment]", markup=False)
+        console.print("no scene: it cannot be simulated again until the mapping has an [experiment]")
 
 
 def _columns(conversion: Conversion) -> dict[str, list[str]]:

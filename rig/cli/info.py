@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.options import Json, RecordingFiles
+from rig.cli.tables import echo, shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,9 +33,9 @@ def info(
     recording = join(files)
     document = describe(recording, quick=quick)
     if as_json:
-        typer.echo(json.dumps(document, indent=1))
+        echo(json.dumps(document, indent=1))
     else:
-        _print(recording, document)
+        _print(recording, shown(document))
 
 
 def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
@@ -42,7 +43,6 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
     from dataclasses import asdict
 
     from recorder.health import examine
-    from recorder.schemas import GAPS
 
     about = recording.metadata["rig"]
     parts = [
@@ -51,7 +51,7 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
             "size_bytes": part.path.stat().st_size,
             "complete": part.complete,
             "ended": part.end_reason,
-            "damaged_chunks": part.damaged,
+            "unchecked": part.unchecked,
             **{
                 name: part.metadata[name] for name in ("series", "trigger", "cut", "recovered") if name in part.metadata
             },
@@ -66,10 +66,7 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
         **{name: about.get(name, "") for name in ("scene", "seed", "parameter_set", "created", "view_rate_hz")},
         "span_s": recording.span_s,
         "messages": recording.messages,
-        "gaps": [
-            {**asdict(gap), "time_s": time_ns / 1e9}
-            for gap, (time_ns, _) in zip(recording.gaps, recording.payloads(GAPS), strict=True)
-        ],
+        "gaps": [{**asdict(gap), "time_s": time_s} for time_s, gap in recording.timed_gaps],
         "events": recording.events,
     }
     if not quick:
@@ -109,6 +106,7 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
             if name in part:
                 rows.append((name, ", ".join(f"{key} {value}" for key, value in part[name].items() if value)))
     rows.append(("ended", document["ended"]))
+    rows.append(("checked", "every byte" + "".join(f" but {text}" for text in recording.unchecked)))
     if "health" in document:
         rows += _verdict(document)
     for name, value in rows:
@@ -122,7 +120,7 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
     _print_channels(console, recording, document.get("health"))
     if "health" in document:
         _print_health(console, document["health"])
-    for event in recording.events:
+    for event in document["events"]:
         time_s = event.get("time_s")
         stamp = f"{time_s:9.4f} s  " if isinstance(time_s, float | int) else " " * 13
         style = "bold" if event.get("event") == "note" else ""
@@ -205,15 +203,15 @@ def _print_channels(console: Console, recording: Recording, health: dict[str, An
             # Of an imported channel, the ends of its counts are no range.
             known = not channel.kind.startswith("imported") or channel.range_v != (-channel.adc_v, channel.adc_v)
             row = [
-                channel.name,
-                channel.unit,
+                shown(channel.name),
+                shown(channel.unit),
                 f"{ends[0]:.4g} to {ends[1]:.4g}" if known else "not known",
                 f"{abs(channel.scale):.2g}",
                 f"{group.rate_hz} Hz",
             ]
-            seen = found.get(channel.name)
+            seen = found.get(shown(channel.name))
             if seen is None:
-                table.add_row(*row, *([""] * 5 if found else []), "" if found else channel.label)
+                table.add_row(*row, *([""] * 5 if found else []), "" if found else shown(channel.label))
                 continue
             numbers = [_number(seen[name], seen["noise"] or channel.scale) for name in ("mean", "low", "high")]
             numbers += [f"{seen[name]:.2g}" if seen[name] is not None else "" for name in ("noise", "noise_calibrated")]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.tables import table_console
+from rig.cli.tables import echo, table_console
 
 
 def keys(
@@ -17,7 +17,7 @@ def keys(
     from rig.interface import page
 
     if markdown:
-        typer.echo(page(), nl=False)
+        echo(page(), nl=False)
         return
     from rich.markdown import Markdown
 

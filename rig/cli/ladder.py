@@ -9,7 +9,7 @@ import typer
 
 from rig.cli.options import Changes, SceneName
 from rig.cli.progress import reporting
-from rig.cli.tables import new_table, table_console
+from rig.cli.tables import echo, new_table, table_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -57,7 +57,7 @@ def ladder(
     if write is not None:
         check_target(write, scene, loaded)
     if not compiled_before():
-        typer.echo(COMPILE_NOTICE, err=True)
+        echo(COMPILE_NOTICE, err=True)
     with reporting() as reporter:
         found = search(
             loaded,
@@ -76,13 +76,13 @@ def ladder(
     if write is not None:
         write_pick(write, scene, pick_of(found))
     if json_output:
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        echo(json.dumps(document, indent=2, allow_nan=False))
         return
     _show(document)
     for path in paths:
-        typer.echo(f"written  {path}")
+        echo(f"written  {path}")
     if write is not None:
-        typer.echo(f'written  {write}: [pick], in force with fidelity = "auto" at the head of the file')
+        echo(f'written  {write}: [pick], in force with fidelity = "auto" at the head of the file')
 
 
 def _show(document: dict[str, Any]) -> None:

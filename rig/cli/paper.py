@@ -10,7 +10,7 @@ import typer
 from rig.cli.folder import check_folder
 from rig.cli.options import Force, Json
 from rig.cli.progress import reporting
-from rig.cli.tables import new_table, table_console
+from rig.cli.tables import echo, new_table, table_console
 
 if TYPE_CHECKING:
     from replays.paper.document import Findings
@@ -43,7 +43,7 @@ def paper(
     if pictures is not None:
         check_folder(pictures, field="--pictures")
     if not compiled_before():
-        typer.echo(COMPILE_NOTICE, err=True)
+        echo(COMPILE_NOTICE, err=True)
     with reporting() as reporter:
         reporter.begin(steps(quick=quick))
         findings = find(quick=quick, processes=processes, progress=reporter.step)
@@ -55,15 +55,15 @@ def paper(
             pictures.mkdir(exist_ok=True)
             drawn = draw_pictures(findings, pictures)
     if json_output:
-        typer.echo(json.dumps(summary(findings), indent=2, allow_nan=False))
+        echo(json.dumps(summary(findings), indent=2, allow_nan=False))
         return
     _show(findings)
     for path in drawn:
-        typer.echo(f"picture  {path}")
+        echo(f"picture  {path}")
     if output is not None:
-        typer.echo(f"report  {output}")
+        echo(f"report  {output}")
     elif not drawn:
-        typer.echo("nothing is written; -o paper.html writes the report with all figures and tables")
+        echo("nothing is written; -o paper.html writes the report with all figures and tables")
 
 
 def summary(findings: Findings) -> dict[str, object]:
@@ -102,4 +102,4 @@ def _show(findings: Findings) -> None:
     console.print(table)
     counts = count(lines)
     console.print(f"corrected: {counts['agrees']} agree, {counts['differs']} differ, {counts['cannot be judged']} "
-                  f"cannot be judged ({JUDGED_BY})", markup=False)  # fmt: skip
+                  f"cannot be judged ({JUDGED_BY})")  # fmt: skip

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from rig.cli.options import Changes, Json, SetName
-from rig.cli.tables import new_table, table_console
+from rig.cli.tables import echo, new_table, table_console
 
 if TYPE_CHECKING:
     from rig.parameters import ParameterSet
@@ -27,7 +25,7 @@ def params(
 
     document = describe(build_model(changed_parameters(name, changes)))
     if json_output:
-        typer.echo(json.dumps(document, indent=2))
+        echo(json.dumps(document, indent=2))
         return
     table = new_table(f"{document['set']}: {document['title']}")
     table.add_column("parameter", no_wrap=True)

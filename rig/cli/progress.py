@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from rig.cli.tables import echo, progress_bar
+
 _EVERY_S = 15.0
 
 
@@ -51,7 +53,7 @@ class Reporter:
             return
         self._printed_s = time.monotonic()
         count = f"{self.done} of {self.total}: " if self.total else ""
-        print(f"{count}{text}", file=sys.stderr, flush=True)
+        echo(f"{count}{text}", err=True)
 
 
 @contextmanager
@@ -60,9 +62,8 @@ def reporting() -> Iterator[Reporter]:
     if not sys.stderr.isatty():
         yield Reporter()
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn
 
-    columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
+    with progress_bar(*columns, transient=True) as bar:
         yield Reporter(bar=bar, task=bar.add_task("", total=None))

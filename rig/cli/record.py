@@ -10,6 +10,7 @@ import typer
 
 from rig.cli.connection import Connect
 from rig.cli.options import Force
+from rig.cli.tables import echo, plain, table_console
 from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 
@@ -120,8 +121,6 @@ def record(
     """Record all streams of a running rig to FILE.mcap, losslessly; Ctrl-C ends the recording well."""
     import os
 
-    from rich.console import Console
-
     from recorder.series import MB, Limits
     from recorder.session import RIG_LOST, RecordingSession
     from recorder.trigger import Capture, Trigger
@@ -168,7 +167,7 @@ def record(
 
     session_of(None)  # whatever is wrong with the options is said before a rig is looked for
     try:
-        with Console(stderr=True).status(f"waiting for a rig at {connect}"):
+        with table_console(stderr=True).status(plain(f"waiting for a rig at {connect}")):
             rig = ZenohClient(connect, wait_s=max(_LINK_S, wait_s))
         with rig as client:
             summary = run_session(session_of(client))
@@ -183,8 +182,6 @@ def run_session(session: RecordingSession) -> Summary:
     """Record with a line of progress; the first SIGINT or SIGTERM ends it well, a second one at once."""
     import signal
 
-    from rich.console import Console
-
     ends = (signal.SIGINT, signal.SIGTERM)
 
     def stop(number: int, _: object) -> None:
@@ -195,24 +192,26 @@ def run_session(session: RecordingSession) -> Summary:
     def remark(lines: tuple[str, ...]) -> None:
         nonlocal told
         for line in lines[told:]:
-            console.print(line, markup=False, soft_wrap=True)
+            console.print(line, soft_wrap=True)
         told = len(lines)
 
     before = {number: signal.signal(number, stop) for number in ends}
-    console = Console(stderr=True, highlight=False)
+    console = table_console(stderr=True, highlight=False)
     told = 0
     try:
-        with console.status(f"recording {session.path}: waiting for the rig") as status:
+        with console.status(plain(f"recording {session.path}: waiting for the rig")) as status:
 
             def show(progress: Progress) -> None:
                 remark(progress.remarks)
-                lost = f"[red]{progress.lost} lost[/]" if progress.lost else "0 lost"
+                lost = f"{progress.lost} lost"
                 files = f", {progress.files} files finished" if progress.files else ""
                 backlog = f", {progress.backlog_bytes / 1e6:.1f} MB wait" if progress.backlog_bytes > 1e6 else ""
-                status.update(
+                line = plain(
                     f"recording {session.path}: {progress.time_s:.1f} s, {progress.rows} samples, {lost}, "
                     f"{progress.size_bytes / 1e6:.1f} MB{files}{backlog}"
                 )
+                line.highlight_words([lost] if progress.lost else [], "red")
+                status.update(line)
 
             summary = session.run(show)
             remark(summary.remarks)
@@ -235,34 +234,34 @@ def tell(summary: Summary) -> None:
         files = f"{summary.path}: no file"
     if summary.fired is not None and not summary.files:
         came = "no trigger came" if not summary.fired else f"{summary.fired} triggers came"
-        typer.echo(f"{came} in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
+        echo(f"{came} in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
     else:
         around = ""
         if summary.fired is not None:
             triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
             around = f" (around {triggers}, of {summary.received_s:.3f} s received)"
-        typer.echo(
+        echo(
             f"{files}: {summary.duration_s:.3f} s from {summary.first_time_s:.3f} s on{around}, "
             f"{sum(sensors)} samples in {len(sensors)} streams, {truth} rows of truth, "
             f"{summary.size_bytes / 1e6:.1f} MB; ended: {summary.reason}"
         )
     if summary.removed:
-        typer.echo(f"{summary.removed} older files were removed to make room")
+        echo(f"{summary.removed} older files were removed to make room")
     if summary.lost or summary.missed:
         for key, lost in summary.lost.items():
-            typer.echo(f"lost: {lost} rows of {key}")
+            echo(f"lost: {lost} rows of {key}")
         for key, missed in summary.missed.items():
-            typer.echo(f"lost: {missed} messages of {key}, says the transport")
+            echo(f"lost: {missed} messages of {key}, says the transport")
         inside = ", those inside a capture," if summary.fired is not None else ""
-        typer.echo(f"the gaps ({summary.gaps}){inside} are recorded in the file on recorder/gaps")
+        echo(f"the gaps ({summary.gaps}){inside} are recorded in the file on recorder/gaps")
     else:
-        typer.echo("lost: nothing")
+        echo("lost: nothing")
     if summary.dropped:
-        typer.echo(
+        echo(
             f"{summary.dropped} blocks found no room before the disk; they are among the lost "
             f"(at most {summary.high_water_bytes / 1e6:.1f} MB waited)"
         )
     if summary.malformed:
-        typer.echo(f"{summary.malformed} payloads were not what their key promises; they are in the file as they came")
+        echo(f"{summary.malformed} payloads were not what their key promises; they are in the file as they came")
     if summary.error:
-        typer.echo(summary.error, err=True)
+        echo(summary.error, err=True)

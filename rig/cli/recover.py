@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.options import Force
 from rig.cli.progress import reporting
+from rig.cli.tables import echo
 from rig.errors import InputError
 
 
@@ -47,7 +48,7 @@ def _is_whole(file: Path) -> bool:
     with reporting() as report:
         whole = is_whole(file, on_progress=lambda done: report.part(done, f"reading {file}"))
     if whole:
-        typer.echo(f"{file} is whole: nothing is to be recovered, nothing was written (--force makes a copy)")
+        echo(f"{file} is whole: nothing is to be recovered, nothing was written (--force makes a copy)")
     return whole
 
 
@@ -58,9 +59,10 @@ def _recover(file: Path, new: Path, *, force: bool) -> None:
         made = recover_file(file, new, force=force, on_progress=lambda done: report.part(done, f"recovering {file}"))
     counts = made.counts
     lost = sum(counts.lost.values())
-    typer.echo(
+    echo(
         f"{new}: {(counts.first_time_ns or 0) / 1e9:.3f} s to {counts.last_time_ns / 1e9:.3f} s, "
         f"{sum(counts.rows.values())} rows, {new.stat().st_size / 1e6:.1f} MB"
-        + (f"; {made.damaged} damaged chunks passed over" if made.damaged else "")
+        + (f"; {made.damaged} damaged records passed over" if made.damaged else "")
+        + "".join(f"; {text}: no checksum covers them" for text in made.unchecked)
         + (f"; {lost} rows are missing in it" if lost else "")
     )

@@ -21,6 +21,7 @@ from rig.cli.can_output import (
 )
 from rig.cli.display import all_lateness, end_with, lateness, showing, stopping_on_signals
 from rig.cli.options import Channels, Expose, FromS, Listen, RecordingFiles, ToS, names_of, pairs
+from rig.cli.tables import echo
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
 
@@ -172,20 +173,20 @@ def replay(
         player.prepare()
         if bus is not None:
             bus.start(paced=not burst)
-            typer.echo(f"rig: {bus}", err=True)
+            echo(f"rig: {bus}", err=True)
         begin_s, end_s = player.reach_s
         if not tape.complete:
-            typer.echo("rig: the recording was cut off; it is played as far as it goes", err=True)
+            echo("rig: the recording was cut off; it is played as far as it goes", err=True)
         what = "paused" if pause else "burst" if burst else f"x{rate:g}"
         if wait_for:
             what += f", waiting for {_clients(wait_for)}"
-        typer.echo(f"rig: replay of {', '.join(map(str, files))}, {begin_s:g} to {end_s:g} s, {what}", err=True)
-        typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends it", err=True)
+        echo(f"rig: replay of {', '.join(map(str, files))}, {begin_s:g} to {end_s:g} s, {what}", err=True)
+        echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends it", err=True)
         with stopping_on_signals(player.stop), showing(player.status, _words):
             summary = player.run()
     _tell(summary)
     if bus is not None:
-        typer.echo(bus.summary())
+        echo(bus.summary())
     end_with(summary["troubles"])
 
 
@@ -209,18 +210,18 @@ def _words(status: dict[str, Any]) -> list[str]:
 
 def _tell(summary: dict[str, Any]) -> None:
     play = summary["replay"]
-    typer.echo(
+    echo(
         f"replay: {summary['reason']} at {summary['time_s']:.3f} s, pass {play['pass']}; "
         f"{summary['played_s']:.3f} s played in {summary['wall_s']:.3f} s, x{play['achieved_rate']:.5g} without pauses"
     )
-    typer.echo(
+    echo(
         f"{play['payloads']} payloads, {summary['blocks']} blocks, {summary['rows']} rows; "
         f"left out {summary['left_out']} payloads"
     )
     if play["rate"] is not None:
-        typer.echo(f"{all_lateness(summary)}, not ready when due {summary['overruns']}")
+        echo(f"{all_lateness(summary)}, not ready when due {summary['overruns']}")
         if play["behind_s"]:
-            typer.echo(
+            echo(
                 f"warning: at the end it was {play['behind_s']:.1f} s behind; for as fast as it goes see --burst",
                 err=True,
             )

@@ -21,6 +21,7 @@ from rig.cli.can_output import (
 )
 from rig.cli.display import all_lateness, end_with, lateness, showing, stopping_on_signals
 from rig.cli.options import Changes, DurationS, Engine, Expose, Listen, Parameters, SceneName, Seed, pairs
+from rig.cli.tables import echo
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
 
@@ -86,7 +87,7 @@ def run(
             slcan=can_slcan,
         )
         notice = "preparing" if compiled_before() else COMPILE_NOTICE
-        typer.echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
+        echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
         simulation = Simulation(loaded)
         block_ticks = _block_ticks(block_ms, simulation)
         # Before anybody can connect: whoever does is answered at once.
@@ -99,17 +100,17 @@ def run(
             everywhere = server if bus is None else bus.beside(server)
             service = Service(simulation, everywhere, _clock(pace), block_ticks=block_ticks)
             if loaded.fidelity_line:
-                typer.echo(f"rig: {loaded.fidelity_line}", err=True)
+                echo(f"rig: {loaded.fidelity_line}", err=True)
             service.prepare()
             if bus is not None:
                 bus.start(paced=paced)
-                typer.echo(f"rig: {bus}", err=True)
-        typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
+                echo(f"rig: {bus}", err=True)
+        echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
         with stopping_on_signals(service.stop), showing(service.status, _words):
             summary = service.run()
     _print_summary(summary)
     if bus is not None:
-        typer.echo(bus.summary())
+        echo(bus.summary())
     end_with(summary["troubles"])
 
 
@@ -162,13 +163,9 @@ def _words(status: dict[str, Any]) -> list[str]:
 
 def _print_summary(summary: dict[str, Any]) -> None:
     queue = summary["queue"]
-    typer.echo(
-        f"scene {summary['scene']}: {summary['reason']} at {summary['time_s']:.3f} s after {summary['wall_s']:.2f} s"
-    )
-    typer.echo(
-        f"real-time factor {summary['real_time_factor']:.6f}, {all_lateness(summary)}, overruns {summary['overruns']}"
-    )
-    typer.echo(
+    echo(f"scene {summary['scene']}: {summary['reason']} at {summary['time_s']:.3f} s after {summary['wall_s']:.2f} s")
+    echo(f"real-time factor {summary['real_time_factor']:.6f}, {all_lateness(summary)}, overruns {summary['overruns']}")
+    echo(
         f"{summary['samples_published']} samples a channel published, blocks dropped {queue['dropped']},"
         f" commands taken {summary['commands']}"
     )

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from rig.cli.tables import echo, table_console
+
 
 def scenes(
     name: Annotated[str | None, typer.Argument(metavar="[SCENE]", help="Show the file of this one.")] = None,
@@ -15,7 +17,6 @@ def scenes(
     """List the scenes that come with the rig, or show one. Your own is a TOML file of the same form."""
     import json
 
-    from rich.console import Console
     from rich.table import Table
 
     from rig.scenes import load_scene, scene_document, scene_names, scene_path
@@ -23,7 +24,7 @@ def scenes(
     if name is not None:
         scene = load_scene(name)
         text = json.dumps(scene_document(scene), indent=2) if json_output else scene_path(name).read_text("utf-8")
-        typer.echo(text.rstrip())
+        echo(text.rstrip())
         return
     table = Table(box=None, header_style="bold")
     for heading in ("scene", "seconds", "what happens"):
@@ -31,4 +32,4 @@ def scenes(
     for each in scene_names():
         scene = load_scene(each)
         table.add_row(each, f"{scene.duration_s:g}", scene.title)
-    Console().print(table)
+    table_console().print(table)

@@ -10,6 +10,7 @@ import typer
 from rig.cli.folder import check_folder
 from rig.cli.options import Force
 from rig.cli.progress import reporting
+from rig.cli.tables import echo
 from rig.errors import InputError
 
 
@@ -35,4 +36,4 @@ def sessions(
         reporter.begin(len(wanted))
         for name in wanted:
             recording, text = make(SESSIONS[name], output, step=reporter.step)
-            typer.echo(f"{recording}  {recording.stat().st_size / 1e3:.0f} kB, {text.name}")
+            echo(f"{recording}  {recording.stat().st_size / 1e3:.0f} kB, {text.name}")

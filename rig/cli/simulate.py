@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.options import Changes, DurationS, Engine, Force, Parameters, SceneName, Seed
 from rig.cli.progress import reporting
+from rig.cli.tables import echo
 
 
 def simulate(
@@ -45,9 +46,9 @@ def simulate(
 
         simulation = Simulation(loaded)
         if loaded.fidelity_line:
-            typer.echo(loaded.fidelity_line, err=True)
+            echo(loaded.fidelity_line, err=True)
         if not compiled_before():
-            typer.echo(COMPILE_NOTICE, err=True)
+            echo(COMPILE_NOTICE, err=True)
         simulation.warm_up()
     with reporting() as reporter, writer_for(output, simulation, force=force) as writer:
         begin = time.perf_counter()
@@ -58,7 +59,7 @@ def simulate(
     factor = seconds / (time.perf_counter() - begin)
     health = simulation.health()
     energy = health["energy"]
-    typer.echo(
+    echo(
         f"{output}: {seconds:g} s simulated, {factor:.1f} times real time with the file, "
         f"{output.stat().st_size / 1e6:.1f} MB; {health['contacts']} contacts, "
         f"energy residual {energy['residual_j']:.1e} J of {energy['dissipated_j']:.3g} J dissipated"
@@ -71,6 +72,6 @@ def simulate(
         if checked.wrong_branch:
             warnings = [*warnings, checked.line()]
         else:
-            typer.echo(f"checked: {checked.line()}")
+            echo(f"checked: {checked.line()}")
     for warning in warnings:
-        typer.echo(f"warning: {warning}", err=True)
+        echo(f"warning: {warning}", err=True)

@@ -10,7 +10,7 @@ import typer
 
 from rig.cli.options import Json
 from rig.cli.progress import reporting
-from rig.cli.tables import new_table, table_console
+from rig.cli.tables import echo, new_table, table_console
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -59,11 +59,11 @@ def stability(
             "disagree": len(wrong),
             "pictures": [str(path) for path in pictures],
         }
-        typer.echo(json.dumps(document, indent=2, allow_nan=False))
+        echo(json.dumps(document, indent=2, allow_nan=False))
     else:
         _show(cells, names)
         for path in pictures:
-            typer.echo(f"picture  {path}")
+            echo(f"picture  {path}")
     if wrong:
         raise typer.Exit(1)
 
@@ -109,7 +109,6 @@ def _show(cells: list[Cell], names: list[str]) -> None:
                 f"! {cell.trial} {cell.case}, {cell.method}: {cell.value:.3g} {cell.unit}, limit {cell.limit:.3g}, "
                 f"expected to {'hold' if cell.expected else 'fail'}: {cell.because}",
                 highlight=False,
-                markup=False,
             )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.connection import Connect, console
+from rig.cli.tables import echo, shown, table_console
 from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def status(
         if not watch:
             document = rig.status()
             if as_json:
-                typer.echo(json.dumps(document, indent=2))
+                echo(json.dumps(document, indent=2))
             else:
                 _print(document)
             return
@@ -44,9 +45,9 @@ def _watch(rig: Console, as_json: bool) -> None:
 
     if as_json:
         for document in _documents(rig):
-            typer.echo(json.dumps(document))
+            echo(json.dumps(document))
         return
-    with Live(auto_refresh=False) as live:
+    with Live(console=table_console(), auto_refresh=False) as live:
         for document in _documents(rig):
             live.update(status_table(document), refresh=True)
 
@@ -71,15 +72,14 @@ def _documents(rig: Console) -> Iterator[dict[str, Any]]:
 
 
 def _print(document: dict[str, Any]) -> None:
-    from rich.console import Console as Screen
-
-    Screen().print(status_table(document))
+    table_console(width=80).print(status_table(document))
 
 
 def status_table(document: dict[str, Any]) -> Table:
     """A status document as a table of two columns."""
     from rich.table import Table
 
+    document = shown(document)
     late, queue, energy = document["lateness_ms"], document["queue"], document["energy"]
     table = Table(title=f"rig: {document['scene']}, {document['state']}", show_header=False, title_justify="left")
     end = "" if document["end_s"] is None else f" of {document['end_s']:g} s"
@@ -129,7 +129,7 @@ def status_table(document: dict[str, Any]) -> Table:
         text = f"lag {client['lag_s']:.3f} s, heard {client['last_heard_s']:.1f} s ago, lost {client['lost']}"
         table.add_row(f"client {name}", text)
     for text in document["warnings"]:
-        table.add_row("warning", f"[yellow]{text}[/yellow]")
+        table.add_row("warning", text, style="yellow")
     return table
 
 

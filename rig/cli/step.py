@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.connection import Connect, console
+from rig.cli.tables import echo
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
 
@@ -25,4 +26,4 @@ def step(
         raise InputError("step", "given TICKS or --blocks", "neither" if ticks is None else "both")
     with console(connect, "step") as rig:
         done = rig.step(ticks) if ticks is not None else rig.step_blocks(blocks or 0)
-        typer.echo(f"stepped to {done.time_s:.6f} s (tick {done.tick})")
+        echo(f"stepped to {done.time_s:.6f} s (tick {done.tick})")

@@ -9,6 +9,7 @@ import typer
 from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
 from rig.cli.connection import Connect
 from rig.cli.display import stopping_on_signals
+from rig.cli.tables import echo
 from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 
@@ -41,8 +42,8 @@ def twins(
             if can:
                 serving.serve_can(can)
             for twin in serving.twins:
-                typer.echo(f"{twin.CODEC.address.name:14s}{twin.url}")
-            typer.echo("rig: open one with its driver, such as drivers.hammer.driver.Hammer; Ctrl-C ends", err=True)
+                echo(f"{twin.CODEC.address.name:14s}{twin.url}")
+            echo("rig: open one with its driver, such as drivers.hammer.driver.Hammer; Ctrl-C ends", err=True)
             with stopping_on_signals(done.set):
                 done.wait()
     except NoReplyError as error:

@@ -10,7 +10,7 @@ import typer
 
 from rig.cli.options import Changes, Engine, Force, Json, RecordingFiles, ReportFile
 from rig.cli.progress import reporting
-from rig.cli.tables import new_table, table_console
+from rig.cli.tables import echo, new_table, table_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -59,7 +59,7 @@ def validate(
     overrides = {key: read_value(value) for key, value in scene_overrides(changes or [], engine=engine).items()}
     recording = join(files)
     if not compiled_before():
-        typer.echo(COMPILE_NOTICE, err=True)
+        echo(COMPILE_NOTICE, err=True)
     with reporting() as reporter:
         found = hold(recording, criteria=rules, changes=overrides, declared=declared, step=reporter.step)
         if report is not None:
@@ -68,11 +68,11 @@ def validate(
             reporter.step("report")
             make_report(found).write(report)
     if json_output:
-        typer.echo(json.dumps(found.document(), indent=2, allow_nan=False))
+        echo(json.dumps(found.document(), indent=2, allow_nan=False))
     else:
         _show(found)
         if report is not None:
-            typer.echo(f"report  {report}")
+            echo(f"report  {report}")
     if not found.good:
         raise typer.Exit(1)
 
@@ -138,9 +138,7 @@ def _statistics(found: Validation) -> Table:
         table.add_column(header, justify="right" if header in ("recorded", "foretold", "limit") else "left")
     for one in found.statistics:
         limit = "" if one.limit is None else f"+- {one.limit:.2g}"
-        # Names in square brackets would be read as markup.
-        title = one.title.replace("[", "\\[")
-        table.add_row(one.phase, title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])
+        table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])
     return table
 
 

@@ -12,6 +12,7 @@ import typer
 
 from rig.cli.connection import Connect
 from rig.cli.options import Force, OptionalRecordingFiles
+from rig.cli.tables import echo
 from rig.errors import InputError, RefusedError, check_new_file
 from rig.transport import DEFAULT_ENDPOINT
 
@@ -89,14 +90,14 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
     recording = join(files)
     name = recording.path.name + (f" and {len(files) - 1} more" if len(files) > 1 else "")
     for text in not_drawn(recording.table):
-        typer.echo(f"not shown: {text}", err=True)
+        echo(f"not shown: {text}", err=True)
     stream = new_stream(name)
     plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
     if save is not None:
         with _saved(stream, save, plan):
             painted = paint(recording, Canvas(stream))
         size = save.stat().st_size / 1e6
-        typer.echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
+        echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
         return
     with window.picture_of(screenshot) if screenshot is not None else window.Window(_kind(web=web)) as shown:
         stream.connect_grpc(shown.url, default_blueprint=plan)
@@ -110,7 +111,7 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
             if not painted.start_s <= at_s <= painted.end_s:
                 raise InputError("--at-s", f"in the recording, {painted.start_s:g} to {painted.end_s:g} s", at_s)
             shown.picture(screenshot, at_s=at_s, end_s=painted.end_s)
-            typer.echo(f"{screenshot}: at {at_s:.3f} s")
+            echo(f"{screenshot}: at {at_s:.3f} s")
         else:
             _tell(shown, name)
             _wait_for_the_end(shown)
@@ -135,18 +136,18 @@ def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> 
         plan = blueprint.layout(described.table, described.geometry, live=True)
         if save is not None:
             with _saved(stream, save, plan, until_interrupted=True):
-                typer.echo(live.LiveView(client, Canvas(stream), described).run())
+                echo(live.LiveView(client, Canvas(stream), described).run())
             return
         with window.Window(_kind(web=web), memory="512MiB") as shown:
             stream.connect_grpc(shown.url, default_blueprint=plan)
             _tell(shown, f"the rig at {connect}")
             try:
                 view = live.LiveView(client, Canvas(stream), described)
-                typer.echo(view.run(stop=lambda: not shown.open))
+                echo(view.run(stop=lambda: not shown.open))
             finally:
                 _close(stream)
             if shown.open:
-                typer.echo("the viewer stays open; end it with Ctrl-C")
+                echo("the viewer stays open; end it with Ctrl-C")
             _wait_for_the_end(shown)
 
 
@@ -157,8 +158,8 @@ def _kind(*, web: bool) -> Kind:
 
 
 def _tell(shown: Window, what: str) -> None:
-    typer.echo(f"viewing {what} at {shown.address}" if shown.address else f"viewing {what}")
-    typer.echo("Ctrl-C ends the viewer")
+    echo(f"viewing {what} at {shown.address}" if shown.address else f"viewing {what}")
+    echo("Ctrl-C ends the viewer")
     sys.stdout.flush()  # the address is wanted now, also in a pipe
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from rig.channels import Channel, Group
+from rig.errors import InputError
 from rig.kernels.signals import COLUMN
 from rig.sensors.noise import draw, noise_streams
 
@@ -172,6 +173,9 @@ class Conditioner:
         self.every = row_rate_hz // self.groups[0].rate_hz
         self.rows_seen = 0
         channels = [channel for group in self.groups for channel in group.channels]
+        for channel in channels:
+            if channel.signal not in COLUMN:
+                raise InputError(f"channel {channel.name}: signal", f"one of {', '.join(COLUMN)}", channel.signal)
         self._columns = np.array([COLUMN[channel.signal] for channel in channels])
         self._spans: list[tuple[str, int, int]] = []
         for group in self.groups:

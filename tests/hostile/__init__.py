@@ -1,10 +1,54 @@
-"""Generated inputs against every door. `RIG_FUZZ_INPUTS=N` makes the runs long: about N inputs for each test."""
+"""What comes from outside, generated: each door takes it, refuses it in one line, or tells what is wrong with it."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import resource
+import time
+import traceback
+from collections.abc import Iterator
+from typing import Any
+
+from rig.errors import DiskError, InputError
+
+LONGEST_S = 20.0
 
 
 def inputs(default: int) -> int:
-    """How many inputs a test generates."""
+    """Number of inputs of a test: short in the suite, as many as RIG_FUZZ_INPUTS says in a long run."""
     return int(os.environ.get("RIG_FUZZ_INPUTS", default))
+
+
+class Door:
+    """Counts what becomes of inputs: taken, refused in one line, or else a fault, each kept once with its place."""
+
+    def __init__(self) -> None:
+        self.taken = self.refused = 0
+        self.faults: dict[str, Any] = {}
+
+    @contextlib.contextmanager
+    def tried(self, what: object, *also: type[Exception]) -> Iterator[None]:
+        """Try one input; `what` shows it where it is a fault."""
+        begin = time.monotonic()
+        try:
+            yield
+            self.taken += 1
+        except (InputError, DiskError, *also) as error:
+            self.refused += 1
+            line = str(error)
+            if not line.isprintable() or len(line) > 6000:
+                self.faults[f"a line of {len(line)} characters"] = line[:300]
+        except Exception as error:
+            frames = traceback.extract_tb(error.__traceback__)
+            place = " < ".join(f"{frame.filename.rsplit('/', 1)[-1]}:{frame.lineno}" for frame in frames[:-4:-1])
+            self.faults.setdefault(f"{type(error).__name__} at {place}", (str(error)[:200], what))
+        if time.monotonic() - begin > LONGEST_S:
+            self.faults["too long"] = what
+
+    def tell(self, name: str) -> None:
+        """Print the counts, and fail where there is a fault."""
+        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        counts = f"{self.taken} taken, {self.refused} refused, {len(self.faults)} kinds of faults"
+        print(f"{name}: {counts}; largest memory so far {peak_mb:.0f} MB")
+        assert not self.faults, "\n".join(f"{place}: {what}" for place, what in self.faults.items())

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from rig.channels import TABLE, Channel, ChannelTable, default_table, parse_table
+from rig.errors import InputError
 from rig.kernels.signals import ROW
 from rig.scenes import HammerCommand
+from rig.sensors.conditioning import Conditioner
 
 TABLE_TEXT = TABLE.read_text()
 CHANNELS = list(default_table().channels.values())
@@ -142,8 +144,16 @@ def test_a_name_stands_once() -> None:
 
 
 def test_unknown_field_in_a_row_is_refused() -> None:
-    with pytest.raises(ValidationError, match="colour"):
+    with pytest.raises(InputError, match=r"channel table.groups.g.channels.0.colour must be left out"):
         parse_table(one_channel('colour = "red"'))
+
+
+def test_a_channel_without_a_sensitivity_and_one_of_no_signal_are_one_line() -> None:
+    with pytest.raises(InputError, match=r"channel table.groups.g.channels.0.sensitivity_v must be given"):
+        parse_table(one_channel().replace("sensitivity_v", "# "))
+    table = parse_table(one_channel().replace('"disk_x"', '"endx"'))
+    with pytest.raises(InputError, match=r"channel c: signal must be one of .*received 'endx'"):
+        Conditioner(list(table.groups.values()), row_rate_hz=20_000, seed=1, noise=True)
 
 
 @given(names=st.permutations(list(default_table().groups)), n=st.integers(0, 5), rate=st.none() | st.integers(1, 10**6))

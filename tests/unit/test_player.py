@@ -578,15 +578,18 @@ def test_a_status_that_the_run_has_ended_comes_after_the_end(folder: Path) -> No
     assert heard.payloads == by_key(payloads)
 
 
-def test_a_damaged_file_ends_the_stream_and_says_so(folder: Path, path: Path) -> None:
+def test_a_file_that_is_damaged_while_it_is_played_ends_the_stream_and_says_so(folder: Path, path: Path) -> None:
     damaged = folder / "damaged.mcap"
     data = bytearray(path.read_bytes())
-    chunk = Tape([path]).chunks[10]
-    data[chunk.offset + chunk.length // 2] ^= 0xFF
     damaged.write_bytes(data)
     server = MemoryServer()
     heard = Heard(server)
     player = Player(Tape([damaged]), server, FreeRun())
+    chunk = Tape([path]).chunks[10]
+    data[chunk.offset + chunk.length // 2] ^= 0xFF
+    damaged.write_bytes(data)
+    with pytest.raises(InputError, match="file must be an intact recording"):
+        Tape([damaged])
     with pytest.raises(InputError, match="file must be an intact recording"):
         player.run()
     assert heard.events[-1]["event"] == "end"

@@ -126,7 +126,7 @@ def test_a_finished_file_with_a_damaged_chunk_is_not_whole(path, tmp_path, capsy
     data[chunk.offset + chunk.length // 2] ^= 0xFF
     source.write_bytes(data)
     assert run("recover", source) == 0
-    assert "1 damaged chunks" in capsys.readouterr().out
+    assert "1 damaged records" in capsys.readouterr().out
     # A .part that was finished but not yet renamed is still to become a recording.
     part = tmp_path / "other.mcap.part"
     part.write_bytes(path.read_bytes())

@@ -27,16 +27,18 @@ from rig.wire import (
 HEAD = 4 + 40
 """Encapsulation and fixed fields before the values [bytes]."""
 
-int64 = st.integers(-(2**63), 2**63 - 1)
+int64 = st.integers(-(2**63) + 1, 2**63 - 1)
+numbers = st.integers(0, 2**53 - 100)
 shapes = st.tuples(st.integers(0, 12), st.integers(1, 6))
-rates = st.floats(allow_nan=False)
+rates = st.floats(1e-3, 1e12)
 
 
 @st.composite
 def blocks(draw: st.DrawFn, dtype: type | None = None) -> Block:
     dtype = dtype or draw(st.sampled_from([np.int32, np.float64]))
     values = draw(hnp.arrays(dtype, shapes))
-    return Block(tick=draw(int64), index=draw(int64), rate_hz=draw(rates), tick_rate_hz=draw(rates), values=values)
+    rate_hz, tick_rate_hz = sorted((draw(rates), max(1.0, draw(rates))))
+    return Block(draw(numbers), draw(numbers), rate_hz, max(1.0, tick_rate_hz), values)
 
 
 def schema(block: Block) -> str:
@@ -124,6 +126,31 @@ def test_damaged_head_gives_a_whole_block_or_value_error(
         return
     assert back.values.ndim == 2
     assert HEAD + back.values.nbytes == len(payload), "nothing that was sent is left out"
+
+
+@pytest.mark.parametrize("kind", [SAMPLE_SCHEMA, TRUTH_SCHEMA])
+@pytest.mark.parametrize(
+    "head",
+    [
+        (-1, 0, 1.0, 1e6),
+        (2**53 + 1, 0, 1.0, 1e6),
+        (0, -1, 1.0, 1e6),
+        (0, 2**53, 1.0, 1e6),
+        (0, 2**62, 1.0, 1e6),
+        (0, 0, -1.0, 1e6),
+        (0, 0, float("nan"), 1e6),
+        (0, 0, float("inf"), 1e6),
+        (0, 0, 1e-300, 1e6),
+        (0, 0, 2e6, 1e6),
+        (0, 0, 1.0, 0.0),
+        (0, 0, 1.0, float("nan")),
+        (0, 0, 1.0, 1e300),
+    ],
+)
+def test_a_block_at_no_time_that_a_clock_can_have_is_refused(kind: str, head: tuple[int, int, float, float]) -> None:
+    values = bytes(4 if kind == SAMPLE_SCHEMA else 8)
+    with pytest.raises(ValueError, match="payload must have times and numbers that a clock can have"):
+        decode_block(b"\x00\x01\x00\x00" + struct.pack("<qqddII", *head, 1, 1) + values, kind)
 
 
 @given(payload=st.binary(max_size=120), kind=st.sampled_from([SAMPLE_SCHEMA, TRUTH_SCHEMA]))

@@ -1,0 +1,217 @@
+"""What the documents of a recording must be: checked once, where it is opened, and believed behind that."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from recorder import schemas
+from rig.channels import ChannelTable
+from rig.errors import InputError
+from rig.outside import Count, input_error, read_json
+
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Rate = Annotated[float, Field(gt=0.0, le=1e12, allow_inf_nan=False)]
+
+
+class _Document(BaseModel):
+    """A document that a rig of any version made: what this one reads of it has its types, the rest is kept."""
+
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
+
+
+class _Text(BaseModel):
+    """Metadata: numbers stand in them as text."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+
+class TruthColumn(_Document):
+    """A column of a truth table."""
+
+    name: str
+    unit: str
+    label: str = ""
+
+
+class TruthTable(_Document):
+    """A truth table."""
+
+    rate_hz: _Rate = 1.0
+    columns: Annotated[tuple[TruthColumn, ...], Field(min_length=1)]
+
+
+class Catalogue(_Document):
+    """The catalogue: what the rig measures, and how counts become values."""
+
+    tick_rate_hz: Annotated[float, Field(ge=1.0, le=1e12)]
+    table: ChannelTable
+    truth: dict[str, TruthTable] = {}
+    reference: dict[str, str] = {}
+
+
+class _Value(_Document):
+    value: _Finite | str
+    unit: str = ""
+
+
+class Parameters(_Document):
+    """The parameters that the rig ran with."""
+
+    set: str = ""
+    values: dict[str, _Value]
+
+
+class Taken(_Document):
+    """A command that the rig took."""
+
+    id: Count
+    tick: Count
+    command: str
+    request: dict[str, Any]
+
+
+class _Fields(_Document):
+    """Of a scene's fields those that are read before the scene itself is checked."""
+
+    parameters: str = ""
+    set: dict[str, _Finite | str] = {}
+
+
+class _Mapping(_Document):
+    channels: dict[str, dict[str, Any]] = {}
+
+
+class _Import(_Document):
+    mapping: _Mapping = _Mapping()
+
+
+class Scene(_Document):
+    """What was run."""
+
+    name: str = ""
+    seed: int | str = ""
+    scene: _Fields | None = None
+    taken: tuple[Taken, ...] = ()
+    imported: _Import | None = Field(None, alias="import")
+
+
+class Event(_Document):
+    """What happened, as the rig or the recorder tells it."""
+
+    event: str
+    tick: int | None = None
+    time_s: _Finite | None = None
+    text: str = ""
+    reason: str = ""
+    tags: list[str] | None = None
+
+
+class Command(Taken):
+    """The event of a command that was taken."""
+
+    event: Literal["command"]
+    time_s: _Finite | None = None
+
+
+class _Queue(_Document):
+    dropped: Count = 0
+
+
+class _Lateness(_Document):
+    p50: _Finite | None = None
+    p99: _Finite | None = None
+    max: _Finite | None = None
+
+
+class Status(_Document):
+    """What the rig said of itself."""
+
+    queue: _Queue = _Queue()
+    lateness_ms: _Lateness | None = None
+    warnings: list[str] = []
+
+
+class Gap(_Document):
+    """What never arrived."""
+
+    key: str
+    index: Annotated[int, Field(ge=-1, lt=2**62)]
+    size: Annotated[int, Field(gt=-(2**62), lt=2**62)]
+
+
+class ClockPair(_Document):
+    """Simulated and wall time of one arrival [s]."""
+
+    time_s: _Finite
+    wall_s: _Finite
+
+
+class Rig(_Text):
+    """Metadata `rig`, which opens a file."""
+
+    format: Literal["rig-recording"]
+    created: datetime
+    view_rate_hz: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    scene: str
+    seed: str
+    parameter_set: str
+
+
+class End(_Text):
+    """Metadata `end`, which closes it."""
+
+    reason: str = "unknown"
+    rows: str = "{}"
+    first_time_s: float | None = None
+    last_time_s: float | None = None
+
+
+class SeriesPart(_Text):
+    """Metadata `series`: one of several files in a row."""
+
+    id: str
+    number: Count
+
+
+METADATA: dict[str, type[BaseModel]] = {"rig": Rig, "end": End, "series": SeriesPart}
+ATTACHED: dict[str, type[BaseModel]] = {"catalogue": Catalogue, "parameters": Parameters, "scene": Scene}
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, Any], Model]:
+    """A document as it stands, and as its model.
+
+    Raises:
+        InputError: It is none, or out of bounds; the message names the first field that is wrong.
+    """
+    document = read_json(payload, field=field)
+    try:
+        return document, model.model_validate_json(payload, strict=True)
+    except ValidationError as error:
+        raise input_error(error, field) from None
+
+
+def told(model: type[Model], entries: dict[str, str], *, field: str) -> Model:
+    """Metadata as its model.
+
+    Raises:
+        InputError: The first field that is wrong.
+    """
+    try:
+        return model.model_validate(entries)
+    except ValidationError as error:
+        raise input_error(error, field) from None
+
+
+def check_version(about: dict[str, str]) -> None:
+    """Refuse what another version of the format holds.
+
+    Raises:
+        InputError: It is another one.
+    """
+    if about.get("version") != schemas.VERSION:
+        raise InputError("file", f"a recording of format version {schemas.VERSION}", about.get("version"))

@@ -1,0 +1,427 @@
+"""An MCAP file as records, each byte that counts held against a checksum; knows nothing of what they say."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from io import BytesIO
+from itertools import pairwise
+from typing import TYPE_CHECKING, BinaryIO
+
+if TYPE_CHECKING:
+    from mcap.records import Channel
+
+MAGIC = b"\x89MCAP0\r\n"
+COPY = "metadata.json"
+"""Attachment that repeats the metadata at the start of a file: a record of metadata has no checksum of its own."""
+MOST_CHUNK_BYTES = 64 << 20
+"""Largest chunk, unpacked: a writer closes one at 1 MiB, and the message that it closes with may be long."""
+_RECORD = struct.Struct("<BQ")
+MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQII")
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+_INDEXED = struct.Struct("<HQ")
+_FOOTER = struct.Struct("<BQQQI")
+_DATA_END = struct.Struct("<BQI")
+_PIECE = 1 << 20
+_CUT_PIECE = 4096
+_LONGEST_NAME = 32
+
+
+class DamagedError(ValueError):
+    """A record is not what was written: its checksum, or its form, says so."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Messages in a row that were packed together; see `Recording.chunks`.
+
+    Attributes:
+        offset: Where its record begins in its file [bytes].
+        length: Length of the record's body [bytes].
+        begin_ns: Least simulated time of its messages [ns].
+        end_ns: Greatest simulated time of its messages [ns].
+        channels: Channels with messages in it, where the file says so.
+        cut: The file ends in it.
+        part: Number of the file that it is in, of `Recording.parts`.
+    """
+
+    offset: int
+    length: int
+    begin_ns: int = 0
+    end_ns: int = 0
+    channels: frozenset[int] | None = None
+    cut: bool = False
+    part: int = 0
+
+
+@dataclass
+class Contents:
+    """What stands in a file outside its chunks, and where these are.
+
+    Attributes:
+        complete: The file was finished.
+        damaged: Records that are not what was written, and are passed over.
+        unchecked: What no checksum covers.
+        metadata: Metadata by name.
+        attachments: Attachments by name.
+        topics: Topic of each channel.
+        counts: Number of messages by channel.
+        chunks: The chunks with messages, in file order.
+    """
+
+    complete: bool = False
+    damaged: int = 0
+    unchecked: tuple[str, ...] = ()
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    topics: dict[int, str] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    chunks: list[Chunk] = field(default_factory=list)
+
+
+def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
+    """Look through a file; a finished one is held against its checksums from the first byte to the last.
+
+    Args:
+        file: The file, behind its magic bytes.
+        size: Its length [bytes].
+        salvage: Take it for one that was cut off, whether it is or not.
+
+    Raises:
+        DamagedError: A finished file is not what was written.
+    """
+    footer = _footer(file, size)
+    if footer is None or salvage:
+        found = _walked(file, size)
+        if footer is not None:
+            with contextlib.suppress(DamagedError):  # a chunk with channels may be among the damaged ones
+                found.topics = _summary(file, size, footer)[0].topics | found.topics
+        return _counted(file, found)
+    found, places, data_end = _summary(file, size, footer)
+    for offset, length in places:
+        if offset + length > data_end:
+            raise DamagedError("an index that points nowhere")
+        file.seek(offset)
+        opcode, rest = _RECORD.unpack(file.read(_RECORD.size))
+        if rest != length - _RECORD.size or not _take(found, opcode, file.read(rest)):
+            raise DamagedError("an index that points to something else")
+    if any(chunk.offset + chunk.length > data_end for chunk in found.chunks):
+        raise DamagedError("an index that points nowhere")
+    file.seek(data_end)
+    opcode, length, expected = _DATA_END.unpack(file.read(_DATA_END.size))
+    if (opcode, length) != (_op().DATA_END, 4):
+        raise DamagedError("no end of the data")
+    if expected or COPY in found.attachments:
+        if _sum(file, data_end) != expected:
+            raise DamagedError("the checksum of the whole does not fit")
+    else:
+        found.unchecked = ("its metadata (by an earlier version, without a checksum of the whole)",)
+    found.complete = True
+    return found
+
+
+def _op() -> type:
+    from mcap.opcode import Opcode
+
+    return Opcode
+
+
+def _sum(file: BinaryIO, end: int) -> int:
+    """CRC-32 of a file up to a place."""
+    file.seek(0)
+    checksum = 0
+    while (left := end - file.tell()) > 0 and (data := file.read(min(_PIECE, left))):
+        checksum = zlib.crc32(data, checksum)
+    return checksum
+
+
+def _footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
+    """Where the summary of a finished file begins, and its checksum."""
+    at = size - len(MAGIC) - _FOOTER.size
+    if at < len(MAGIC):
+        return None
+    file.seek(at)
+    opcode, length, start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
+    whole = (opcode, length) == (_op().FOOTER, _FOOTER.size - _RECORD.size) and file.read(len(MAGIC)) == MAGIC
+    return (start, checksum) if whole else None
+
+
+def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Contents, list[tuple[int, int]], int]:
+    """Channels, counts and chunks by the summary; where metadata and attachments are; where the data end."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import AttachmentIndex, Channel, MetadataIndex, Statistics
+
+    opcodes = _op()
+    start, expected = footer
+    data_end, end = start - _DATA_END.size, size - len(MAGIC) - _FOOTER.size
+    if data_end < len(MAGIC) or start > end:
+        raise DamagedError("a footer that points nowhere")
+    file.seek(start)
+    data = file.read(size - len(MAGIC) - 4 - start)
+    if zlib.crc32(data) != expected:
+        raise DamagedError("the checksum of the summary does not fit")
+    found, places = Contents(), []
+    for opcode, at, stop in records(data[: end - start]):
+        if opcode == opcodes.CHUNK_INDEX:
+            found.chunks.append(_chunk_indexed(data[at:stop]))
+            continue
+        body = ReadDataStream(BytesIO(data[at:stop]))
+        if opcode == opcodes.CHANNEL:
+            channel = Channel.read(body)
+            _add_topic(found, channel)
+        elif opcode == opcodes.STATISTICS:
+            found.counts = dict(Statistics.read(body).channel_message_counts)
+        elif opcode in (opcodes.ATTACHMENT_INDEX, opcodes.METADATA_INDEX):
+            index = (AttachmentIndex if opcode == opcodes.ATTACHMENT_INDEX else MetadataIndex).read(body)
+            places.append((index.offset, index.length))
+    for earlier, later in pairwise(found.chunks):
+        if later.offset < earlier.offset + earlier.length:
+            raise DamagedError("chunks that lie upon each other")
+    used = set(found.counts).union(*(chunk.channels or () for chunk in found.chunks))
+    if not used <= set(found.topics):
+        raise DamagedError("messages on a channel that is not there")
+    found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # one without an index has no messages
+    return found, places, data_end
+
+
+def _chunk_indexed(body: bytes) -> Chunk:
+    begin_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
+    stop = _CHUNK_INDEX.size + indexed
+    if stop > len(body) or indexed % _INDEXED.size or length < _RECORD.size:
+        raise DamagedError("an index of a chunk that is none")
+    channels = frozenset(number for number, _ in _INDEXED.iter_unpack(body[_CHUNK_INDEX.size : stop]))
+    return Chunk(offset, length - _RECORD.size, begin_ns, end_ns, channels)
+
+
+def _add_topic(found: Contents, channel: Channel) -> None:
+    if found.topics.setdefault(channel.id, channel.topic) != channel.topic:
+        raise DamagedError("one number for two channels")
+
+
+def _take(found: Contents, opcode: int, body: bytes) -> bool:
+    """Take a record of metadata or an attachment; False for others.
+
+    Raises:
+        DamagedError: It is not what was written, or its name comes twice.
+    """
+    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import McapError
+    from mcap.records import Attachment, Metadata
+
+    opcodes = _op()
+    stream = ReadDataStream(BytesIO(body))
+    try:
+        if opcode == opcodes.ATTACHMENT:
+            if len(body) < 4 or zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
+                raise DamagedError("an attachment whose checksum does not fit")
+            attachment = Attachment.read(stream)
+            kept, name, value = found.attachments, attachment.name, attachment.data
+        elif opcode == opcodes.METADATA:
+            metadata = Metadata.read(stream)
+            kept, name, value = found.metadata, metadata.name, metadata.metadata
+        else:
+            return False
+    except (McapError, struct.error, UnicodeDecodeError):
+        raise DamagedError("a record that does not end where it should") from None
+    if stream.count != len(body) or name in kept:
+        raise DamagedError(f"{name} twice" if name in kept else "a record that does not end where it should")
+    kept[name] = value  # type: ignore[assignment]
+    return True
+
+
+def _walked(file: BinaryIO, size: int) -> Contents:
+    """The records of a file that was cut off, one behind the other, as far as it goes.
+
+    A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through.
+    """
+    opcodes = _op()
+    found = Contents()
+    position = len(MAGIC)
+    while position + _RECORD.size <= size:
+        file.seek(position)
+        opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+        end = position + _RECORD.size + length
+        if opcode == 0 or end > size:
+            # Cut off, or zeros where a power cut left unwritten pages; else its length is not what was written.
+            if opcode == opcodes.CHUNK and _says(file, length):
+                found.chunks.append(Chunk(position, size - position - _RECORD.size, cut=True))
+            elif not (length == 0 and _zeros(file) if opcode == 0 else _says_index(file, opcode, length)):
+                found.damaged += 1
+            break
+        if opcode == opcodes.DATA_END and length == 4:
+            break
+        if opcode == opcodes.CHUNK:
+            found.chunks.append(Chunk(position, length))
+        elif opcode not in (opcodes.HEADER, opcodes.MESSAGE_INDEX):
+            try:
+                found.damaged += length > size or not _take(found, opcode, file.read(length))
+            except DamagedError:
+                found.damaged += 1
+        position = end
+    return found
+
+
+def _says(file: BinaryIO, length: int) -> bool:
+    """Whether a chunk that was cut is as long as it says in two places, as far as the file goes."""
+    head = file.read(_CHUNK.size + _LONGEST_NAME + 8)
+    if len(head) < _CHUNK.size:
+        return True
+    name = _CHUNK.unpack_from(head)[-1]
+    packed = head[_CHUNK.size + name : _CHUNK.size + name + 8]
+    return len(packed) < 8 or _CHUNK.size + name + 8 + int.from_bytes(packed, "little") == length
+
+
+def _says_index(file: BinaryIO, opcode: int, length: int) -> bool:
+    """The same of another record that was cut: an index behind a chunk, or the metadata at the end."""
+    opcodes = _op()
+    if opcode == opcodes.MESSAGE_INDEX:
+        head = file.read(6)
+        return len(head) < 6 or 6 + int.from_bytes(head[2:], "little") == length
+    return opcode in (opcodes.METADATA, opcodes.ATTACHMENT, opcodes.DATA_END)
+
+
+def _zeros(file: BinaryIO) -> bool:
+    while data := file.read(_PIECE):
+        if data.count(0) < len(data):
+            return False
+    return True
+
+
+def _counted(file: BinaryIO, found: Contents) -> Contents:
+    """Find channels, counts and times of a cut file in its chunks; one that does not unpack is passed over."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.exceptions import McapError
+    from mcap.records import Channel
+
+    opcodes = _op()
+    good, counts, unchecked = [], [], 0
+    for chunk in found.chunks:
+        times_ns: list[int] = []
+        inside: dict[int, int] = {}
+        try:
+            data = unpack(file, chunk)
+            for opcode, start, end in records(data, cut=chunk.cut):
+                if opcode == opcodes.MESSAGE:
+                    number, time_ns = _stamp(data, start, end)
+                    inside[number] = inside.get(number, 0) + 1
+                    times_ns.append(time_ns)
+                elif opcode == opcodes.CHANNEL:
+                    _add_topic(found, Channel.read(ReadDataStream(BytesIO(data[start:end]))))
+        except (McapError, struct.error, ValueError):
+            found.damaged += 1
+            continue
+        if times_ns:
+            good.append(replace(chunk, begin_ns=min(times_ns), end_ns=max(times_ns), channels=frozenset(inside)))
+            counts.append(inside)
+            unchecked += len(times_ns) if chunk.cut else 0
+    for inside in counts:
+        if not set(inside) <= set(found.topics):
+            found.damaged += 1
+        for number in set(inside) & set(found.topics):
+            found.counts[number] = found.counts.get(number, 0) + inside[number]
+    found.chunks = good
+    if COPY not in found.attachments:
+        found.unchecked += ("its metadata (by an earlier version)",)
+    if unchecked:
+        found.unchecked += (f"the last {unchecked} messages (of the chunk in which it was cut off)",)
+    return found
+
+
+def _stamp(data: bytes, start: int, end: int) -> tuple[int, int]:
+    """Channel and time of a message [ns]."""
+    if end - start < MESSAGE.size:
+        raise DamagedError("a message without a head")
+    number, _, time_ns, _ = MESSAGE.unpack_from(data, start)
+    return number, time_ns
+
+
+def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]:
+    """Opcode, start and end of the body of each record.
+
+    Args:
+        data: Records behind each other.
+        cut: The last one may be cut off.
+
+    Raises:
+        DamagedError: They do not end with the data.
+    """
+    position = 0
+    while position + _RECORD.size <= len(data):
+        opcode, length = _RECORD.unpack_from(data, position)
+        if opcode == 0:  # no record: zeros
+            break
+        start = position + _RECORD.size
+        position = start + length
+        if position <= len(data):
+            yield opcode, start, position
+    if position != len(data) and not cut:
+        raise DamagedError("records that do not end with their chunk")
+
+
+def messages(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int, bytes]]:
+    """Channel, simulated time [ns], wall time of arrival [unix ns] and payload of each message of a chunk."""
+    opcode_of_message = _op().MESSAGE
+    for opcode, start, end in records(data, cut=cut):
+        if opcode == opcode_of_message:
+            _stamp(data, start, end)
+            number, _, log_time, publish_time = MESSAGE.unpack_from(data, start)
+            yield number, log_time, publish_time, data[start + MESSAGE.size : end]
+
+
+def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
+    """Records of a chunk, unpacked to the size that it declares and checked against their sum.
+
+    Raises:
+        DamagedError: It is not what was written, or larger than a recorder makes one.
+    """
+    import zstandard
+
+    if chunk.length > MOST_CHUNK_BYTES + _PIECE:
+        raise DamagedError(f"a chunk of {chunk.length} bytes")
+    file.seek(chunk.offset + _RECORD.size)
+    body = file.read(chunk.length)
+    if len(body) < _CHUNK.size + 8:
+        if chunk.cut:
+            return b""
+        raise DamagedError("a chunk without a head")
+    *_, size, checksum, name_length = _CHUNK.unpack_from(body)
+    name, packed = body[_CHUNK.size : _CHUNK.size + name_length], body[_CHUNK.size + name_length + 8 :]
+    if size > MOST_CHUNK_BYTES or name not in (b"", b"zstd"):
+        raise DamagedError(f"a chunk of {size} bytes, packed by {name[:_LONGEST_NAME]!r}")
+    if chunk.cut:
+        return _unpack_cut(packed, size) if name else packed
+    told = int.from_bytes(body[_CHUNK.size + name_length : _CHUNK.size + name_length + 8], "little")
+    if told != len(packed):
+        raise DamagedError("a chunk that does not end where it should")
+    data = packed
+    if name:
+        try:
+            # What the packed data say of their size is allocated, so it is asked first.
+            if zstandard.frame_content_size(packed) not in (-1, size):
+                raise DamagedError("a chunk of another size than it says")
+            data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        except zstandard.ZstdError as error:
+            raise DamagedError(str(error)) from None
+    if len(data) != size or zlib.crc32(data) != checksum:
+        raise DamagedError("a chunk whose checksum does not fit")
+    return data
+
+
+def _unpack_cut(packed: bytes, size: int) -> bytes:
+    """What can be unpacked of a chunk that the file ends in; the last record in it may be cut."""
+    import zstandard
+
+    found, length = [], 0
+    # In small pieces: where it ends in zeros or in nothing, the blocks before that are good.
+    with (
+        contextlib.suppress(zstandard.ZstdError),
+        zstandard.ZstdDecompressor().stream_reader(BytesIO(packed), read_size=_CUT_PIECE) as reader,
+    ):
+        while length < size and (data := reader.read(min(_CUT_PIECE, size - length))):
+            found.append(data)
+            length += len(data)
+    return b"".join(found)

@@ -1,0 +1,180 @@
+"""Recordings that lie: every byte is held against a checksum, documents have models, sizes are bounded by the file.
+
+Truth here is the recording before it was spoilt. RIG_FUZZ_INPUTS sets the number of inputs of each test.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import time
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording
+from recorder.rewrite import is_whole, recover
+from rig.errors import InputError
+from tests.hostile import Door, inputs
+from tests.hostile.files import Layout, attachments_of, contents, far_block, spoil_bytes, uses, write
+
+pytestmark = pytest.mark.filterwarnings("default::RuntimeWarning")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("hostile") / "run.mcap")
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write(tmp_path_factory.mktemp("hostile") / "left.mcap", leave=True)
+
+
+@pytest.fixture(scope="module")
+def layout(path: Path) -> Layout:
+    return Layout(Recording.open(path))
+
+
+def flipped(data: bytes, at: int, bit: int) -> bytes:
+    return data[:at] + bytes([data[at] ^ (1 << bit)]) + data[at + 1 :]
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_each_of_600_flipped_bits_in_attachments_is_told(
+    path: Path, part: Path, finished: bool, tmp_path: Path
+) -> None:
+    data = (path if finished else part).read_bytes()
+    places = [at for start, end in attachments_of(data) for at in range(start, end)]
+    rng = np.random.default_rng(1)
+    spoilt = tmp_path / ("x.mcap" if finished else "x.mcap.part")
+    told = 0
+    for at, bit in zip(rng.choice(places, 600), rng.integers(0, 8, 600), strict=True):
+        spoilt.write_bytes(flipped(data, int(at), int(bit)))
+        with pytest.raises(InputError):
+            Recording.open(spoilt)
+        assert not is_whole(spoilt)
+        told += 1
+    assert told == 600
+
+
+def test_a_changed_calibration_is_never_recovered_as_if_it_were_whole(path: Path, tmp_path: Path) -> None:
+    data = path.read_bytes()
+    at = data.index(b'"sensitivity_v": ')
+    spoilt = tmp_path / "x.mcap"
+    spoilt.write_bytes(flipped(data, at + 19, 1))
+    with pytest.raises(InputError, match="calibration"):
+        recover(spoilt)
+    # One that is not needed is left out, and counted.
+    at = data.index(b"A recording of the virtual")
+    spoilt.write_bytes(flipped(data, at, 1))
+    assert recover(spoilt).damaged == 1
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_no_changed_byte_gives_other_contents_untold(path: Path, part: Path, finished: bool, tmp_path: Path) -> None:
+    source = path if finished else part
+    data, before = source.read_bytes(), contents(Recording.open(source))
+    messages = before[0]
+    spoilt = tmp_path / ("x.mcap" if finished else "x.mcap.part")
+    rng = np.random.default_rng(2 + finished)
+    door, same, shorter = Door(), 0, 0
+    for number in range(inputs(150)):
+        changed = spoil_bytes(data, rng)
+        spoilt.write_bytes(changed)
+        with door.tried(number):
+            recording = Recording.open(spoilt)
+            found = contents(recording)
+            if found == before and recording.complete == finished:
+                same += 1
+                continue
+            # Told: it is not complete. It holds the first messages as they were, and says what no checksum covers.
+            shorter += 1
+            assert not recording.complete
+            sure = found[0] if not recording.unchecked else found[0][: -_unsure(recording)]
+            assert sure == messages[: len(sure)], "a message is another one"
+            assert found[3:6] == before[3:6], "a document is another one"
+    door.tell(f"bytes ({same} the same, {shorter} told to be shorter)")
+    assert door.refused > 0.3 * inputs(150)
+
+
+def _unsure(recording: Recording) -> int:
+    (told,) = recording.unchecked
+    return int(told.split()[2])
+
+
+def test_what_is_put_together_wrongly_is_refused_or_read_and_never_a_traceback(layout: Layout, tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    doors = {name: Door() for name in uses()}
+    for number in range(inputs(160)):
+        path = layout.spoilt(rng).write(tmp_path / "x.mcap", rng)
+        name, use = list(uses().items())[number % len(doors)]
+        with doors[name].tried(number):
+            use(path, tmp_path)
+    for name, door in doors.items():
+        door.tell(name)
+        assert door.taken
+
+
+def test_a_block_in_a_far_future_costs_neither_time_nor_memory(layout: Layout, tmp_path: Path) -> None:
+    tracemalloc.start()
+    begin = time.monotonic()
+    for tick, index in ((2**52, 2**52), (1_003_000, 2**52), (2**52, 60), (2**53, 2**53 - 20), (3_000, 60)):
+        changed = Layout.__new__(Layout)
+        changed.metadata, changed.attachments = layout.metadata, layout.attachments
+        changed.messages = [*layout.messages, ("rig/sensors/probes", far_block(tick, index), 2**62)]
+        path = changed.write(tmp_path / "x.mcap")
+        for use in uses().values():
+            with contextlib.suppress(InputError):
+                use(path, tmp_path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 300e6
+    assert time.monotonic() - begin < 60.0
+    assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 100e6
+
+
+def _bomb(declared: int, packed: bytes, compression: bytes, checksum: int) -> bytes:
+    name = struct.pack("<I", len(compression)) + compression
+    body = struct.pack("<QQQI", 0, 0, declared, checksum) + name + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+def _packed(size: int, *, told: int | None) -> bytes:
+    """A zstd frame of as many zeros, four bytes to each 128 KiB of them (RFC 8878), with or without its size told."""
+    head = struct.pack("<IB", 0xFD2FB528, 0xC0 if told is not None else 0) + bytes([7 << 3])
+    head += b"" if told is None else struct.pack("<Q", told)
+    count = size >> 17
+    block = struct.pack("<I", (1 << 17) << 3 | 1 << 1)[:3] + b"\0"
+    last = struct.pack("<I", (1 << 17) << 3 | 1 << 1 | 1)[:3] + b"\0"
+    return head + block * (count - 1) + last
+
+
+@pytest.mark.parametrize("cut", [0, 40])
+@pytest.mark.parametrize(
+    ("compression", "declared", "told"),
+    [
+        *((b"zstd", declared, told) for declared in (4 << 30, 1 << 20) for told in (4 << 30, 1 << 20, None)),
+        *((name, size, None) for name in (b"lz4", b"", b"zstd") for size in (2**63, 1 << 20)),
+    ],
+)
+def test_a_packed_chunk_of_4_gb_is_refused_before_it_is_unpacked(
+    part: Path, tmp_path: Path, cut: int, compression: bytes, declared: int, told: int | None
+) -> None:
+    packed = _packed(4 << 30, told=told)
+    assert len(packed) < 132_000
+    bomb = tmp_path / "bomb.mcap.part"
+    chunk = _bomb(declared, packed, compression, zlib.crc32(bytes(1 << 20)))
+    bomb.write_bytes(part.read_bytes() + chunk[: len(chunk) - cut])
+    tracemalloc.start()
+    begin = time.monotonic()
+    with contextlib.suppress(InputError) if cut else pytest.raises(InputError, match="intact"):
+        Recording.open(bomb)
+    recover(bomb, tmp_path / "new.mcap", force=True)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6
+    assert time.monotonic() - begin < 10.0

@@ -1,0 +1,340 @@
+"""TOML and other systems' logs that lie, and names that a terminal would act on.
+
+RIG_FUZZ_INPUTS sets the number of inputs of each test.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import json
+import logging
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rig.cli
+from recorder.reader import Recording
+from replays.formats.conversion import convert
+from replays.formats.imported import write_recording
+from replays.formats.mapping import FileOptions, load_mapping
+from replays.formats.source import open_source
+from replays.formats.template import example
+from replays.validation.criteria import DEFAULT, load_criteria
+from rig.channels import TABLE, parse_table
+from rig.cli import tables
+from rig.cli.main import main
+from rig.errors import InputError
+from rig.parameters import SETS, load_parameters
+from rig.scenes import SCENES, load_scene, read_value
+from tests.hostile import Door, inputs
+from tests.hostile.files import Layout, Rng, spoil_bytes, write
+
+PIECES = (
+    "9" * 5000, "0x" + "f" * 5000, "1e400", "nan", "-inf", "2" * 30, "[" * 3000, "{a=" * 500, '"""', "true", "-1",
+    "0", "1e-300", '"[/]"', '"\\u001b[2J"', "[]", "{}", "1979-05-27", "'x'", "a." * 300 + "a = 1\n", "[[drive]]\n",
+    "[set]\n",    '"' + "x" * 10_000 + '"', "\x00", "=", "\n",
+)  # fmt: skip
+
+
+def spoil_toml(text: str, rng: Rng) -> bytes:
+    """TOML with other values, lines that stand elsewhere, pieces put in, or other bytes."""
+    for _ in range(int(rng.integers(1, 4))):
+        lines = text.split("\n")
+        at = int(rng.integers(0, len(lines)))
+        piece = PIECES[int(rng.integers(0, len(PIECES)))]
+        match rng.integers(0, 6):
+            case 0:
+                lines[at] = re.sub(r"=.*", lambda _, piece=piece: f"= {piece}", lines[at], count=1)
+            case 1:
+                del lines[at]
+            case 2:
+                lines.insert(int(rng.integers(0, len(lines))), lines[at])
+            case 3:
+                lines.insert(at, f"x{rng.integers(0, 9)} = {piece}")
+            case 4:
+                return spoil_bytes(text.encode() or b"x", rng)
+            case _:
+                place = int(rng.integers(0, len(lines[at]) + 1))
+                lines[at] = lines[at][:place] + piece + lines[at][place:]
+        text = "\n".join(lines)
+    return text.encode()
+
+
+def test_toml_of_every_kind_is_taken_or_refused_in_one_line(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+
+    def text(path: Path) -> str:
+        return path.read_bytes().decode(errors="replace")
+
+    kinds: dict[str, tuple[list[str], Callable[[Path], object]]] = {
+        "scene": ([path.read_text() for path in SCENES.glob("*.toml")], lambda path: load_scene(path)),
+        "set": ([path.read_text() for path in SETS.glob("*.toml")], lambda path: load_parameters(str(path))),
+        "mapping": ([example()], load_mapping),
+        "criteria": ([DEFAULT.read_text()], load_criteria),
+        "channels": ([TABLE.read_text()], lambda path: parse_table(text(path))),
+        "--set": (
+            ["5.2", "[1, 2]", '"x"', "{a = 1}"],
+            lambda path: read_value(text(path)),
+        ),
+    }
+    doors = {name: Door() for name in kinds}
+    for number in range(inputs(200)):
+        name = list(kinds)[number % len(kinds)]
+        texts, load = kinds[name]
+        path = tmp_path / f"x{name.strip('-')}.toml"
+        path.write_bytes(data := spoil_toml(texts[int(rng.integers(0, len(texts)))], rng))
+        with doors[name].tried(data[:200]):
+            load(path)
+    for name, door in doors.items():
+        door.tell(name)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["9" * 5000, "-" + "9" * 30, "0x" + "f" * 5000, "[" * 5000, "[" * 40 + "]" * 40, "{a." + "a." * 200 + "a = 1}"],
+)
+def test_numbers_and_nesting_beyond_all_bounds_are_one_line(
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.toml").write_text(f"seed = {text}\n")
+    for arguments in (["params", "--set", f"contact.friction={text}"], ["scenes", str(tmp_path / "x.toml")]):
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        printed = capsys.readouterr()
+        assert end.value.code == 2
+        assert printed.err.count("\n") == 1
+        assert "must be" in printed.err
+        assert len(printed.err) < 400
+
+
+def test_a_long_dotted_key_takes_no_time(tmp_path: Path) -> None:
+    (tmp_path / "x.toml").write_text("a." * 200_000 + "a = 1\n")
+    with pytest.raises(InputError, match="keys of at most 32 parts"):
+        load_scene(tmp_path / "x.toml")
+    (tmp_path / "y.toml").write_text("#" * (2 << 20))
+    with pytest.raises(InputError, match="at most 1048576 bytes"):
+        load_scene(tmp_path / "y.toml")
+
+
+RATE_HZ = 1000.0
+X = "[channels]\ndisk_x = { source = 'x', unit = 'mm' }\n"
+
+
+def logs(folder: Path) -> dict[str, bytes]:
+    """A small log of each format, by suffix."""
+    import nptdms
+    import pyarrow
+    import pyuff
+    import soundfile
+    from asammdf import MDF, Signal
+    from pyarrow import parquet
+
+    t = np.arange(200) / RATE_HZ
+    x = np.round(np.sin(100 * t), 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mdf = MDF(version="4.10")
+        mdf.append([Signal(samples=x, timestamps=t, name="x", unit="mm")], common_timebase=True)
+        mdf.save(folder / "a.mf4", overwrite=True)
+        mdf.close()
+    with nptdms.TdmsWriter(folder / "a.tdms") as writer:
+        writer.write_segment([nptdms.ChannelObject("g", "x", x, {"wf_increment": 1e-3, "unit_string": "mm"})])
+    pyuff.UFF(str(folder / "a.uff")).write_sets(pyuff.prepare_58(
+        binary=1, func_type=1, rsp_node=1, rsp_dir=1, ref_node=1, ref_dir=1, data=x, x=t, id1="x",
+        abscissa_spacing=1, abscissa_min=0.0, abscissa_inc=1e-3, abscissa_spec_data_type=17,
+        ordinate_spec_data_type=8, orddenom_spec_data_type=0, num_pts=len(t), ord_data_type=4, z_axis_value=0.0,
+        z_axis_spec_data_type=0, ordinate_axis_units_lab="mm",
+    ), "add")  # fmt: skip
+    table = pyarrow.table({"time": t, "x": x})
+    parquet.write_table(table, folder / "a.parquet")
+    soundfile.write(folder / "a.wav", x, 1000, subtype="PCM_16")
+    column = {"name": "x", "unit": "mm", "label": "l", "full_scale": 2.0, "offset_exported": 0.5}
+    beside = {"start": "2024-01-01T00:00:00+00:00", "tables": [{"first_s": 0.0, "columns": [column]}]}
+    (folder / "a.wav.json").write_text(json.dumps(beside))
+    lines = [f"{time:.4f},{value:.4f}" for time, value in zip(t, x, strict=True)]
+    (folder / "a.csv").write_text("\n".join(["time,x [mm]", *lines]))
+    head = (
+        "LabVIEW Measurement\t\nSeparator\tTab\nDecimal_Separator\t.\nX_Columns\tOne\nDate\t2024/01/01\n"
+        "Time\t10:00:00\n"
+        "***End_of_Header***\t\nChannels\t1\nY_Unit_Label\tmm\nDelta_X\t0.001\n***End_of_Header***\t\nX_Value\tx\tComment\n"
+    )
+    (folder / "a.lvm").write_text(head + "\n".join(line.replace(",", "\t") for line in lines))
+    return {path.name[1:]: path.read_bytes() for path in folder.iterdir() if path.name.startswith("a.")}
+
+
+# pyuff leaves its file to the garbage collector, and asammdf what it could not open.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "whole").mkdir()
+    whole = logs(tmp_path / "whole")
+    (tmp_path / "m.toml").write_text(X)
+    mapping = load_mapping(tmp_path / "m.toml")
+    rng = np.random.default_rng(6)
+    doors = {suffix: Door() for suffix in whole}
+    logging.disable(logging.CRITICAL)
+    for suffix in whole:  # each is taken as it is
+        if not suffix.endswith(".json"):
+            convert([tmp_path / "whole" / f"a{suffix}"], mapping)
+    for number in range(inputs(140)):
+        suffix = list(whole)[number % len(whole)]
+        data = whole[suffix]
+        for _ in range(int(rng.integers(1, 3))):
+            data = spoil_bytes(data or b"x", rng)
+        folder = tmp_path / "spoilt"
+        folder.mkdir(exist_ok=True)
+        (folder / "a.wav").write_bytes(whole[".wav"])
+        (folder / "a.wav.json").write_bytes(whole[".wav.json"])
+        (folder / f"a{suffix}").write_bytes(data)
+        file = folder / f"a{suffix.removesuffix('.json')}"
+        with doors[suffix].tried((suffix, number)), contextlib.redirect_stderr(io.StringIO()):
+            for entry in open_source(file, FileOptions()).entries:
+                wanted = replace_source(mapping, entry.name, entry.group)
+                with contextlib.suppress(InputError):
+                    open_source(file, FileOptions()).read(entry)
+            conversion = convert([file], wanted)
+            if number % 4 == 0:
+                write_recording(conversion, tmp_path / "out.mcap", force=True)
+                Recording.open(tmp_path / "out.mcap")
+    logging.disable(logging.NOTSET)
+    for suffix, door in doors.items():
+        door.tell(suffix)
+
+
+def replace_source(mapping: Any, name: str, group: str) -> Any:
+    one = mapping.channels["disk_x"].model_copy(update={"source": name, "group": group or None})
+    return mapping.model_copy(update={"channels": {"disk_x": one}})
+
+
+NAMES = ("[/]", "[red]", "[bold", "\\[", "\x1b[2J\x1b[31m", "\u202eabc", "a\nrig: forged", "x" * 10_000, ":smile:")
+
+
+def printed_safely(text: str) -> None:
+    assert "Traceback" not in text
+    for line in text.split("\n"):
+        assert line.isprintable(), repr(line[:200])
+        assert not line.startswith("rig: forged")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_info_prints_names_that_a_terminal_would_act_on(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    layout = Layout(Recording.open(write(tmp_path / "run.mcap")))
+    text = json.dumps(name)[1:-1]
+    for old in ('"disk_x"', '"hammer"', '"forces"'):
+        for file in ("catalogue.json", "scene.json"):
+            layout.attachments[file] = layout.attachments[file].replace(old.encode(), f'"{text}"'.encode())
+            if file == "catalogue.json":
+                layout.attachments[file] = layout.attachments[file].replace(b'"mm"', f'"{text}"'.encode())
+            break
+    layout.metadata["rig"]["scene"] = layout.metadata["rig"]["seed"] = name
+    layout.metadata["end"]["reason"] = name
+    layout.messages = [
+        (topic, payload.replace(b"a note", text.encode()).replace(b"warned", text.encode()), time_ns)
+        for topic, payload, time_ns in layout.messages
+    ]
+    path = layout.write(tmp_path / "x.mcap")
+    for arguments in (
+        ["info", str(path)],
+        ["recover", str(path)],
+        ["export", str(path), "-o", str(tmp_path / "o.csv")],
+    ):
+        with contextlib.suppress(SystemExit):
+            main(arguments)
+        printed = capsys.readouterr()
+        printed_safely(printed.out + printed.err)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_status_and_a_validation_print_them_too(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from rig.cli.status import status_table
+
+    document = {
+        "scene": name, "state": "running", "end_s": None, "time_s": 1.0, "tick": 5, "pace": name, "block_ms": 1.0,
+        "real_time_factor": 1.0, "lateness_ms": {"p50": 0.0, "p99": 0.0, "max": 0.0, "last": 0.0}, "overruns": 0,
+        "queue": {"depth": 0, "capacity": 1, "high_water": 0, "dropped": 0}, "spin_hz": 5.0,
+        "energy": {"residual_j": 0.0, "dissipated_j": 0.0, "residual_share": 0.0},
+        "engine": {"name": name, "step_us": 25}, "samples_published": 1, "commands": 0, "congestion": {name: 1.0},
+        "clients": {name: {"lag_s": 0.0, "last_heard_s": 0.0, "lost": 0}}, "warnings": [name],
+        "replay": {"rate": 1.0, "waiting_for": 0, "paused": False, "passes": None, "files": [name], "from_s": 0.0,
+                   "to_s": 1.0, "pass": 1},
+    }  # fmt: skip
+    tables.table_console().print(status_table(document))
+    for text in (name, f"scene {name}"):
+        tables.echo(text.replace("\n", " "))
+        with tables.table_console().status(tables.plain(text)):
+            pass
+        with tables.progress_bar() as bar:
+            bar.add_task(text.replace("\n", " "), total=1)
+        table = tables.new_table(text.replace("\n", " "))
+        table.add_column(text.replace("\n", " "))
+        table.add_row(text.replace("\n", " "))
+        tables.table_console(width=400).print(table, text.replace("\n", " "))
+    printed = capsys.readouterr()
+    printed_safely(printed.out + printed.err)
+
+
+@pytest.mark.parametrize("name", ["[/]", "[red]x", "\x1b[2J", "\u202e"])
+def test_paths_with_such_names_end_no_command(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / name
+    folder.mkdir(parents=True)
+    write(folder / "run.mcap")
+    (folder / "x.csv").write_text("time,x [mm]\n" + "\n".join(f"{k / 1000},{k}" for k in range(50)))
+    (folder / "m.toml").write_text(X)
+    for arguments in (
+        ["info", f"{name}/run.mcap"],
+        ["cut", f"{name}/run.mcap", "-o", f"{name}/cut.mcap"],
+        ["recover", f"{name}/run.mcap", "--force"],
+        ["export", f"{name}/run.mcap", "-o", f"{name}/out.csv", "--channels", "probes"],
+        ["import", f"{name}/x.csv", "-m", f"{name}/m.toml", "-o", f"{name}/in.mcap"],
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        printed = capsys.readouterr()
+        assert end.value.code == 0, printed.err
+        printed_safely(printed.out + printed.err)
+
+
+def test_nothing_is_printed_but_through_the_one_door() -> None:
+    """No command makes a console, a progress bar or a live display of its own, or prints past the door."""
+    found = []
+    for path in sorted(Path(next(iter(rig.cli.__path__))).glob("*.py")):
+        if path.name in ("tables.py", "main.py"):
+            continue
+        tree = ast.parse(path.read_text())
+        typed = [
+            branch for branch in tree.body if isinstance(branch, ast.If) and "TYPE_CHECKING" in ast.unparse(branch.test)
+        ]
+        only_typed = {id(node) for branch in typed for node in ast.walk(branch)}
+        for node in ast.walk(tree):
+            if (
+                isinstance(node, ast.ImportFrom)
+                and (node.module or "").startswith("rich")
+                and id(node) not in only_typed
+            ):
+                made = {"Console", "Progress", "TextColumn"} & {alias.name for alias in node.names}
+                found += [f"{path.name}: imports {name}" for name in made]
+            if isinstance(node, ast.Call):
+                name = ast.unparse(node.func)
+                if name in ("typer.echo", "print", "typer.secho", "rich.print", "sys.stdout.write", "sys.stderr.write"):
+                    found.append(f"{path.name}:{node.lineno}: {name}")
+                if name == "Live" and not any(keyword.arg == "console" for keyword in node.keywords):
+                    found.append(f"{path.name}:{node.lineno}: a live display on a console of its own")
+                if any(keyword.arg == "markup" for keyword in node.keywords) or name.endswith("from_markup"):
+                    found.append(f"{path.name}:{node.lineno}: markup")
+    sources = [ast.parse(path.read_text()) for path in Path(next(iter(rig.cli.__path__))).glob("*.py")]
+    names = {alias.asname for tree in sources for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)
+             and (node.module or "").startswith("rich") for alias in node.names if alias.asname}  # fmt: skip
+    assert not found
+    assert not names, "nothing of rich under another name"
