@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import struct
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ from rig.wire import (
 )
 
 if TYPE_CHECKING:
+    from mcap.records import ChunkIndex
     from mcap.writer import Writer
 
 NS = 1_000_000_000
@@ -191,6 +193,55 @@ class _Topic:
     group: Group | None = None
 
 
+class _ChunkIndexes:
+    """The index of a file's chunks, read off the file when it is finished: kept in memory it would grow with it.
+
+    Args:
+        file: The file in the making.
+    """
+
+    _RECORD, _CHUNK, _CHANNEL = struct.Struct("<BQ"), struct.Struct("<QQQII"), struct.Struct("<H")
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def append(self, index: ChunkIndex) -> None:
+        """Keep nothing."""
+
+    def __iter__(self) -> Iterator[ChunkIndex]:
+        from mcap.stream_reader import MAGIC_SIZE
+        from mcap.opcode import Opcode
+        from mcap.records import ChunkIndex
+
+        self._file.flush()
+        number, position = self._file.fileno(), MAGIC_SIZE
+        index = None
+        while head := os.pread(number, 100, position):
+            kind, length = self._RECORD.unpack_from(head)
+            body, whole = self._RECORD.size, self._RECORD.size + length
+            if kind == Opcode.MESSAGE_INDEX and index is not None:
+                index.message_index_offsets[self._CHANNEL.unpack_from(head, body)[0]] = position
+                index.message_index_length += whole
+            elif index is not None:
+                yield index
+                index = None
+            if kind == Opcode.CHUNK:
+                first, last, raw_size, _, letters = self._CHUNK.unpack_from(head, body)
+                data = body + self._CHUNK.size + letters
+                index = ChunkIndex(
+                    message_start_time=first,
+                    message_end_time=last,
+                    chunk_start_offset=position,
+                    chunk_length=whole,
+                    message_index_offsets={},
+                    message_index_length=0,
+                    compression=head[data - letters : data].decode(),
+                    compressed_size=length - (data - body) - 8,
+                    uncompressed_size=raw_size,
+                )
+            position += whole
+
+
 class RecordingWriter:
     """Writes payloads as they came, the view messages derived from them, gaps and clock pairs.
 
@@ -199,7 +250,6 @@ class RecordingWriter:
     `recorder/clock` repeats two a second in plain JSON.
 
     The file is FILE.mcap.part until `finish`, and is flushed to the disk so often that a kill loses less than 0.5 s.
-    The index of a file stays in memory until then, about 30 MB an hour: a reason to rotate long recordings.
     """
 
     def __init__(
@@ -289,6 +339,7 @@ class RecordingWriter:
         from mcap.writer import Writer as McapWriter
 
         mcap = McapWriter(self._file, chunk_size=_CHUNK_BYTES)
+        mcap._Writer__chunk_indices = _ChunkIndexes(self._file)  # type: ignore[attr-defined]
         self._mcap: Writer | None = mcap
         with self._guard():
             mcap.start(profile="ros2", library="rotor-stator-rig recorder")
