@@ -270,7 +270,7 @@ class Service:
         self._steps: list[tuple[int, Future[dict[str, Any]], dict[str, Any]]] = []
         self._step_target: int | None = None
 
-        self._rows = wire.RowCount()
+        self._rows = wire.Continuity()
         self._samples_rate_hz = 0.0
         self._samples_published = 0
         self._congestion: dict[str, float] = {}
@@ -596,7 +596,7 @@ class Service:
         if entry.frame is not None:
             for key, block in blocks_of(entry.frame):
                 self._server.publish(key, wire.encode_block(block))
-                self._rows.follow(key, block)
+                self._rows.follow(key, block.index, len(block.values))
             self._count_samples(entry.frame)
         for event in entry.after:
             self._publish_event(event)
