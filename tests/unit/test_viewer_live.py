@@ -24,6 +24,9 @@ pytestmark = pytest.mark.wallclock
 class ScriptedClient:
     """Hands over a list of payloads as soon as the viewer watches for the rig, then may take the rig away."""
 
+    foreign = 0
+    rig = "a rig"
+
     def __init__(self, recording: Synthetic, payloads: Iterable[tuple[str, bytes]], *, killed: bool = False) -> None:
         self._replies = documents_of(recording)
         self._payloads = list(payloads)
