@@ -34,7 +34,7 @@ _LATE_NS = NS // 2
 """For so long after its end a capture waits for streams that are behind the others, and the ring keeps more than it
 need for an event that comes after its blocks [ns of simulated time]."""
 _FAR_NS = 60 * NS
-"""An event that names a time further off, which can be no time of effect, counts as one of now [ns]."""
+"""An event that names a later time, or one that the ring no longer holds, counts as one of now [ns]."""
 MOST_CAPTURES = 1000
 _MOST_FIRED = 1000
 """Triggers that a file lists; more are only counted."""
@@ -369,11 +369,11 @@ class Captures:
         return start_ns, end_ns
 
     def _time_of(self, document: dict[str, Any] | None) -> int:
-        """Simulated time that a document names [ns], as far as that is near what the streams have come to."""
+        """Simulated time that a document names [ns], where that is near what the streams have come to."""
         tick = tick_in(document)
         time_ns = self._latest_ns if tick is None else max(0, tick * NS // self._tick_rate_hz)
-        far = self._first_ns is not None and abs(time_ns - self._latest_ns) > _FAR_NS
-        return self._latest_ns if far else time_ns
+        near = -self._pre_ns - _LATE_NS <= time_ns - self._latest_ns <= _FAR_NS
+        return time_ns if near or self._first_ns is None else self._latest_ns
 
     def _write(self, key: str, payload: bytes, wall_ns: int) -> None:
         """To the capture that is open, as long as there is room for it."""

@@ -2,8 +2,8 @@
 
 A forged or damaged block must neither be believed nor end anything, while a gap, a repetition and a rig that is started
 again are what happens. A block says enough to tell: columns and rates stand in the catalogue, time and row number hang
-together, and a step of the row number is believed once a second block follows behind it. Until then the block behind
-the step waits; where the old line goes on instead, it was none of it and is refused.
+together, and a step of the row number is believed once another block goes on from it. Until then blocks behind the step
+wait; where the old line goes on instead, they were none of it and are refused.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ _MOST_STEP = 1 << 40
 _MOST_OTHERS = 16
 """Streams that the catalogue does not name and that are taken nevertheless (a replay can give them other keys)."""
 _BLOCK_BYTES = 64 << 20
+_MOST_WAITING = 8
+"""Blocks of a stream that wait; with more, so much is lost that no block goes on from another, and they are taken."""
 _EVENT_BYTES = 1 << 20
 _Text = Annotated[str, Field(max_length=10_000)]
 _Rate = Annotated[float, Field(gt=0.0, le=1e12)]
@@ -161,8 +163,8 @@ class Intake:
     def __init__(self, catalogue: Catalogue) -> None:
         self._promises = catalogue.promises()
         self._most = len(self._promises) + _MOST_OTHERS
-        self._waiting: dict[str, Taken] = {}
-        """The block behind a step, until the next one tells whose line goes on."""
+        self._waiting: dict[str, list[Taken]] = {}
+        """Blocks behind a step, as they came, until another one tells whose line goes on."""
         self.next: dict[str, int] = {}
         """Number of the row that is due next, by key."""
         self.refused = 0
@@ -198,19 +200,23 @@ class Intake:
         new, due = Taken(key, block, payload, wall_ns), self.next.get(key, block.index)
         if block.index - due > _MOST_STEP:
             return self._refuse(key, f"row {block.index} is {block.index - due} rows ahead")
-        taken = []
-        if (waiting := self._waiting.pop(key, None)) is not None:
-            first = waiting.block.index
-            if waiting.end <= block.index and (first > due or block.index < due):
-                taken, due = [waiting], waiting.end
+        waiting = self._waiting.setdefault(key, [])
+        self.next.setdefault(key, due)
+        place = next((n for n, each in enumerate(waiting) if each.end == block.index), None)
+        if block.index != due and place is None:
+            waiting.append(new)
+            return self._first(key, behind=True) if len(waiting) > _MOST_WAITING else []
+        line = [new]
+        for n, each in reversed(list(enumerate(waiting))):
+            # What the new block goes on from; with gap upon gap, also those between that and the old line.
+            between = n != place and due <= each.block.index and each.end <= line[0].block.index
+            if block.index != due and (n == place or (between and len(line) > 1)):
+                line.insert(0, each)
             else:
-                self._refuse(key, f"row {first} came where row {due} was due, and nothing went on from it")
-        self.next[key] = due
-        if block.index != due:
-            self._waiting[key] = new
-            return taken
+                self._refuse_step(each)
+        waiting.clear()
         self.next[key] = new.end
-        return [*taken, new]
+        return line
 
     def rest(self, rows: Mapping[str, int] | None, key: str | None = None) -> list[Taken]:
         """At the end: the blocks that still wait and are part of what was published.
@@ -220,12 +226,35 @@ class Intake:
             key: Only of this stream.
         """
         found = []
-        for each in list(self._waiting.values()):
-            last = each.end if rows is None else rows.get(each.key, 0)
-            if key in (None, each.key) and self.next[each.key] < each.end <= last:
-                found.append(self._waiting.pop(each.key))
-                self.next[each.key] = each.end
+        for name in list(self._waiting) if key is None else [key]:
+            last = None if rows is None else rows.get(name, 0)
+            while taken := self._first(name, last=last):
+                found += taken
         return found
+
+    def _first(self, key: str, *, last: int | None = None, behind: bool = False) -> list[Taken]:
+        """Of the blocks that wait, the next one ahead, up to row `last`; else, if that may be, the first one behind."""
+        waiting, due = self._waiting.get(key, []), self.next.get(key, 0)
+        ahead = [
+            n
+            for n, each in enumerate(waiting)
+            if due <= each.block.index and each.end <= (each.end if last is None else last)
+        ]
+        if not ahead and not (behind and waiting):
+            return []
+        place = min(ahead, key=lambda n: waiting[n].block.index, default=0)
+        for each in waiting[:place]:
+            self._refuse_step(each)
+        chosen = waiting[place]
+        del waiting[: place + 1]
+        self.next[key] = chosen.end
+        return [chosen]
+
+    def _refuse_step(self, waiting: Taken) -> None:
+        due = self.next[waiting.key]
+        self._refuse(
+            waiting.key, f"row {waiting.block.index} came where row {due} was due, and nothing went on from it"
+        )
 
     def _refuse(self, key: str, why: str) -> list[Taken]:
         self.refused += 1

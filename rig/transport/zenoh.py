@@ -37,6 +37,9 @@ _HEARTBEAT_S = 0.25
 _FIFO = 20_000
 """Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops (or waits,
 where it is not paced), and the rest is recovered."""
+_HEARTBEATS = 500
+"""Heartbeats that a subscriber holds: several of each key. The memory of a ring is taken as it goes round, so that a long
+one grows for hours."""
 _PORTION = 200
 """Messages asked for at a time, below 1 MB: while a cache answers its publisher waits, and sockets hold that much."""
 _ATTEMPTS = 4
@@ -611,7 +614,7 @@ class ZenohClient:
 
         stream = _Stream(ask, on_message, on_miss, history=history)
         subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_FIFO))
-        heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", zenoh.handlers.RingChannel(_FIFO))
+        heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", zenoh.handlers.RingChannel(_HEARTBEATS))
         self._declared += [subscriber, heartbeats]
         streams.drain(subscriber, take, f"takes {key}", first=begin)
         streams.drain(heartbeats, heartbeat, f"heartbeats {key}")
