@@ -38,8 +38,8 @@ _FIFO = 20_000
 """Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops (or waits,
 where it is not paced), and the rest is recovered."""
 _HEARTBEATS = 500
-"""Heartbeats that a subscriber holds: several of each key. The memory of a ring is taken as it goes round, so that a long
-one grows for hours."""
+"""Heartbeats that a subscriber holds: several of each key. A ring takes its memory as it first goes round, a long one
+for hours."""
 _PORTION = 200
 """Messages asked for at a time, below 1 MB: while a cache answers its publisher waits, and sockets hold that much."""
 _ATTEMPTS = 4
