@@ -14,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -24,18 +24,10 @@ from drivers.samples import Pile, Samples, StreamEndedError
 from drivers.samples import Sequence as RowSequence
 from drivers.sources import Source, open_source
 from rig.errors import InputError
+from rig.wire import Gap
 
 _GAPS = 1000
 """Gaps that are remembered; all are counted."""
-
-
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """Rows of one stream that never came: `size` of them, from number `index` on."""
-
-    stream: str
-    index: int
-    size: int
 
 
 class Aligner:

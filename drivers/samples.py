@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rig.wire import Continuity
+
 
 class StreamEndedError(EOFError):
     """Nothing more will come; the message says why."""
@@ -64,32 +66,34 @@ RESTART_S = 5.0
 
 
 class Sequence:
-    """Follows the row numbers of one stream."""
+    """Follows the rows of one stream that may come late or twice, and gives what is new of them."""
 
     def __init__(self) -> None:
-        self._next: int | None = None
-        self.lost = 0
+        self._rows = Continuity()
+
+    @property
+    def lost(self) -> int:
         """Rows that never came."""
-        self.stale = 0
+        return self._rows.lost.get("", 0)
+
+    @property
+    def stale(self) -> int:
         """Rows that came twice, or after later ones."""
-        self.runs = 0
+        return self._rows.stale
+
+    @property
+    def runs(self) -> int:
         """How often the numbers began anew."""
+        return self._rows.runs.get("", 0)
 
     def follow(self, samples: Samples) -> Samples | None:
         """The same rows without those that came before, with the gap before them; None where nothing is new."""
-        expected = samples.index if self._next is None else self._next
-        behind = expected - samples.index
-        if behind > 0 and (samples.index == 0 or behind > RESTART_S * samples.rate_hz):
-            self.runs += 1
-            expected, behind = samples.index, 0
-        stale = min(max(behind, 0), len(samples))
-        self.stale += stale
-        gap = max(0, -behind)
-        self.lost += gap
+        stale, lost = self.stale, self.lost
+        self._rows.follow("", samples.index, len(samples), late_rows=RESTART_S * samples.rate_hz)
+        stale = self.stale - stale
         if stale == len(samples):
             return None
-        self._next = samples.index + len(samples)
-        return replace(samples.rows(stale, len(samples)), gap=gap)
+        return replace(samples.rows(stale, len(samples)), gap=self.lost - lost)
 
 
 class Pile:

@@ -5,17 +5,17 @@ Only sensor keys, the catalogue, the events and the rig's token are asked for: w
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pydantic import ValidationError
-
 from rig import wire
 from rig.channels import ChannelTable, Group
 from rig.errors import InputError
-from rig.transport import Client
+from rig.intake import Catalogue, Intake, Taken, event_in
+from rig.transport import Client, NoReplyError
 
 GRACE_S = 2.0
 """After an end that does not tell the number of rows, and after the last block: silence that ends the stream [s]."""
@@ -67,15 +67,14 @@ class RigStream:
         self._lock = threading.Lock()
         self._listeners: dict[str, list[_Listener]] = {}
         self._subscribed: set[str] = set()
-        self._watching = False
-        self._next: dict[str, int] = {}
-        """Number of the row that comes next, by group."""
+        self._intake: Intake | None = None
+        self._gone = False
         self._ends: dict[str, tuple[int, str]] = {}
         """Groups of which the run's end was announced: number of rows in all, and the reason."""
         self._heard_s = 0.0
         """When the last block came [s, monotonic]."""
         self.malformed = 0
-        """Payloads that were not what their key promises."""
+        """Payloads that were not what their key and the rig's catalogue promise."""
         self.missed = 0
         """Messages that the transport could not bring back; the rows show the gaps too."""
 
@@ -86,11 +85,10 @@ class RigStream:
             NoReplyError: No rig answers.
             InputError: What answers is no rig of this version.
         """
-        catalogue = wire.decode_document(self._client.request(wire.CATALOGUE))
-        try:
-            return ChannelTable.model_validate(catalogue.get("table"))
-        except ValidationError:
-            raise InputError("catalogue", "that of a rig of this version", sorted(catalogue)) from None
+        return self._catalogue().table
+
+    def _catalogue(self) -> Catalogue:
+        return Catalogue.read(wire.decode_document(self._client.request(wire.CATALOGUE)))
 
     def group(self, name: str) -> Group:
         """One group of the table.
@@ -116,11 +114,12 @@ class RigStream:
                 run begins, its blocks come, numbered from 0.
         """
         listener = _Listener(on_block, on_end)
+        intake = self._intake or Intake(self._catalogue())
         with self._lock:
             self._listeners.setdefault(group, []).append(listener)
-            new, watch = group not in self._subscribed, not self._watching
+            new, watch = group not in self._subscribed, self._intake is None
             self._subscribed.add(group)
-            self._watching = True
+            self._intake = self._intake or intake
         # Not under the lock: a transport may deliver at once.
         if watch:
             self._client.subscribe(wire.EVENTS, self._on_event, on_miss=self._on_miss)
@@ -145,52 +144,61 @@ class RigStream:
         self.missed += count
 
     def _on_block(self, group: str, payload: bytes) -> None:
-        try:
-            block = wire.decode_block(payload, wire.SAMPLE_SCHEMA)
-        except ValueError:
-            self.malformed += 1
-            return
+        key = wire.sensor_key(group)
         with self._lock:
-            end = block.index + len(block.values)
-            if block.index < self._next.get(group, 0):
+            intake = self._intake
+            assert intake is not None
+            due, refused = intake.next.get(key, 0), intake.refused
+            try:
+                taken = intake.take(key, payload)
+            except ValueError:
+                self.malformed += 1
+                return
+            self.malformed += intake.refused - refused
+            if taken:
+                self._heard_s = time.monotonic()
+            if intake.next.get(key, 0) < due:
                 # Another run.
                 self._ends.pop(group, None)
-            self._next[group] = end
-            self._heard_s = time.monotonic()
-            rows, reason = self._ends.get(group, (end + 1, ""))
-            done = end >= rows
+            ending = self._ends.get(group)
+            if ending is not None:
+                taken += intake.rest({key: ending[0]}, key)
+            done = ending is not None and intake.next.get(key, 0) >= ending[0]
             if done:
                 del self._ends[group]
+        self._hand_on(group, taken, ending[1] if done and ending else None)
+
+    def _hand_on(self, group: str, taken: list[Taken], reason: str | None) -> None:
         for listener in self._of(group):
-            listener.on_block(block)
-            if done:
+            for each in taken:
+                listener.on_block(each.block)
+            if reason is not None:
                 listener.on_end(reason)
 
     def _on_event(self, _: str, payload: bytes) -> None:
         try:
-            event = wire.decode_document(payload)
-            if event["event"] != "end":
-                return
-            rows, reason = event.get("rows"), f"the rig's run has ended: {event['reason']}"
-            rows = rows if rows is None else dict(rows)
-        except (ValueError, KeyError, TypeError):
+            event = event_in(payload)
+        except ValueError:
             self.malformed += 1
             return
+        if event["event"] != "end":
+            return
+        rows, reason = event.get("rows"), f"the rig's run has ended: {event.get('reason') or 'without a reason'}"
         if rows is None:
             # A recording that does not tell what there was: whatever may still come has its time.
             self._heard_s = time.monotonic()
             self._end_in_silence(GRACE_S, reason)
             return
-        done = []
-        with self._lock:
-            for group in self._subscribed:
+        for group in list(self._subscribed):
+            key = wire.sensor_key(group)
+            with self._lock:
+                assert self._intake is not None
                 # Blocks and events travel apart: the last blocks may be still to come.
-                total = rows.get(wire.sensor_key(group), 0)
-                if self._next.get(group, 0) >= total:
-                    done.append(group)
-                else:
+                taken, total = self._intake.rest(rows, key), rows.get(key, 0)
+                done = self._intake.next.get(key, 0) >= total
+                if not done:
                     self._ends[group] = (total, reason)
-        self._end(done, reason)
+            self._hand_on(group, taken, reason if done else None)
 
     def _end_in_silence(self, wait_s: float, reason: str) -> None:
         """End all groups once no block has come for so long; look again at the earliest time at which that can be."""
@@ -200,7 +208,7 @@ class RigStream:
             if rest_s > 0.0:
                 self._end_in_silence(rest_s, reason)
             else:
-                self._end(list(self._subscribed), reason)
+                self._end(reason)
 
         timer = threading.Timer(wait_s, look)
         timer.daemon = True
@@ -208,14 +216,19 @@ class RigStream:
 
     def _on_alive(self, alive: bool) -> None:
         if alive:
+            if self._gone:
+                # What is there now may be another rig.
+                with contextlib.suppress(NoReplyError, ValueError):
+                    self._intake = Intake(self._catalogue())
+            self._gone = False
             return
+        self._gone = True
         with self._lock:
-            groups = list(self._subscribed)
             self._ends.clear()
-            self._next.clear()
-        self._end(groups, RIG_GONE)
+        self._end(RIG_GONE)
 
-    def _end(self, groups: list[str], reason: str) -> None:
-        for group in groups:
-            for listener in self._of(group):
-                listener.on_end(reason)
+    def _end(self, reason: str) -> None:
+        for group in list(self._subscribed):
+            with self._lock:
+                taken = self._intake.rest(None, wire.sensor_key(group)) if self._intake is not None else []
+            self._hand_on(group, taken, reason)

@@ -6,16 +6,15 @@ rate of zero. Such a payload is malformed like one that does not decode; it must
 
 from __future__ import annotations
 
-import struct
 from typing import Any
 
 import numpy as np
 
-from rig.wire import EDGES, Block, decode_block, schema_of
+from rig.intake import event_in
+from rig.wire import EDGES, EVENTS, Block, decode_block, decode_document, schema_of
 
 _MOST = 1 << 53
 """Ticks up to here are exact in every number that they become: 285 years of microseconds."""
-_PLACE = struct.Struct("<qq")
 
 
 def block_in(key: str, payload: bytes) -> Block:
@@ -38,12 +37,16 @@ def block_in(key: str, payload: bytes) -> Block:
     return block
 
 
+def document_in(key: str, payload: bytes) -> dict[str, Any]:
+    """The document in a payload; one on the key of events is an event.
+
+    Raises:
+        ValueError: It is not what the key promises.
+    """
+    return event_in(payload) if key == EVENTS else decode_document(payload)
+
+
 def tick_in(document: dict[str, Any] | None) -> int | None:
     """The tick that a document names; None if it names none."""
     tick = document.get("tick") if document is not None else None
     return tick if isinstance(tick, int) and not isinstance(tick, bool) and abs(tick) <= _MOST else None
-
-
-def place_of(payload: bytes) -> tuple[int, int] | None:
-    """Tick and row number that a block says it begins at, without a look at the rest; None if it is too short."""
-    return _PLACE.unpack_from(payload, 4) if len(payload) >= 4 + _PLACE.size else None

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from recorder.payload import place_of
+from recorder.payload import block_in
 from recorder.schemas import PART_SUFFIX
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination, remove
 from rig.errors import InputError
@@ -31,6 +31,8 @@ _NEW_BYTES = 300_000
 """What a file takes that was only just begun, with its end."""
 _FLUSH_BYTES = MB // 4
 """At the budget, more than that in memory is flushed, for it is less once it is compressed; less is let go."""
+_MOST_COMMANDS = 10_000
+"""Latest commands that a file names as sent before it."""
 _CHECK_S = 0.25
 _BEHIND_NS = NS
 """Simulated time by which streams may be apart at a seam: more, and one of them is still catching up [ns]."""
@@ -112,16 +114,17 @@ def _parts_of(path: Path) -> list[Path]:
 
 
 def lack_of_room(folder: Path, keep_free_mb: float, *, index_bytes: int = 0) -> str:
-    """What is wrong if a disk has less room than is to be left on it [MB]; empty if nothing is."""
-    if not keep_free_mb:
-        return ""
+    """What is wrong if a disk has less room than is to be left on it [MB]; empty if nothing is.
+
+    With nothing to be left there must still be room to end the file well.
+    """
     try:
         disk = os.statvfs(folder)
     except OSError:
         return ""  # the next write says what is wrong
     if disk.f_bavail * disk.f_frsize >= keep_free_mb * MB + _PENDING_BYTES + index_bytes:
         return ""
-    return f"less than {keep_free_mb:g} MB are free on the disk"
+    return f"less than {keep_free_mb:g} MB are free on the disk" if keep_free_mb else "the disk is full"
 
 
 class Room:
@@ -182,6 +185,8 @@ class Commands:
     def follow(self, key: str, document: dict[str, Any] | None) -> None:
         """Take a document of the stream."""
         if key == EVENTS and document is not None and document.get("event") == "command":
+            if len(self._taken) >= _MOST_COMMANDS:
+                self._taken.pop(next(iter(self._taken)))
             fields = ("id", "tick", "command", "request")
             self._taken.setdefault(document.get("id"), {name: document.get(name) for name in fields})
 
@@ -324,10 +329,13 @@ class Series:
     def _is_seam(self, key: str, payload: bytes) -> bool:
         """Whether the file is full and this is the first block of a later time than all that it holds."""
         writer, limits = self._writer, self._limits
-        place = None if key == EDGES or schema_of(key) is None else place_of(payload)
-        if place is None:
+        if key == EDGES or schema_of(key) is None:
             return False
-        block_ns = self._reached_ns[key] = place[0] * NS // writer.tick_rate_hz
+        try:
+            tick = block_in(key, payload).tick
+        except ValueError:
+            return False
+        block_ns = self._reached_ns[key] = tick * NS // writer.tick_rate_hz
         if writer.first_time_ns is None or block_ns <= writer.last_time_ns:
             return False
         full = limits.rotate_mb is not None and writer.size_bytes >= limits.rotate_mb * MB

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from recorder.payload import block_in, place_of
+from recorder.payload import block_in
 from recorder.series import Limits, Series, check_room, check_series
 from recorder.trigger import Capture, Captures, check_captures
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_view_rate
 from rig.channels import ChannelTable
 from rig.errors import InputError
+from rig.intake import Catalogue, Intake
+from rig.text import printable
 from rig.transport import Client, NoReplyError
 from rig.wire import (
     ALIVE,
@@ -52,6 +54,11 @@ RECOVERY_S = 2.0
 up [s]."""
 PATIENCE_S = 30.0
 """After the end of the stream: longest wait [s]."""
+RETURN_S = 10.0
+"""Unless told otherwise, how long a rig that is lost may take to be there again with the same run [s]: a recorder that
+was stopped for a minute loses its links, and is linked again in a second or two."""
+_DOCUMENTS_BYTES = 64 << 20
+"""What documents may take of memory when blocks find no more room."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +111,8 @@ class Summary:
         received_s: Simulated time from the first to the last row received, kept or not [s].
         fired: Triggers that came; None where it was not recorded around triggers.
         remarks: What the user should know, a line each.
+        refused: Blocks that cannot be of the rig, and were left out.
+        ended_early: Up to which time it is recorded, where that is not all that was asked for; empty else.
     """
 
     path: Path
@@ -124,6 +133,20 @@ class Summary:
     received_s: float = 0.0
     fired: int | None = None
     remarks: tuple[str, ...] = ()
+    refused: int = 0
+    ended_early: str = ""
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """What is missing, a line each."""
+        lines = [f"{lost} rows of {key}" for key, lost in self.lost.items()]
+        lines += [f"{missed} messages of {key}, says the transport" for key, missed in self.missed.items()]
+        return (*lines, self.ended_early) if self.ended_early else tuple(lines)
+
+    @property
+    def good(self) -> bool:
+        """Whether the run did not fail, and all of it was recorded that was to be."""
+        return not (self.error or self.losses or self.reason.startswith("failed"))
 
 
 class Sink(Protocol):
@@ -187,7 +210,7 @@ class Sink(Protocol):
 class _Inbox:
     """Bounded by bytes; a full one refuses blocks rather than make the transport wait, for that would stall the rig.
 
-    What it refuses shows as a gap of the row numbers. Documents are small and rare, and always taken.
+    What it refuses shows as a gap of the row numbers. Documents are small and rare, and have room of their own.
     """
 
     def __init__(self, capacity_bytes: int) -> None:
@@ -207,7 +230,8 @@ class _Inbox:
         with self._ready:
             if self._closed:
                 return
-            if self._bytes + len(payload) > self._capacity and schema_of(key) is not None:
+            capacity = self._capacity + (_DOCUMENTS_BYTES if schema_of(key) is None else 0)
+            if self._bytes + len(payload) > capacity:
                 self.dropped += 1
                 return
             self._items.append((key, payload, wall_ns))
@@ -253,6 +277,7 @@ class RecordingSession:
         view_rate_hz: float = 500.0,
         history: bool = False,
         wait_s: float = 0.0,
+        patience_s: float | None = None,
         force: bool = False,
         limits: Limits | None = None,
         capture: Capture | None = None,
@@ -271,6 +296,8 @@ class RecordingSession:
             history: Also record what the rig's cache still holds from before; rows since the start of the run that it
                 no longer holds count as lost.
             wait_s: How long a rig may take to answer at the beginning [s]: one that is being prepared listens already.
+            patience_s: How long a rig that is lost may take to be there again [s]; the same run is then recorded on,
+                with a gap. None: `RETURN_S`.
             force: Replace an existing file.
             limits: Size of the files, and what they may take of the disk.
             capture: Record only around triggers.
@@ -286,6 +313,9 @@ class RecordingSession:
         check_view_rate(view_rate_hz)
         if not wait_s >= 0.0:
             raise InputError("wait_s", "at least 0", wait_s)
+        patience_s = RETURN_S if patience_s is None else patience_s
+        if not patience_s >= 0.0:
+            raise InputError("patience_s", "at least 0", patience_s)
         self._limits = limits or Limits()
         self._capture = capture
         if capture is None:
@@ -303,6 +333,7 @@ class RecordingSession:
         self._view_rate_hz = view_rate_hz
         self._history = history
         self._wait_s = wait_s
+        self._patience_s = patience_s
         self._force = force
         self._wall_ns = wall_ns
         self._monotonic_s = monotonic_s
@@ -313,9 +344,12 @@ class RecordingSession:
         self._end_reason = ""
         self._end_rows: dict[str, int] | None = None
         """Number of the row after the last one published, by key, as the end event tells it."""
+        self._rig: str | None = None
+        """Who the rig is, as the transport tells."""
         self._rig_lost = False
+        self._lost_s = 0.0
         self._replaced = False
-        self._arrived: dict[str, int] = {}
+        self._remarks: list[str] = []
         self._heard_s = 0.0
         self._streams: set[str] = set()
         self._beyond: set[str] = set()
@@ -343,10 +377,12 @@ class RecordingSession:
             InputError: The file cannot be created.
         """
         catalogue, parameters, scene = (decode_document(self._ask(key)) for key in (CATALOGUE, PARAMETERS, SCENE))
+        promised = Catalogue.read(catalogue)
+        self._rig = self._client.rig
         writer = self._open_sink(catalogue, parameters, scene)
-        self._tick_rate_hz = round(catalogue["tick_rate_hz"])
-        self._streams = {sensor_key(group) for group in writer.table.groups}
-        self._streams |= {truth_key(table) for table in catalogue.get("truth", {})}
+        self._intake = Intake(promised)
+        self._tick_rate_hz = round(promised.tick_rate_hz)
+        self._streams = {*map(sensor_key, promised.table.groups), *map(truth_key, promised.truth)}
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
         thread.start()
         reason = "failed"
@@ -403,7 +439,7 @@ class RecordingSession:
         return Captures(
             self.path,
             self._capture,
-            table=ChannelTable.model_validate(catalogue["table"]),
+            table=Catalogue.read(catalogue).table,
             tick_rate_hz=round(catalogue["tick_rate_hz"]),
             scene=scene,
             open_writer=open_writer,
@@ -415,24 +451,38 @@ class RecordingSession:
     # On the transport's threads.
 
     def _on_message(self, key: str, payload: bytes) -> None:
-        if schema_of(key) is not None and (place := place_of(payload)) is not None:
-            index = place[1]
+        wall_ns = self._wall_ns()
+        if schema_of(key) is None:
+            if not self._replaced:
+                self._inbox.put(key, payload, wall_ns)
+            return
+        due = self._intake.next.get(key, 0)
+        try:
+            taken = self._intake.take(key, payload, wall_ns)
+        except ValueError:
+            if self._intake.knows(key):
+                self._inbox.put(key, payload, wall_ns)  # kept as it came, for the reader to judge
+            return
+        if taken:
             # Whoever goes on after the rig was lost and counts from the start again is another one in its place.
-            self._replaced = self._replaced or (self._rig_lost and index < self._arrived.get(key, 0))
-            self._arrived[key] = index
+            self._replaced = self._replaced or (self._rig_lost and taken[0].block.index < due)
             self._heard_s = self._monotonic_s()
-        if not self._replaced:
-            self._inbox.put(key, payload, self._wall_ns())
+        for each in taken if not self._replaced else ():
+            self._inbox.put(each.key, each.payload, each.wall_ns)
 
     def _on_miss(self, key: str, messages: int) -> None:
         self._misses.append((key, messages, self._wall_ns()))
 
     def _on_alive(self, alive: bool) -> None:
         if not alive:
+            self._lost_s = self._monotonic_s()
             self._rig_lost = True
-            self._wake.set()
         elif self._rig_lost:
-            self._replaced = True
+            self._replaced = self._replaced or self._client.rig != self._rig
+            self._rig_lost = self._replaced
+            if not self._replaced:
+                self._remarks.append("the link to the rig was lost, and is back; what could not be fetched is a gap")
+        self._wake.set()
 
     # On the writer thread.
 
@@ -477,9 +527,8 @@ class RecordingSession:
 
     def _follow(self, key: str, document: dict) -> None:
         if key == EVENTS and document.get("event") == "end":
-            rows = document.get("rows")
-            self._end_rows = rows if isinstance(rows, dict) else None
-            self._end_reason = str(document.get("reason", "ended"))
+            self._end_rows = document.get("rows")
+            self._end_reason = printable(document.get("reason") or "ended", 500)
             self._wake.set()
         elif key == STATUS and document.get("state") == "ended" and not self._end_reason:
             self._end_reason = "ended before the recording began"
@@ -501,17 +550,31 @@ class RecordingSession:
                 return writer.ended
             if self._beyond and (self._beyond >= self._streams or now_s - self._within_s > RECOVERY_S):
                 return "duration reached"
-            if ended_s is None and (self._end_reason or self._rig_lost):
+            gone = self._replaced or (self._rig_lost and now_s - self._lost_s > self._patience_s)
+            if ended_s is None and (self._end_reason or gone):
                 ended_s = now_s
             if ended_s is not None and self._nothing_left(writer, now_s, ended_s):
                 return self._end_reason or RIG_LOST
             if now_s - heartbeat_s >= HEARTBEAT_S and not self._rig_lost:
                 heartbeat_s = now_s
                 self._report(writer)
+            self._look_for_strangers()
             if on_progress is not None:
                 on_progress(self._progress(writer))
             self._wake.wait(0.2 if ended_s is None else 0.05)
             self._wake.clear()
+
+    def _look_for_strangers(self) -> None:
+        """Say once that somebody else publishes what only the rig should."""
+        for count, what in (
+            (self._client.foreign, "messages that are not from this rig were left out"),
+            (
+                self._intake.refused,
+                f"blocks that cannot be of this rig were left out ({printable(self._intake.why, 300)})",
+            ),
+        ):
+            if count and not any(what in remark for remark in self._remarks):
+                self._remarks.append(f"warning: {what}")
 
     def _nothing_left(self, writer: Sink, now_s: float, ended_s: float) -> bool:
         """After the end: whatever may still come has had its time."""
@@ -545,7 +608,7 @@ class RecordingSession:
             backlog_bytes=self._inbox.waiting_bytes,
             dropped=self._inbox.dropped,
             files=len(writer.files),
-            remarks=writer.remarks,
+            remarks=(*writer.remarks, *self._remarks),
         )
 
     def _finish(self, writer: Sink, reason: str) -> str:
@@ -555,11 +618,16 @@ class RecordingSession:
         try:
             while self._misses:
                 writer.write_missed(*self._misses.popleft())
+            for each in self._intake.rest(self._end_rows) if not self._replaced and self._failure is None else ():
+                if self._is_in_time(each.key, each.payload):
+                    writer.write(each.key, each.payload, each.wall_ns)
             if reason == self._end_reason and self._end_rows:
                 writer.note_short(self._end_rows, self._wall_ns())
             notes = {
                 "dropped_payloads": str(self._inbox.dropped),
                 "backlog_high_water_bytes": str(self._inbox.high_water_bytes),
+                "refused_blocks": str(self._intake.refused),
+                "foreign_messages": str(self._client.foreign),
             }
             writer.finish(reason, notes=notes)
         except RecordingError as error:
@@ -593,5 +661,16 @@ class RecordingSession:
             high_water_bytes=self._inbox.high_water_bytes,
             received_s=counts.extent_ns / NS,
             fired=writer.fired if isinstance(writer, Captures) else None,
-            remarks=writer.remarks,
+            remarks=(*writer.remarks, *self._remarks),
+            refused=self._intake.refused + self._client.foreign,
+            ended_early=self._ended_early(writer, reason, trouble),
         )
+
+    def _ended_early(self, writer: Sink, reason: str, trouble: str) -> str:
+        """Up to which time it is recorded, where that is not all that was asked for; empty else."""
+        counts = sum(writer.kept(), Counts())
+        if trouble or writer.out_of_room:
+            return f"all that came after {counts.safe_time_ns / NS:.3f} s, where the recording ended before the run"
+        if self._rig_lost and not self._end_reason:
+            return f"what the rig may have sent after {counts.last_time_ns / NS:.3f} s, where it was lost"
+        return ""

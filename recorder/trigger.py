@@ -19,13 +19,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from recorder.payload import block_in, tick_in
+from recorder.payload import block_in, document_in, tick_in
 from recorder.schemas import PART_SUFFIX
 from recorder.series import Commands, Limits, Room
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination, remove
 from rig.channels import ChannelTable
 from rig.errors import InputError
-from rig.wire import EDGES, EVENTS, SENSORS, Block, Continuity, Gap, decode_document, schema_of
+from rig.wire import EDGES, EVENTS, SENSORS, Block, Continuity, schema_of
 
 EVENT_NAMES = ("hammer", "speed", "release", "note", "warning")
 """Events of the stream that can be waited for."""
@@ -33,6 +33,8 @@ _LEVEL = re.compile(r"\s*(\|?)([A-Za-z_]\w*)(\|?)\s*([<>])\s*([-+.\deE]+)\s*")
 _LATE_NS = NS // 2
 """For so long after its end a capture waits for streams that are behind the others, and the ring keeps more than it
 need for an event that comes after its blocks [ns of simulated time]."""
+_FAR_NS = 60 * NS
+"""An event that names a later time, or one that the ring no longer holds, counts as one of now [ns]."""
 MOST_CAPTURES = 1000
 _MOST_FIRED = 1000
 """Triggers that a file lists; more are only counted."""
@@ -255,7 +257,6 @@ class Captures:
         self.out_of_room = False
         self.fired = 0
         self.remarks: tuple[str, ...] = ()
-        self.next_index: dict[str, int] = {}
         self._capture = capture
         self._tick_rate_hz = tick_rate_hz
         self._limits = limits or Limits(keep_free_mb=0.0)
@@ -271,6 +272,7 @@ class Captures:
         self._latest_ns = 0
         self._first_ns: int | None = None
         self._continuity = Continuity()
+        self.next_index = self._continuity.next
         self._gaps = 0
         self._missed: dict[str, int] = {}
         self._malformed = 0
@@ -303,7 +305,7 @@ class Captures:
         document = block = None
         try:
             if schema is None:
-                document = decode_document(payload)
+                document = document_in(key, payload)
             else:
                 block = block_in(key, payload)
         except ValueError:
@@ -356,9 +358,7 @@ class Captures:
 
     def _follow(self, key: str, block: Block) -> tuple[int, int]:
         rows = len(block.values)
-        gap: Gap | None = self._continuity.follow(key, block.index, rows)
-        self._gaps += gap is not None
-        self.next_index[key] = block.index + rows
+        self._gaps += self._continuity.follow(key, block.index, rows) is not None
         start_ns = max(0, block.tick * NS // self._tick_rate_hz)
         end_ns = start_ns
         if key != EDGES and block.rate_hz > 0.0:
@@ -369,8 +369,11 @@ class Captures:
         return start_ns, end_ns
 
     def _time_of(self, document: dict[str, Any] | None) -> int:
+        """Simulated time that a document names [ns], where that is near what the streams have come to."""
         tick = tick_in(document)
-        return self._latest_ns if tick is None else max(0, tick * NS // self._tick_rate_hz)
+        time_ns = self._latest_ns if tick is None else max(0, tick * NS // self._tick_rate_hz)
+        near = -self._pre_ns - _LATE_NS <= time_ns - self._latest_ns <= _FAR_NS
+        return time_ns if near or self._first_ns is None else self._latest_ns
 
     def _write(self, key: str, payload: bytes, wall_ns: int) -> None:
         """To the capture that is open, as long as there is room for it."""
@@ -512,6 +515,6 @@ class Captures:
 
 def _document(payload: bytes) -> dict[str, Any] | None:
     try:
-        return decode_document(payload)
+        return document_in(EVENTS, payload)
     except ValueError:
         return None

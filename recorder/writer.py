@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import struct
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 from recorder import schemas
-from recorder.payload import block_in, tick_in
+from recorder.payload import block_in, document_in, tick_in
 from recorder.records import COPY
 from recorder.views import Messages, View, Views
 from rig.channels import ChannelTable, Group
@@ -28,7 +29,6 @@ from rig.wire import (
     Block,
     Continuity,
     Gap,
-    decode_document,
     encode_document,
     schema_of,
     sensor_key,
@@ -36,6 +36,7 @@ from rig.wire import (
 )
 
 if TYPE_CHECKING:
+    from mcap.records import ChunkIndex
     from mcap.writer import Writer
 
 NS = 1_000_000_000
@@ -65,6 +66,7 @@ class Counts:
         missed: Messages that the transport gave up, by key.
         malformed: Payloads that were not what their key promises.
         size_bytes: Bytes on the disk.
+        safe_time_ns: Simulated time up to which all is on the disk [ns].
     """
 
     first_time_ns: int | None = None
@@ -75,6 +77,7 @@ class Counts:
     missed: dict[str, int] = field(default_factory=dict)
     malformed: int = 0
     size_bytes: int = 0
+    safe_time_ns: int = 0
 
     @property
     def extent_ns(self) -> int:
@@ -92,6 +95,7 @@ class Counts:
             missed=_sum(self.missed, later.missed),
             malformed=self.malformed + later.malformed,
             size_bytes=self.size_bytes + later.size_bytes,
+            safe_time_ns=max(self.safe_time_ns, later.safe_time_ns),
         )
 
 
@@ -192,6 +196,55 @@ class _Topic:
     group: Group | None = None
 
 
+class _ChunkIndexes:
+    """The index of a file's chunks, read off the file when it is finished: kept in memory it would grow with it.
+
+    Args:
+        file: The file in the making.
+    """
+
+    _RECORD, _CHUNK, _CHANNEL = struct.Struct("<BQ"), struct.Struct("<QQQII"), struct.Struct("<H")
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def append(self, index: ChunkIndex) -> None:
+        """Keep nothing."""
+
+    def __iter__(self) -> Iterator[ChunkIndex]:
+        from mcap.opcode import Opcode
+        from mcap.records import ChunkIndex
+        from mcap.stream_reader import MAGIC_SIZE
+
+        self._file.flush()
+        number, position = self._file.fileno(), MAGIC_SIZE
+        index = None
+        while head := os.pread(number, 100, position):
+            kind, length = self._RECORD.unpack_from(head)
+            body, whole = self._RECORD.size, self._RECORD.size + length
+            if kind == Opcode.MESSAGE_INDEX and index is not None:
+                index.message_index_offsets[self._CHANNEL.unpack_from(head, body)[0]] = position
+                index.message_index_length += whole
+            elif index is not None:
+                yield index
+                index = None
+            if kind == Opcode.CHUNK:
+                first, last, raw_size, _, letters = self._CHUNK.unpack_from(head, body)
+                data = body + self._CHUNK.size + letters
+                index = ChunkIndex(
+                    message_start_time=first,
+                    message_end_time=last,
+                    chunk_start_offset=position,
+                    chunk_length=whole,
+                    message_index_offsets={},
+                    message_index_length=0,
+                    compression=head[data - letters : data].decode(),
+                    compressed_size=length - (data - body) - 8,
+                    uncompressed_size=raw_size,
+                )
+            position += whole
+
+
 class RecordingWriter:
     """Writes payloads as they came, the view messages derived from them, gaps and clock pairs.
 
@@ -200,7 +253,6 @@ class RecordingWriter:
     `recorder/clock` repeats two a second in plain JSON.
 
     The file is FILE.mcap.part until `finish`, and is flushed to the disk so often that a kill loses less than 0.5 s.
-    The index of a file stays in memory until then, about 30 MB an hour: a reason to rotate long recordings.
     """
 
     def __init__(
@@ -254,9 +306,8 @@ class RecordingWriter:
         self.view_rate_hz = view_rate_hz
         self._views = Views(self.table, rate_hz=view_rate_hz)
         self.continuity = Continuity()
-        self.gaps: list[Gap] = []
-        self.next_index: dict[str, int] = {}
-        """Number of the row that is due next, by key."""
+        self.gaps = 0
+        """Steps of the row numbers."""
         self.missed: dict[str, int] = {}
         """Messages that the transport reported as lost for good, by key."""
         self.malformed = 0
@@ -273,6 +324,7 @@ class RecordingWriter:
         self._wall_ns = wall_ns
         self._monotonic_s = monotonic_s
         self._synced_s = monotonic_s()
+        self._safe_time_ns = 0
         self._clock_ns = 0
         self._chunks = 0
         self._chunk_bytes = 0
@@ -282,7 +334,6 @@ class RecordingWriter:
         self._schema_ids: dict[str, int] = {}
         for key, index in (due or {}).items():
             self.continuity.follow(key, index, 0)
-            self.next_index[key] = index
         try:
             self._file = _open_part(self.part, replace=force)
         except OSError as error:
@@ -290,6 +341,7 @@ class RecordingWriter:
         from mcap.writer import Writer as McapWriter
 
         mcap = McapWriter(self._file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
+        mcap._Writer__chunk_indices = _ChunkIndexes(self._file)  # type: ignore[attr-defined]
         self._mcap: Writer | None = mcap
         with self._guard():
             mcap.start(profile="ros2", library="rotor-stator-rig recorder")
@@ -343,6 +395,11 @@ class RecordingWriter:
         return {sensor_key(group) for group in self.table.groups} | {truth_key(table) for table in self._truth}
 
     @property
+    def next_index(self) -> dict[str, int]:
+        """Number of the row that is due next, by key."""
+        return self.continuity.next
+
+    @property
     def closed(self) -> bool:
         """Nothing more can be written: finished, or ended by the disk."""
         return self._mcap is None
@@ -366,7 +423,7 @@ class RecordingWriter:
             document = block = None
             try:
                 if topic.schema is None:
-                    document = decode_document(payload)
+                    document = document_in(key, payload)
                 else:
                     block = block_in(key, payload)
             except ValueError:
@@ -402,10 +459,11 @@ class RecordingWriter:
             last_time_ns=self.last_time_ns,
             rows=dict(self.continuity.received),
             lost=dict(self.continuity.lost),
-            gaps=len(self.gaps),
+            gaps=self.gaps,
             missed=dict(self.missed),
             malformed=self.malformed,
             size_bytes=self.size_bytes,
+            safe_time_ns=self._safe_time_ns,
         )
 
     def short_of(self, rows: dict[str, int]) -> dict[str, int]:
@@ -417,7 +475,7 @@ class RecordingWriter:
         Returns:
             The same for the streams that were met and are short of it.
         """
-        due = dict(self.next_index)
+        due = dict(self.continuity.next)
         return {key: end for key, end in rows.items() if due.get(key, end) < end}
 
     def note_short(self, rows: dict[str, int], wall_ns: int) -> None:
@@ -476,6 +534,7 @@ class RecordingWriter:
             if self.path.exists() and not self._force:
                 raise FileExistsError(errno.EEXIST, f"{self.path} was created by someone else meanwhile")
             self.part.replace(self.path)
+            self._safe_time_ns = self.last_time_ns
             self._mcap = None
         _sync_folder(self.path.parent)
 
@@ -567,7 +626,7 @@ class RecordingWriter:
             "last_time_s": f"{self.last_time_ns / NS:.9f}",
             "rows": json.dumps(self.continuity.received),
             "lost_rows": json.dumps({key: lost for key, lost in self.continuity.lost.items() if lost}),
-            "gaps": str(len(self.gaps)),
+            "gaps": str(self.gaps),
             "missed_messages": json.dumps(self.missed),
             "malformed": str(self.malformed),
         }
@@ -631,12 +690,11 @@ class RecordingWriter:
     def _write_block(self, topic: _Topic, key: str, payload: bytes, block: Block, wall_ns: int) -> None:
         time_ns = max(0, block.tick * NS // self.tick_rate_hz)
         rows = len(block.values)
-        if self._from_start and key not in self.next_index:
+        if self._from_start and key not in self.continuity.next:
             self.continuity.follow(key, 0, 0)
         gap = self.continuity.follow(key, block.index, rows)
         if gap is not None:
             self._note_gap(gap, wall_ns, time_ns=time_ns)
-        self.next_index[key] = block.index + rows
         self._add(topic, payload, time_ns, wall_ns)
         self.first_time_ns = time_ns if self.first_time_ns is None else min(time_ns, self.first_time_ns)
         if key != EDGES and block.rate_hz > 0.0:
@@ -670,7 +728,7 @@ class RecordingWriter:
             self._add(self._view_events, schemas.encode_log(time_ns, level, key, text), time_ns, wall_ns)
 
     def _note_gap(self, gap: Gap, wall_ns: int, *, time_ns: int | None = None) -> None:
-        self.gaps.append(gap)
+        self.gaps += 1
         about = {"kind": "rows", "key": gap.key, "index": gap.index, "size": gap.size}
         self._write_gap(about, wall_ns, time_ns=time_ns)
 
@@ -693,6 +751,7 @@ class RecordingWriter:
         self._check_name()
         self.size_bytes = self._file.tell()
         self._unflushed_bytes = self._chunk_bytes = 0
+        self._safe_time_ns = self.last_time_ns
         self._synced_s = self._monotonic_s()
 
     def _readme(self, catalogue: dict[str, Any]) -> str:

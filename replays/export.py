@@ -180,7 +180,7 @@ class McapRun:
             wall_ns=time.time_ns if epoch_ns is None else lambda: epoch_ns,
             monotonic_s=time.monotonic if epoch_ns is None else lambda: 0.0,
         )
-        self._rows = wire.RowCount()
+        self._rows = wire.Continuity()
         self._event({"event": "start", "scene": simulation.scene.name, "seed": simulation.scene.seed, "pace": "none"})
         return self
 
@@ -207,7 +207,7 @@ class McapRun:
             self._event(event)
         for key, block in blocks_of(frame):
             self._writer.write(key, wire.encode_block(block), self._wall(frame.tick))
-            self._rows.follow(key, block)
+            self._rows.follow(key, block.index, len(block.values))
 
     def _event(self, event: dict[str, Any]) -> None:
         tick = int(event.get("tick", self.simulation.tick))  # a frame's own: the simulation is further on by now

@@ -133,6 +133,29 @@ def page() -> str:
         "",
         f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.",
         "",
+        "## What a slow subscriber misses",
+        "",
+        "The rig does not wait for subscribers: what finds a link full is dropped for that link, so a plain zenoh "
+        "subscriber that is slow, or is stopped, loses messages, and nothing tells it but a step of `index` and of the "
+        "number of the message (`source_info.source_sn`, from 0 for each key, without a gap). `rig record`, "
+        "`drivers.daq` and `rig.transport.zenoh.ZenohClient.subscribe` fetch what is missing by themselves; "
+        "zenoh's AdvancedSubscriber does so too.",
+        "",
+        "Anybody else asks the rig's cache, which holds the last 3000 messages of each key, 30 s at blocks of 10 ms:",
+        "",
+        "```python",
+        "replies = session.get(",
+        f'    "{wire.sensor_key("probes")}/@adv/**?_sn=1200..1299",  # or ?_max=1 for the latest; without it all',
+        "    consolidation=zenoh.ConsolidationMode.NONE,  # else one reply a key",
+        "    accept_replies=zenoh.ReplyKeyExpr.ANY,  # they come on the key of the messages, not on that of the query",
+        ")",
+        "blocks = {reply.ok.source_info.source_sn: reply.ok.payload.to_bytes() for reply in replies if reply.ok}",
+        "```",
+        "",
+        "A number that is not among the replies is no longer kept. Ask for at most 200 messages at a time: while the "
+        "cache answers, the publisher of that key waits. Take messages only where `source_info.source_id.zid` is the "
+        "session that `session.info.peers_zid()` names, as a session of another client can publish on these keys too.",
+        "",
         "## Other ports",
         "",
         "`rig twins` listens on 127.0.0.1:7462: requests to an instrument are queries, its data is published, under "

@@ -264,7 +264,7 @@ class Service:
         self._steps: list[tuple[int, Pending, dict[str, Any]]] = []
         self._step_target: int | None = None
 
-        self._rows = wire.RowCount()
+        self._rows = wire.Continuity()
         self._samples_rate_hz = 0.0
         self._samples_published = 0
         self._congestion: dict[str, float] = {}
@@ -566,7 +566,9 @@ class Service:
         self._answer(entry)
 
     def _publish_block(self, key: str, block: wire.Block) -> None:
-        self._rows.follow(key, block)  # whoever does not get it learns from the end what is missing
+        self._rows.follow(
+            key, block.index, len(block.values)
+        )  # whoever does not get it learns from the end what is missing
         self._server.publish(key, wire.encode_block(block))
 
     def _publish_event(self, event: dict[str, Any]) -> None:

@@ -2,7 +2,8 @@
 
 A block is one CDR message (little-endian, ROS 2 message definitions below), so that any reader of ROS 2 messages
 decodes it without this project. A document is JSON. A stream is an event `start`, blocks, and an event `end` with a
-reason; any step of a block's index other than its length is a gap, counted by `Continuity` and never hidden.
+reason; any step of a block's index other than its length is a gap, counted by `Continuity` and never hidden. What of
+it comes from outside is taken by an `Intake` (`rig.intake`).
 """
 
 from __future__ import annotations
@@ -161,47 +162,61 @@ def decode_document(payload: bytes) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Rows that never arrived: `size` of them, from number `index` on."""
+    """A step of the row numbers of a stream, before row `index + size`.
+
+    Attributes:
+        key: The stream.
+        index: Number of the row that was due.
+        size: Rows that never arrived, from that one on; below 0 the numbers have stepped back by so many.
+    """
 
     key: str
     index: int
     size: int
 
 
-class RowCount:
-    """Counts what is published, for the event that ends a run.
+class Continuity:
+    """Follows the row numbers of any number of streams, and counts what has come and what has not.
 
-    Blocks and events travel apart: whoever has the end can tell from its `rows` what it still lacks.
+    Attributes:
+        next: Number of the row that is due next, by key.
+        received: Rows that have come, each once, by key.
+        lost: Rows that never came, by key.
+        stale: Rows that came twice, or after later ones.
+        runs: How often the numbers of a stream began anew, by key; 0 where they never did.
     """
 
     def __init__(self) -> None:
         self.next: dict[str, int] = {}
-        """Number of the row after the last one, by key."""
+        self.received: dict[str, int] = {}
+        self.lost: dict[str, int] = {}
+        self.stale = 0
+        self.runs: dict[str, int] = {}
 
-    def follow(self, key: str, block: Block) -> None:
-        """Count a block."""
-        self.next[key] = block.index + len(block.values)
+    def follow(self, key: str, index: int, rows: int, *, late_rows: float = 0.0) -> Gap | None:
+        """Take the next rows of a stream; return the step before them, if there is one.
+
+        Args:
+            key: The stream.
+            index: Number of the first row.
+            rows: How many.
+            late_rows: Rows that are at most so far behind come late or a second time; with others, and with row 0, the
+                numbers begin anew.
+        """
+        expected = self.next.get(key, index)
+        size = index - expected
+        late = index > 0 and 0 < -size <= late_rows
+        stale = min(-size, rows) if late else 0
+        self.next[key] = max(expected, index + rows) if late else index + rows
+        self.received[key] = self.received.get(key, 0) + rows - stale
+        self.lost[key] = self.lost.get(key, 0) + max(0, size)
+        self.stale += stale
+        self.runs[key] = self.runs.get(key, 0) + (size < 0 and not late)
+        return Gap(key=key, index=expected, size=size) if size else None
 
     def tell(self, event: dict[str, Any]) -> dict[str, Any]:
-        """The event as it is published: with the counts where it is the end."""
+        """An event as it is published: an `end` with the number of the row after the last one, by key.
+
+        Blocks and events travel apart: whoever has the end can tell from its `rows` what it still lacks.
+        """
         return {**event, "rows": dict(self.next)} if event.get("event") == "end" else event
-
-
-class Continuity:
-    """Follows the row numbers of any number of streams and reports each gap with its size."""
-
-    def __init__(self) -> None:
-        self._next: dict[str, int] = {}
-        self.lost: dict[str, int] = {}
-        self.received: dict[str, int] = {}
-
-    def follow(self, key: str, index: int, rows: int) -> Gap | None:
-        """Take the next block of a stream; return the gap before it, if there is one."""
-        expected = self._next.get(key, index)
-        self._next[key] = index + rows
-        self.received[key] = self.received.get(key, 0) + rows
-        self.lost.setdefault(key, 0)
-        if index == expected:
-            return None
-        self.lost[key] += max(0, index - expected)
-        return Gap(key=key, index=expected, size=index - expected)

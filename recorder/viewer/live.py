@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections import deque
 from collections.abc import Callable
@@ -16,6 +15,8 @@ from recorder.viewer.geometry import Geometry
 from recorder.viewer.painter import Painter
 from rig import wire
 from rig.channels import ChannelTable
+from rig.intake import Catalogue, Intake, event_in
+from rig.text import printable
 from rig.transport import Client
 
 NAME = "viewer"
@@ -27,6 +28,8 @@ _HEARTBEAT_S = 0.5
 _INBOX = 4000
 """Payloads held at most, about 4 s of all streams; then the oldest go."""
 _QUIET_S = 0.3
+_GONE_S = 3.0
+"""How long a rig that is gone may take to be there again [s]: a viewer that was stopped is linked again in a second."""
 _CHECK_S = 1.0
 _PATIENCE_S = 0.3
 _CONTACT = wire.truth_key("contact")
@@ -37,14 +40,19 @@ class Described:
     """What a rig says of itself, as far as it is drawn.
 
     Attributes:
-        table: Its channels.
+        catalogue: Its streams.
         geometry: Its lengths.
         contact_columns: Column names of its truth table of the contact; empty if it has none.
     """
 
-    table: ChannelTable
+    catalogue: Catalogue
     geometry: Geometry
     contact_columns: tuple[str, ...]
+
+    @property
+    def table(self) -> ChannelTable:
+        """Its channels."""
+        return self.catalogue.table
 
 
 def ask(client: Client, *, wait_s: float = 2.0) -> Described:
@@ -56,14 +64,15 @@ def ask(client: Client, *, wait_s: float = 2.0) -> Described:
 
     Raises:
         NoReplyError: No rig answers.
+        InputError: What answers is no rig of this version.
     """
-    catalogue = wire.decode_document(client.request(wire.CATALOGUE, timeout_s=max(wait_s, 0.5)))
+    catalogue = Catalogue.read(wire.decode_document(client.request(wire.CATALOGUE, timeout_s=max(wait_s, 0.5))))
     parameters = wire.decode_document(client.request(wire.PARAMETERS))
-    contact = catalogue.get("truth", {}).get("contact", {}).get("columns", [])
+    contact = catalogue.truth.get("contact")
     return Described(
-        table=ChannelTable.model_validate(catalogue["table"]),
+        catalogue=catalogue,
         geometry=Geometry.from_parameters(parameters),
-        contact_columns=tuple(column["name"] for column in contact),
+        contact_columns=() if contact is None else tuple(str(column.get("name")) for column in contact.columns),
     )
 
 
@@ -91,15 +100,23 @@ class LiveView:
         columns = described.contact_columns
         self._force_column = columns.index("normal_force") if "normal_force" in columns else None
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=_INBOX)
+        self._intake = Intake(described.catalogue)
         self._continuity = wire.Continuity()
         self._received_index = 0
         self._there: bool | None = None
         self._gone_at_s = 0.0
         self._end: str | None = None
         self._stalled = False
-        self.malformed = 0
+        self.failed = False
+        """Whether the run failed, or the rig went without an end."""
+        self._malformed = 0
         self.skipped = 0
         """Sensor rows that arrived and were not drawn, because the viewer's window did not take them."""
+
+    @property
+    def malformed(self) -> int:
+        """Payloads that were not what their key and the rig's catalogue promise."""
+        return self._malformed + self._intake.refused
 
     @property
     def received(self) -> int:
@@ -151,8 +168,10 @@ class LiveView:
         if now_s - heard_s < _QUIET_S:
             return None
         if self._end is not None:
+            self.failed = self._end.startswith("failed")
             return f"the rig ended: {self._end}"
-        if self._there is False and now_s - self._gone_at_s > _QUIET_S:
+        if self._there is False and now_s - self._gone_at_s > _GONE_S:
+            self.failed = True
             return "the rig is gone without ending its stream (killed, or the connection broke)"
         return None
 
@@ -199,23 +218,23 @@ class LiveView:
     def _draw_events(self, payloads: list[bytes]) -> None:
         for payload in payloads:
             try:
-                event = wire.decode_document(payload)
-                self._painter.add_event(event)
-            except (ValueError, TypeError, json.JSONDecodeError):
-                self.malformed += 1
+                event = event_in(payload)
+            except ValueError:
+                self._malformed += 1
                 continue
-            if event.get("event") == "end":
-                self._end = str(event.get("reason", "no reason given"))
+            self._painter.add_event(event)
+            if event["event"] == "end":
+                self._end = printable(event.get("reason") or "no reason given", 500)
 
     def _draw_blocks(self, key: str, payloads: list[bytes]) -> None:
-        schema = wire.schema_of(key)
-        run: list[wire.Block] = []
+        taken = []
         for payload in payloads:
             try:
-                block = wire.decode_block(payload, schema or "")
-            except (ValueError, KeyError):
-                self.malformed += 1
-                continue
+                taken += self._intake.take(key, payload)
+            except ValueError:
+                self._malformed += 1
+        run: list[wire.Block] = []
+        for _, block, *_ in taken:
             gap = self._continuity.follow(key, block.index, len(block.values))
             if gap is not None:
                 self._draw_run(key, run)
@@ -244,14 +263,11 @@ class LiveView:
         ticks_a_row = run[0].tick_rate_hz / run[0].rate_hz
         times_s = (run[0].tick + ticks_a_row * np.arange(len(values))) / run[0].tick_rate_hz
         if key == _CONTACT:
-            if self._force_column is not None and values.shape[1] > self._force_column:
+            if self._force_column is not None:
                 self._painter.add_truth(times_s, values[:, self._force_column])
             return
         name = self._groups[key]
         group = self._table.groups[name]
-        if values.shape[1] != len(group.channels):
-            self.malformed += len(run)
-            return
         if key == self._beat_key:
             self._canvas.clock.mark(float(times_s[-1]), self._wall())
         self._painter.add(name, times_s, group.engineering(values))

@@ -172,7 +172,7 @@ class Painter:
     def add_event(self, event: Mapping[str, Any]) -> None:
         """Take an event of the stream."""
         name = str(event.get("event", "event"))
-        time_s = float(event.get("time_s", 0.0))
+        time_s = float(event.get("time_s") or 0.0)
         if name == "hammer":
             self._windows.append((time_s - AROUND_HAMMER_S, time_s + AROUND_HAMMER_S))
         level, text = schemas.event_text(dict(event))

@@ -75,10 +75,10 @@ def _payloads(conversion: Conversion) -> Iterator[tuple[int, str, bytes]]:
         ],
         key=lambda item: item[0],
     )
-    rows = wire.RowCount()
+    rows = wire.Continuity()
     for tick, key, content in due:
         if isinstance(content, wire.Block):
-            rows.follow(key, content)
+            rows.follow(key, content.index, len(content.values))
             content = wire.encode_block(content)
         yield tick, key, content
     yield conversion.end_tick, wire.EVENTS, _event(conversion.end_tick, "end", reason="completed", rows=rows.next)

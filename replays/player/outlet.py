@@ -28,7 +28,7 @@ class Outlet:
         self._tick_rate_hz = tick_rate_hz
         self._stamp = Stamp() if renumber else None
         self._pass = 0
-        self._rows = wire.RowCount()
+        self._rows = wire.Continuity()
         self._held: dict[str, list[bytes]] = {wire.EVENTS: [], wire.STATUS: []}
         """What tells that the recorded run has ended, until the play has."""
         groups = list(edit.catalogue["table"]["groups"])
@@ -98,7 +98,7 @@ class Outlet:
         if self._stamp is not None:
             block = self._stamp.block(item.key, block)
         self._publish(key, item.payload if block is recorded else wire.encode_block(block))
-        self._rows.follow(key, block)
+        self._rows.follow(key, block.index, len(block.values))
         self.blocks += 1
         self.rows += len(block.values)
         if key == self._counted:

@@ -55,6 +55,14 @@ def record(
     wait_s: Annotated[
         float, typer.Option(metavar="S", help="Wait that long for the rig to be there, in s.", min=0.0)
     ] = 0.0,
+    patience_s: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="How long a rig that is lost may take to be there again, in s; the same run is then recorded on.",
+            min=0.0,
+        ),
+    ] = 10.0,
     force: Force = False,
     rotate_mb: Annotated[
         float | None,
@@ -118,11 +126,15 @@ def record(
         typer.Option(help="What may wait in memory for a slow disk, in MB; more is a gap.", rich_help_panel=_DISK),
     ] = 256.0,
 ) -> None:
-    """Record all streams of a running rig to FILE.mcap, losslessly; Ctrl-C ends the recording well."""
+    """Record all streams of a running rig to FILE.mcap, losslessly; Ctrl-C ends the recording well.
+
+    Exit status 0: all that was to be recorded is in the file. 1: rows or messages were lost, the run failed, the rig
+    was lost, or the disk ended the recording; what was lost is told, and what is there is kept. 2: wrong input.
+    """
     import os
 
     from recorder.series import MB, Limits
-    from recorder.session import RIG_LOST, RecordingSession
+    from recorder.session import RecordingSession
     from recorder.trigger import Capture, Trigger
     from rig.transport.zenoh import ZenohClient
 
@@ -159,6 +171,7 @@ def record(
             view_rate_hz=view_rate_hz,
             history=history,
             wait_s=wait_s,
+            patience_s=patience_s,
             force=force,
             limits=limits,
             capture=capture,
@@ -174,7 +187,7 @@ def record(
     except NoReplyError as error:
         raise RefusedError(str(error)) from None
     tell(summary)
-    if summary.error or summary.reason == RIG_LOST:
+    if not summary.good:
         raise typer.Exit(1)
 
 
@@ -247,15 +260,11 @@ def tell(summary: Summary) -> None:
         )
     if summary.removed:
         echo(f"{summary.removed} older files were removed to make room")
+    for line in summary.losses or ("nothing",):
+        echo(f"lost: {line}")
     if summary.lost or summary.missed:
-        for key, lost in summary.lost.items():
-            echo(f"lost: {lost} rows of {key}")
-        for key, missed in summary.missed.items():
-            echo(f"lost: {missed} messages of {key}, says the transport")
         inside = ", those inside a capture," if summary.fired is not None else ""
         echo(f"the gaps ({summary.gaps}){inside} are recorded in the file on recorder/gaps")
-    else:
-        echo("lost: nothing")
     if summary.dropped:
         echo(
             f"{summary.dropped} blocks found no room before the disk; they are among the lost "
@@ -263,5 +272,7 @@ def tell(summary: Summary) -> None:
         )
     if summary.malformed:
         echo(f"{summary.malformed} payloads were not what their key promises; they are in the file as they came")
+    if summary.refused:
+        echo(f"{summary.refused} messages were not from this rig, or cannot be; they were left out")
     if summary.error:
         echo(summary.error, err=True)

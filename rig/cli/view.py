@@ -135,8 +135,11 @@ def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> 
         stream = new_stream(f"rig at {connect}")
         plan = blueprint.layout(described.table, described.geometry, live=True)
         if save is not None:
+            view = live.LiveView(client, Canvas(stream), described)
             with _saved(stream, save, plan, until_interrupted=True):
-                echo(live.LiveView(client, Canvas(stream), described).run())
+                echo(view.run())
+            if view.failed:
+                raise typer.Exit(1)
             return
         with window.Window(_kind(web=web), memory="512MiB") as shown:
             stream.connect_grpc(shown.url, default_blueprint=plan)
@@ -148,7 +151,11 @@ def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> 
                 _close(stream)
             if shown.open:
                 echo("the viewer stays open; end it with Ctrl-C")
-            _wait_for_the_end(shown)
+            try:
+                _wait_for_the_end(shown)
+            finally:
+                if view.failed:
+                    raise typer.Exit(1)
 
 
 def _kind(*, web: bool) -> Kind:
@@ -213,7 +220,7 @@ def _saved(
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Ctrl-C and a request to terminate are both how a viewer ends: child processes go, the exit status is 0."""
+    """Ctrl-C and a request to terminate are both how a viewer ends: child processes go, and it is no failure."""
     import signal
 
     def interrupt(*_: object) -> None:

@@ -57,6 +57,14 @@ class Server(Protocol):
 class Client(Protocol):
     """A client's side of a transport."""
 
+    foreign: int
+    """Messages that were left out because they were not from the rig that this client is linked to."""
+
+    @property
+    def rig(self) -> str | None:
+        """Who the rig at the other end of the link is; another one when it is started again. None without a link."""
+        ...
+
     def subscribe(
         self,
         key: str,

@@ -111,8 +111,11 @@ class MemoryServer:
 class MemoryClient:
     """A client's side of a `MemoryServer` in the same process."""
 
+    foreign = 0
+
     def __init__(self, server: MemoryServer) -> None:
         self._server = server
+        self.rig = f"{id(server):x}"
 
     def subscribe(
         self,

@@ -41,6 +41,9 @@ _HEARTBEAT_S = 0.25
 _FIFO = 20_000
 """Messages that wait for a callback: about 20 s of all streams. Beyond that the link backs up, the rig drops (or waits,
 where it is not paced), and the rest is recovered."""
+_HEARTBEATS = 500
+"""Heartbeats that a subscriber holds: several of each key. A ring takes its memory as it first goes round, a long one
+for hours."""
 _PORTION = 200
 """Messages asked for at a time, below 1 MB: while a cache answers its publisher waits, and sockets hold that much."""
 _ATTEMPTS = 4
@@ -436,8 +439,6 @@ class _Stream:
     def take(self, sample: Any) -> None:
         """Take the next message that arrived, after all that should have come before it."""
         info = sample.source_info
-        if info is None:  # not from a rig
-            return
         publisher, number = _publisher(info.source_id), info.source_sn
         with self._lock:
             last = self._last.get(publisher)
@@ -462,8 +463,12 @@ class _Stream:
         from zenoh import ext
 
         key, _, rest = str(sample.key_expr).partition("/@adv/pub/")
-        zid, eid = rest.split("/")[:2]
-        self.at_least((zid, int(eid)), key, int(ext.z_deserialize(ext.UInt32, sample.payload)))
+        try:
+            zid, eid = rest.split("/")[:2]
+            publisher, number = (zid, int(eid)), int(ext.z_deserialize(ext.UInt32, sample.payload))
+        except (ValueError, ext.ZDeserializeError):
+            return
+        self.at_least(publisher, key, number)
 
     def at_least(self, publisher: _Publisher, key: str, number: int) -> None:
         """Take note that a publisher has sent a message of this number."""
@@ -565,8 +570,33 @@ class ZenohClient:
         self._host, self._port = parse_endpoint(endpoint, field="connect")
         self.endpoint = endpoint
         self._declared: list[Any] = []
+        self._rigs: set[str] = set()
+        """Rigs that this client is or was linked to: what they sent may still be on its way."""
+        self.foreign = 0
         self._streams: _Session | None = None
         self._session = self._open(wait_s)
+
+    @property
+    def rig(self) -> str | None:
+        """Who the rig at the other end of the link is; None without a link."""
+        return next(iter(self._linked()), None)
+
+    def _linked(self) -> set[str]:
+        # A client listens on nothing, so that whom it is linked to is whom it has asked for.
+        found = set(map(str, self._session.session.info.peers_zid()))
+        self._rigs |= found
+        return found
+
+    def _is_rigs(self, publisher: str | None) -> bool:
+        """Whether a message is from the rig, by the publisher that it names; others are counted, and left out."""
+        if publisher is not None and (publisher in self._rigs or publisher in self._linked()):
+            return True
+        self.foreign += 1
+        return False
+
+    def _from_rig(self, sample: Any) -> bool:
+        info = sample.source_info
+        return self._is_rigs(None if info is None else str(info.source_id.zid))
 
     def _open(self, wait_s: float) -> _Session:
         import zenoh
@@ -613,10 +643,16 @@ class ZenohClient:
         if self._streams is None:
             self._streams = self._open(5.0)
         streams, session = self._streams, self._streams.session
+        self._linked()
         if not lossless:
             subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_RING))
             self._declared.append(subscriber)
-            streams.drain(subscriber, lambda x: on_message(str(x.key_expr), x.payload.to_bytes()), f"takes {key}")
+
+            def take_any(sample: Any) -> None:
+                if self._from_rig(sample):
+                    on_message(str(sample.key_expr), sample.payload.to_bytes())
+
+            streams.drain(subscriber, take_any, f"takes {key}")
             return
 
         def get(link: _Session, selector: str) -> list[Any]:
@@ -626,7 +662,7 @@ class ZenohClient:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 accept_replies=zenoh.ReplyKeyExpr.ANY,
             )
-            return [reply.ok for reply in replies if reply.ok is not None]
+            return [reply.ok for reply in replies if reply.ok is not None and self._from_rig(reply.ok)]
 
         def ask(name: str, publisher: _Publisher, selection: str) -> list[Any]:
             zid, eid = publisher
@@ -638,15 +674,23 @@ class ZenohClient:
                 # What came before these replies, over the same link, goes first: it may be older than all that the
                 # caches still have, where this process was stopped meanwhile.
                 while (sample := subscriber.try_recv()) is not None:
-                    stream.take(sample)
+                    take(sample)
                 stream.begin(heads)
+
+        def take(sample: Any) -> None:
+            if self._from_rig(sample):
+                stream.take(sample)
+
+        def heartbeat(sample: Any) -> None:
+            if self._is_rigs(str(sample.key_expr).partition("/@adv/pub/")[2].partition("/")[0]):
+                stream.heartbeat(sample)
 
         stream = _Stream(ask, on_message, on_miss, history=history)
         subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_FIFO))
-        heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", zenoh.handlers.RingChannel(_FIFO))
+        heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", zenoh.handlers.RingChannel(_HEARTBEATS))
         self._declared += [subscriber, heartbeats]
-        streams.drain(subscriber, stream.take, f"takes {key}", first=begin)
-        streams.drain(heartbeats, stream.heartbeat, f"heartbeats {key}")
+        streams.drain(subscriber, take, f"takes {key}", first=begin)
+        streams.drain(heartbeats, heartbeat, f"heartbeats {key}")
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Ask the rig and return its reply.

@@ -88,8 +88,8 @@ class Publisher:
     def blocks(self, key: str = PROBES) -> int:
         return len(self.sent.get(key, []))
 
-    def end(self) -> None:
-        """End the stream well."""
+    def end(self, reason: str = "completed") -> None:
+        """End the stream."""
         self._stop.set()
         self._thread.join()
         rows = {}
@@ -99,7 +99,7 @@ class Publisher:
                 block = decode_block(payloads[-1], schema)
                 rows[key] = block.index + len(block.values)
         tick = self.blocks() * 10_000
-        end = {"event": "end", "tick": tick, "time_s": tick / 1e6, "reason": "completed", "rows": rows}
+        end = {"event": "end", "tick": tick, "time_s": tick / 1e6, "reason": reason, "rows": rows}
         self.server.publish(EVENTS, encode_document(end))
 
     def close(self) -> None:
@@ -318,6 +318,43 @@ def test_a_trigger_makes_a_file_of_its_own(tmp_path):
     assert stream_.lost == 0
 
 
+def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_path):
+    port = free_port()
+    path = tmp_path / "run.mcap"
+    code = "import rig.transport.zenoh; rig.transport.zenoh._LEASE_S = 1.0; "
+    with publisher(port) as rig, recorder(path, port, before=code) as process:
+        wait_for(lambda: received(rig) > 0)
+        links = rig.server.congestion()["links"]
+        process.send_signal(signal.SIGSTOP)
+        wait_for(lambda: rig.server.congestion()["links"] < links)
+        process.send_signal(signal.SIGCONT)
+        wait_for(lambda: rig.server.congestion()["links"] == links)
+        wait_for(lambda: received(rig) > 200 * rig.blocks() - 4000)
+        rig.end()
+        output, errors = process.communicate(timeout=40.0)
+    assert "is back" in errors
+    assert "ended: completed" in output
+    recording = Recording.open(path)
+    lost = sum(stream_.lost for stream_ in recording.streams.values())
+    assert process.returncode == (1 if "lost: nothing" not in output else 0)
+    assert lost == sum(
+        int(line.split()[1]) for line in output.splitlines() if line.startswith("lost: ") and " rows " in line
+    )
+    stream_ = recording.streams[PROBES]
+    assert stream_.last_time_s == pytest.approx(rig.blocks() * 0.01, abs=0.001)
+
+
+def test_a_run_that_failed_is_an_exit_status(tmp_path):
+    port = free_port()
+    with publisher(port) as rig, recorder(tmp_path / "run.mcap", port) as process:
+        wait_for(lambda: received(rig) > 0)
+        rig.end("failed: SimulationError: not finite")
+        output, _ = process.communicate(timeout=20.0)
+    assert process.returncode == 1
+    assert "ended: failed: SimulationError: not finite" in output
+    assert "lost: nothing" in output
+
+
 def test_a_second_recorder_to_the_same_file_is_refused_and_the_first_one_goes_on(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
@@ -348,6 +385,8 @@ def test_a_full_disk_ends_the_command_with_what_was_kept_and_recover_finishes_it
         output, errors = process.communicate(timeout=30.0)
         assert process.returncode == 1
         assert "ended: disk error" in output
+        assert "lost: all that came after " in output
+        assert "lost: nothing" not in output
         assert "is kept in" in " ".join(errors.split())
         part = path.with_name("run.mcap.part")
         recover([part])

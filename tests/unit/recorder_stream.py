@@ -85,6 +85,9 @@ def stream(blocks: int, *, block_ms: int = 10) -> Iterator[tuple[str, bytes]]:
 class ScriptedClient:
     """A client whose rig is the test: what it publishes is handed over on the caller's thread."""
 
+    foreign = 0
+    rig = "a rig"
+
     def __init__(self) -> None:
         self.replies = {key: encode_document(document) for key, document in documents().items()}
         self.reported: list[tuple[str, bytes]] = []

@@ -115,7 +115,7 @@ def test_a_gap_of_one_stream_is_a_gap_of_all_and_names_the_stream() -> None:
     out = made.feed("a", part(0, 30, columns=2)) + made.feed("b", part(0, 10, name="b", columns=2))
     out += made.feed("b", part(17, 13, name="b", columns=2))
     assert [(each.index, len(each), each.gap) for each in out] == [(0, 10, 0), (17, 13, 7)]
-    assert [(gap.stream, gap.index, gap.size) for gap in made.gaps] == [("b", 10, 7)]
+    assert [(gap.key, gap.index, gap.size) for gap in made.gaps] == [("b", 10, 7)]
     assert made.lost == {"a": 0, "b": 7}
 
 
@@ -196,14 +196,14 @@ def test_a_slower_rate_takes_every_nth_row_of_the_rig() -> None:
 def test_gaps_are_reported_with_their_size() -> None:
     with on_memory(channels=CHANNELS) as (rig, daq):
         rig.publish(*GROUPS)
-        rig.publish("forces", skip=2)
-        rig.publish("probes", "hammer", blocks=3)
+        rig.publish("forces", skip=2, blocks=2)
+        rig.publish("probes", "hammer", blocks=4)
         blocks = [daq.read(10 * BLOCK, timeout_s=0.2) if n == 0 else daq.read(BLOCK) for n in range(2)]
         assert [(block.index, len(block), block.gap) for block in blocks] == [
             (0, BLOCK, 0),
             (3 * BLOCK, BLOCK, 2 * BLOCK),
         ]
-        assert [(gap.stream, gap.index, gap.size) for gap in daq.gaps] == [("forces", BLOCK, 2 * BLOCK)]
+        assert [(gap.key, gap.index, gap.size) for gap in daq.gaps] == [("forces", BLOCK, 2 * BLOCK)]
 
 
 def test_the_iterator_ends_with_the_run() -> None:

@@ -191,6 +191,22 @@ def test_the_oldest_files_make_room_where_that_was_asked_for(tmp_path):
     assert int(Recording.open(file.files[0]).metadata["series"]["number"]) == file.removed
 
 
+def test_the_oldest_files_make_room_on_a_disk_of_which_nothing_is_to_be_left(tmp_path, monkeypatch):
+    disk_bytes = 8_000_000
+
+    def statvfs(_: object) -> SimpleNamespace:
+        taken = sum(file.stat().st_size for file in tmp_path.iterdir())
+        return SimpleNamespace(f_bavail=disk_bytes - taken, f_frsize=1)
+
+    monkeypatch.setattr(os, "statvfs", statvfs)
+    file = series(tmp_path / "run.mcap", rotate_mb=1.0, keep_free_mb=0.0, when_full="remove-oldest")
+    write(file, list(stream(700)))
+    assert (file.ended, file.files) == ("", sorted(tmp_path.iterdir()))
+    assert file.removed > 0
+    assert sum(part.stat().st_size for part in file.files) <= disk_bytes
+    assert join(file.files).streams[PROBES].last_time_s == pytest.approx(7.0 - 50e-6)
+
+
 def test_room_is_left_on_the_disk(tmp_path, monkeypatch):
     free = [100]
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=free[0], f_frsize=1_000_000))

@@ -44,6 +44,7 @@ PROBES = sensor_key("probes")
 def _short_waits(monkeypatch):
     monkeypatch.setattr(recorder.session, "QUIET_S", 0.05)
     monkeypatch.setattr(recorder.session, "RECOVERY_S", 0.3)
+    monkeypatch.setattr(recorder.session, "RETURN_S", 0.3)
 
 
 @pytest.fixture
@@ -223,6 +224,7 @@ def test_a_rig_that_is_started_again_is_not_mixed_into_the_recording(path):
         client.on_alive(False)
         for item in items[:30]:  # before its token
             client.publish(*item)
+        client.rig = "another rig"
         client.on_alive(True)
         for item in items[30:]:
             client.publish(*item)
@@ -254,7 +256,7 @@ def test_a_fault_of_the_recorder_itself_is_told_and_the_file_is_finished(path, m
     assert Recording.open(path).complete
 
 
-def test_payloads_with_impossible_times_and_half_characters_are_kept_and_end_nothing(path):
+def test_blocks_with_impossible_times_are_left_out_and_odd_documents_are_kept_and_neither_ends_anything(path):
     client = ScriptedClient()
     head = struct.Struct("<qqddII")
     good = encode_block(block_of(PROBES, 0))
@@ -287,11 +289,15 @@ def test_payloads_with_impossible_times_and_half_characters_are_kept_and_end_not
         RecordingSession(client, path, duration_s=1.0), client, play(client, [*items, list(stream(1))[-1]])
     )
     assert (summary.reason, summary.error) == ("completed", "")
-    assert summary.malformed == len(wrong) + 1
+    assert (summary.malformed, summary.refused) == (5, len(wrong))
+    assert "cannot be of this rig" in summary.remarks[0]
     assert (summary.rows, summary.lost) == ({PROBES: 400}, {})
     recording = Recording.open(path)
     assert recording.samples("probes").index.tolist() == list(range(400))
-    assert [payload for _, payload in recording.payloads(PROBES)] == [p for key, p in items if key == PROBES]
+    kept = [item for item in items if item not in wrong]
+    for key, more in ((PROBES, 0), (EVENTS, 1), (STATUS, 0)):
+        found = [payload for _, payload in recording.payloads(key)]
+        assert found[: len(found) - more] == [payload for each, payload in kept if each == key]
 
 
 def test_what_is_being_written_still_counts_against_the_backlog():
@@ -321,6 +327,29 @@ def test_stop_keeps_everything_received(path):
     assert (summary.reason, summary.rows[PROBES]) == ("interrupted by SIGINT", 40_000)
 
 
+def test_a_rig_that_is_back_with_the_same_run_is_recorded_on_and_the_gap_is_told(path):
+    client = ScriptedClient()
+    items = list(stream(40))
+    third = len(items) // 3
+
+    def act() -> None:
+        for item in items[:third]:
+            client.publish(*item)
+        client.on_alive(False)
+        time.sleep(0.1)
+        client.on_alive(True)
+        for item in items[2 * third :]:
+            client.publish(*item)
+
+    summary = record(RecordingSession(client, path), client, act)
+    assert (summary.reason, summary.good) == ("completed", False)
+    recording = Recording.open(path)
+    assert recording.streams[PROBES].rows + summary.lost[PROBES] == 8000
+    assert summary.lost[PROBES] > 0
+    assert recording.streams[PROBES].lost == summary.lost[PROBES]
+    assert any("is back" in remark for remark in summary.remarks)
+
+
 def test_a_lost_rig_closes_the_file_well(path):
     client = ScriptedClient()
 
@@ -331,6 +360,7 @@ def test_a_lost_rig_closes_the_file_well(path):
 
     summary = record(RecordingSession(client, path), client, act)
     assert summary.reason == RIG_LOST
+    assert summary.losses == ("what the rig may have sent after 0.100 s, where it was lost",)
     recording = Recording.open(path)
     assert recording.complete
     assert recording.end_reason == RIG_LOST
@@ -418,6 +448,8 @@ def test_a_disk_error_ends_the_session_with_what_was_written(path, monkeypatch):
         stop.set()
         thread.join()
     assert summary.reason == "disk error"
+    assert len(summary.losses) == 1
+    assert summary.losses[0].startswith("all that came after")
     assert "No space left on device" in summary.error
     assert summary.path == path.with_name("run.mcap.part")
     assert not path.exists()

@@ -252,7 +252,8 @@ def test_gaps_are_recorded_where_they_are(tmp_path, items):
     ]
     file = write(path, kept)
     recording = Recording.open(path)
-    assert recording.gaps == [Gap(PROBES, 1400, 400), Gap(PROBES, 4000, 200)] == file.gaps
+    assert recording.gaps == [Gap(PROBES, 1400, 400), Gap(PROBES, 4000, 200)]
+    assert file.gaps == 2
     assert json.loads(recording.metadata["end"]["lost_rows"]) == {PROBES: 600}
     assert recording.streams[PROBES].lost == 600
     index = recording.samples("probes").index

@@ -521,3 +521,39 @@ def test_backlog_counts_what_the_other_side_has_not_read() -> None:
             sender.sendall(bytes(100_000))
             peer = idle.getsockname()[1]
             until(lambda: _backlog(port) == {peer: 100_000})
+
+
+def test_what_a_slow_plain_subscriber_missed_comes_from_the_cache_as_the_documentation_says(
+    server: ZenohServer,
+) -> None:
+    import json
+    import re
+
+    import zenoh
+
+    from rig.interface import page
+    from rig.wire import sensor_key
+
+    key = sensor_key("probes")
+    (code,) = re.findall(r"```python\n(.*?)```", page(), re.DOTALL)
+    config = zenoh.Config()
+    for name, value in (
+        ("mode", "peer"), ("listen/endpoints", []), ("connect/endpoints", [f"tcp/{server.endpoint}"]),
+        ("scouting/multicast/enabled", False),
+    ):  # fmt: skip
+        config.insert_json5(name, json.dumps(value))
+    with zenoh.open(config) as session:
+        slow = session.declare_subscriber(key, zenoh.handlers.RingChannel(10))
+        until(lambda: bool(list(session.info.peers_zid())))
+        time.sleep(0.3)
+        for number in range(1400):
+            server.publish(key, b"%d" % number)
+        time.sleep(0.5)
+        got = {}
+        while (sample := slow.try_recv()) is not None:
+            got[sample.source_info.source_sn] = sample.payload.to_bytes()
+            assert str(sample.source_info.source_id.zid) in map(str, session.info.peers_zid())
+        assert len(got) <= 10, "it has lost the rest"
+        found: dict[str, Any] = {"session": session, "zenoh": zenoh}
+        exec(code, found)
+        assert found["blocks"] == {number: b"%d" % number for number in range(1200, 1300)}

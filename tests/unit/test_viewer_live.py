@@ -24,6 +24,9 @@ pytestmark = pytest.mark.wallclock
 class ScriptedClient:
     """Hands over a list of payloads as soon as the viewer watches for the rig, then may take the rig away."""
 
+    foreign = 0
+    rig = "a rig"
+
     def __init__(self, recording: Synthetic, payloads: Iterable[tuple[str, bytes]], *, killed: bool = False) -> None:
         self._replies = documents_of(recording)
         self._payloads = list(payloads)
@@ -119,7 +122,8 @@ def test_heartbeat_tells_what_was_received(recording: Synthetic, tmp_path: Path)
 
 def test_a_killed_rig_is_noticed(recording: Synthetic, tmp_path: Path) -> None:
     half = payloads_of(recording)[:300]
-    reason, _, saved = run(ScriptedClient(recording, half, killed=True), tmp_path / "killed.rrd")
+    reason, view, saved = run(ScriptedClient(recording, half, killed=True), tmp_path / "killed.rrd")
+    assert view.failed
     assert reason.startswith("the rig is gone without ending its stream")
     assert saved["/events", "TextLog:text"].values[-1] == [reason]
     assert saved["/events", "TextLog:level"].values[-1] == ["WARN"]

@@ -1,0 +1,407 @@
+"""Generated blocks, events and status documents into everything that takes a rig's streams.
+
+A true stream comes in between. None of it may be lost, nothing of the rest may be believed where it can be told from
+the truth, and nothing may end or grow.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import recorder.session
+from drivers.daq import Daq
+from drivers.sources.rig import RigSource
+from recorder.reader import Recording, join
+from recorder.series import Limits
+from recorder.session import RecordingSession, Summary
+from recorder.trigger import Capture, Trigger
+from recorder.viewer import live
+from rig import wire
+from rig.channels import default_table
+from rig.errors import InputError
+from rig.intake import Catalogue, Intake
+from rig.transport.memory import MemoryClient, MemoryServer
+from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.hostile import inputs
+from tests.unit.recorder_stream import TRUTH_COLUMNS, ScriptedClient, block_of, documents
+from tests.unit.test_transport_zenoh import free_endpoint
+
+pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(7200)]
+KEYS = [wire.sensor_key(group) for group in default_table().groups] + [wire.truth_key(table) for table in TRUTH_COLUMNS]
+PROBES = wire.sensor_key("probes")
+HEAD = struct.Struct("<qqddII")
+ODD_NUMBERS = [0, 1, -1, 2, 255, 2**31, 2**32 - 1, 2**40, 2**52, 2**53, 2**62, 2**63 - 1, -(2**63), 10**15, 10**18]
+ODD_RATES = [0.0, -1.0, 1e-300, 1e300, float("inf"), float("nan"), 1.0, 19_999.0, 20_000.5, 1e6, 2000.0]
+ODD_VALUES: list[Any] = [
+    None, True, -1, 0, 1.5, 1e300, 2**62, "", "x", "[/]", "\x1b[2J", "9" * 400, [], {}, [[]], {"a": []}, [1, "2", None],
+    {"rig/sensors/probes": -1}, {"rig/sensors/probes": "7"}, {"rig/sensors/probes": 0}, "\u202e", ["tag", 3], "end",
+]  # fmt: skip
+FIELDS = ("event", "tick", "time_s", "wall_s", "reason", "rows", "text", "tags", "id", "command", "request", "from")
+NAMES = ("start", "command", "hammer", "speed", "note", "warning", "end")
+
+
+class Truth:
+    """The rig's own blocks, cheap to make: those of the first instant with other numbers."""
+
+    def __init__(self) -> None:
+        self._first = {key: bytearray(wire.encode_block(block_of(key, 0))) for key in KEYS}
+        self.rows = {key: len(block_of(key, 0).values) for key in KEYS}
+
+    def payload(self, key: str, number: int) -> bytes:
+        made = bytearray(self._first[key])
+        struct.pack_into("<qq", made, 4, number * 10_000, number * self.rows[key])
+        return bytes(made)
+
+
+def forged(rng: np.random.Generator, truth: Truth, number: int, near: dict[str, set[int]]) -> tuple[str, bytes]:
+    """Something on a key of the rig that the rig did not send, before its block `number` of each stream.
+
+    Two forged blocks that go on from each other, each right in all that can be seen, are a rig that was started again:
+    `near` holds the numbers of those that came since the last true one, so that this does not come.
+    """
+    key, kind = str(rng.choice(KEYS)), int(rng.integers(14))
+    payload = bytearray(truth.payload(key, number))
+    tick, index, rate_hz, tick_rate_hz, columns, size = HEAD.unpack_from(payload, 4)
+    rows = truth.rows[key]
+    if kind == 0:  # one field of the head
+        fields: list[Any] = [tick, index, rate_hz, tick_rate_hz, columns, size]
+        place = int(rng.integers(6))
+        other = ODD_RATES[rng.integers(len(ODD_RATES))] if place in (2, 3) else ODD_NUMBERS[rng.integers(15)]
+        fields[place] = other if place < 4 else abs(int(other)) % 2**32
+        HEAD.pack_into(payload, 4, *fields)
+        if tuple(fields) == (tick, index, rate_hz, tick_rate_hz, columns, size):
+            payload.pop()
+    elif kind == 1:  # other columns, whole
+        columns = int(rng.choice([1, 2, 3, 5, 7, 40]))
+        columns += columns == HEAD.unpack_from(payload, 4)[4]
+        dtype = np.int32 if key.startswith(wire.SENSORS) else np.float64
+        block = wire.Block(tick, index, rate_hz, tick_rate_hz, np.ones((rows, columns), dtype))
+        return key, wire.encode_block(block)
+    elif kind in (2, 3):  # far off, and consistent in itself
+        step = int(rng.choice([1, -1])) * int(10 ** rng.uniform(0, 12))
+        far = max(0, number + step + (step > 0))
+        if far == number or crowded(near[key], far):
+            return key, b"\x00"
+        struct.pack_into("<qq", payload, 4, far * 10_000, far * rows)
+    elif kind == 4:  # once more
+        past = max(0, number - int(rng.integers(1, 50)))
+        return key, truth.payload(key, past) if past < number and not crowded(near[key], past) else b"\x00"
+    elif kind == 5:  # of another kind
+        dtype = np.float64 if key.startswith(wire.SENSORS) else np.int32
+        values = np.ones((rows, columns), dtype)
+        return key, wire.encode_block(wire.Block(tick, index, rate_hz, tick_rate_hz, values))
+    elif kind == 6:
+        return key, bytes(payload[: rng.integers(len(payload))])
+    elif kind == 7:
+        return key, rng.bytes(int(rng.integers(200)))
+    elif kind == 8:  # bits of the head, but not so few of the time that it stays likely
+        for place in rng.integers(4, 44, size=3):
+            payload[place] ^= 1 << int(rng.integers(8))
+        payload[4 + 3] ^= 0x40
+    elif kind == 9:
+        name = f"rig/{rng.choice(['sensors', 'truth'])}/x{rng.integers(10**6)}"
+        return name, bytes(payload)
+    elif kind == 10:
+        block = wire.Block(tick, index, rate_hz, tick_rate_hz, np.ones((0, columns), np.int32))
+        return key, wire.encode_block(block)
+    elif kind == 11:
+        rate_hz = float(rng.choice([1.0, 1000.0, 19_999.0, 40_000.0]))
+        HEAD.pack_into(payload, 4, tick, index, rate_hz, tick_rate_hz, columns, size)
+    elif kind == 12:
+        return wire.EVENTS, odd_event(rng)
+    else:
+        document = {name: odd(rng) for name in ("state", "tick", "time_s", "clients", "warnings")}
+        if document["state"] == "ended":
+            document["state"] = None
+        return wire.STATUS, json.dumps(document).encode()
+    return key, bytes(payload)
+
+
+def crowded(near: set[int], number: int) -> bool:
+    """Whether a block would go on from another one, or be one too many."""
+    if len(near) > 8 or near & {number - 1, number, number + 1}:
+        return True
+    near.add(number)
+    return False
+
+
+def odd(rng: np.random.Generator) -> Any:
+    return ODD_VALUES[rng.integers(len(ODD_VALUES))]
+
+
+def odd_event(rng: np.random.Generator) -> bytes:
+    """An event with a field that it must not have; an `end` never has a form that could be the rig's."""
+    document: dict[str, Any] = {"event": str(rng.choice(NAMES)), "tick": 5, "time_s": 5e-6}
+    for name in rng.choice(FIELDS, size=3):
+        document[str(name)] = odd(rng)
+    if document["event"] == "end":
+        document["reason"] = 7
+    if rng.random() < 0.1:
+        return b'{"event":' + b"[" * int(rng.integers(2000)) + b"1"
+    return json.dumps(document).encode()
+
+
+def mixed(count: int, seed: int) -> Iterator[tuple[str, bytes, bool]]:
+    """So many forged payloads among true ones, with whether they are true, and the true end."""
+    truth, rng = Truth(), np.random.default_rng(seed)
+    number, sent = 0, 0
+    # The first block of a stream has nothing before it that a forged one could be held against.
+    while sent < count or number < 5:
+        for key in KEYS:
+            yield key, truth.payload(key, number), True
+        number += 1
+        near: dict[str, set[int]] = {key: {number - 1} for key in KEYS}
+        for _ in range(int(rng.integers(0, 30)) if sent < count else 0):
+            yield *forged(rng, truth, number, near), False
+            sent += 1
+    rows = {key: number * truth.rows[key] for key in KEYS}
+    end = {"event": "end", "tick": number * 10_000, "time_s": number * 0.01, "reason": "completed", "rows": rows}
+    yield wire.EVENTS, wire.encode_document(end), True
+
+
+def fed(
+    session: RecordingSession, client: ScriptedClient, count: int, seed: int
+) -> tuple[Summary, dict[str, list[int]]]:
+    """Record what is fed from another thread; the summary, and the row numbers of the true blocks."""
+    true: dict[str, list[int]] = {key: [] for key in KEYS}
+
+    def feed() -> None:
+        while wire.STATUS not in client.subscribed:
+            time.sleep(0.002)
+        for key, payload, is_true in mixed(count, seed):
+            while len(session._inbox) > 2000:
+                time.sleep(0.001)
+            client.publish(key, payload)
+            if is_true and key in true:
+                true[key].append(struct.unpack_from("<q", payload, 12)[0])
+
+    thread = threading.Thread(target=feed)
+    thread.start()
+    try:
+        return session.run(), true
+    finally:
+        thread.join()
+
+
+def memory_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+@pytest.fixture(autouse=True)
+def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder.session, "QUIET_S", 0.05)
+
+
+@pytest.mark.parametrize("limits", [Limits(), Limits(rotate_s=1.0)], ids=["one file", "several files"])
+def test_a_recording_holds_the_true_rows_and_no_others(tmp_path: Path, limits: Limits) -> None:
+    client = ScriptedClient()
+    session = RecordingSession(client, tmp_path / "run.mcap", limits=limits)
+    summary, true = fed(session, client, inputs(3000), seed=1)
+    assert (summary.reason, summary.error, summary.losses) == ("completed", "", ())
+    assert summary.refused > inputs(3000) / 3
+    recording = join(summary.files)
+    assert recording.complete
+    for key in KEYS:
+        stream = recording.streams[key]
+        assert (stream.rows, stream.lost) == (summary.rows[key], 0), key
+    for key, indexes in true.items():
+        found = [struct.unpack_from("<q", p, 12)[0] for _, p in recording.payloads(key) if is_block(key, p)]
+        assert found == indexes, key
+    assert memory_mb() < 1000.0
+
+
+def is_block(key: str, payload: bytes) -> bool:
+    try:
+        wire.decode_block(payload, wire.schema_of(key) or "")
+    except ValueError:
+        return False
+    return True
+
+
+def test_captures_end_and_hold_only_true_rows(tmp_path: Path) -> None:
+    client = ScriptedClient()
+    triggers = tuple(map(Trigger.parse, ("note", "hammer", "P_N>1e9", "speed<-1e9")))
+    capture = Capture(triggers, pre_s=0.2, post_s=0.2, longest_s=2.0, again="ignore")
+    session = RecordingSession(client, tmp_path / "run.mcap", capture=capture)
+    summary, _ = fed(session, client, inputs(3000), seed=2)
+    assert (summary.reason, summary.error, summary.losses) == (
+        "completed" if summary.reason == "completed" else "1000 captures made",
+        "",
+        (),
+    )
+    assert summary.files
+    for number, file in enumerate(summary.files):
+        recording = Recording.open(file)
+        assert recording.complete
+        for key in KEYS:
+            found = [
+                wire.decode_block(p, wire.schema_of(key) or "").index
+                for _, p in recording.payloads(key)
+                if is_block(key, p)
+            ]
+            # A capture around what came before the first block has none of some streams.
+            assert found == list(range(found[0], found[-1] + 1, Truth().rows[key])) if found else number == 0, key
+    assert memory_mb() < 1000.0
+
+
+def test_a_daq_reads_on_and_gets_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    count, server = inputs(3000), MemoryServer(cache=10)
+    for key, document in documents().items():
+        server.answer(key, lambda _, document=document: wire.encode_document(document))
+    server.announce()
+    daq = Daq(RigSource(MemoryClient(server)), channels=["disk_x", "P_N"], buffer_s=1e6)
+    block = block_of(PROBES, 0)
+    expected = default_table().groups["probes"].engineering(block.values)[:, 0]
+    rows = 0
+    for key, payload, _ in mixed(count, seed=3):
+        server.publish(key, payload)
+        while daq._pile.rows:
+            samples = daq.read()
+            assert (samples.index, samples.gap) == (rows, 0)
+            np.testing.assert_array_equal(samples["disk_x"], expected)
+            rows += len(samples)
+    assert daq._ended == "the rig's run has ended: completed"
+    assert (daq.lost, daq.gaps, daq.unmatched) == ({"probes": 0, "forces": 0}, [], 0)
+    daq.close()
+    assert memory_mb() < 1000.0
+
+
+class Still:
+    """A painter that only counts."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self.rows = 0
+        self.now_s = 0.0
+
+    def add(self, name: str, times_s: np.ndarray, values: np.ndarray) -> None:
+        self.rows += len(values)
+        assert values.shape[1] == len(default_table().groups[name].channels)
+
+    def add_truth(self, times_s: np.ndarray, values: np.ndarray) -> None:
+        assert times_s.shape == values.shape
+
+    def add_event(self, event: dict[str, Any]) -> None:
+        live.Painter.add_event(self, event)  # type: ignore[arg-type]
+
+    _windows: list[tuple[float, float]] = []  # noqa: RUF012
+
+    def note(self, time_s: float, text: str, *, level: str = "INFO") -> None:
+        assert np.isfinite(time_s)
+
+    def frame(self, name: str) -> None:
+        pass
+
+
+def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = ScriptedClient()
+    described = live.Described(Catalogue.read(documents()[wire.CATALOGUE]), None, ("penetration", "normal_force"))  # type: ignore[arg-type]
+    still = Still()
+    with monkeypatch.context() as patch:
+        patch.setattr(live, "Painter", lambda *_, **__: still)
+        view = live.LiveView(
+            client, type("Canvas", (), {"clock": type("Clock", (), {"mark": lambda *_: None})()})(), described
+        )
+    view._painter = still  # type: ignore[assignment]
+    rows = 0
+    for number, (key, payload, is_true) in enumerate(mixed(inputs(3000), seed=4)):
+        view._take(key, payload)
+        if is_true and key.startswith(wire.SENSORS):
+            rows += len(wire.decode_block(payload, wire.SAMPLE_SCHEMA).values)
+        if number % 500 == 0:
+            view._draw()
+    view._draw()
+    assert (view.received, view.lost, still.rows) == (rows, 0, rows)
+    assert view._end == "completed"
+    assert view.malformed > inputs(3000) / 3
+
+
+def test_a_step_is_believed_once_something_follows_it_and_a_lone_block_is_not() -> None:
+    truth = Truth()
+    for numbers, taken, refused in (
+        ([0, 1, 5, 6], [0, 1, 5, 6], 0),  # a gap
+        ([0, 1, 5, 9, 10], [0, 1, 5, 9, 10], 0),  # gap upon gap
+        ([0, *range(1, 30, 2)], [0, 1, *range(3, 15, 2)], 0),  # every other one, which takes longer
+        ([7, 8, 0, 1, 2], [7, 8, 0, 1, 2], 0),  # started again
+        ([0, 1, 2**40, 2, 3], [0, 1, 2, 3], 1),  # out of the world
+        ([0, 1, 900, 2, 3], [0, 1, 2, 3], 1),
+        ([5, 6, 5, 7, 8], [5, 6, 7, 8], 1),  # once more
+        ([5, 6, 900, 3, 900, 7, 8], [5, 6, 7, 8], 3),
+    ):
+        intake = Intake(Catalogue.read(documents()[wire.CATALOGUE]))
+        found = []
+        for number in numbers:
+            rows = truth.rows[PROBES]
+            found += (
+                intake.take(PROBES, truth.payload(PROBES, number))
+                if number < 2**39
+                else intake.take(
+                    PROBES,
+                    wire.encode_block(
+                        wire.Block(number * 10_000, number * rows, 2e4, 1e6, np.ones((rows, 4), np.int32))
+                    ),
+                )
+            )
+        assert [each.block.index // truth.rows[PROBES] for each in found] == taken, numbers
+        assert intake.refused == refused, numbers
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"table": 1}, {"table": {"groups": 3}}, {"tick_rate_hz": 0}, {"tick_rate_hz": "x"}, {"truth": []}, {"table": None},
+     {"truth": {"state": {"rate_hz": -1, "columns": []}}}],
+)  # fmt: skip
+def test_a_catalogue_that_is_none_is_one_line_for_recorder_and_daq(tmp_path: Path, change: dict[str, Any]) -> None:
+    client = ScriptedClient()
+    client.replies[wire.CATALOGUE] = wire.encode_document({**documents()[wire.CATALOGUE], **change})
+    with pytest.raises(InputError, match="catalogue"):
+        RecordingSession(client, tmp_path / "run.mcap").run()
+    with pytest.raises(InputError, match="catalogue"):
+        RecordingSession(client, tmp_path / "run.mcap", capture=Capture((Trigger.parse("note"),))).run()
+    with pytest.raises(InputError, match="catalogue"):
+        Daq(RigSource(client))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_another_session_publishes_is_left_out_and_counted() -> None:
+    import zenoh
+
+    endpoint, truth = free_endpoint(), Truth()
+    with ZenohServer(endpoint) as server:
+        server.publish(PROBES, truth.payload(PROBES, 0))
+        with ZenohClient(endpoint) as client:
+            got: dict[bool, list[bytes]] = {True: [], False: []}
+            events: list[bytes] = []
+            for lossless, taken in got.items():
+                client.subscribe(PROBES, lambda _, p, taken=taken: taken.append(p), lossless=lossless)
+            client.subscribe(wire.EVENTS, lambda _, p: events.append(p), history=True)
+            time.sleep(0.5)
+            config = zenoh.Config()
+            for name, value in (
+                ("mode", "client"), ("connect/endpoints", [f"tcp/{endpoint}"]), ("scouting/multicast/enabled", False),
+            ):  # fmt: skip
+                config.insert_json5(name, json.dumps(value))
+            with zenoh.open(config) as forger:
+                publisher = forger.declare_publisher(PROBES)
+                for number in range(1, 51):
+                    server.publish(PROBES, truth.payload(PROBES, number))
+                    publisher.put(b"forged")
+                    forger.put(PROBES, truth.payload(PROBES, 10**6 + number))
+                    forger.put(wire.EVENTS, b'{"event":"end","reason":"forged","rows":{}}')
+                    forger.put(f"{PROBES}/@adv/pub/{forger.zid()}/1/_", b"\x07\x00\x00\x00")
+                    time.sleep(0.002)
+                time.sleep(0.5)
+            sent = [truth.payload(PROBES, number) for number in range(1, 51)]
+            assert got == {True: sent, False: sent}
+            assert events == []
+            assert client.foreign >= 4 * 50
+            assert client.rig is not None
