@@ -184,7 +184,10 @@ class Intake:
         """
         if len(payload) > _BLOCK_BYTES:
             raise InputError("block", f"at most {_BLOCK_BYTES} bytes", len(payload))
-        block = wire.decode_block(payload, wire.schema_of(key) or "")
+        try:
+            block = wire.decode_block(payload, wire.schema_of(key) or "")
+        except wire.ImplausibleError as error:
+            return self._refuse(key, str(error))
         promise = self._promises.get(key)
         if promise is None:
             promise = Promise(block.values.shape[1], block.rate_hz, block.tick_rate_hz)

@@ -114,12 +114,16 @@ def encode_block(block: Block) -> bytes:
     return b"".join((_ENCAPSULATION, head, values.tobytes()))
 
 
+class ImplausibleError(ValueError):
+    """A whole message that names a time, a number or a rate that no stream can have."""
+
+
 def decode_block(payload: bytes, schema: str) -> Block:
     """The block in a CDR message.
 
     Raises:
-        ValueError: The payload is not a whole message of that schema, or names a time, a number or a rate that no
-            stream can have. A rate of 0 is that of edges, which have none.
+        ValueError: The payload is not a whole message of that schema.
+        ImplausibleError: It is one that no stream can have. A rate of 0 is that of edges, which have none.
     """
     dtype = _DTYPES[schema]
     start = len(_ENCAPSULATION) + _HEAD.size
@@ -138,7 +142,7 @@ def decode_block(payload: bytes, schema: str) -> Block:
         and (1e-6 <= rate_hz <= tick_rate_hz or (rate_hz == 0.0 and schema == TRUTH_SCHEMA))
         and (rate_hz == 0.0 or rows <= _MOST_BLOCK_S * rate_hz)
     ):
-        raise ValueError(
+        raise ImplausibleError(
             "payload must have times and numbers that a clock can have; "
             f"instead received {rows} rows from {index} on at tick {tick}, {rate_hz} Hz of {tick_rate_hz} Hz"
         )
