@@ -600,9 +600,11 @@ class Gateway:
         while not self._stopping:
             try:
                 message = self._bus.recv(0.2)
-            except (can.CanError, OSError, ValueError):
+            except Exception as error:
                 # Bus off, or no hub: it may come back, and the rig runs on meanwhile.
                 self.counts.errors += 1
+                if not isinstance(error, (can.CanError, OSError, ValueError)):
+                    self._guard.tell("hearing the bus", error)
                 time.sleep(0.1)
                 continue
             if message is not None:
@@ -651,8 +653,10 @@ class Gateway:
         try:
             key = wire.command_key(command.kind.name.lower())
             reply = check(_Reply, self._client.request(key, request, timeout_s=self._timeout_s), field="reply")
-        except (NoReplyError, ValueError):
+        except Exception as error:
             reply = None
+            if not isinstance(error, (NoReplyError, ValueError)):
+                self._guard.tell("asking the rig", error)
         if not self._settle(asked):
             return
         if reply is None:

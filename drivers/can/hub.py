@@ -379,10 +379,9 @@ class Hub:
         self._numbers[node] = endpoint.number
 
     def _detach(self, endpoint: _Endpoint) -> None:
-        """Take its controller off the bus: what waits there is lost; a frame on the wire is still sent.
-
-        What was offered a moment ago is found to be lost only when the model comes to it.
-        """
+        """Take its controller off the bus: what waits there is lost; a frame on the wire is still sent."""
+        # What was offered a moment ago waits there as well by then, and the controller's place is free for another.
+        self._advance(self._now())
         waiting = self._model.node(endpoint.node).queued
         self._model.detach(endpoint.node)
         lost = waiting - self._model.node(endpoint.node).queued
@@ -425,10 +424,7 @@ class Hub:
 
     def _step(self, now: int) -> tuple[list[bytes], int, bool]:
         """Let the bus run until now: messages to send, when to come back, and whether only then."""
-        # One more: what was offered by now must have begun.
-        results = self._model.advance_records(max(now + 1, self._model.now_ns))
-        if len(results):
-            self._take_results(results)
+        self._advance(now)
         next_ns = self._model.next_ns()
         self._credit = min(_BURST, self._credit + (now - self._credit_ns) * 1e-9 * _MESSAGES_A_SECOND)
         self._credit_ns = now
@@ -456,6 +452,12 @@ class Hub:
         if self._outbox:
             wake_ns = min(wake_ns, tick_ns)
         return payloads, wake_ns, next_ns is not None or bool(self._outbox)
+
+    def _advance(self, now: int) -> None:
+        # One more: what was offered by now must have begun.
+        results = self._model.advance_records(max(now + 1, self._model.now_ns))
+        if len(results):
+            self._take_results(results)
 
     def _take_results(self, results: np.ndarray) -> None:
         """Note what the model is done with, and keep what the endpoints must hear of."""

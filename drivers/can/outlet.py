@@ -166,7 +166,7 @@ class Outlet:
                 if not self._rest:
                     moved_s = time.monotonic()
                     self._changed.wait_for(lambda: self._messages or self._ending, _POLL_S)
-                    while self._messages and len(self._rest) + len(self._messages[0]) <= _WRITTEN:
+                    while self._messages and (not self._rest or len(self._rest + self._messages[0]) <= _WRITTEN):
                         self._rest += self._messages.popleft()
                     self._changed.notify_all()
                 if not self._rest:
@@ -174,10 +174,10 @@ class Outlet:
                         return
                     continue
             if self._ready(select.POLLOUT):
-                moved_s = time.monotonic()
                 try:
                     with self._changed, contextlib.suppress(BlockingIOError):
                         self._rest = self._rest[os.write(self._descriptor, self._rest) :]
+                        moved_s = time.monotonic()
                 except OSError:
                     self._ending = True
                     self._forget()
@@ -216,7 +216,9 @@ class Outlet:
                     continue
                 crowded = not self._put(self._overflow() + text if crowded else text)
                 self.counts["dropped"] += crowded
-        except (can.CanError, OSError, ValueError):
+        except Exception as error:
+            if not isinstance(error, (can.CanError, OSError, ValueError)):
+                self._guard.tell("hearing the bus", error)
             self._lose()
         finally:
             self._guard(bus.shutdown)

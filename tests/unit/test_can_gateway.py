@@ -441,6 +441,33 @@ def test_a_command_that_the_rig_does_not_answer_times_out_and_too_many_are_refus
         own.shutdown()
 
 
+def test_threads_of_a_gateway_outlive_what_fails_in_them_and_a_command_is_asked_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with rig(Fake(duration_s=None), paced=True) as setup:
+        setup.start()
+        until(lambda: bool(setup.tap.of("Probes")))
+        good, asked = setup.gateway._client.request, []
+
+        def bad(key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
+            asked.append((key, good(key, payload, timeout_s=timeout_s)))
+            raise ZeroDivisionError("spoilt")
+
+        monkeypatch.setattr(setup.gateway._client, "request", bad)
+        assert setup.tap.ask(*command_frame(Kind.SPEED, 1, speed_hz=5.0))["result"] == Result.TIMED_OUT
+        assert len(asked) == 1
+        for name in ("_unpack", "_take_message", "_send_due"):
+            monkeypatch.setattr(setup.gateway, name, lambda *_: 1 / 0)
+        monkeypatch.setattr(setup.gateway._bus, "recv", lambda _: {}[1])
+        before = setup.gateway._guard.failures
+        until(lambda: setup.gateway._guard.failures > before + 10)
+        assert any("the CAN gateway failed" in text for text in setup.service.status()["warnings"])
+        monkeypatch.undo()
+        count = len(setup.tap.of("Probes"))
+        until(lambda: len(setup.tap.of("Probes")) > count + 100)
+        assert setup.tap.ask(*command_frame(Kind.SPEED, 2, speed_hz=5.0))["result"] == Result.ACCEPTED
+
+
 def test_100_000_random_frames_are_no_command_and_few_are_answered() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         random = np.random.default_rng(1)

@@ -331,6 +331,22 @@ def test_a_full_transmit_queue_is_waited_for_or_told_and_can_be_flushed(way: str
         assert len(found) + dropped == offered
 
 
+def test_many_flushes_during_one_frame_use_up_no_controllers() -> None:
+    with Rig("process", "10k") as rig:
+        sender, receiver = rig.bus(), rig.bus()
+        for _ in range(1000):
+            sender.send(message(0x100), timeout=0)
+            sender.flush_tx_buffer()
+        assert len(rig.model._names) < 8
+        sender.send(message(0x300), timeout=0)
+        found = 0
+        while read(receiver, 1)[0].arbitration_id != 0x300:
+            found += 1
+        until(lambda: rig.hub.status()["nodes"][0]["done"] == 1001)
+        assert found + 1 + rig.hub.status()["nodes"][0]["dropped"] == 1001
+        assert rig.hub._waiting == 0
+
+
 def test_what_was_sent_before_a_shutdown_is_on_the_bus(rig: Rig) -> None:
     sender, receiver = rig.bus(), rig.bus()
     for number in range(300):
