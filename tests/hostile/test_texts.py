@@ -14,6 +14,7 @@ import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -304,6 +305,23 @@ def test_paths_with_such_names_end_no_command(
         printed = capsys.readouterr()
         assert end.value.code == 0, printed.err
         printed_safely(printed.out + printed.err)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recording_to_such_a_path_is_made(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from rig.cli.record import run_session
+
+    progress = SimpleNamespace(
+        time_s=1.0, rows=5, lost=3, size_bytes=10, files=0, backlog_bytes=0, remarks=(name.replace("\n", " "),)
+    )
+    summary = SimpleNamespace(remarks=progress.remarks)
+
+    def run(show: Callable[[Any], None]) -> Any:
+        show(progress)
+        return summary
+
+    assert run_session(SimpleNamespace(path=Path(name), run=run, stop=lambda _: None)) is summary  # type: ignore[arg-type]
+    printed_safely(capsys.readouterr().err)
 
 
 def test_nothing_is_printed_but_through_the_one_door() -> None:
