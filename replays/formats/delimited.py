@@ -16,6 +16,7 @@ from replays.formats import columnar
 from replays.formats.dialect import MISSING, Layout, find_layout, instant, time_column
 from replays.formats.source import Entry, Signal, Source, damaged, even_rate_hz
 from rig.errors import InputError
+from rig.text import printable
 
 if TYPE_CHECKING:
     from replays.formats.mapping import FileOptions
@@ -166,6 +167,10 @@ def _instants(path: Path, column: Any, options: FileOptions) -> Any:
     return pyarrow.chunked_array([pyarrow.array(found, kind)])
 
 
+def _quoted(name: str) -> str:
+    return printable(name).replace('"', '""')
+
+
 class Rows:
     """A CSV file that grows by rows: numbers in the fewest digits that give them back, on two threads."""
 
@@ -175,7 +180,7 @@ class Rows:
         self._csv = csv
         self._schema = schema
         self._file = path.open("wb")
-        self._file.write((",".join(f'"{name}"' for name in schema.names) + "\n").encode())
+        self._file.write((",".join(f'"{_quoted(name)}"' for name in schema.names) + "\n").encode())
         # Formatting a number takes ten times as long as simulating it, and needs no lock.
         self._pool = ThreadPoolExecutor(max_workers=2)
         self._due: deque[Future[bytes]] = deque()

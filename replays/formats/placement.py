@@ -14,6 +14,8 @@ from replays.formats.mapping import Mapping
 from rig.channels import default_table
 from rig.errors import InputError
 
+_MOST_TIMES, _MOST_ROWS = 1000, 1_000_000
+"""So many times the values that a file has, and so many rows more, samples may become at another rate."""
 _NEAR = 0.01
 """Part of a sample by which untouched samples may lie beside the instants that they are given."""
 
@@ -74,6 +76,10 @@ def place(
         else:
             start, hair = zero_s + math.ceil((first[name] - zero_s) * rate - 1e-6) / rate, 1e-6
         rows = math.floor((last[name] - start) * rate + hair) + 1
+        held = max(entry.axis.rows for entry in entries)
+        if rows > _MOST_TIMES * held + _MOST_ROWS:
+            must = f"such that {held} values in {name} become at most {_MOST_TIMES * held + _MOST_ROWS} rows"
+            raise InputError("resample.rate_hz", must, f"{rate} Hz, {rows} rows")
         group = PlacedGroup(rate, start, rows, {}, {}, {entry.name: entry for entry in entries})
         for entry in entries:
             _put(group, entry, mapping)

@@ -16,6 +16,7 @@ import numpy as np
 from replays.formats import unit as units
 from replays.formats.source import Entry, Signal, Source, damaged, library
 from rig.errors import InputError
+from rig.text import printable
 
 if TYPE_CHECKING:
     from replays.formats.mapping import FileOptions
@@ -163,4 +164,4 @@ def _header(table: Table, column: Column, selection: Selection) -> bytes:
 
 
 def _ascii(text: str, width: int) -> str:
-    return text.encode("ascii", "replace").decode()[:width]
+    return printable(text).encode("ascii", "replace").decode()[:width]

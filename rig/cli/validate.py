@@ -10,7 +10,7 @@ import typer
 
 from rig.cli.options import Changes, Engine, Force, Json, RecordingFiles, ReportFile
 from rig.cli.progress import reporting
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.tables import echo, new_table, shown, table_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -80,7 +80,7 @@ def validate(
 def _show(found: Validation) -> None:
     console = table_console(width=160, highlight=False)
     changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
-    console.print(f"{found.title}, scene {found.scene}" + (f", validated with {changed}" if changed else ""))
+    console.print(shown(f"{found.title}, scene {found.scene}") + (f", validated with {changed}" if changed else ""))
     console.print(found.verdict_line)
     if found.explained is not None:
         console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")

@@ -17,6 +17,7 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.rewrite import is_whole, recover
+from rig.cli.main import main
 from rig.errors import InputError
 from tests.hostile import Door, inputs
 from tests.hostile.files import Layout, attachments_of, contents, far_block, spoil_bytes, uses, write
@@ -72,6 +73,26 @@ def test_a_changed_calibration_is_never_recovered_as_if_it_were_whole(path: Path
     at = data.index(b"A recording of the virtual")
     spoilt.write_bytes(flipped(data, at, 1))
     assert recover(spoilt).damaged == 1
+
+
+@pytest.mark.parametrize("command", ["info", "validate", "identify", "recover", "cut", "export", "replay", "view"])
+def test_a_sensitivity_that_was_turned_is_told_by_every_command(
+    command: str, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = path.read_bytes()
+    at = data.index(b'"sensitivity_v": 3.94') + len(b'"sensitivity_v": 3.')
+    monkeypatch.chdir(tmp_path)
+    Path("x.mcap").write_bytes(flipped(data, at, 3))
+    assert Path("x.mcap").read_bytes()[at - 2 : at + 2] == b"3.14"
+    more = {"cut": ["-o", "y.mcap"], "export": ["-o", "y.csv"], "identify": ["--fit", "contact.friction"],
+            "view": ["--save", "y.rrd"], "replay": ["--listen", "127.0.0.1:22990"]}  # fmt: skip
+    with pytest.raises(SystemExit) as end:
+        main([command, "x.mcap", *more.get(command, [])])
+    printed = capsys.readouterr()
+    assert end.value.code == 2
+    assert printed.err.startswith("rig: file must be")
+    assert printed.err.count("\n") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["x.mcap"]
 
 
 @pytest.mark.parametrize("finished", [True, False])

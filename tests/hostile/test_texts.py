@@ -14,6 +14,7 @@ import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,10 @@ import pytest
 import rig.cli
 from recorder.reader import Recording
 from replays.formats.conversion import convert
+from replays.formats.export import export
 from replays.formats.imported import write_recording
 from replays.formats.mapping import FileOptions, load_mapping
+from replays.formats.selection import select
 from replays.formats.source import open_source
 from replays.formats.template import example
 from replays.validation.criteria import DEFAULT, load_criteria
@@ -85,7 +88,7 @@ def test_toml_of_every_kind_is_taken_or_refused_in_one_line(tmp_path: Path) -> N
         ),
     }
     doors = {name: Door() for name in kinds}
-    for number in range(inputs(200)):
+    for number in range(inputs(120)):
         name = list(kinds)[number % len(kinds)]
         texts, load = kinds[name]
         path = tmp_path / f"x{name.strip('-')}.toml"
@@ -183,7 +186,7 @@ def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) 
     for suffix in whole:  # each is taken as it is
         if not suffix.endswith(".json"):
             convert([tmp_path / "whole" / f"a{suffix}"], mapping)
-    for number in range(inputs(140)):
+    for number in range(inputs(80)):
         suffix = list(whole)[number % len(whole)]
         data = whole[suffix]
         for _ in range(int(rng.integers(1, 3))):
@@ -206,6 +209,17 @@ def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) 
     logging.disable(logging.NOTSET)
     for suffix, door in doors.items():
         door.tell(suffix)
+
+
+@pytest.mark.parametrize(("method", "rate_hz"), [("linear", 1_000_000), ("polyphase", 1_000_000), ("none", None)])
+def test_two_values_at_far_times_are_not_a_reason_for_a_terabyte(
+    method: str, rate_hz: int | None, tmp_path: Path
+) -> None:
+    (tmp_path / "x.csv").write_text("time,x [mm]\n0,1\n1e9,2\n2e9,3\n")
+    rate = "" if rate_hz is None else f"rate_hz = {rate_hz}\n"
+    (tmp_path / "m.toml").write_text(f'{X}[resample]\nmethod = "{method}"\n{rate}')
+    with pytest.raises(InputError, match=r"resample\.rate_hz must be"):
+        convert([tmp_path / "x.csv"], load_mapping(tmp_path / "m.toml"))
 
 
 def replace_source(mapping: Any, name: str, group: str) -> Any:
@@ -251,6 +265,23 @@ def test_info_prints_names_that_a_terminal_would_act_on(
             main(arguments)
         printed = capsys.readouterr()
         printed_safely(printed.out + printed.err)
+
+
+@pytest.mark.parametrize("name", [*NAMES[:7], 'a","b', "\n    -1\n    -1\n    58"])
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_names_do_not_change_the_form_of_what_is_exported(name: str, tmp_path: Path) -> None:
+    layout = Layout(Recording.open(write(tmp_path / "run.mcap")))
+    catalogue = json.loads(layout.attachments["catalogue.json"])
+    for channel in catalogue["table"]["groups"]["probes"]["channels"][:1]:
+        channel["name"] = channel["unit"] = channel["label"] = name
+    layout.attachments["catalogue.json"] = json.dumps(catalogue).encode()
+    recording = Recording.open(layout.write(tmp_path / "x.mcap"))
+    for suffix in (".csv", ".uff"):
+        export(select(recording, channels=["probes"], merged=suffix == ".csv"), tmp_path / f"out{suffix}")
+        found = open_source(tmp_path / f"out{suffix}", FileOptions())
+        assert [entry.rows for entry in found.entries] == [60] * 4
+        for entry in found.entries:
+            assert len(found.read(entry).values) == 60
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -304,6 +335,23 @@ def test_paths_with_such_names_end_no_command(
         printed = capsys.readouterr()
         assert end.value.code == 0, printed.err
         printed_safely(printed.out + printed.err)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_recording_to_such_a_path_is_made(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    from rig.cli.record import run_session
+
+    progress = SimpleNamespace(
+        time_s=1.0, rows=5, lost=3, size_bytes=10, files=0, backlog_bytes=0, remarks=(name.replace("\n", " "),)
+    )
+    summary = SimpleNamespace(remarks=progress.remarks)
+
+    def run(show: Callable[[Any], None]) -> Any:
+        show(progress)
+        return summary
+
+    assert run_session(SimpleNamespace(path=Path(name), run=run, stop=lambda _: None)) is summary  # type: ignore[arg-type]
+    printed_safely(capsys.readouterr().err)
 
 
 def test_nothing_is_printed_but_through_the_one_door() -> None:
