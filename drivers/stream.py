@@ -18,7 +18,8 @@ from rig.intake import Catalogue, Intake, Taken, event_in
 from rig.transport import Client, NoReplyError
 
 GRACE_S = 2.0
-"""After an end that does not tell the number of rows, and after the last block: silence that ends the stream [s]."""
+"""After an end that does not tell the number of rows, and after the last block: silence that ends the stream; and how
+long a rig that is gone may take to be there again [s]."""
 RIG_GONE = "the rig has gone"
 
 
@@ -68,6 +69,7 @@ class RigStream:
         self._listeners: dict[str, list[_Listener]] = {}
         self._subscribed: set[str] = set()
         self._intake: Intake | None = None
+        self._rig: str | None = None
         self._gone = False
         self._ends: dict[str, tuple[int, str]] = {}
         """Groups of which the run's end was announced: number of rows in all, and the reason."""
@@ -119,6 +121,7 @@ class RigStream:
             self._listeners.setdefault(group, []).append(listener)
             new, watch = group not in self._subscribed, self._intake is None
             self._subscribed.add(group)
+            self._rig = self._client.rig if watch else self._rig
             self._intake = self._intake or intake
         # Not under the lock: a transport may deliver at once.
         if watch:
@@ -215,20 +218,26 @@ class RigStream:
         timer.start()
 
     def _on_alive(self, alive: bool) -> None:
-        if alive:
-            if self._gone:
-                # What is there now may be another rig.
-                with contextlib.suppress(NoReplyError, ValueError):
-                    self._intake = Intake(self._catalogue())
-            self._gone = False
-            return
-        self._gone = True
-        with self._lock:
-            self._ends.clear()
-        self._end(RIG_GONE)
+        self._gone = not alive
+        if not alive:
+            # A process that was stopped for longer than its link lives is linked again at once.
+            timer = threading.Timer(GRACE_S, self._give_up)
+            timer.daemon = True
+            timer.start()
+        elif self._client.rig != self._rig:
+            self._give_up(replaced=True)
+            self._rig = self._client.rig
+            with contextlib.suppress(NoReplyError, ValueError):
+                self._intake = Intake(self._catalogue())
+
+    def _give_up(self, *, replaced: bool = False) -> None:
+        if (self._gone or replaced) and self._rig is not None:
+            self._rig = None
+            self._end(RIG_GONE)
 
     def _end(self, reason: str) -> None:
         for group in list(self._subscribed):
             with self._lock:
+                self._ends.pop(group, None)
                 taken = self._intake.rest(None, wire.sensor_key(group)) if self._intake is not None else []
             self._hand_on(group, taken, reason)
