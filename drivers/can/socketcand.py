@@ -320,7 +320,6 @@ class SocketcandServer:
         buses: By name, what makes a node on the bus: one for each connection.
         host: Where to listen.
         port: Likewise; 0 takes a free one.
-        expose: Allow a host other than 127.0.0.1: there is no password, and all can send.
         room: Bytes that may wait for one client.
         patience_s: How long a client may take nothing of what waits before it is disconnected [s].
 
@@ -334,14 +333,12 @@ class SocketcandServer:
         *,
         host: str = "127.0.0.1",
         port: int = PORT,
-        expose: bool = False,
         room: int = ROOM,
         patience_s: float = PATIENCE_S,
     ) -> None:
-        from rig.transport.zenoh import LOOPBACK_HOSTS
+        from rig.transport.zenoh import check_loopback
 
-        if host not in LOOPBACK_HOSTS and not expose:
-            raise InputError("socketcand", "on 127.0.0.1 unless --expose is given as well", f"{host}:{port}")
+        check_loopback(host, port, field="socketcand")
         self._buses = dict(buses)
         self._room = room
         self._patience_s = patience_s

@@ -40,9 +40,6 @@ def hub(
     slcan: Annotated[
         bool, typer.Option("--slcan", help="Also play an SLCAN adapter on a port of its own for each bus.")
     ] = False,
-    expose: Annotated[
-        bool, typer.Option("--expose", help="Allow --listen and --socketcand on a host other than 127.0.0.1.")
-    ] = False,
     acknowledge: Annotated[
         bool, typer.Option(help="Acknowledge frames, so that an only node on the bus can send.")
     ] = True,
@@ -65,14 +62,14 @@ def hub(
         raise InputError("CHANNEL", "named once each", " ".join(channels))
     rates = parse_speed(speed)
     models = [BusModel(rates, error_rate=error_rate, seed=seed + number) for number in range(len(channels))]
-    with ZenohServer(listen, expose=expose) as server, ExitStack() as stack:
+    with ZenohServer(listen) as server, ExitStack() as stack:
         hubs = [Hub(model, name, server, acknowledge=acknowledge) for model, name in zip(models, channels, strict=True)]
         stopped = threading.Event()
         with stopping_on_signals(stopped.set):
             for one in hubs:
                 stack.enter_context(one)
             buses = {one.channel: partial(HubBus, one) for one in hubs}
-            outlets = stack.enter_context(CanOutlets(buses, rates, socketcand=socketcand, slcan=slcan, expose=expose))
+            outlets = stack.enter_context(CanOutlets(buses, rates, socketcand=socketcand, slcan=slcan))
             for line in outlets.lines():
                 typer.echo(f"rig: {line}", err=True)
             typer.echo(f"rig: CAN {', '.join(channels)} at {rates} on {listen}; Ctrl-C ends it", err=True)

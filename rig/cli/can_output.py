@@ -90,7 +90,6 @@ class CanOutput:
         overload: Run even where the bus cannot carry all.
         socketcand: HOST:PORT of a server for socketcand clients, or none.
         slcan: Whether to play an SLCAN adapter of the bus.
-        expose: Allow a socketcand host other than 127.0.0.1.
 
     Raises:
         InputError: What was asked for does not make a bus, or not one that can carry the messages.
@@ -107,7 +106,6 @@ class CanOutput:
         overload: bool = False,
         socketcand: str | None = None,
         slcan: bool = False,
-        expose: bool = False,
     ) -> None:
         from rig.transport.memory import MemoryServer
 
@@ -122,7 +120,7 @@ class CanOutput:
         if (socketcand is not None or slcan) and self.interface not in _SHARED:
             must = f"on {', '.join(_SHARED[:-1])} or {_SHARED[-1]} with --can-socketcand and --can-slcan"
             raise InputError("--can", must, spec)
-        self._outlet_settings: dict[str, Any] = {"socketcand": socketcand, "slcan": slcan, "expose": expose}
+        self._outlet_settings: dict[str, Any] = {"socketcand": socketcand, "slcan": slcan}
         self._outlets: CanOutlets | None = None
         self._open_more: OpenBus | None = None
         self._memory = MemoryServer(cache=0)
@@ -243,7 +241,6 @@ def can_output(
     overload: bool,
     socketcand: str | None,
     slcan: bool,
-    expose: bool,
 ) -> CanOutput | None:
     """The bus that the --can options ask for, or None; as for `CanOutput`.
 
@@ -260,7 +257,7 @@ def can_output(
         "slcan": slcan,
     }
     if spec is not None:
-        return CanOutput(spec, **settings, expose=expose)
+        return CanOutput(spec, **settings)
     if any(setting is not None and setting is not False for setting in settings.values()):
         raise InputError("--can", "given with the other --can options", None)
     return None

@@ -19,8 +19,21 @@ from rig.cli.can_output import (
     CanSocketcand,
     can_output,
 )
+from rig.cli.connection import exposure, tell_where
 from rig.cli.display import all_lateness, lateness, showing, stopping_on_signals
-from rig.cli.options import Changes, DurationS, Engine, Expose, Listen, Parameters, SceneName, Seed, pairs
+from rig.cli.options import (
+    Changes,
+    DurationS,
+    Engine,
+    Expose,
+    Keys,
+    Listen,
+    Parameters,
+    Plaintext,
+    SceneName,
+    Seed,
+    pairs,
+)
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
 
@@ -46,7 +59,9 @@ def run(
         float, typer.Option(help="Length of a published block, in ms; the last 3000 are kept for clients that stall.")
     ] = 10.0,
     listen: Listen = DEFAULT_ENDPOINT,
-    expose: Expose = False,
+    expose: Expose = None,
+    tls: Keys = None,
+    plaintext: Plaintext = False,
     parameters: Parameters = None,
     changes: Changes = None,
     engine: Engine = None,
@@ -62,6 +77,7 @@ def run(
     can_slcan: CanSlcan = False,
 ) -> None:
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
+    exposed = exposure(expose, tls, plaintext=plaintext)
     overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
 
     from rig.pacing import rare_collections
@@ -83,10 +99,9 @@ def run(
             overload=can_overload,
             socketcand=can_socketcand,
             slcan=can_slcan,
-            expose=expose,
         )
     paced = pace is Pace.REAL_TIME
-    with ZenohServer(listen, expose=expose, wait=not paced) as server, ExitStack() as stack:
+    with ZenohServer(listen, exposed=exposed, wait=not paced) as server, ExitStack() as stack:
         if bus is not None:
             stack.enter_context(bus)
         with rare_collections():
@@ -102,7 +117,7 @@ def run(
             if bus is not None:
                 bus.start(paced=paced)
                 typer.echo(f"rig: {bus}", err=True)
-        typer.echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
+        tell_where(server, exposed)
         with stopping_on_signals(service.stop), showing(service.status, _words):
             summary = service.run()
     _print_summary(summary)
