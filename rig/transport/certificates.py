@@ -24,9 +24,8 @@ if TYPE_CHECKING:
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
-SERVER = "server"
+SERVER, SIGNER = "server", "rig authority"
 HOLDERS = (SERVER, *ROLES)
-LONGEST_DAYS = 3650
 _AUTHORITY, _CERTIFICATE, _KEY = "authority.pem", "certificate.pem", "key.pem"
 _LAYOUT = {Path(holder, file) for holder in HOLDERS for file in ("", _AUTHORITY, _CERTIFICATE, _KEY)}
 _SKEW = timedelta(hours=1)
@@ -69,14 +68,17 @@ class Holder(NamedTuple):
         context.verify_flags &= ~getattr(ssl, "VERIFY_X509_STRICT", 0)
         context.load_cert_chain(self.folder / _CERTIFICATE, self.folder / _KEY)
         with socket.create_connection((host, port), timeout=timeout_s) as plain:
+            greeted = False
             try:
                 with context.wrap_socket(plain, server_hostname=host) as link:
+                    greeted = True
                     # What the other side says about our certificate comes only now; else it waits for us to speak.
                     link.recv(1)
-            except TimeoutError:
-                return None
+            except (TimeoutError, ConnectionError):
+                return None if greeted else "no TLS is spoken there"
             except ssl.SSLError as error:
-                return (getattr(error, "verify_message", None) or error.reason or str(error)).replace("_", " ").lower()
+                said = getattr(error, "verify_message", None) or error.reason or str(error)
+                return f"{said.replace('_', ' ').lower()} (keys of another rig, or expired?)"
         return None
 
 
@@ -153,7 +155,7 @@ def make(
     try:
         signing = ec.generate_private_key(ec.SECP256R1())
         issue = _Issue(signing, timedelta(days=days))
-        authority = issue.certificate("rig authority", signing, None, [])
+        authority = issue.certificate(SIGNER, signing, None, [])
         for holder in HOLDERS:
             key = ec.generate_private_key(ec.SECP256R1())
             if holder == SERVER:
@@ -193,7 +195,7 @@ class _Issue(NamedTuple):
 
         now = datetime.now(UTC)
         named = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-        issuer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rig authority")])
+        issuer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, SIGNER)])
         builder = (
             x509.CertificateBuilder(issuer, named, key.public_key(), x509.random_serial_number())
             .not_valid_before(now - _SKEW)

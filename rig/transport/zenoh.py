@@ -244,7 +244,7 @@ class ZenohServer:
             if "in use" in str(error):
                 must = "a free address (another rig runs there, or another program)"
             field, where = "listen", endpoint
-            if exposed is not None and locators[1] in str(error):
+            if exposed is not None and f"{host}:{port}" in str(error):
                 field, where = "expose", exposed.endpoint
             raise InputError(field, must, where) from None
         self.endpoint = endpoint

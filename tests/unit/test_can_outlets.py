@@ -424,7 +424,6 @@ def test_a_server_keeps_to_this_machine() -> None:
             SocketcandServer({}, port=server.port)
 
 
-
 @pytest.mark.parametrize("size", [1, 2, 7, 1000])
 def test_commands_come_in_any_portions(size: int) -> None:
     text = b"x< hi ><echo>\n < send 1 0 > y z < " + b"a" * 600 + b"> < end >"
@@ -753,5 +752,5 @@ def test_outlets_of_the_command_line() -> None:
         CanOutput("slcan:/dev/pts/99", slcan=True)
     with pytest.raises(InputError, match="--can must be given"):
         run("hammer", can_slcan=True)
-    with pytest.raises(InputError, match="on 127.0.0.1"):
+    with pytest.raises(InputError, match=r"on 127\.0\.0\.1"):
         CanOutlets({}, speed("1M"), socketcand="0.0.0.0:29536")
