@@ -57,7 +57,8 @@ def page() -> str:
         "",
         "Made from the channel table by `rig keys --markdown > rig/KEYS.md`; do not edit by hand.",
         "",
-        "Everything travels over zenoh on 127.0.0.1 (port 7460 by default); no router, no multicast. "
+        "Everything travels over zenoh on 127.0.0.1 (port 7460 by default), and with `--expose HOST --tls DIR` by TLS "
+        "(port 7463 by default); no router, no multicast. "
         "Simulated time is an integer tick of 1 us.",
         "",
         "## Blocks",
