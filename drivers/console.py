@@ -144,6 +144,11 @@ class Console:
         """The rig's status document, as published twice a second."""
         return wire.decode_document(self._client.request(wire.STATUS, timeout_s=self._timeout_s))
 
+    @property
+    def connection(self) -> str | None:
+        """By which certificates the rig and this console know each other; None without TLS."""
+        return getattr(self._client, "connection", None)
+
     def _command(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> Accepted:
         for name, value in fields.items():
             if isinstance(value, float) and not math.isfinite(value):

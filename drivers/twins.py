@@ -11,7 +11,7 @@ from drivers.drive.twin import DriveTwin
 from drivers.force.twin import ForceTwin
 from drivers.hammer.twin import HammerTwin
 from drivers.instrument.twin import Twin
-from drivers.link import Port, parse_loopback
+from drivers.link import Port
 from drivers.magnet.twin import MagnetTwin
 from drivers.proximity.twin import ProximityTwin
 from drivers.stream import RigStream
@@ -49,7 +49,6 @@ class Twins:
         from drivers.link.zenoh import ZenohPort
         from rig.transport.zenoh import ZenohServer
 
-        parse_loopback(endpoint, field="listen")
         server = self._closing.enter_context(ZenohServer(endpoint))
         for kind in TWINS:
             self.serve(kind, ZenohPort(server, kind.CODEC.address, f"zenoh:{endpoint}"))

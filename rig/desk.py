@@ -23,9 +23,12 @@ from rig.outside import LARGEST, Name, Outside, a_line, check, read_json
 from rig.text import printable
 from rig.transport import Server
 from rig.transport.clients import Clients
+from rig.transport.limit import CommandLimit
 
 REQUEST_BYTES = 10_000
 _PENDING_COMMANDS = 256
+_AT_ONCE = 64
+"""Commands that are taken between two blocks: they take some ms."""
 _KINDS = 100
 """Kinds of warnings that become events; the status shows the latest of the others too."""
 _FIGURES = re.compile(r"\d+(\.\d+)?(e[-+]?\d+)?")
@@ -116,6 +119,7 @@ class Desk:
         running: What a command that comes too late should have been sent while, such as "the rig runs".
         wake: Makes the thread that runs look for commands.
         tell: Takes each new kind of trouble, on any thread, for an event.
+        limit: How many commands a second are taken; steps wait for each other and are not counted.
     """
 
     def __init__(
@@ -127,6 +131,7 @@ class Desk:
         running: str,
         wake: Callable[[], None],
         tell: Callable[[str], None],
+        limit: CommandLimit | None = None,
     ) -> None:
         self._server = server
         self._commands = commands
@@ -134,6 +139,7 @@ class Desk:
         self._running = running
         self._wake = wake
         self._tell = tell
+        self._limit = limit or CommandLimit()
         self._pending: deque[Pending] = deque()
         self._lock = threading.Lock()
         self._ended = ""
@@ -175,15 +181,20 @@ class Desk:
             raise InputError("command", f"one of {', '.join(self._commands)}", name)
         request = read_json(payload, field=name, most_bytes=REQUEST_BYTES)
         sender = check(_Signed, {"from": request.pop("from", "unknown")}, field="").sender
+        if name != "step":
+            self._limit.check(sender)
         model = REQUESTS.get(name)
         return Pending(name, request, None if model is None else check(model, request, field=name), sender)
 
     def taken(self) -> Iterator[Pending]:
-        """The commands that have come, oldest first; what must never happen to one is that it is not answered."""
-        while self._pending:
+        """The commands that have come, oldest first, as many as may be taken between two blocks."""
+        for _ in range(_AT_ONCE):
             with self._lock:
+                if not self._pending:
+                    return
                 pending = self._pending.popleft()
             yield pending
+        self._wake()  # there may be more
 
     def close(self, ended: str, also: list[Pending]) -> None:
         """Refuse what is still waiting, and what comes later.

@@ -11,6 +11,7 @@ from rig import wire
 from rig.channels import Channel, default_table
 from rig.kernels import signals
 from rig.scenes import COMMANDS, SensorChoice
+from rig.transport.access import DOORS, PLAIN, ROLES, TRUTH, Verb
 
 _DOCUMENTS = {
     wire.EVENTS: (
@@ -39,6 +40,14 @@ _OTHER_COMMANDS = {
     "note": "`text` and `tags` (a list of words); does nothing, but is published as an event, and so recorded",
 }
 
+_VERBS = {
+    Verb.ASK: "send a request and get the reply",
+    Verb.RECEIVE: "subscribe, and fetch from the rig's cache what was missed",
+    Verb.SEND: "put",
+    Verb.WATCH: "see the token appear and vanish",
+    Verb.SHOW: "show a token of one's own",
+}
+
 
 def page() -> str:
     """The page as Markdown."""
@@ -49,7 +58,8 @@ def page() -> str:
         "",
         "Made from the channel table by `rig keys --markdown > rig/KEYS.md`; do not edit by hand.",
         "",
-        "Everything travels over zenoh on 127.0.0.1 (port 7460 by default); no router, no multicast. "
+        "Everything travels over zenoh on 127.0.0.1 (port 7460 by default), and with `--expose HOST --tls DIR` by TLS "
+        "(port 7463 by default); no router, no multicast. "
         "Simulated time is an integer tick of 1 us.",
         "",
         "## Blocks",
@@ -155,6 +165,30 @@ def page() -> str:
         "A number that is not among the replies is no longer kept. Ask for at most 200 messages at a time: while the "
         "cache answers, the publisher of that key waits. Take messages only where `source_info.source_id.zid` is the "
         "session that `session.info.peers_zid()` names, as a session of another client can publish on these keys too.",
+        "",
+        "## Who may do what",
+        "",
+        "What is not in this table is denied to everybody: no client can put a block, an event or a status, answer a "
+        "request, delete anything or show the rig's token. "
+        "On the loopback nobody is asked who he is, so there is one column for all, "
+        f"`{PLAIN}`; it also holds for `--expose HOST --plaintext`. "
+        "With `--expose HOST --tls DIR` the role is the name in the client's certificate (`rig keys init`), and "
+        "nobody is let in without one. `truth`: with a grant of its own (`rig keys init --truth ROLE`).",
+        "",
+        f"| what | keys | verb | {PLAIN} | {' | '.join(ROLES)} |",
+        "|---|---|---|---|" + "---|" * len(ROLES),
+        *(
+            f"| {door.what} | {', '.join(f'`{key}`' for key in door.keys)} | {door.verb} | yes | "
+            + " | ".join("yes" if door in doors else "truth" if door is TRUTH else "-" for doors in ROLES.values())
+            + " |"
+            for door in DOORS
+        ),
+        "",
+        *(f"- {verb}: {what}" for verb, what in _VERBS.items()),
+        "",
+        "Denied requests get an empty reply, and denied subscriptions nothing: our own clients ask for the rig's token "
+        "to tell that from a rig that is not there. Instruments and CAN buses are served on the loopback alone "
+        "(from elsewhere: `ssh -L 7462:127.0.0.1:7462 HOST`).",
         "",
         "## Other ports",
         "",

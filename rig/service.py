@@ -21,6 +21,7 @@ from rig.desk import Desk, Note, Pending, Step, finite, one_line
 from rig.errors import InputError
 from rig.pacing import Clock, Lockstep, RealTime, StepTimeoutError, short_collections
 from rig.transport import Server
+from rig.transport.limit import CommandLimit
 
 SIMULATION_COMMANDS = ("hammer", "speed", "release")
 """Commands that the simulation itself checks and carries out."""
@@ -207,6 +208,7 @@ class Service:
             with one client that stalls in the middle of its recovery.
         status_period_s: Wall time between status messages [s].
         linger_s: At the end of a run, wait at most this long [s] until clients have recovered what they missed.
+        limit: How many commands a second are taken.
 
     Raises:
         InputError: `block_ticks` does not fit the simulation.
@@ -222,6 +224,7 @@ class Service:
         queue_seconds: float = 30.0,
         status_period_s: float = 0.5,
         linger_s: float = 10.0,
+        limit: CommandLimit | None = None,
     ) -> None:
         if block_ticks <= 0 or block_ticks % simulation.block_ticks:
             raise InputError("block_ticks", f"a whole multiple of {simulation.block_ticks} ticks", block_ticks)
@@ -254,6 +257,7 @@ class Service:
             running="the rig runs",
             wake=clock.wake,
             tell=self._warn,
+            limit=limit,
         )
         self._accepted = 0
         self._taken: tuple[dict[str, Any], ...] = ()

@@ -20,9 +20,9 @@ import numpy as np
 from can.bus import BusState  # noqa: TID253
 
 from drivers.can import medium
-from drivers.link import parse_loopback
 from rig.errors import InputError, RefusedError
 from rig.outside import check, read_json
+from rig.transport.zenoh import parse_loopback
 
 if TYPE_CHECKING:
     from can.typechecking import AutoDetectedConfig, CanFilters

@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, Any
 from drivers.can import medium
 from drivers.can.health import Guard
 from drivers.can.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
-from drivers.link import parse_loopback
 from rig.errors import InputError
+from rig.transport.zenoh import parse_loopback
 
 if TYPE_CHECKING:
     import can

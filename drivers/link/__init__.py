@@ -119,21 +119,6 @@ class Port(Protocol):
         ...
 
 
-def parse_loopback(text: str, *, field: str) -> tuple[str, int]:
-    """Split HOST:PORT of a door that asks nobody who they are, and so is not open to other machines.
-
-    Raises:
-        InputError: It is not of that form, or not of this machine alone.
-    """
-    from rig.transport.zenoh import LOOPBACK_HOSTS, parse_endpoint
-
-    host, port = parse_endpoint(text, field=field)
-    if host not in LOOPBACK_HOSTS:
-        tunnel = f"ssh -L {port}:127.0.0.1:{port} USER@HOST"
-        raise InputError(field, f"on 127.0.0.1, since there is no password; from another machine: {tunnel}", text)
-    return host, port
-
-
 def open_link(url: str, address: Address) -> Link:
     """The way to an instrument.
 

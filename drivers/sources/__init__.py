@@ -8,7 +8,7 @@ from typing import Protocol
 from drivers.samples import Samples
 from rig.errors import InputError
 
-FORMS = "zenoh:HOST:PORT, can:INTERFACE:CHANNEL[?NAME=VALUE&...]"
+FORMS = "zenoh:HOST:PORT[?tls=DIR], can:INTERFACE:CHANNEL[?NAME=VALUE&...]"
 
 
 class Source(Protocol):
@@ -61,7 +61,8 @@ def open_source(url: str, *, wait_s: float = 3.0) -> Source:
     """The source at a URL.
 
     Args:
-        url: `zenoh:127.0.0.1:7460`, or `can:zenoh:can0` with settings of python-can's bus as `?NAME=VALUE&...`.
+        url: `zenoh:127.0.0.1:7460`, `zenoh:lab.example:7463?tls=keys/viewer` for a rig that is exposed, or
+            `can:zenoh:can0` with settings of python-can's bus as `?NAME=VALUE&...`.
         wait_s: How long to wait for a rig to be there [s].
 
     Raises:
@@ -73,8 +74,9 @@ def open_source(url: str, *, wait_s: float = 3.0) -> Source:
         from drivers.sources.rig import RigSource
         from rig.transport.zenoh import ZenohClient, parse_endpoint
 
-        parse_endpoint(rest, field="zenoh")
-        client = ZenohClient(rest, wait_s=wait_s)
+        endpoint, query, folder = rest.partition("?tls=")
+        parse_endpoint(endpoint, field="zenoh")
+        client = ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)
         return RigSource(client, close=client.close)
     if kind == "can" and rest:
         from drivers.sources.can import CanSource

@@ -72,7 +72,6 @@ _PANELS: dict[str, dict[str, Any]] = {
         "params": params.params,
         "laws": laws.laws,
         "magnets": magnets.magnets,
-        "keys": keys.keys,
     },
     "The rig as a service": {
         "run": run.run,
@@ -137,6 +136,7 @@ for _panel, _commands in _PANELS.items():
         _settings = {"ignore_unknown_options": True} if _name in ("speed", "rate", "seek", "step") else {}
         app.command(_name, rich_help_panel=_panel, context_settings=_settings)(_function)
 
+app.add_typer(keys.app, name="keys", rich_help_panel="Start here")
 can.app.command()(can_messages.dbc)
 can.app.command()(can_messages.load)
 app.add_typer(can.app, name="can", rich_help_panel="The rig as a service")

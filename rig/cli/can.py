@@ -55,10 +55,9 @@ def hub(
     from drivers.can.hub import Hub
     from drivers.can.interface import HubBus
     from drivers.can.timing import speed as parse_speed
-    from drivers.link import parse_loopback
     from rig.cli.can_outlets import CanOutlets
     from rig.errors import InputError
-    from rig.transport.zenoh import ZenohServer
+    from rig.transport.zenoh import ZenohServer, parse_loopback
 
     parse_loopback(listen, field="listen")
     if len(set(channels)) < len(channels):

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, console, show
+from rig.cli.connection import Connect, Tls, console, show
 from rig.transport import DEFAULT_ENDPOINT
 
 
@@ -18,9 +18,10 @@ def hammer(
         str, typer.Option(metavar="x|y|-x|-y|ANGLE", help="Along x or y, or at an angle from x towards y, in degrees.")
     ] = "x",
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
 ) -> None:
     """Hit the shaft of a running rig at the disk."""
-    with console(connect, "hammer") as rig:
+    with console(connect, "hammer", tls) as rig:
         show(rig.hammer(force_n=force_n, duration_ms=duration_ms, direction=_direction(direction)), "hammer")
 
 

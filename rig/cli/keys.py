@@ -1,19 +1,27 @@
-"""`rig keys`: keys, messages and units."""
+"""`rig keys`: keys, messages and units; `rig keys init`: who may connect to a rig that is exposed."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from rig.cli.options import Force
 from rig.cli.tables import echo, table_console
 
+app = typer.Typer()
 
+
+@app.callback(invoke_without_command=True)
 def keys(
+    context: typer.Context,
     *,
     markdown: Annotated[bool, typer.Option("--markdown", help="As the Markdown source of rig/KEYS.md.")] = False,
 ) -> None:
-    """Show every key, message and unit of the rig's streams, made from the channel table."""
+    """Show every key, message and unit of the rig's streams, and who may use them; or make certificates (`init`)."""
+    if context.invoked_subcommand is not None:
+        return
     from rig.interface import page
 
     if markdown:
@@ -22,3 +30,38 @@ def keys(
     from rich.markdown import Markdown
 
     table_console(width=160).print(Markdown(page()))
+
+
+@app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder.")],
+    *,
+    host: Annotated[
+        list[str] | None,
+        typer.Option(help="Name or address by which others reach the rig's computer; may be repeated."),
+    ] = None,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 365,
+    truth: Annotated[
+        list[str] | None, typer.Option(metavar="ROLE", help="A role that may read the truth too; may be repeated.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Make the certificates of a rig that is exposed: its own, and one for each role.
+
+    The roles are operator, recorder and viewer; `rig keys` shows what each may do.
+    """
+    from rig.transport import EXPOSED_PORT
+    from rig.transport.access import ROLES
+    from rig.transport.certificates import SERVER, make
+
+    names = make(folder, hosts=host or [], days=days, truth=truth or [], force=force)
+    echo(f"{folder / SERVER}: stays on this computer, {', '.join(names)}:")
+    echo(f"    rig run SCENE --expose {names[0]} --tls {folder}")
+    for role in ROLES:
+        granted = ", who may read the truth" if role in (truth or []) else ""
+        echo(f"{folder / role}: for the role {role}{granted}; copy it to where it is used:")
+        echo(f"    rig status --connect {names[0]}:{EXPOSED_PORT} --tls {role}")
+    if not host:
+        echo("Without --host they hold on this computer only.")
+    echo(f"Valid for {days} days. Whoever has a folder has its role: copy it by a safe way, such as scp -r.")
+    echo("The key that signed them is not kept: to add or withdraw one, make all anew (--force).")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, console, show
+from rig.cli.connection import Connect, Tls, console, show
 from rig.transport import DEFAULT_ENDPOINT
 
 
@@ -15,7 +15,8 @@ def note(
     *,
     tag: Annotated[list[str] | None, typer.Option(help="A word to find it by; may be repeated.")] = None,
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
 ) -> None:
     """Put a note with the present simulated and wall time into every recording that is being made of a rig."""
-    with console(connect, "note") as rig:
+    with console(connect, "note", tls) as rig:
         show(rig.note(text, tags=tag or []), "note")

@@ -37,8 +37,31 @@ Force = Annotated[bool, typer.Option("--force", help="Replace what is there alre
 ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="FILE", help="Write a report with pictures, .html or .pdf.")
 ]
-Listen = Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where to listen.")]
-Expose = Annotated[bool, typer.Option("--expose", help="Allow --listen on a host other than 127.0.0.1.")]
+Listen = Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where to listen, on 127.0.0.1.")]
+_EXPOSURE = "For other computers"
+Expose = Annotated[
+    str | None,
+    typer.Option(
+        "--expose",
+        metavar="HOST[:PORT]",
+        help="Listen at this address of this computer as well, with --tls; port 7463 unless given.",
+        rich_help_panel=_EXPOSURE,
+    ),
+]
+Keys = Annotated[
+    Path | None,
+    typer.Option(
+        "--tls", metavar="DIR", help="Made by `rig keys init`: who may connect, and do what.", rich_help_panel=_EXPOSURE
+    ),
+]
+Plaintext = Annotated[
+    bool,
+    typer.Option(
+        "--plaintext",
+        help="Instead of --tls: let everybody in, and do everything, unencrypted.",
+        rich_help_panel=_EXPOSURE,
+    ),
+]
 
 
 def names_of(text: str | None) -> list[str]:

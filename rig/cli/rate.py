@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, console, show
+from rig.cli.connection import Connect, Tls, console, show
 from rig.transport import DEFAULT_ENDPOINT
 
 
@@ -14,7 +14,8 @@ def rate(
     x: Annotated[float, typer.Argument(metavar="X", help="Recorded seconds a second, 0.01 to 1000.")],
     *,
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
 ) -> None:
     """Set how fast the replay of a recording goes."""
-    with console(connect, "rate") as rig:
+    with console(connect, "rate", tls) as rig:
         show(rig.rate(x), "rate")

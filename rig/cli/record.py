@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.connection import Connect
+from rig.cli.connection import Connect, Tls
 from rig.cli.options import Force
 from rig.cli.tables import echo, plain, table_console
 from rig.errors import InputError, RefusedError
@@ -43,6 +43,7 @@ def record(
     output: Annotated[Path, typer.Option("--output", "-o", help="File to record to, ends in .mcap.")],
     *,
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
     duration_s: Annotated[
         float | None, typer.Option(help="Simulated time to record, in s; without it until the rig's run ends.")
     ] = None,
@@ -181,7 +182,7 @@ def record(
     session_of(None)  # whatever is wrong with the options is said before a rig is looked for
     try:
         with table_console(stderr=True).status(plain(f"waiting for a rig at {connect}")):
-            rig = ZenohClient(connect, wait_s=max(_LINK_S, wait_s))
+            rig = ZenohClient(connect, wait_s=max(_LINK_S, wait_s), tls=tls)
         with rig as client:
             summary = run_session(session_of(client))
     except NoReplyError as error:

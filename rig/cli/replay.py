@@ -19,8 +19,9 @@ from rig.cli.can_output import (
     CanSocketcand,
     can_output,
 )
+from rig.cli.connection import exposure, tell_where
 from rig.cli.display import all_lateness, end_with, lateness, showing, stopping_on_signals
-from rig.cli.options import Channels, Expose, FromS, Listen, RecordingFiles, ToS, names_of, pairs
+from rig.cli.options import Channels, Expose, FromS, Keys, Listen, Plaintext, RecordingFiles, ToS, names_of, pairs
 from rig.cli.tables import echo
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
@@ -105,7 +106,9 @@ def replay(
         typer.Option(metavar="NAME=NAME", help="Another name for a channel, as if wired so.", rich_help_panel=_CHANGE),
     ] = None,
     listen: Listen = DEFAULT_ENDPOINT,
-    expose: Expose = False,
+    expose: Expose = None,
+    tls: Keys = None,
+    plaintext: Plaintext = False,
     can: CanBus = None,
     can_rate: CanRate = None,
     can_classic: CanClassic = False,
@@ -119,6 +122,7 @@ def replay(
 
     From another terminal: `rig pause`, `rig resume`, `rig seek S`, `rig rate X`, `rig step`, `rig stop`, `rig status`.
     """
+    exposed = exposure(expose, tls, plaintext=plaintext)
     from rig.pacing import FreeRun, RealTime, rare_collections
 
     with rare_collections():
@@ -154,7 +158,7 @@ def replay(
             slcan=can_slcan,
         )
     # What the transport keeps for those who miss it lasts shorter when it goes faster, so there it waits for them.
-    with ZenohServer(listen, expose=expose, wait=burst or rate > 1.0) as server, ExitStack() as stack:
+    with ZenohServer(listen, exposed=exposed, wait=burst or rate > 1.0) as server, ExitStack() as stack:
         if bus is not None:
             stack.enter_context(bus)
         player = Player(
@@ -181,7 +185,7 @@ def replay(
         if wait_for:
             what += f", waiting for {_clients(wait_for)}"
         echo(f"rig: replay of {', '.join(map(str, files))}, {begin_s:g} to {end_s:g} s, {what}", err=True)
-        echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends it", err=True)
+        tell_where(server, exposed)
         with stopping_on_signals(player.stop), showing(player.status, _words):
             summary = player.run()
     _tell(summary)

@@ -19,8 +19,21 @@ from rig.cli.can_output import (
     CanSocketcand,
     can_output,
 )
+from rig.cli.connection import exposure, tell_where
 from rig.cli.display import all_lateness, end_with, lateness, showing, stopping_on_signals
-from rig.cli.options import Changes, DurationS, Engine, Expose, Listen, Parameters, SceneName, Seed, pairs
+from rig.cli.options import (
+    Changes,
+    DurationS,
+    Engine,
+    Expose,
+    Keys,
+    Listen,
+    Parameters,
+    Plaintext,
+    SceneName,
+    Seed,
+    pairs,
+)
 from rig.cli.tables import echo
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT
@@ -47,7 +60,9 @@ def run(
         float, typer.Option(help="Length of a published block, in ms; the last 3000 are kept for clients that stall.")
     ] = 10.0,
     listen: Listen = DEFAULT_ENDPOINT,
-    expose: Expose = False,
+    expose: Expose = None,
+    tls: Keys = None,
+    plaintext: Plaintext = False,
     parameters: Parameters = None,
     changes: Changes = None,
     engine: Engine = None,
@@ -63,6 +78,7 @@ def run(
     can_slcan: CanSlcan = False,
 ) -> None:
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
+    exposed = exposure(expose, tls, plaintext=plaintext)
     overrides = scene_overrides(changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed)
 
     from rig.pacing import rare_collections
@@ -93,7 +109,7 @@ def run(
         # Before anybody can connect: whoever does is answered at once.
         simulation.warm_up()
     paced = pace is Pace.REAL_TIME
-    with ZenohServer(listen, expose=expose, wait=not paced) as server, ExitStack() as stack:
+    with ZenohServer(listen, exposed=exposed, wait=not paced) as server, ExitStack() as stack:
         if bus is not None:
             stack.enter_context(bus)
         with rare_collections():
@@ -105,7 +121,7 @@ def run(
             if bus is not None:
                 bus.start(paced=paced)
                 echo(f"rig: {bus}", err=True)
-        echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends the run", err=True)
+        tell_where(server, exposed)
         with stopping_on_signals(service.stop), showing(service.status, _words):
             summary = service.run()
     _print_summary(summary)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, console, show
+from rig.cli.connection import Connect, Tls, console, show
 from rig.transport import DEFAULT_ENDPOINT
 
 
@@ -14,7 +14,8 @@ def seek(
     seconds: Annotated[float, typer.Argument(help="Simulated time in the recording, in s.")],
     *,
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
 ) -> None:
     """Let the replay of a recording go on from another position; one that is paused stays so."""
-    with console(connect, "seek") as rig:
+    with console(connect, "seek", tls) as rig:
         show(rig.seek(seconds), "seek")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, console, show
+from rig.cli.connection import Connect, Tls, console, show
 from rig.transport import DEFAULT_ENDPOINT
 
 
@@ -14,7 +14,8 @@ def speed(
     hz: Annotated[float, typer.Argument(metavar="HZ", help="Spin speed [Hz], approached at the drive's ramp rate.")],
     *,
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
 ) -> None:
     """Set the spin speed of a running rig."""
-    with console(connect, "speed") as rig:
+    with console(connect, "speed", tls) as rig:
         show(rig.speed(hz), f"speed {hz:g} Hz")

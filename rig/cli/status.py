@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.connection import Connect, console
+from rig.cli.connection import Connect, Tls, console
 from rig.cli.tables import echo, shown, table_console
 from rig.transport import DEFAULT_ENDPOINT
 
@@ -24,11 +24,12 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="The whole status document, as JSON.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Again twice a second, until Ctrl-C or the end.")] = False,
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
 ) -> None:
     """Show time, pace, lateness, losses, clients and doubts of a running rig."""
-    with console(connect, "status") as rig:
+    with console(connect, "status", tls) as rig:
         if not watch:
-            document = rig.status()
+            document = _ask(rig)
             if as_json:
                 echo(json.dumps(document, indent=2))
             else:
@@ -58,17 +59,21 @@ def _documents(rig: Console) -> Iterator[dict[str, Any]]:
 
     from rig.transport import NoReplyError
 
-    document = rig.status()
+    document = _ask(rig)
     while True:
         yield document
         if document["state"] != "running":
             return
         time.sleep(0.5)
         try:
-            document = rig.status()
+            document = _ask(rig)
         except NoReplyError:
             # It ended, and was gone before it could be asked again.
             return
+
+
+def _ask(rig: Console) -> dict[str, Any]:
+    return {**rig.status(), "connection": rig.connection}
 
 
 def _print(document: dict[str, Any]) -> None:
@@ -117,6 +122,8 @@ def status_table(document: dict[str, Any]) -> Table:
     counts = document["congestion"]
     links = [f"{name} {value:g}" for name, value in counts.items() if not name.startswith("can_")]
     table.add_row("links", ", ".join(links) or "-")
+    if document.get("connection"):
+        table.add_row("connection", document["connection"])
     if "can_load" in counts:
         shares = [f"load at most {100 * counts['can_load']:.1f} %"]
         shares += [

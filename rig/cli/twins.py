@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
-from rig.cli.connection import Connect
+from rig.cli.connection import Connect, Tls
 from rig.cli.display import stopping_on_signals
 from rig.cli.tables import echo
 from rig.errors import InputError, RefusedError
@@ -23,6 +23,7 @@ def twins(
     ] = None,
     listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where they listen with --zenoh.")] = INSTRUMENTS,
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
 ) -> None:
     """Serve the six instruments of a running rig to their drivers; Ctrl-C switches them off."""
     import threading
@@ -34,7 +35,7 @@ def twins(
         raise InputError("rig twins", "given --zenoh, --pty or --can SPEC, or several of them", "none")
     done = threading.Event()
     try:
-        with ZenohClient(connect) as client, Twins(client) as serving:
+        with ZenohClient(connect, tls=tls) as client, Twins(client) as serving:
             if zenoh:
                 serving.serve_zenoh(listen)
             if pty:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.connection import Connect
+from rig.cli.connection import Connect, Tls
 from rig.cli.options import Force, OptionalRecordingFiles
 from rig.cli.tables import echo
 from rig.errors import InputError, RefusedError, check_new_file
@@ -28,6 +28,7 @@ def view(
     *,
     live: Annotated[bool, typer.Option("--live", help="View the running rig.")] = False,
     connect: Connect = DEFAULT_ENDPOINT,
+    tls: Tls = None,
     wait_s: Annotated[float, typer.Option(help="Wait that long for the rig to be there, in s (with --live).")] = 5.0,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
     save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening a viewer.")] = None,
@@ -48,7 +49,7 @@ def view(
     try:
         with _interruptible():
             if live:
-                _view_live(connect, wait_s=wait_s, web=web, save=save)
+                _view_live(connect, tls=tls, wait_s=wait_s, web=web, save=save)
             elif files:
                 _view_file(files, web=web, save=save, screenshot=screenshot, at_s=at_s)
     except WindowError as error:
@@ -117,14 +118,14 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
             _wait_for_the_end(shown)
 
 
-def _view_live(connect: str, *, wait_s: float, web: bool, save: Path | None) -> None:
+def _view_live(connect: str, *, tls: Path | None, wait_s: float, web: bool, save: Path | None) -> None:
     from recorder.viewer import blueprint, live, window
     from recorder.viewer.canvas import Canvas, new_stream
     from rig.transport import NoReplyError
     from rig.transport.zenoh import ZenohClient
 
     try:
-        client = ZenohClient(connect, wait_s=wait_s)
+        client = ZenohClient(connect, wait_s=wait_s, tls=tls)
     except NoReplyError as error:
         raise RefusedError(str(error)) from None
     with client:

@@ -12,6 +12,8 @@ from typing import Protocol
 
 DEFAULT_ENDPOINT = "127.0.0.1:7460"
 """Where a rig listens, and clients look for one, unless told otherwise."""
+EXPOSED_PORT = 7463
+"""Port of a rig on a host that it is exposed on, unless told otherwise."""
 
 
 class NoReplyError(ConnectionError):

@@ -1,4 +1,4 @@
-"""Server and client over zenoh: loopback TCP between two peers, no router, no multicast, no gossip.
+"""Server and client over zenoh: TCP on the loopback, TLS beyond it, between two peers; no router, multicast or gossip.
 
 The server publishes without waiting (a stalled subscriber must not delay it) and keeps the last messages of each key;
 a lossless client notices from the numbers of the messages what it did not get, and fetches it from there.
@@ -14,15 +14,20 @@ import os
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rig import wire
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
+from rig.transport.access import Verb, allows, rules
+
+if TYPE_CHECKING:
+    from rig.transport.certificates import Holder
 
 LOOPBACK_HOSTS = ("127.0.0.1", "localhost")
 
@@ -50,6 +55,12 @@ _ATTEMPTS = 4
 _RETRY_S = 0.25
 _RING = 2000
 """Messages that a subscriber which may lose some holds: about 2 s of all streams."""
+_FROM_CLIENTS = {"transport/link/rx/max_message_size": 1 << 20}
+"""The largest that a server takes: requests have at most 64 kB. What it sends is not bounded by this."""
+_FROM_AFAR = {"transport/unicast/max_sessions": 32, "transport/unicast/accept_pending": 8}
+"""Where it is exposed; a client that subscribes has two sessions."""
+_OPENING_S, _OPENING_TLS_S = 0.5, 2.0
+"""How long one attempt to connect may take: beyond the loopback it is several times there and back."""
 
 
 def parse_endpoint(text: str, *, field: str = "endpoint") -> tuple[str, int]:
@@ -68,10 +79,10 @@ def check_free(endpoint: str, *, field: str = "listen") -> None:
     """Find out early whether an address can be listened on; what takes it meanwhile is found when it is.
 
     Raises:
-        InputError: It is malformed, in use, or none of this machine.
+        InputError: It is malformed, in use, or not of this machine alone.
     """
-    host, port = parse_endpoint(endpoint, field=field)
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+    host, port = parse_loopback(endpoint, field=field)
+    with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
@@ -84,9 +95,22 @@ def _not_free(field: str, endpoint: str, *, in_use: bool) -> InputError:
     return InputError(field, must if in_use else "an address of this machine that can be listened on", endpoint)
 
 
-def _locator(host: str, port: int) -> str:
+def parse_loopback(text: str, *, field: str) -> tuple[str, int]:
+    """Split HOST:PORT of a door that asks nobody who they are, and so is not open to other machines.
+
+    Raises:
+        InputError: It is not of that form, or not of this machine alone.
+    """
+    host, port = parse_endpoint(text, field=field)
+    if host not in LOOPBACK_HOSTS:
+        tunnel = f"ssh -L {port}:127.0.0.1:{port} USER@HOST"
+        raise InputError(field, f"on 127.0.0.1, since there is no password; from another machine: {tunnel}", text)
+    return host, port
+
+
+def _locator(host: str, port: int, *, tls: bool = False) -> str:
     # "localhost" may resolve to ::1 first, where nobody listens.
-    return f"tcp/{'127.0.0.1' if host == 'localhost' else host}:{port}"
+    return f"{'tls' if tls else 'tcp'}/{'127.0.0.1' if host == 'localhost' else host}:{port}"
 
 
 def _config(**settings: Any) -> Any:
@@ -100,6 +124,8 @@ def _config(**settings: Any) -> Any:
         "scouting/gossip/enabled": False,
         # Blocks are of a few kB: shared memory saves nothing and would leave segments behind when a process is killed.
         "transport/shared_memory/enabled": False,
+        "transport/unicast/compression/enabled": False,
+        "adminspace/enabled": False,
         "transport/link/tx/lease": round(_LEASE_S * 1000),
         "transport/link/tx/keep_alive": 30,
         # Recovered messages wait for room in their link, and while they do, the publisher of that key waits for its
@@ -210,32 +236,58 @@ def _fifo() -> Any:
     return zenoh.handlers.FifoChannel(256)
 
 
-class ZenohServer:
-    """The rig's side: listens on one address.
+class Exposure(NamedTuple):
+    """Where a rig listens beyond the loopback.
 
     Args:
-        endpoint: HOST:PORT to listen on.
-        expose: Allow a host other than loopback.
+        endpoint: HOST:PORT.
+        holder: The rig's own certificate and who may connect; None lets everybody in, unencrypted.
+    """
+
+    endpoint: str
+    holder: Holder | None
+
+
+class ZenohServer:
+    """The rig's side: listens on the loopback, and elsewhere where it is told to.
+
+    Whoever connects may do what `rig.transport.access` says.
+
+    Args:
+        endpoint: HOST:PORT to listen on, on the loopback.
+        exposed: Where else.
         wait: Make `publish` wait for slow subscribers (at most 5 s, then their link is closed and they recover from
             the cache) instead of letting them recover later. For runs that are not paced by the wall clock: there the
             cache would hold a much shorter wall time.
 
     Raises:
-        InputError: The endpoint is malformed, in use, or not on loopback without `expose`.
+        InputError: An endpoint is malformed, in use, or `endpoint` not on the loopback.
     """
 
-    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, expose: bool = False, wait: bool = False) -> None:
+    def __init__(
+        self, endpoint: str = DEFAULT_ENDPOINT, *, exposed: Exposure | None = None, wait: bool = False
+    ) -> None:
         import zenoh
 
-        host, port = parse_endpoint(endpoint, field="listen")
-        if host not in LOOPBACK_HOSTS and not expose:
-            raise InputError("listen", "on 127.0.0.1 unless --expose is given as well", endpoint)
+        host, port = parse_loopback(endpoint, field="listen")
+        self._ports = {port}
+        locators = [_locator(host, port)]
+        settings: dict[str, Any] = dict(_FROM_CLIENTS)
+        if exposed is not None:
+            host, port = parse_endpoint(exposed.endpoint, field="expose")
+            self._ports.add(port)
+            locators.append(_locator(host, port, tls=exposed.holder is not None))
+            settings |= _FROM_AFAR
+            if exposed.holder is not None:
+                settings["transport/link/tls"] = exposed.holder.settings(listens=True)
         try:
-            self._session = _Session(_config(listen__endpoints=[_locator(host, port)], connect__endpoints=[]))
+            self._session = _Session(_config(listen__endpoints=locators, access_control=rules(), **settings))
         except zenoh.ZError as error:
-            raise _not_free("listen", endpoint, in_use="in use" in str(error)) from None
+            field, where = "listen", endpoint
+            if exposed is not None and f"{host}:{port}" in str(error):
+                field, where = "expose", exposed.endpoint
+            raise _not_free(field, where, in_use="in use" in str(error)) from None
         self.endpoint = endpoint
-        self._port = port
         self._congestion_control = zenoh.CongestionControl.BLOCK if wait else zenoh.CongestionControl.DROP
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []
@@ -331,15 +383,18 @@ class ZenohServer:
         A put waits once, for 1 ms, when a link's queue fills, and drops at once from then on: `slow_puts` counts
         the beginnings of long stalls, not their length. What shows a stall at once and as long as it lasts is the
         number of bytes that its link holds unread (`backlog_bytes`: the largest of all links, 0 where the operating
-        system does not tell). `stalls` counts how often a link was found stalled that was not in the call before.
+        system does not tell). `stalls` counts how often a link was found stalled that was not in the call before;
+        `links_NAME` are those whose certificate has that name.
         """
         links = list(self._session.session.info.links())
-        backlog = _backlog(self._port)
+        names = Counter(f"links_{link.auth_identifier}" for link in links if link.auth_identifier is not None)
+        backlog = {other: size for port in self._ports for other, size in _backlog(port).items()}
         stalled = {port for port, size in backlog.items() if size > _STALLED_BYTES}
         self._stalls += len(stalled - self._stalled)
         self._stalled = stalled
         return {
             "links": len(links),
+            **names,
             "stalled_links": len(stalled),
             "stalls": self._stalls,
             "backlog_bytes": max(backlog.values(), default=0),
@@ -351,7 +406,8 @@ class ZenohServer:
         """Send the last replies, and close the session and with it all that was declared."""
         self._replies.put(None)
         # zenoh waits for some seconds until a stalled link takes the farewell.
-        _hang_up(self._port, {port for port, size in _backlog(self._port).items() if size > _STALLED_BYTES})
+        for port in self._ports:
+            _hang_up(port, {other for other, size in _backlog(port).items() if size > _STALLED_BYTES})
         self._session.close()
 
     def __enter__(self) -> ZenohServer:
@@ -560,14 +616,20 @@ class ZenohClient:
     Args:
         endpoint: HOST:PORT of the rig.
         wait_s: How long to wait for a rig to be there [s]; may be infinite.
+        tls: Folder with the keys of a role (`rig keys init`), for a rig that is exposed; None connects without.
 
     Raises:
-        InputError: The endpoint is malformed.
-        NoReplyError: No rig was there in time.
+        InputError: The endpoint is malformed, or the folder holds no keys.
+        NoReplyError: No rig was there in time, or it does not let us in.
     """
 
-    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0) -> None:
+    def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0, tls: Path | str | None = None) -> None:
         self._host, self._port = parse_endpoint(endpoint, field="connect")
+        self._holder: Holder | None = None
+        if tls is not None:
+            from rig.transport.certificates import holder_in
+
+            self._holder = holder_in(tls, server=False)
         self.endpoint = endpoint
         self._declared: list[Any] = []
         self._rigs: set[str] = set()
@@ -602,25 +664,51 @@ class ZenohClient:
         import zenoh
 
         deadline = time.monotonic() + wait_s
+        longest_s, settings = _OPENING_S, {}
+        if self._holder is not None:
+            longest_s, settings = _OPENING_TLS_S, {"transport/link/tls": self._holder.settings(listens=False)}
         while True:
             left = deadline - time.monotonic()
             config = _config(
                 listen__endpoints=[],
-                connect__endpoints=[_locator(self._host, self._port)],
+                connect__endpoints=[_locator(self._host, self._port, tls=self._holder is not None)],
                 # Opening waits for the link, so that the first request cannot come too early; in slices, so that
                 # Ctrl-C works meanwhile.
-                connect__timeout_ms=round(1000 * min(0.5, max(left, 0.05))),
+                connect__timeout_ms=round(1000 * min(longest_s, max(left, 0.05))),
                 connect__exit_on_failure=True,
                 connect__retry={"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
+                **settings,
             )
             try:
                 return _Session(config)
             except zenoh.ZError:
                 if time.monotonic() >= deadline:
-                    raise self._no_reply() from None
+                    raise self._not_let_in() from None
+
+    def _not_let_in(self) -> NoReplyError:
+        """Whether nobody is there, or somebody who does not let us in."""
+        try:
+            if self._holder is None:
+                socket.create_connection((self._host, self._port), timeout=1.0).close()
+                why = "without a certificate: for a rig that is exposed give --tls FOLDER; else it is no rig, or hangs"
+            elif (said := self._holder.turned_away(self._host, self._port)) is not None:
+                why = f"as {self._holder.name}, by the keys in {self._holder.folder}: {said}"
+            else:
+                why = "though its certificates are right: it has too many links, or hangs"
+        except OSError:
+            return self._no_reply()
+        return NoReplyError(f"{self.endpoint} listens, but does not let us in {why}")
 
     def _no_reply(self) -> NoReplyError:
         return NoReplyError(f"no rig answers at {self.endpoint}; start one with: rig run hammer (see rig run --help)")
+
+    @property
+    def connection(self) -> str | None:
+        """By which certificates both ends know each other; None without TLS."""
+        if self._holder is None:
+            return None
+        rig = next((link.auth_identifier for link in self._session.session.info.links()), None)
+        return f"TLS as {self._holder.name}, valid until {self._holder.expires:%Y-%m-%d}; the rig is {rig}"
 
     def subscribe(
         self,
@@ -717,8 +805,14 @@ class ZenohClient:
                     return payload_back
                 if (text := payload_back.decode(errors="replace")) != "Timeout":
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
-            # Without a rig the reply is empty at once: it may be about to start.
-            if time.monotonic() + 0.05 >= deadline:
+            # Without a rig the reply is empty at once: it may be about to start. So it is where the rig denies this.
+            late = time.monotonic() + 0.05 >= deadline
+            role = None if self._holder is None else self._holder.name
+            denied = not allows(role, Verb.ASK, key)
+            if (late or denied) and self.tokens(wire.ALIVE):
+                what = f"denies {key} to {role or 'everybody'}" if denied else f"does not answer {key}"
+                raise NoReplyError(f"the rig at {self.endpoint} {what}")
+            if late:
                 raise self._no_reply()
             time.sleep(0.05)
 

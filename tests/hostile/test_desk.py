@@ -15,6 +15,7 @@ from rig.pacing import Lockstep
 from rig.scenes import COMMANDS as DONE_TO_THE_RIG
 from rig.scenes import parse_command
 from rig.service import COMMANDS, Service
+from rig.transport.limit import CommandLimit
 from rig.transport.memory import MemoryClient, MemoryServer
 from tests.hostile import inputs
 from tests.hostile.documents import documents
@@ -50,8 +51,10 @@ class Checked(FakeSimulation):
 @pytest.fixture
 def served() -> Any:
     """A run in lockstep, served on a thread: simulation, client, and what its service finds."""
-    server, simulation = MemoryServer(cache=0), Checked()
-    service = Service(simulation, server, Lockstep(), block_ticks=10_000, status_period_s=0.05, linger_s=0.0)
+    server, simulation, unbound = MemoryServer(cache=0), Checked(), CommandLimit(1e9, 10**9)
+    service = Service(
+        simulation, server, Lockstep(), block_ticks=10_000, status_period_s=0.05, linger_s=0.0, limit=unbound
+    )
     service.prepare()
     summary: dict[str, Any] = {}
     thread = threading.Thread(target=lambda: summary.update(service.run()))

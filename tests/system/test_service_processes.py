@@ -148,7 +148,7 @@ with ZenohClient(endpoint, wait_s=10.0) as client:
     client.subscribe("rig/sensors/a", lambda _, payload: numbers.append(int.from_bytes(payload[:8], "little")),
                      on_miss=lambda key, count: missed.append(count), history=True)
     until(1)
-    client.request("rig/ready", timeout_s=10.0)
+    client.request("rig/scene", timeout_s=10.0)
     until(total)
 print(len(numbers), numbers == sorted(set(numbers)), sum(missed))
 """
@@ -166,7 +166,7 @@ def stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
             ready.set()
             return b""
 
-        server.answer("rig/ready", answer)
+        server.answer("rig/scene", answer)
         server.publish("rig/sensors/a", (0).to_bytes(8, "little"))
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         with subprocess.Popen(

@@ -433,10 +433,10 @@ def test_no_door_of_the_bus_is_open_to_other_machines_whatever_is_asked(place: s
         r"must be on 127\.0\.0\.1, since there is no password; from another machine: ssh -L 29536:127.0.0.1:29536 "
     )
     for opening in (
-        lambda: run("hammer", can="virtual:x", can_socketcand=place, expose=True, listen=free_endpoint()),
+        lambda: run("hammer", can="virtual:x", can_socketcand=place, listen=free_endpoint()),
         lambda: CanOutput("virtual:x", socketcand=place),
         lambda: CanOutlets({}, speed("1M"), socketcand=place),
-        lambda: run("hammer", can=f"zenoh:can0?endpoint={place}", expose=True, listen=free_endpoint()),
+        lambda: run("hammer", can=f"zenoh:can0?endpoint={place}", listen=free_endpoint()),
         lambda: hub(["can0"], socketcand=place),
         lambda: hub(["can0"], listen=place),
         lambda: Twins(MemoryClient(MemoryServer())).serve_zenoh(place),

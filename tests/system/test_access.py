@@ -1,0 +1,342 @@
+"""Who may say what to a live rig: every row of the table, tried by everybody that it names, and by those it does not.
+
+Each subject does everything that it can with every key: it subscribes, fetches history, asks, puts, deletes, answers
+and shows tokens. What came of it, at the rig and at an honest client beside it, must be what the table says.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh  # noqa: TID253
+from cryptography import x509  # noqa: TID253
+from cryptography.hazmat.primitives.asymmetric import ec  # noqa: TID253
+from cryptography.x509.oid import ExtendedKeyUsageOID as Usage  # noqa: TID253
+
+from rig.errors import InputError
+from rig.transport import NoReplyError
+from rig.transport.access import DOORS, PLAIN, ROLES, WITH_TRUTH, Door, Verb, allows, doors_of
+from rig.transport.certificates import SIGNER, _host, _Issue, _write, holder_in, make
+from rig.transport.zenoh import Exposure, ZenohClient, ZenohServer
+from tests.unit.test_transport_zenoh import free_endpoint, until
+
+pytestmark = pytest.mark.wallclock
+
+NAMES = [name for role in ROLES for name in (role, role + WITH_TRUTH)]
+STRANGER = "stranger"
+KEYS = sorted({key for door in DOORS for key in door.keys})
+FORGED = b"forged"
+
+
+def example(pattern: str, chunk: str = "a") -> str:
+    return pattern.replace("**", chunk).replace("*", chunk)
+
+
+def everything(session: zenoh.Session, selector: str) -> Iterator[zenoh.Reply]:
+    """All replies, also where several have one key."""
+    none, anything = zenoh.ConsolidationMode.NONE, zenoh.ReplyKeyExpr.ANY
+    return iter(session.get(selector, timeout=2.0, consolidation=none, accept_replies=anything))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One authority's certificates for every name there is, for one that is no role, and for one that has expired."""
+    folder = tmp_path_factory.mktemp("keys")
+    signing = ec.generate_private_key(ec.SECP256R1())
+    issue, late = _Issue(signing, timedelta(days=1)), _Issue(signing, timedelta(minutes=-1))
+    authority = issue.certificate(SIGNER, signing, None, [])
+    hosts = [_host("127.0.0.1"), _host("localhost")]
+    for holder, name, by, usage in (
+        ("server", "the rig", issue, Usage.SERVER_AUTH),
+        ("expired", "operator", late, Usage.CLIENT_AUTH),
+        *((name, name, issue, Usage.CLIENT_AUTH) for name in (*NAMES, STRANGER)),
+    ):
+        key = ec.generate_private_key(ec.SECP256R1())
+        subjects = hosts if usage is Usage.SERVER_AUTH else [x509.DNSName("client")]
+        _write(folder / holder, authority, by.certificate(name, key, usage, subjects), key)
+    make(folder / "others", days=1)
+    return folder
+
+
+def settings_in(folder: Path) -> dict[str, Any]:
+    """As `Holder.settings`, of a folder that our own checks would refuse."""
+    return {
+        "root_ca_certificate": str(folder / "authority.pem"),
+        "connect_certificate": str(folder / "certificate.pem"),
+        "connect_private_key": str(folder / "key.pem"),
+        "enable_mtls": True,
+    }
+
+
+@contextmanager
+def hostile(locator: str, mode: str = "client", folder: Path | None = None) -> Iterator[zenoh.Session]:
+    """A session of zenoh's own, without any of our manners."""
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "listen/endpoints": [],
+        "connect/endpoints": [locator],
+        "connect/timeout_ms": 1000,
+        "connect/exit_on_failure": True,
+    }
+    if folder is not None:
+        settings["transport/link/tls"] = settings_in(folder)
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as session:
+        yield session
+
+
+class Rig:
+    """Every key of the table in use, and a client of either mode that listens to everything."""
+
+    def __init__(self, server: ZenohServer) -> None:
+        self.heard: set[str] = set()
+        self.shown: set[str] = set()
+        self.server = server
+        for door in DOORS:
+            for pattern in door.keys:
+                key = example(pattern)
+                if door.verb is Verb.ASK:
+                    server.answer(key, lambda _: b"honest")
+                elif door.verb is Verb.RECEIVE:
+                    server.publish(key, b"honest")
+                elif door.verb is Verb.SEND:
+                    server.hear(pattern, lambda key, _: self.heard.add(key))
+                elif door.verb is Verb.SHOW:
+                    server.watch(pattern, lambda key, there: self.shown.add(key) if there else None)
+
+    def publish(self) -> None:
+        for key in receivable(DOORS):
+            self.server.publish(key, b"honest")
+
+    def announce(self) -> None:
+        for door in DOORS:
+            if door.verb is Verb.WATCH:
+                self.server.announce(example(door.keys[0]))
+
+
+def keys_of(doors: tuple[Door, ...], verb: Verb) -> set[str]:
+    return {example(key) for door in doors if door.verb is verb for key in door.keys}
+
+
+def receivable(doors: tuple[Door, ...]) -> set[str]:
+    return keys_of(doors, Verb.RECEIVE)
+
+
+class Try:
+    """All that somebody does at once, and what it sees of it."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
+        self.received: set[str] = set()
+        self.heartbeats: set[str] = set()
+        self.kept: list[Any] = []
+        self.tokens: list[Any] = []
+        every = [*map(example, KEYS), "rig/**"]
+        for key in every:
+            self._listen(key, lambda sample: self.received.add(str(sample.key_expr)))
+            beat = f"{key}/@adv/pub/**"
+            self._listen(beat, lambda sample: self.heartbeats.add(str(sample.key_expr).partition("/@adv")[0]))
+            self.kept.append(session.declare_queryable(key, lambda query: query.reply(query.key_expr, FORGED)))
+            self.kept.append(session.declare_queryable(f"{key}/@adv/**", lambda query: query.reply("rig/a", FORGED)))
+        for pattern in KEYS:
+            self.tokens.append(session.liveliness().declare_token(example(pattern)))
+            # Not to its own subscriptions.
+            for _ in range(5):
+                session.put(example(pattern), FORGED, allowed_destination=zenoh.Locality.REMOTE)
+            session.delete(example(pattern), allowed_destination=zenoh.Locality.REMOTE)
+
+    def _listen(self, key: str, callback: Callable[[Any], None]) -> None:
+        self.kept.append(self.session.declare_subscriber(key, callback))
+
+    def answered(self, selector: str) -> set[str]:
+        replies = everything(self.session, selector)
+        return {str(reply.ok.key_expr) for reply in replies if reply.ok and reply.ok.payload.to_bytes() == b"honest"}
+
+    def history(self) -> set[str]:
+        keys = {example(key) for key in KEYS}
+        return set.union(*(self.answered(f"{key}/@adv/**?_max=1") for key in (*keys, "rig/**")))
+
+    def sees(self, key: str) -> bool:
+        return any(reply.ok for reply in self.session.liveliness().get(key, timeout=2.0))
+
+
+SUBJECTS = [
+    pytest.param(None, "client", id=f"{PLAIN}, client"),
+    pytest.param(None, "peer", id=f"{PLAIN}, peer"),
+    *(pytest.param(name, mode, id=f"{name}, {mode}") for name, mode in zip(NAMES, ["client", "peer"] * 3, strict=True)),
+    pytest.param(STRANGER, "client", id="certificate of no role"),
+]
+
+
+@pytest.mark.parametrize(("name", "mode"), SUBJECTS)
+def test_everybody_may_do_what_the_table_says_and_nothing_else(name: str | None, mode: str, folders: Path) -> None:
+    plain, exposed = free_endpoint(), free_endpoint()
+    doors = doors_of(name)
+    seen: list[tuple[str, bytes]] = []
+    with (
+        ZenohServer(plain, exposed=Exposure(exposed, holder_in(folders / "server", server=True))) as server,
+        ZenohClient(plain) as honest,
+        hostile(f"tcp/{plain}") as beside,
+        hostile(f"tcp/{plain}" if name is None else f"tls/{exposed}", mode, name and folders / name) as session,
+    ):
+        rig = Rig(server)
+        honest.subscribe("rig/**", lambda key, payload: seen.append((key, payload)), lossless=False)
+        beside.declare_subscriber("rig/**", lambda sample: seen.append((str(sample.key_expr), bytes(sample.payload))))
+        attempt = Try(session)
+        # What a subject may ask for is answered in the order of its link: behind the answer everything has been taken.
+        answers = {key: attempt.answered(key) for key in map(example, KEYS)}
+        history = attempt.history()
+        time.sleep(0.3)
+        rig.publish()
+        allowed = receivable(doors)
+        until(lambda: allowed <= attempt.received and allowed <= attempt.heartbeats, timeout_s=5.0)
+        until(lambda: rig.heard >= keys_of(doors, Verb.SEND) and rig.shown >= keys_of(doors, Verb.SHOW), timeout_s=5.0)
+        # Nobody has been asked to believe anything yet: what an honest client gets is the rig's own, or nothing.
+        forged_tokens = {
+            key for door in DOORS if door.verb is Verb.WATCH for key in honest.tokens(example(door.keys[0]))
+        }
+        asked = {honest.request(key) for key in keys_of(DOORS, Verb.ASK)}
+        selectors = ("rig/command/unknown", "rig/**", "rig/**/@adv/**?_max=1", "rig/sensors/unknown/@adv/**")
+        victims = (honest._session.session, beside)
+        replies = [reply for victim in victims for selector in selectors for reply in everything(victim, selector)]
+        for token in attempt.tokens:
+            token.undeclare()
+        rig.announce()
+        until(lambda: all(map(attempt.sees, keys_of(doors, Verb.WATCH))))
+        tokens = {key for key in keys_of(DOORS, Verb.WATCH) if attempt.sees(key)}
+        until(lambda: len({key for key, _ in seen}) >= len(receivable(DOORS)))
+        assert {key for key, found in answers.items() if found} == keys_of(doors, Verb.ASK)
+        assert attempt.received == allowed
+        assert attempt.heartbeats == allowed
+        assert history == allowed
+        assert rig.heard == keys_of(doors, Verb.SEND)
+        assert {key for key in rig.shown if key in map(example, KEYS)} == keys_of(doors, Verb.SHOW)
+        assert tokens == keys_of(doors, Verb.WATCH)
+        assert forged_tokens == set()
+        assert asked == {b"honest"}
+        assert FORGED not in {bytes(reply.result.payload) for reply in replies}
+        assert {payload for _, payload in seen} == {b"honest"}, "nothing that a client puts reaches another"
+
+
+@pytest.mark.parametrize(
+    ("who", "why"),
+    [
+        ("others/operator", "of another authority"),
+        ("expired", "expired"),
+        ("server", "the rig's own, which is no client's"),
+        (None, "none"),
+    ],
+    ids=["wrong authority", "expired", "the rig's", "no certificate"],
+)
+def test_without_a_valid_certificate_nobody_is_let_in(who: str | None, why: str, folders: Path) -> None:
+    plain, exposed = free_endpoint(), free_endpoint()
+    holder = holder_in(folders / "server", server=True)
+    with ZenohServer(plain, exposed=Exposure(exposed, holder)) as server:
+        server.announce()
+        for locator in (f"tls/{exposed}", f"tcp/{exposed}"):
+            with pytest.raises(zenoh.ZError), hostile(locator, folder=who and folders / who):
+                pytest.fail(f"let in by {locator}, though its certificate is {why}")
+        # And somebody who is let in still is.
+        with hostile(f"tls/{exposed}", folder=folders / "viewer"):
+            until(lambda: server.congestion().get("links_viewer") == 1)
+
+
+def test_a_link_ends_when_its_certificate_does(folders: Path, tmp_path: Path) -> None:
+    plain, exposed = free_endpoint(), free_endpoint()
+    signing = ec.generate_private_key(ec.SECP256R1())
+    issue, brief = _Issue(signing, timedelta(days=1)), _Issue(signing, timedelta(seconds=4))
+    authority = issue.certificate(SIGNER, signing, None, [])
+    for holder, by, usage in (("server", issue, Usage.SERVER_AUTH), ("viewer", brief, Usage.CLIENT_AUTH)):
+        key = ec.generate_private_key(ec.SECP256R1())
+        _write(tmp_path / holder, authority, by.certificate(holder, key, usage, [_host("127.0.0.1")]), key)
+    with (
+        ZenohServer(plain, exposed=Exposure(exposed, holder_in(tmp_path, server=True))) as server,
+        hostile(f"tls/{exposed}", folder=tmp_path / "viewer"),
+    ):
+        assert server.congestion()["links_viewer"] == 1
+        until(lambda: "links_viewer" not in server.congestion(), timeout_s=10.0)
+
+
+def test_clients_say_why_they_are_not_let_in_and_what_is_denied(folders: Path) -> None:
+    plain, exposed = free_endpoint(), free_endpoint()
+    with ZenohServer(plain, exposed=Exposure(exposed, holder_in(folders / "server", server=True))) as server:
+        server.answer("rig/command/hammer", lambda _: b"hit")
+        server.answer("rig/status", lambda _: b"well")
+        server.announce()
+        with ZenohClient(exposed, tls=folders / "viewer") as viewer:
+            assert viewer.request("rig/status") == b"well"
+            assert str(viewer.connection).startswith("TLS as viewer, valid until ")
+            assert str(viewer.connection).endswith("; the rig is the rig")
+            before = time.monotonic()
+            with pytest.raises(NoReplyError, match=rf"^the rig at {exposed} denies rig/command/hammer to viewer$"):
+                viewer.request("rig/command/hammer", timeout_s=10.0)
+            assert time.monotonic() - before < 2.0, "a denial is told at once"
+            with pytest.raises(NoReplyError, match=rf"^the rig at {exposed} does not answer rig/parameters$"):
+                viewer.request("rig/parameters", timeout_s=0.2)
+        for endpoint, tls, message in (
+            (exposed, None, "without a certificate: for a rig that is exposed give --tls"),
+            (
+                exposed,
+                folders / "others" / "viewer",
+                r"as viewer, by the keys in .*: .*\(keys of another rig",
+            ),
+            (plain, folders / "viewer", "as viewer, .*: no TLS is spoken there"),
+        ):
+            with pytest.raises(NoReplyError, match=rf"^{endpoint} listens, but does not let us in {message}"):
+                ZenohClient(endpoint, wait_s=0.2, tls=tls)
+    with pytest.raises(NoReplyError, match=f"^no rig answers at {exposed}"):
+        ZenohClient(exposed, wait_s=0.2, tls=folders / "viewer")
+    for folder in ("server", "expired", "nowhere"):
+        with pytest.raises(InputError, match=r"^--tls must be a"):
+            ZenohClient(exposed, tls=folders / folder)
+
+
+def test_an_exposed_rig_takes_so_many_links_and_messages_of_so_many_bytes(folders: Path) -> None:
+    plain, exposed = free_endpoint(), free_endpoint()
+    heard: list[int] = []
+    with ExitStack() as stack:
+        holder = holder_in(folders / "server", server=True)
+        server = stack.enter_context(ZenohServer(plain, exposed=Exposure(exposed, holder)))
+        server.hear("rig/clients/*", lambda _, payload: heard.append(len(payload)))
+        session = stack.enter_context(hostile(f"tls/{exposed}", folder=folders / "recorder"))
+        for size in (100, 500_000, 2 << 20, 101):
+            session.put("rig/clients/a", bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: bool(heard) and heard[-1] == 101)
+        assert heard == [100, 500_000, 101]
+        for _ in range(31):
+            stack.enter_context(hostile(f"tls/{exposed}", folder=folders / "viewer"))
+        with pytest.raises(zenoh.ZError), hostile(f"tls/{exposed}", folder=folders / "viewer"):
+            pytest.fail("there is a bound")
+
+
+@pytest.mark.parametrize("busy", ["plain", "exposed"])
+def test_without_its_ports_no_rig_opens(busy: str, folders: Path) -> None:
+    ends = {"plain": free_endpoint(), "exposed": free_endpoint()}
+    exposed = Exposure(ends["exposed"], holder_in(folders / "server", server=True))
+    field = {"plain": "listen", "exposed": "expose"}[busy]
+    with (
+        ZenohServer(ends[busy]),
+        pytest.raises(InputError, match=rf"^{field} must be a free address .*'{ends[busy]}'"),
+        ZenohServer(ends["plain"], exposed=exposed),
+    ):
+        pytest.fail("opened without a port")
+
+
+def test_the_table_names_every_key_once_a_verb_and_no_two_roles_alike() -> None:
+    pairs = [(door.verb, key) for door in DOORS for key in door.keys]
+    assert len(set(pairs)) == len(pairs)
+    assert len({doors_of(name) for name in (None, STRANGER, *NAMES)}) == len(NAMES) + 2
+    assert allows("viewer", Verb.RECEIVE, "rig/sensors/probes")
+    assert not allows("viewer", Verb.RECEIVE, "rig/truth/state")
+    assert allows("viewer" + WITH_TRUTH, Verb.RECEIVE, "rig/truth/state")
+    assert not allows(STRANGER + WITH_TRUTH, Verb.RECEIVE, "rig/truth/state")

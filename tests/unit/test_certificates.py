@@ -1,0 +1,147 @@
+"""`rig keys init`: folders that are whole, private, never lost and never half made; and what --expose asks for."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+import pytest
+
+from rig.cli.connection import exposure
+from rig.cli.main import main
+from rig.errors import InputError
+from rig.transport.access import ROLES
+from rig.transport.certificates import HOLDERS, SERVER, holder_in, make
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_every_holder_gets_a_folder_that_is_whole_and_private(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    assert make(folder, hosts=["lab.example", "192.0.2.7", "::1"], days=2, truth=["viewer"]) == [
+        "lab.example",
+        "192.0.2.7",
+        "::1",
+        "localhost",
+        "127.0.0.1",
+    ]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(HOLDERS)
+    for path in folder.rglob("*"):
+        mode = stat.S_IMODE(path.stat().st_mode)
+        assert mode == (0o700 if path.is_dir() else 0o600 if path.name == "key.pem" else mode)
+        assert not mode & 0o022
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert holder_in(folder, server=True).name == "lab.example"
+    assert holder_in(folder, server=True) == holder_in(folder / SERVER, server=True)
+    assert {role: holder_in(folder / role, server=False).name for role in ROLES} == {
+        "operator": "operator",
+        "recorder": "recorder",
+        "viewer": "viewer+truth",
+    }
+    assert [path.name for path in tmp_path.iterdir()] == ["keys"], "nothing else is left"
+
+
+def test_what_is_there_is_replaced_only_on_purpose_and_only_if_it_is_ours(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    folder.mkdir()
+    make(folder)  # an empty folder holds nothing to lose
+    before = files(folder)
+    with pytest.raises(InputError, match=r"^DIR must be a new folder"):
+        make(folder)
+    (folder / "viewer" / "key.pem").unlink()
+    with pytest.raises(InputError, match=r"^DIR must be a new folder"):
+        make(folder)
+    make(folder, force=True)
+    assert files(folder).keys() == before.keys()
+    assert not set(files(folder).values()) & set(before.values())
+    (folder / "viewer" / "notes.txt").write_text("mine")
+    for other in (folder, folder / "viewer" / "notes.txt"):
+        with pytest.raises(InputError, match=r"^DIR must be a new folder"):
+            make(other, force=True)
+    assert (folder / "viewer" / "notes.txt").read_text() == "mine"
+
+
+def test_a_failure_half_way_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "keys"
+    make(folder)
+    before = files(folder)
+    from rig.transport import certificates
+
+    written: list[Path] = []
+    write = certificates._write
+
+    def fail(folder: Path, *rest: object) -> None:
+        written.append(folder)
+        if len(written) == 3:
+            raise OSError(28, "No space left on device")
+        write(folder, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(certificates, "_write", fail)
+    with pytest.raises(OSError, match="No space"):
+        make(folder, force=True)
+    assert files(folder) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["keys"]
+
+
+@pytest.mark.parametrize("host", ["", "bad host", "a_b", "-a", "a..b", "x" * 65, "*", "lab.example:7463", "ä.example"])
+def test_names_that_are_none_are_refused(host: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^--host must be the name or address"):
+        make(tmp_path / "keys", hosts=[host])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folders_without_keys_are_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "keys"
+    make(folder, days=-0.01)
+    with pytest.raises(InputError, match=r"^--tls must be a certificate that is valid .*, expired'"):
+        holder_in(folder / "viewer", server=False)
+    make(folder, force=True)
+    for wrong, server in ((folder, False), (folder / "server", False), (folder / "viewer", True), (tmp_path, True)):
+        with pytest.raises(InputError, match=r"^--tls must be a folder with the keys of "):
+            holder_in(wrong, server=server)
+    for name, broken in (("certificate.pem", b"\xff\x00 no certificate"), ("key.pem", None)):
+        part = folder / "viewer" / name
+        part.unlink() if broken is None else part.write_bytes(broken)
+        with pytest.raises(InputError, match=r"^--tls must be a folder with the keys of one role"):
+            holder_in(folder / "viewer", server=False)
+
+
+def test_the_command_says_what_goes_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "keys"
+    with pytest.raises(SystemExit) as end:
+        main(["keys", "init", str(folder), "--host", "lab.example", "--truth", "recorder"])
+    assert end.value.code == 0
+    output = capsys.readouterr().out
+    assert f"rig run SCENE --expose lab.example --tls {folder}" in output
+    assert "for the role recorder, who may read the truth; copy it" in output
+    assert "rig status --connect lab.example:7463 --tls viewer" in output
+    for arguments, message in (
+        ((str(folder),), "DIR must be a new folder (--force"),
+        ((str(tmp_path / "b"), "--truth", "nobody"), "--truth must be one of operator, recorder, viewer"),
+        ((str(tmp_path / "c" / "d"),), "DIR must be in a folder that can be written"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(["keys", "init", *arguments])
+        assert end.value.code == 2
+        assert capsys.readouterr().err.startswith(f"rig: {message}")
+
+
+def test_exposure_says_who_may_come_in(tmp_path: Path) -> None:
+    make(tmp_path / "keys")
+    assert exposure(None, None, plaintext=False) is None
+    exposed = exposure("192.0.2.1", tmp_path / "keys", plaintext=False)
+    assert exposed is not None
+    assert exposed.endpoint == "192.0.2.1:7463"
+    assert exposed.holder == holder_in(tmp_path / "keys" / "server", server=True)
+    assert exposure("lab.example:9000", None, plaintext=True) == ("lab.example:9000", None)
+    with pytest.raises(
+        InputError, match=r"--expose must be given with --tls DIR \(made by: rig keys init DIR --host lab"
+    ):
+        exposure("lab.example:9000", None, plaintext=False)
+    with pytest.raises(InputError, match="received 'both'"):
+        exposure("lab.example", tmp_path / "keys", plaintext=True)
+    for keys, plaintext in ((tmp_path / "keys", False), (None, True)):
+        with pytest.raises(InputError, match="given with --expose HOST"):
+            exposure(None, keys, plaintext=plaintext)
