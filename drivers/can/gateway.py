@@ -43,7 +43,7 @@ from drivers.can.signals import (
 from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
-from rig.outside import Outside, check
+from rig.outside import DOCUMENT_BYTES, Outside, check, input_error
 from rig.transport import Client, NoReplyError
 
 if TYPE_CHECKING:
@@ -171,6 +171,13 @@ class _Asked:
     answered: bool = False
 
 
+class _Catalogue(Outside, extra="ignore"):
+    """The rig's channels, as they come."""
+
+    tick_rate_hz: Annotated[int, pydantic.Field(ge=1, le=10**12)]
+    table: dict[str, Any]
+
+
 class _Reply(Outside, extra="ignore"):
     """The rig's answer to a command: when it takes effect, or the field that is wrong and what it must be."""
 
@@ -239,9 +246,13 @@ class Gateway:
         self._load = load
         self._timeout_s = command_timeout_s
         self._now = now
-        catalogue = wire.decode_document(client.request(wire.CATALOGUE, timeout_s=5.0))
-        table = ChannelTable.model_validate(catalogue["table"])
-        self._tick_rate_hz = int(catalogue["tick_rate_hz"])
+        answer = client.request(wire.CATALOGUE, timeout_s=5.0)
+        catalogue = check(_Catalogue, answer, field="catalogue", most_bytes=DOCUMENT_BYTES)
+        try:
+            table = ChannelTable.model_validate(catalogue.table)
+        except pydantic.ValidationError as error:
+            raise input_error(error, "catalogue.table") from None
+        self._tick_rate_hz = catalogue.tick_rate_hz
         self._messages = default_messages()
         self._by_name = self._messages.by_name
         self._rate_hz, self._steps = _steps(table, schedule)

@@ -500,6 +500,23 @@ def test_a_rig_that_does_not_fit_the_messages_is_refused(change: Any, message: s
     assert str(caught.value).startswith(message)
 
 
+@pytest.mark.parametrize(
+    ("payload", "field"),
+    [
+        (b"", "catalogue"),
+        (b"{}", "catalogue.tick_rate_hz"),
+        (b'{"tick_rate_hz":0,"table":{}}', "catalogue.tick_rate_hz"),
+        (b'{"tick_rate_hz":1000000,"table":{"groups":{"x":1}}}', "catalogue.table.groups.x"),
+    ],
+)
+def test_what_is_no_catalogue_is_refused_in_one_line(payload: bytes, field: str) -> None:
+    server = MemoryServer()
+    server.answer(wire.CATALOGUE, lambda _: payload)
+    with pytest.raises(InputError) as caught:
+        Gateway(MemoryClient(server), Stubborn(), Schedule(None, 10_000))
+    assert caught.value.field == field
+
+
 def _calibrated(table: Any) -> Any:
     group = table.groups["probes"]
     rows = (group.channels[0].model_copy(update={"sensitivity_v": 4.0}), *group.channels[1:])
