@@ -395,7 +395,8 @@ class ZenohBus(_MediumBus):
 
     Args:
         channel: Name of the bus.
-        endpoint: HOST:PORT of the hub, on the loopback.
+        endpoint: HOST:PORT of the hub. A host other than 127.0.0.1 must be asked for by `expose`.
+        expose: Allow such a host.
         connect_s: How long to wait for the hub to be there [s].
         **settings: Those of every bus here: can_filters, receive_own_messages, fd, listen_only, rx_queue_size, bitrate,
             data_bitrate, timing.
@@ -409,10 +410,11 @@ class ZenohBus(_MediumBus):
         channel: Any = "can0",
         *,
         endpoint: str = medium.DEFAULT_ENDPOINT,
+        expose: bool = False,
         connect_s: float = 1.0,
         **settings: Any,
     ) -> None:
-        self._address, self._connect_s = str(endpoint), connect_s
+        self._address, self._expose, self._connect_s = str(endpoint), expose, connect_s
         super().__init__(channel, **settings)
         # Only now: a hub that comes back is joined anew, which must not meet the first time.
         self._client.watch(medium.alive_key(self.channel), self._watch)
@@ -420,11 +422,12 @@ class ZenohBus(_MediumBus):
 
     def _connect(self) -> None:
         from rig.transport import NoReplyError
-        from rig.transport.zenoh import ZenohClient, check_loopback, parse_endpoint
+        from rig.transport.zenoh import LOOPBACK_HOSTS, ZenohClient, parse_endpoint
 
         try:
-            host, port = parse_endpoint(self._address)
-            check_loopback(host, port, field="endpoint")
+            host, _ = parse_endpoint(self._address)
+            if host not in LOOPBACK_HOSTS and not self._expose:
+                raise InputError("endpoint", "on 127.0.0.1 unless expose=True is given as well", self._address)
             if not medium.is_name(self.channel):
                 raise InputError("channel", "letters, digits, - and _, such as can0", self.channel)
         except InputError as error:

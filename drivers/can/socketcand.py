@@ -320,6 +320,7 @@ class SocketcandServer:
         buses: By name, what makes a node on the bus: one for each connection.
         host: Where to listen.
         port: Likewise; 0 takes a free one.
+        expose: Allow a host other than 127.0.0.1: there is no password, and all can send.
         room: Bytes that may wait for one client.
         patience_s: How long a client may take nothing of what waits before it is disconnected [s].
 
@@ -333,12 +334,14 @@ class SocketcandServer:
         *,
         host: str = "127.0.0.1",
         port: int = PORT,
+        expose: bool = False,
         room: int = ROOM,
         patience_s: float = PATIENCE_S,
     ) -> None:
-        from rig.transport.zenoh import check_loopback
+        from rig.transport.zenoh import LOOPBACK_HOSTS
 
-        check_loopback(host, port, field="socketcand")
+        if host not in LOOPBACK_HOSTS and not expose:
+            raise InputError("socketcand", "on 127.0.0.1 unless --expose is given as well", f"{host}:{port}")
         self._buses = dict(buses)
         self._room = room
         self._patience_s = patience_s

@@ -21,6 +21,7 @@ class CanOutlets:
         speed: Bit rates of the buses.
         socketcand: HOST:PORT of a server for all of them, or none.
         slcan: Whether each has a port with an adapter.
+        expose: Allow a host other than 127.0.0.1.
 
     Raises:
         InputError: There can be no such server.
@@ -33,6 +34,7 @@ class CanOutlets:
         *,
         socketcand: str | None = None,
         slcan: bool = False,
+        expose: bool = False,
     ) -> None:
         self._server: SocketcandServer | None = None
         self._ports: dict[str, SlcanPort] = {}
@@ -43,7 +45,7 @@ class CanOutlets:
                 from rig.transport.zenoh import parse_endpoint
 
                 host, port = parse_endpoint(socketcand, field="socketcand")
-                self._server = stack.enter_context(SocketcandServer(buses, host=host, port=port))
+                self._server = stack.enter_context(SocketcandServer(buses, host=host, port=port, expose=expose))
             if slcan:
                 from drivers.can.slcan_port import SlcanPort
 

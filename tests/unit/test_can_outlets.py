@@ -415,13 +415,13 @@ def test_random_bytes_do_no_harm() -> None:
         until(lambda: any(same(CLASSIC[0], found) for found in iter(lambda: other.recv(0), None)))
 
 
-def test_a_server_keeps_to_this_machine() -> None:
-    with pytest.raises(InputError, match=r"socketcand must be on 127\.0\.0\.1 \(from elsewhere: ssh -L 29536:"):
-        SocketcandServer({}, host="0.0.0.0", port=29536)
+def test_a_server_keeps_to_this_machine_unless_asked() -> None:
+    with pytest.raises(InputError, match=r"socketcand must be on 127\.0\.0\.1 unless --expose .*'0\.0\.0\.0:0'"):
+        SocketcandServer({}, host="0.0.0.0", port=0)
+    with SocketcandServer({}, host="0.0.0.0", port=0, expose=True) as server, pytest.raises(InputError, match="free"):
+        SocketcandServer({}, host="127.0.0.1", port=server.port)
     with SocketcandServer({}, port=0) as server:
         assert server.host == "127.0.0.1"
-        with pytest.raises(InputError, match="free"):
-            SocketcandServer({}, port=server.port)
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 1000])
@@ -752,5 +752,5 @@ def test_outlets_of_the_command_line() -> None:
         CanOutput("slcan:/dev/pts/99", slcan=True)
     with pytest.raises(InputError, match="--can must be given"):
         run("hammer", can_slcan=True)
-    with pytest.raises(InputError, match=r"on 127\.0\.0\.1"):
+    with pytest.raises(InputError, match="unless --expose"):
         CanOutlets({}, speed("1M"), socketcand="0.0.0.0:29536")
