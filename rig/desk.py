@@ -119,7 +119,7 @@ class Desk:
         running: What a command that comes too late should have been sent while, such as "the rig runs".
         wake: Makes the thread that runs look for commands.
         tell: Takes each new kind of trouble, on any thread, for an event.
-        limit: How many commands a second are taken; steps wait for each other and are not counted.
+        limit: How many commands a second are taken; steps wait for each other, and a stop ends it all: these are not counted.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class Desk:
             raise InputError("command", f"one of {', '.join(self._commands)}", name)
         request = read_json(payload, field=name, most_bytes=REQUEST_BYTES)
         sender = check(_Signed, {"from": request.pop("from", "unknown")}, field="").sender
-        if name != "step":
+        if name not in ("step", "stop"):
             self._limit.check(sender)
         model = REQUESTS.get(name)
         return Pending(name, request, None if model is None else check(model, request, field=name), sender)

@@ -167,7 +167,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _whole(digits: str) -> int:
     # Long before Python's own limit of 4300 digits, beyond which it raises.
-    if len(digits) > len(str(-LARGEST)) or abs(number := int(digits)) > LARGEST:
+    if len(digits) > len(str(-LARGEST)) or not -LARGEST - 1 <= (number := int(digits)) <= LARGEST:
         raise InputError("", f"without whole numbers beyond +-{LARGEST}", printable(digits, 60))
     return number
 

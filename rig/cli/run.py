@@ -88,9 +88,11 @@ def run(
         from rig.scenes import load_scene
         from rig.service import Service
         from rig.simulation import Simulation
-        from rig.transport.zenoh import ZenohServer, check_free
+        from rig.transport.zenoh import ZenohServer, check_free, parse_endpoint, parse_loopback
 
-        check_free(listen)
+        check_free(parse_loopback(listen, field="listen"), field="listen")
+        if exposed is not None:
+            check_free(parse_endpoint(exposed.endpoint, field="expose"), field="expose")
         loaded = load_scene(scene, overrides)
         bus = can_output(
             can,

@@ -75,19 +75,18 @@ def parse_endpoint(text: str, *, field: str = "endpoint") -> tuple[str, int]:
     return host, int(port)
 
 
-def check_free(endpoint: str, *, field: str = "listen") -> None:
+def check_free(place: tuple[str, int], *, field: str) -> None:
     """Find out early whether an address can be listened on; what takes it meanwhile is found when it is.
 
     Raises:
-        InputError: It is malformed, in use, or not of this machine alone.
+        InputError: It is in use, or none of this machine.
     """
-    host, port = parse_loopback(endpoint, field=field)
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((host, port))
+            probe.bind(place)
         except OSError as error:
-            raise _not_free(field, endpoint, in_use=error.errno == errno.EADDRINUSE) from None
+            raise _not_free(field, "{}:{}".format(*place), in_use=error.errno == errno.EADDRINUSE) from None
 
 
 def _not_free(field: str, endpoint: str, *, in_use: bool) -> InputError:
@@ -104,7 +103,8 @@ def parse_loopback(text: str, *, field: str) -> tuple[str, int]:
     host, port = parse_endpoint(text, field=field)
     if host not in LOOPBACK_HOSTS:
         tunnel = f"ssh -L {port}:127.0.0.1:{port} USER@HOST"
-        raise InputError(field, f"on 127.0.0.1, since there is no password; from another machine: {tunnel}", text)
+        must = f"on 127.0.0.1, since there is no password; from another machine: {tunnel} (a rig also takes --expose)"
+        raise InputError(field, must, text)
     return host, port
 
 

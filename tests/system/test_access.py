@@ -196,6 +196,9 @@ def test_everybody_may_do_what_the_table_says_and_nothing_else(name: str | None,
         # What a subject may ask for is answered in the order of its link: behind the answer everything has been taken.
         answers = {key: attempt.answered(key) for key in map(example, KEYS)}
         history = attempt.history()
+        # Nor is the rig's own configuration for anybody: only the session's own answers.
+        own = {str(session.info.zid())}
+        assert {str(reply.replier_id.zid) for reply in everything(session, "@/**") if reply.replier_id} <= own
         time.sleep(0.3)
         rig.publish()
         allowed = receivable(doors)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import stat
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from rig.cli.connection import exposure
+from drivers.sources import open_source
+from rig.cli.connection import exposure, tell_where
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.transport.access import ROLES
@@ -145,3 +147,20 @@ def test_exposure_says_who_may_come_in(tmp_path: Path) -> None:
     for keys, plaintext in ((tmp_path / "keys", False), (None, True)):
         with pytest.raises(InputError, match="given with --expose HOST"):
             exposure(None, keys, plaintext=plaintext)
+
+
+def test_plain_exposure_says_what_is_open(capsys: pytest.CaptureFixture[str]) -> None:
+    server = SimpleNamespace(endpoint="127.0.0.1:7460")
+    tell_where(server, exposure("192.0.2.1", None, plaintext=True))  # type: ignore[arg-type]
+    errors = capsys.readouterr().err
+    assert "WARNING: 192.0.2.1:7463 is open to everybody who reaches it, unencrypted" in errors
+    assert "commands, notes, truth" in errors
+    tell_where(server, None)  # type: ignore[arg-type]
+    assert capsys.readouterr().err == "rig: listening on 127.0.0.1:7460; Ctrl-C or `rig stop` ends it\n"
+
+
+def test_the_url_of_a_daq_names_its_keys_too(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^--tls must be a folder with the keys of one role .*nowhere'"):
+        open_source(f"zenoh:127.0.0.1:7463?tls={tmp_path}/nowhere")
+    with pytest.raises(InputError, match=r"^zenoh must be HOST:PORT"):
+        open_source("zenoh:127.0.0.1?tls=keys")

@@ -49,7 +49,7 @@ def test_malformed_endpoints_are_refused(text: str) -> None:
 
 
 def test_a_host_other_than_loopback_must_be_allowed_by_name() -> None:
-    with pytest.raises(InputError, match=r"listen must be on 127\.0\.0\.1 .*ssh -L 7999:127\.0\.0\.1:7999.* --expose"):
+    with pytest.raises(InputError, match=r"listen must be on 127\.0\.0\.1, .*ssh -L 7999:127\.0\.0\.1:7999.* --expose"):
         ZenohServer("0.0.0.0:7999")
 
 
