@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rig.text import printable, shown
 
-
 _LONGEST_LINE = 5000
 
 
