@@ -7,6 +7,8 @@ from pathlib import Path
 
 from rig.text import printable, shown
 
+_LONGEST_LINE = 5000
+
 
 class InputError(ValueError):
     """A field has a value it must not have.
@@ -20,7 +22,7 @@ class InputError(ValueError):
         self.field = field
         self.must = must
         self.received = received
-        super().__init__(printable(f"{field} must be {must}; instead received {shown(received)}"))
+        super().__init__(printable(f"{field} must be {must}; instead received {shown(received)}", _LONGEST_LINE))
 
 
 class RefusedError(InputError):

@@ -178,8 +178,8 @@ class EngineChoice(_Part):
     @model_validator(mode="before")
     @classmethod
     def _own_step(cls, data: Any) -> Any:
-        method = ENGINES.get(data.get("name", next(iter(ENGINES)))) if isinstance(data, dict) else None
-        if method is None:
+        name = data.get("name", next(iter(ENGINES))) if isinstance(data, dict) else None
+        if not isinstance(name, str) or (method := ENGINES.get(name)) is None:
             return data
         return {"step_us": method.step_us, "tolerance": method.tolerance, **data}
 

@@ -25,19 +25,20 @@ from recorder.reader import Recording
 from replays.formats.conversion import convert
 from replays.formats.export import export
 from replays.formats.imported import write_recording
-from replays.formats.mapping import FileOptions, load_mapping
+from replays.formats.mapping import FileOptions, Mapping, load_mapping
 from replays.formats.selection import select
 from replays.formats.source import open_source
 from replays.formats.template import example
-from replays.validation.criteria import DEFAULT, load_criteria
+from replays.validation.criteria import DEFAULT, Criteria, load_criteria
 from rig.channels import TABLE, parse_table
 from rig.cli import tables
 from rig.cli.main import main
 from rig.errors import InputError
+from rig.outside import check, read_toml
 from rig.parameters import SETS, load_parameters
-from rig.scenes import SCENES, load_scene, read_value
+from rig.scenes import SCENES, load_scene, parse_scene, read_value, scene_document, scene_names
 from tests.hostile import Door, inputs
-from tests.hostile.files import Layout, Rng, spoil_bytes, write
+from tests.hostile.files import Layout, Rng, spoil_bytes, spoil_document, write
 
 PIECES = (
     "9" * 5000, "0x" + "f" * 5000, "1e400", "nan", "-inf", "2" * 30, "[" * 3000, "{a=" * 500, '"""', "true", "-1",
@@ -71,7 +72,7 @@ def spoil_toml(text: str, rng: Rng) -> bytes:
 
 
 def test_toml_of_every_kind_is_taken_or_refused_in_one_line(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng([5, inputs(120)])
 
     def text(path: Path) -> str:
         return path.read_bytes().decode(errors="replace")
@@ -95,6 +96,31 @@ def test_toml_of_every_kind_is_taken_or_refused_in_one_line(tmp_path: Path) -> N
         path.write_bytes(data := spoil_toml(texts[int(rng.integers(0, len(texts)))], rng))
         with doors[name].tried(data[:200]):
             load(path)
+    for name, door in doors.items():
+        door.tell(name)
+
+
+def test_documents_of_another_form_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
+    """The same TOML files as documents, with values of another type and tables that are none."""
+    (tmp_path / "m.toml").write_text(example())
+    kinds: dict[str, tuple[list[Any], Callable[[Any], object]]] = {
+        "scene": ([scene_document(load_scene(name)) for name in scene_names()], parse_scene),
+        "scene file": ([read_toml(path) for path in SCENES.glob("*.toml")], lambda document: parse_scene(document)),
+        "mapping": ([read_toml(tmp_path / "m.toml")], lambda document: check(Mapping, document, field="")),
+        "criteria": ([read_toml(DEFAULT)], lambda document: check(Criteria, document, field="")),
+    }
+    rng = np.random.default_rng([7, inputs(200)])
+    doors = {name: Door() for name in kinds}
+    for number in range(inputs(200)):
+        name = list(kinds)[number % len(kinds)]
+        documents, load = kinds[name]
+        document = documents[int(rng.integers(0, len(documents)))]
+        for _ in range(int(rng.integers(1, 4))):
+            document = spoil_document(document, rng)
+        if "\\ud800" in json.dumps(document, default=str):  # no file holds half a character
+            continue
+        with doors[name].tried(number):
+            load(document)
     for name, door in doors.items():
         door.tell(name)
 
@@ -180,7 +206,7 @@ def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) 
     whole = logs(tmp_path / "whole")
     (tmp_path / "m.toml").write_text(X)
     mapping = load_mapping(tmp_path / "m.toml")
-    rng = np.random.default_rng(6)
+    rng = np.random.default_rng([6, inputs(80)])
     doors = {suffix: Door() for suffix in whole}
     logging.disable(logging.CRITICAL)
     for suffix in whole:  # each is taken as it is
