@@ -119,7 +119,7 @@ class Desk:
         running: What a command that comes too late should have been sent while, such as "the rig runs".
         wake: Makes the thread that runs look for commands.
         tell: Takes each new kind of trouble, on any thread, for an event.
-        limit: How many commands a second are taken; steps wait for each other, and a stop ends it all: these are not counted.
+        limit: How many commands a second are taken, without `step`, which waits for its turn, and `stop`.
     """
 
     def __init__(
