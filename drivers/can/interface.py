@@ -22,7 +22,7 @@ from can.bus import BusState  # noqa: TID253
 from drivers.can import medium
 from rig.errors import InputError, RefusedError
 from rig.outside import check, read_json
-from rig.transport.zenoh import parse_loopback
+from rig.transport.endpoint import parse_loopback
 
 if TYPE_CHECKING:
     from can.typechecking import AutoDetectedConfig, CanFilters

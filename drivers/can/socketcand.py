@@ -28,7 +28,7 @@ from drivers.can import medium
 from drivers.can.health import Guard
 from drivers.can.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
 from rig.errors import InputError
-from rig.transport.zenoh import parse_loopback
+from rig.transport.endpoint import parse_loopback
 
 if TYPE_CHECKING:
     import can

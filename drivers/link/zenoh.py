@@ -38,7 +38,8 @@ class ZenohLink:
     """
 
     def __init__(self, endpoint: str, address: Address, *, wait_s: float = 1.0) -> None:
-        from rig.transport.zenoh import ZenohClient, parse_endpoint
+        from rig.transport.endpoint import parse_endpoint
+        from rig.transport.zenoh import ZenohClient
 
         parse_endpoint(endpoint, field="zenoh")
         self._name = address.name

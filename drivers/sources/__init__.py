@@ -72,7 +72,8 @@ def open_source(url: str, *, wait_s: float = 3.0) -> Source:
     kind, _, rest = url.partition(":")
     if kind == "zenoh" and rest:
         from drivers.sources.rig import RigSource
-        from rig.transport.zenoh import ZenohClient, parse_endpoint
+        from rig.transport.endpoint import parse_endpoint
+        from rig.transport.zenoh import ZenohClient
 
         endpoint, query, folder = rest.partition("?tls=")
         parse_endpoint(endpoint, field="zenoh")

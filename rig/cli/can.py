@@ -57,7 +57,8 @@ def hub(
     from drivers.can.timing import speed as parse_speed
     from rig.cli.can_outlets import CanOutlets
     from rig.errors import InputError
-    from rig.transport.zenoh import ZenohServer, parse_loopback
+    from rig.transport.endpoint import parse_loopback
+    from rig.transport.zenoh import ZenohServer
 
     parse_loopback(listen, field="listen")
     if len(set(channels)) < len(channels):

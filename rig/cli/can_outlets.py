@@ -40,7 +40,7 @@ class CanOutlets:
         with ExitStack() as stack:
             if socketcand is not None:
                 from drivers.can.socketcand import SocketcandServer
-                from rig.transport.zenoh import parse_loopback
+                from rig.transport.endpoint import parse_loopback
 
                 host, port = parse_loopback(socketcand, field="socketcand")
                 self._server = stack.enter_context(SocketcandServer(buses, host=host, port=port))

@@ -108,8 +108,8 @@ class CanOutput:
         socketcand: str | None = None,
         slcan: bool = False,
     ) -> None:
+        from rig.transport.endpoint import parse_loopback
         from rig.transport.memory import MemoryServer
-        from rig.transport.zenoh import parse_loopback
 
         self.interface, self.channel, self._settings = parse_spec(spec)
         # Before anything is opened.

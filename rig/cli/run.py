@@ -88,7 +88,8 @@ def run(
         from rig.scenes import load_scene
         from rig.service import Service
         from rig.simulation import Simulation
-        from rig.transport.zenoh import ZenohServer, check_free, parse_endpoint, parse_loopback
+        from rig.transport.endpoint import check_free, parse_endpoint, parse_loopback
+        from rig.transport.zenoh import ZenohServer
 
         check_free(parse_loopback(listen, field="listen"), field="listen")
         if exposed is not None:

@@ -321,7 +321,7 @@ def test_a_trigger_makes_a_file_of_its_own(tmp_path):
 def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
-    code = "import rig.transport.zenoh; rig.transport.zenoh._LEASE_S = 1.0; "
+    code = "import rig.transport.session; rig.transport.session._LEASE_S = 1.0; "
     with publisher(port) as rig, recorder(path, port, before=code) as process:
         wait_for(lambda: received(rig) > 0)
         links = rig.server.congestion()["links"]

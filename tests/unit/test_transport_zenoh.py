@@ -16,7 +16,9 @@ import pytest
 
 from rig.errors import InputError
 from rig.transport import NoReplyError
-from rig.transport.zenoh import ZenohClient, ZenohServer, _backlog, _Stream, parse_endpoint
+from rig.transport.endpoint import backlog_of, parse_endpoint
+from rig.transport.recovery import Recovery
+from rig.transport.zenoh import ZenohClient, ZenohServer
 
 pytestmark = pytest.mark.wallclock
 
@@ -254,7 +256,7 @@ class Subscription:
         self.missed = 0
         self.pauses = 0
         self.publisher = publisher
-        self.stream = _Stream(
+        self.stream = Recovery(
             publisher.ask,
             lambda _, payload: self.got.append(int(payload)),
             self._miss,
@@ -516,11 +518,11 @@ def test_backlog_counts_what_the_other_side_has_not_read() -> None:
         listener.listen()
         port = listener.getsockname()[1]
         with socket.create_connection(("127.0.0.1", port)) as idle, listener.accept()[0] as sender:
-            if not _backlog(port):
+            if not backlog_of(port):
                 pytest.skip("this system does not tell")
             sender.sendall(bytes(100_000))
             peer = idle.getsockname()[1]
-            until(lambda: _backlog(port) == {peer: 100_000})
+            until(lambda: backlog_of(port) == {peer: 100_000})
 
 
 def test_what_a_slow_plain_subscriber_missed_comes_from_the_cache_as_the_documentation_says(
