@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from recorder import schemas
 from rig.channels import ChannelTable
@@ -26,6 +26,11 @@ class _Text(BaseModel):
     """Metadata: numbers stand in them as text."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+
+def _instant(text: str) -> str:
+    datetime.fromisoformat(text)
+    return text
 
 
 class TruthColumn(_Document):
@@ -145,15 +150,15 @@ class Gap(_Document):
 class ClockPair(_Document):
     """Simulated and wall time of one arrival [s]."""
 
-    time_s: _Finite
-    wall_s: _Finite
+    time_s: Annotated[float, Field(ge=0.0, le=1e10)]
+    wall_s: Annotated[float, Field(ge=0.0, le=1e11)]
 
 
 class Rig(_Text):
     """Metadata `rig`, which opens a file."""
 
     format: Literal["rig-recording"]
-    created: datetime
+    created: Annotated[str, AfterValidator(_instant)]
     view_rate_hz: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
     scene: str
     seed: str

@@ -46,9 +46,11 @@ class Door:
         if time.monotonic() - begin > LONGEST_S:
             self.faults["too long"] = what
 
-    def tell(self, name: str) -> None:
-        """Print the counts, and fail where there is a fault."""
-        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        counts = f"{self.taken} taken, {self.refused} refused, {len(self.faults)} kinds of faults"
-        print(f"{name}: {counts}; largest memory so far {peak_mb:.0f} MB")
-        assert not self.faults, "\n".join(f"{place}: {what}" for place, what in self.faults.items())
+
+def tell(doors: dict[str, Door]) -> None:
+    """Print the counts, and fail where there is a fault."""
+    for name, door in doors.items():
+        print(f"{name}: {door.taken} taken, {door.refused} refused, {len(door.faults)} kinds of faults")
+    print(f"largest memory of the process {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    found = [f"{name}: {place}: {what}" for name, door in doors.items() for place, what in door.faults.items()]
+    assert not found, "\n".join(found)

@@ -19,7 +19,7 @@ from recorder.reader import Recording
 from recorder.rewrite import is_whole, recover
 from rig.cli.main import main
 from rig.errors import InputError
-from tests.hostile import Door, inputs
+from tests.hostile import Door, inputs, tell
 from tests.hostile.files import Layout, attachments_of, contents, far_block, spoil_bytes, uses, write
 
 pytestmark = pytest.mark.filterwarnings("default::RuntimeWarning")
@@ -118,7 +118,7 @@ def test_no_changed_byte_gives_other_contents_untold(path: Path, part: Path, fin
             sure = found[0] if not recording.unchecked else found[0][: -_unsure(recording)]
             assert sure == messages[: len(sure)], "a message is another one"
             assert found[3:6] == before[3:6], "a document is another one"
-    door.tell(f"bytes ({same} the same, {shorter} told to be shorter)")
+    tell({f"bytes ({same} the same, {shorter} told to be shorter)": door})
     assert door.refused > 0.3 * inputs(150)
 
 
@@ -135,9 +135,8 @@ def test_what_is_put_together_wrongly_is_refused_or_read_and_never_a_traceback(l
         name, use = list(uses().items())[number % len(doors)]
         with doors[name].tried(number):
             use(path, tmp_path)
-    for name, door in doors.items():
-        door.tell(name)
-        assert door.taken
+    tell(doors)
+    assert all(door.taken for door in doors.values())
 
 
 def test_a_block_in_a_far_future_costs_neither_time_nor_memory(layout: Layout, tmp_path: Path) -> None:

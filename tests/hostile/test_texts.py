@@ -37,7 +37,7 @@ from rig.errors import InputError
 from rig.outside import check, read_toml
 from rig.parameters import SETS, load_parameters
 from rig.scenes import SCENES, load_scene, parse_scene, read_value, scene_document, scene_names
-from tests.hostile import Door, inputs
+from tests.hostile import Door, inputs, tell
 from tests.hostile.files import Layout, Rng, spoil_bytes, spoil_document, write
 
 PIECES = (
@@ -96,8 +96,7 @@ def test_toml_of_every_kind_is_taken_or_refused_in_one_line(tmp_path: Path) -> N
         path.write_bytes(data := spoil_toml(texts[int(rng.integers(0, len(texts)))], rng))
         with doors[name].tried(data[:200]):
             load(path)
-    for name, door in doors.items():
-        door.tell(name)
+    tell(doors)
 
 
 def test_documents_of_another_form_are_taken_or_refused_in_one_line(tmp_path: Path) -> None:
@@ -121,8 +120,7 @@ def test_documents_of_another_form_are_taken_or_refused_in_one_line(tmp_path: Pa
             continue
         with doors[name].tried(number):
             load(document)
-    for name, door in doors.items():
-        door.tell(name)
+    tell(doors)
 
 
 @pytest.mark.parametrize(
@@ -233,8 +231,7 @@ def test_logs_of_other_systems_are_taken_or_refused_in_one_line(tmp_path: Path) 
                 write_recording(conversion, tmp_path / "out.mcap", force=True)
                 Recording.open(tmp_path / "out.mcap")
     logging.disable(logging.NOTSET)
-    for suffix, door in doors.items():
-        door.tell(suffix)
+    tell(doors)
 
 
 @pytest.mark.parametrize(("method", "rate_hz"), [("linear", 1_000_000), ("polyphase", 1_000_000), ("none", None)])
