@@ -381,7 +381,7 @@ def test_nothing_is_printed_but_through_the_one_door() -> None:
     """No command makes a console, a progress bar or a live display of its own, or prints past the door."""
     found = []
     for path in sorted(Path(next(iter(rig.cli.__path__))).glob("*.py")):
-        if path.name in ("tables.py", "main.py"):
+        if path.name in ("tables.py", "app.py", "main.py"):
             continue
         tree = ast.parse(path.read_text())
         typed = [
