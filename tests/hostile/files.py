@@ -221,7 +221,10 @@ class Layout:
             other = self.messages[int(rng.integers(0, len(self.messages)))][1]
             self.messages[at] = (topic, other, time_ns)
         elif payload[:1] == b"{":
-            self.messages[at] = (topic, spoil_json(json.loads(payload), rng), time_ns)
+            try:
+                self.messages[at] = (topic, spoil_json(json.loads(payload), rng), time_ns)
+            except ValueError:  # spoilt already
+                return
         else:
             self.messages[at] = (topic, spoil_block(payload, rng), time_ns)
 
