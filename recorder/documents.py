@@ -44,7 +44,7 @@ class TruthColumn(_Document):
 class TruthTable(_Document):
     """A truth table."""
 
-    rate_hz: _Rate = 1.0
+    rate_hz: _Rate
     columns: Annotated[tuple[TruthColumn, ...], Field(min_length=1)]
 
 

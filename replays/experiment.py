@@ -16,7 +16,7 @@ from rig.offline import Run, SentCommand, frames, simulate
 from rig.parameters import DEFAULT_SET, load_parameters, set_names
 from rig.scenes import COMMANDS, Scene, change_scene, parse_scene
 from rig.simulation import TICK_RATE_HZ, Frame, Simulation
-from rig.wire import EDGES
+from rig.wire import EDGES, sensor_key, truth_key
 
 
 @dataclass(frozen=True)
@@ -83,11 +83,20 @@ class Experiment:
 
 
 def _end_s(recording: Recording) -> float:
-    """Simulated time behind the last row of any stream [s]."""
+    """Simulated time behind the last row of any stream [s].
+
+    Raises:
+        InputError: The times of a stream do not fit its row numbers: no run ends there.
+    """
+    rates = {sensor_key(name): group.rate_hz for name, group in recording.table.groups.items()}
+    rates |= {truth_key(name): table["rate_hz"] for name, table in recording.catalogue.get("truth", {}).items()}
     ends = [0.0]
     for key, stream in recording.streams.items():
         if key != EDGES and stream.rows > 1:  # edges come once a turn, not at a rate
-            period_s = (stream.last_time_s - stream.first_time_s) / (stream.rows + stream.lost - 1)
+            steps = stream.rows + stream.lost - 1
+            period_s = (stream.last_time_s - stream.first_time_s) / steps
+            if key in rates and not 0.5 < period_s * rates[key] < 2.0:
+                raise InputError("file", "a recording whose times fit its row numbers", f"{recording.path}, {key}")
             ends.append(stream.last_time_s + period_s)
     return math.floor(max(ends) * TICK_RATE_HZ + 0.5) / TICK_RATE_HZ
 

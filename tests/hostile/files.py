@@ -153,6 +153,8 @@ def spoil_json(document: Any, rng: Rng) -> bytes:
 
 def spoil_block(payload: bytes, rng: Rng) -> bytes:
     """A block with another head, or other bytes."""
+    if len(payload) < 44:
+        return spoil_bytes(payload or b"x", rng)
     head = list(struct.unpack_from("<qqddII", payload, 4))
     numbers = (0, -1, 1, 2**31, 2**40, 2**52, 2**53, 2**62, 2**63 - 1, -(2**63))
     rates = (0.0, -1.0, 1e-300, 1e-5, 1.0, 1e6, 1e12, 1e300, float("nan"), float("inf"))
@@ -219,7 +221,10 @@ class Layout:
             other = self.messages[int(rng.integers(0, len(self.messages)))][1]
             self.messages[at] = (topic, other, time_ns)
         elif payload[:1] == b"{":
-            self.messages[at] = (topic, spoil_json(json.loads(payload), rng), time_ns)
+            try:
+                self.messages[at] = (topic, spoil_json(json.loads(payload), rng), time_ns)
+            except ValueError:  # spoilt already
+                return
         else:
             self.messages[at] = (topic, spoil_block(payload, rng), time_ns)
 
