@@ -20,10 +20,10 @@ from rig.errors import InputError
 from rig.intake import Catalogue, Intake
 from rig.text import printable
 from rig.transport import Client, NoReplyError
+from rig.transport.clients import Reporter
 from rig.wire import (
     ALIVE,
     CATALOGUE,
-    CLIENTS,
     EDGES,
     EVENTS,
     PARAMETERS,
@@ -32,7 +32,6 @@ from rig.wire import (
     STATUS,
     TRUTH,
     decode_document,
-    encode_document,
     schema_of,
     sensor_key,
     truth_key,
@@ -328,7 +327,7 @@ class RecordingSession:
             check_room(path, self._limits)
         self.path = path
         self._client = client
-        self._name = name
+        self._reporter = Reporter(client, name)
         self._duration_ns = math.inf if duration_s is None else duration_s * NS
         self._view_rate_hz = view_rate_hz
         self._history = history
@@ -588,14 +587,8 @@ class RecordingSession:
     def _report(self, writer: Sink, *, done: bool = False) -> None:
         groups = list(writer.table.groups)
         first = sensor_key("probes" if "probes" in groups or not groups else groups[0])
-        beat = {
-            "name": self._name,
-            "received_index": writer.next_index.get(first, 0),
-            "lost": sum(writer.counts().lost.values()),
-            "wall_s": self._wall_ns() / NS,
-            "done": done,
-        }
-        self._client.report(f"{CLIENTS}/{self._name}", encode_document(beat))
+        lost = sum(writer.counts().lost.values())
+        self._reporter.tell(writer.next_index.get(first, 0), lost=lost, done=done)
 
     def _progress(self, writer: Sink) -> Progress:
         counts = writer.counts()

@@ -31,6 +31,8 @@ REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
 
 _STEP_S = 3600
 """Longest single step [s of simulated time]."""
+_HELD_UP_S = 1.0
+"""Blocks that wait to be published for longer than this are told [s]."""
 _TAKEN_BYTES = 500_000
 """What is told to latecomers of the commands so far; the oldest go first, and are counted."""
 
@@ -286,6 +288,9 @@ class Service:
         warnings = list(health.get("warnings", []))
         if self._queue.dropped:
             warnings.append(f"{self._queue.dropped} blocks dropped: the publisher did not keep up")
+        waiting_s = len(self._queue) * self._block_ticks / self._rate
+        if self._may_drop and waiting_s > _HELD_UP_S:
+            warnings.append(f"{waiting_s:.1f} s of blocks wait: a client holds up the publisher")
         warnings += self._desk.warnings()
         return finite(
             {

@@ -12,6 +12,7 @@ from drivers.stream import RigStream, thin, whole_step
 from rig import wire
 from rig.channels import Group
 from rig.transport import Client
+from rig.transport.clients import Reporter
 
 _REPORT_S = 0.4
 _numbers = count(1)
@@ -30,7 +31,7 @@ class RigSource:
         self._client = client
         self._close = close
         self._leave: list[Callable[[], None]] = []
-        self._name = f"daq-{os.getpid()}-{next(_numbers)}"
+        self._told_by = Reporter(client, f"daq-{os.getpid()}-{next(_numbers)}")
         self._scale = 1.0
         """Rows of the stream that clients report on, for one of ours."""
         self._read: tuple[int | None, int, int] | None = None
@@ -106,14 +107,8 @@ class RigSource:
 
     def _report(self, *, done: bool = False) -> None:
         self._told, room, lost = self._read or (None, 0, 0)
-        beat = {
-            "name": self._name,
-            "received_index": None if self._told is None else int(self._told * self._scale),
-            "room": int(room * self._scale),
-            "lost": lost,
-            "done": done,
-        }
-        self._client.report(f"{wire.CLIENTS}/{self._name}", wire.encode_document(beat))
+        index = None if self._told is None else int(self._told * self._scale)
+        self._told_by.tell(index, lost=lost, room=int(room * self._scale), done=done)
 
     def close(self) -> None:
         """Listen no more."""

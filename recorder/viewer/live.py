@@ -18,6 +18,7 @@ from rig.channels import ChannelTable
 from rig.intake import Catalogue, Intake, event_in
 from rig.text import printable
 from rig.transport import Client
+from rig.transport.clients import Reporter
 
 NAME = "viewer"
 ROWS_PER_S = 500.0
@@ -91,6 +92,7 @@ class LiveView:
             wall: The wall clock [s since 1970].
         """
         self._client = client
+        self._reporter = Reporter(client, NAME)
         self._canvas = canvas
         self._table = described.table
         self._wall = wall
@@ -183,14 +185,7 @@ class LiveView:
         self._there = there
 
     def _report(self, *, done: bool = False) -> None:
-        document = {
-            "name": NAME,
-            "received_index": self._received_index,
-            "lost": self.lost,
-            "wall_s": self._wall(),
-            "done": done,
-        }
-        self._client.report(f"{wire.CLIENTS}/{NAME}", wire.encode_document(document))
+        self._reporter.tell(self._received_index, lost=self.lost, done=done)
 
     def _check_canvas(self) -> None:
         """Stop drawing for a viewer that takes nothing, or memory would fill with what it still has to get."""

@@ -34,6 +34,7 @@ _AHEAD_BLOCKS = 2000
 what a recorder can take in (90 s of the default streams)."""
 _LOOK_S = 0.1
 _CROWDED_S = 2e-3
+_HELD_S = 5.0
 _BEHIND_S = 0.5
 """Lateness that is told: a busy machine is late by tens of milliseconds, and catches up."""
 
@@ -157,6 +158,8 @@ class Player:
             wake=self._wake,
             tell=lambda text: self._told.append(text),
         )
+        self._held: tuple[str, float] | None = None
+        """Name of the client that a burst waits for, and since when [s, monotonic]."""
         self._told: deque[str] = deque()
         """Warnings that wait for the playing thread."""
         self._woken = threading.Event()
@@ -246,6 +249,8 @@ class Player:
                 f"x{self._playhead.rate:g} is more than this machine and the clients keep up with: "
                 f"{self._behind_s:.1f} s behind"
             )
+        if self._held is not None and (held_s := time.monotonic() - self._held[1]) > _HELD_S:
+            warnings.append(f"has waited {held_s:.0f} s for client {self._held[0]} to take what was sent")
         return warnings + self._desk.warnings()
 
     @property
@@ -396,7 +401,12 @@ class Player:
     def _crowded(self) -> bool:
         """Whether a client that reports has too much on its way."""
         rows = min(_AHEAD_S * self._outlet.rate_hz, _AHEAD_BLOCKS * self._outlet.block_rows)
-        return rows > 0 and self._desk.clients.crowded(self._outlet.published, round(rows))
+        name = self._desk.clients.crowded(self._outlet.published, round(rows)) if rows > 0 else None
+        if name is None:
+            self._held = None
+        elif self._held is None or self._held[0] != name:
+            self._held = name, time.monotonic()
+        return name is not None
 
     # Passes through the recording.
 

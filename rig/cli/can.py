@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rig.cli.display import stopping_on_signals
+from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
 
 app = typer.Typer(help="The virtual CAN bus.", no_args_is_help=True)

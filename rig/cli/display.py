@@ -1,8 +1,7 @@
-"""What the terminal shows of a run or a replay that is served here, while it lasts; and how signals end it."""
+"""What the terminal shows of a run or a replay that is served here, while it lasts."""
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -11,28 +10,10 @@ from typing import Any
 
 import typer
 
-from rig.cli.main import ENDING
 from rig.cli.tables import echo, progress_bar
 
 Status = Callable[[], dict[str, Any]]
 Line = Callable[[dict[str, Any]], list[str]]
-
-
-@contextmanager
-def stopping_on_signals(stop: Callable[[], object]) -> Iterator[None]:
-    """SIGINT, SIGTERM and SIGHUP end the work in good order; a second SIGINT interrupts at once."""
-
-    def handle(number: int, _: object) -> None:
-        if number == signal.SIGINT:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        stop()
-
-    former = {number: signal.signal(number, handle) for number in ENDING if signal.getsignal(number) != signal.SIG_IGN}
-    try:
-        yield
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

@@ -20,8 +20,9 @@ from rig.cli.can_output import (
     can_output,
 )
 from rig.cli.connection import exposure, tell_where
-from rig.cli.display import all_lateness, end_with, lateness, showing, stopping_on_signals
+from rig.cli.display import all_lateness, end_with, lateness, showing
 from rig.cli.options import Channels, Expose, FromS, Keys, Listen, Plaintext, RecordingFiles, ToS, names_of, pairs
+from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT

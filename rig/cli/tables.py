@@ -6,6 +6,7 @@ line breaks and marks that turn the direction of writing come out in their escap
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -25,7 +26,9 @@ def echo(text: object = "", *, err: bool = False, nl: bool = True) -> None:
         err: To stderr.
         nl: With a line break at the end.
     """
-    typer.echo("\n".join(map(printable, str(text).split("\n"))), err=err, nl=nl)
+    # Who reads what happens may have gone; what happens goes on.
+    with contextlib.suppress(*([OSError] if err else [])):
+        typer.echo("\n".join(map(printable, str(text).split("\n"))), err=err, nl=nl)
 
 
 def shown(document: Any) -> Any:

@@ -8,7 +8,7 @@ import typer
 
 from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
 from rig.cli.connection import Connect, Tls
-from rig.cli.display import stopping_on_signals
+from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
 from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError

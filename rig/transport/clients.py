@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import secrets
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from rig.outside import Count, Name, Outside, check
-from rig.transport import Server
+from rig import wire
+from rig.outside import Count, Name, Outside, a_line, check
+from rig.transport import Client, Server
 
 _SHOWN = 64
 """Clients in the status."""
@@ -46,6 +48,29 @@ class Report(Outside):
     done: bool = False
     """Whether it leaves."""
     wall_s: float | None = None
+    secret: Annotated[str, a_line(64)] | None = None
+    """What only this client knows: who reports under its name without it is somebody else."""
+
+
+class Reporter:
+    """A client's own side: tells the rig how far it has come.
+
+    Args:
+        client: Transport to the rig.
+        name: What it is called in the status.
+    """
+
+    def __init__(self, client: Client, name: str) -> None:
+        self._client = client
+        self._name = name
+        self._secret = secrets.token_hex(16)
+
+    def tell(self, received_index: int | None, *, lost: int, room: int | None = None, done: bool = False) -> None:
+        """Report; as of `Report`."""
+        report = Report(
+            name=self._name, received_index=received_index, lost=lost, room=room, done=done, secret=self._secret
+        )
+        self._client.report(f"{wire.CLIENTS}/{self._name}", report.model_dump_json().encode())
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +82,18 @@ class _Heard:
     room: int | None
     moved_s: float
     """When it was last heard to have got on."""
-    moves: int
-    """How often."""
+    from_index: int
+    from_s: float
+    """Where it stood when it was first heard, or last stepped back."""
+
+    @property
+    def pace(self) -> float:
+        """How fast it gets on [rows/s]."""
+        return ((self.received_index or 0) - self.from_index) / max(self.heard_s - self.from_s, 1.0)
+
+
+_Who = tuple[str, str | None]
+"""Name and secret."""
 
 
 class Clients:
@@ -71,8 +106,8 @@ class Clients:
     def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
         self._lock = threading.Lock()
-        self._reports: dict[str, _Heard] = {}
-        self._joined: dict[str, int] = {}
+        self._reports: dict[_Who, _Heard] = {}
+        self._joined: dict[_Who, int] = {}
         """Row that was next when a client was first seen that had nothing yet: what it will be measured from."""
         self._swept_s = now_s()
         self.malformed = 0
@@ -86,34 +121,36 @@ class Clients:
         except ValueError:
             self.malformed += 1
             return
-        now_s = self._now_s()
+        now_s, who, index = self._now_s(), (name, report.secret), report.received_index
         with self._lock:
             if report.done:
-                self._forget(name)
+                self._forget(who)
                 return
-            before = self._reports.get(name)
+            before = self._reports.get(who)
             if before is None:
                 self._make_room(now_s)
-            if before is None or before.received_index == report.received_index:
-                moved_s, moves = (now_s, 0) if before is None else (before.moved_s, before.moves)
+                origin, moved_s = (index or 0, now_s), now_s
             else:
-                moved_s, moves = now_s, before.moves + 1
-            self._reports[name] = _Heard(report.received_index, report.lost, now_s, report.room, moved_s, moves)
+                step = (index or 0) - (before.received_index or 0)
+                begins = step < 0 or before.received_index is None
+                origin = (index or 0, now_s) if begins else (before.from_index, before.from_s)
+                moved_s = now_s if step > 0 else before.moved_s
+            self._reports[who] = _Heard(index, report.lost, now_s, report.room, moved_s, *origin)
 
     def _make_room(self, now_s: float) -> None:
         """For other names: forget those long silent, or where none is, a quarter, of those that did not get on."""
         if len(self._reports) < _MOST and now_s - self._swept_s < _FORGOTTEN_S:
             return
         self._swept_s = now_s
-        for name in [name for name, row in self._reports.items() if now_s - row.heard_s > _FORGOTTEN_S]:
-            self._forget(name)
+        for who in [who for who, row in self._reports.items() if now_s - row.heard_s > _FORGOTTEN_S]:
+            self._forget(who)
         if len(self._reports) >= _MOST:
-            for name in sorted(self._reports, key=lambda name: self._reports[name].moves)[: _MOST // 4]:
-                self._forget(name)
+            for who in sorted(self._reports, key=lambda who: self._reports[who].pace)[: _MOST // 4]:
+                self._forget(who)
 
-    def _forget(self, name: str) -> None:
-        self._reports.pop(name, None)
-        self._joined.pop(name, None)
+    def _forget(self, who: _Who) -> None:
+        self._reports.pop(who, None)
+        self._joined.pop(who, None)
 
     @property
     def present(self) -> int:
@@ -130,16 +167,19 @@ class Clients:
         now_s = self._now_s()
         with self._lock:
             # Those that get on first: names can be made up by the thousand.
-            first = sorted(self._reports.items(), key=lambda row: -row[1].moves)
-        return {
-            name: {
+            first = sorted(self._reports.items(), key=lambda row: -row[1].pace)
+        rows: dict[str, dict[str, Any]] = {}
+        for who, report in first[:_SHOWN]:
+            name = who[0]
+            while name in rows:
+                name += " (another)"
+            rows[name] = {
                 "received_index": report.received_index,
-                "lag_s": round(self._lacks(name, report, published) / rate_hz, 4) if rate_hz else 0.0,
+                "lag_s": round(self._lacks(who, report, published) / rate_hz, 4) if rate_hz else 0.0,
                 "last_heard_s": round(now_s - report.heard_s, 3),
                 "lost": report.lost,
             }
-            for name, report in first[:_SHOWN]
-        }
+        return rows
 
     @property
     def hidden(self) -> int:
@@ -155,26 +195,26 @@ class Clients:
             stuck_s: Without those that have got nothing for so long [s].
         """
         live = self._live(silent=silent, stuck_s=stuck_s)
-        return max((self._lacks(name, report, published) for name, report in live.items()), default=0)
+        return max((self._lacks(who, report, published) for who, report in live.items()), default=0)
 
-    def crowded(self, published: int, most: int) -> bool:
-        """Whether a client that is there has more on its way than so many rows, or than half of its own room."""
-        return any(
-            self._lacks(name, report, published) > (most if report.room is None else min(most, report.room // 2))
-            for name, report in self._live().items()
-        )
+    def crowded(self, published: int, most: int) -> str | None:
+        """Name of a client that is there and has more on its way than so many rows, or than half of its own room."""
+        for who, report in self._live().items():
+            if self._lacks(who, report, published) > (most if report.room is None else min(most, report.room // 2)):
+                return who[0]
+        return None
 
-    def _lacks(self, name: str, report: _Heard, published: int) -> int:
+    def _lacks(self, who: _Who, report: _Heard, published: int) -> int:
         """Rows that a client still has to get."""
         has = report.received_index
-        return max(0, published - (self._joined.setdefault(name, published) if has is None else has))
+        return max(0, published - (self._joined.setdefault(who, published) if has is None else has))
 
-    def _live(self, *, silent: bool = False, stuck_s: float = _STUCK_S) -> dict[str, _Heard]:
+    def _live(self, *, silent: bool = False, stuck_s: float = _STUCK_S) -> dict[_Who, _Heard]:
         now_s = self._now_s()
         with self._lock:
             return {
-                name: row
-                for name, row in self._reports.items()
+                who: row
+                for who, row in self._reports.items()
                 # Whoever is silent has been stopped, not stuck: it may be about to go on.
                 if (row.heard_s - row.moved_s < stuck_s and now_s - row.heard_s < _GONE_S)
                 or (silent and now_s - row.heard_s >= _GONE_S)

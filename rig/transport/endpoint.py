@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import socket
+import struct
 from pathlib import Path
 
 from rig.errors import InputError
@@ -87,4 +88,6 @@ def hang_up(port: int, peers: set[int]) -> None:
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(file.name))) as link:
             ends = link.getsockname(), link.getpeername()
             if all(isinstance(end, tuple) for end in ends) and ends[0][1] == port and ends[1][1] in peers:
+                # Zenoh lets closing wait for what was not sent, and ours may be the last to close.
+                link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
                 link.shutdown(socket.SHUT_RDWR)

@@ -16,7 +16,10 @@ _LEASE_S = 60.0
 """A stopped subscriber sends no keep-alives, and must keep its link for well over 10 s. A killed process is noticed
 by its closed socket, not by the lease."""
 PATIENCE_S = 20.0
-"""How long recovered messages wait for room in a link, and their receiver for the reply [s]."""
+"""How long a receiver waits for recovered messages [s]."""
+_HELD_S = 2.0
+"""How long recovered messages wait for room in a link whose other side does not read them [s]. Then it is closed: a
+client of ours connects again and asks again, and one that means harm holds up no longer."""
 
 
 def locator(host: str, port: int, *, tls: bool = False) -> str:
@@ -43,7 +46,7 @@ def config_of(**settings: Any) -> Any:
         # Recovered messages wait for room in their link, and while they do, the publisher of that key waits for its
         # cache. After this time the link is closed instead, which can cost that client messages. It must be below the
         # time that the service can queue [us].
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(PATIENCE_S * 1e6),
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": round(_HELD_S * 1e6),
     }
     for key, value in {**shared, **{name.replace("__", "/"): value for name, value in settings.items()}}.items():
         config.insert_json5(key, json.dumps(value))

@@ -39,9 +39,14 @@ _HEARTBEATS = 500
 for hours."""
 _RING = 2000
 """Messages that a subscriber which may lose some holds: about 2 s of all streams."""
-_FROM_CLIENTS = {"transport/link/rx/max_message_size": 1 << 20}
-"""The largest that a server takes: requests have at most 64 kB. What it sends is not bounded by this."""
-_FROM_AFAR = {"transport/unicast/max_sessions": 32, "transport/unicast/accept_pending": 8}
+_FROM_CLIENTS = {
+    "transport/link/rx/max_message_size": 1 << 20,
+    "transport/unicast/accept_timeout": 3000,
+    "transport/unicast/accept_pending": 1000,
+}
+"""The largest that a server takes: requests have at most 64 kB. What it sends is not bounded by this. And how many may
+be about to connect, for how long [ms]: whoever opens connections and says nothing must not shut out all others."""
+_FROM_AFAR = {"transport/unicast/max_sessions": 32, "transport/unicast/accept_pending": 32}
 """Where it is exposed; a client that subscribes has two sessions."""
 _OPENING_S, _OPENING_TLS_S = 0.5, 2.0
 """How long one attempt to connect may take: beyond the loopback it is several times there and back."""
@@ -67,7 +72,7 @@ class ZenohServer:
     Args:
         endpoint: HOST:PORT to listen on, on the loopback.
         exposed: Where else.
-        wait: Make `publish` wait for slow subscribers (at most 5 s, then their link is closed and they recover from
+        wait: Make `publish` wait for slow subscribers (at most 2 s, then their link is closed and they recover from
             the cache) instead of letting them recover later. For runs that are not paced by the wall clock: there the
             cache would hold a much shorter wall time.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rig.transport.clients import _MOST, _SHOWN, Clients
+from rig.transport.clients import _MOST, _SHOWN, Clients, Reporter
 
 
 class Time:
@@ -109,6 +109,34 @@ def test_who_reports_but_gets_nothing_is_not_waited_for_for_ever(clients: Client
     assert not clients.crowded(1000, 500)
     report(clients, "stuck", received_index=10)
     assert clients.behind(1000) == 990, "it goes on"
+
+
+def test_nobody_reports_under_the_name_of_another(clients: Clients, time_: Time) -> None:
+    class Rig:
+        def report(self, key: str, payload: bytes) -> None:
+            clients.take(key, payload)
+
+    recorder = Reporter(Rig(), "recorder")  # pyright: ignore[reportArgumentType]
+    recorder.tell(500, lost=0)
+    time_.now_s = 3.5
+    for forged in ({"received_index": 2**62 - 1, "lost": 7}, {"received_index": 1, "done": True}):
+        report(clients, "recorder", **forged)
+        report(clients, "recorder", **forged, secret="0" * 32)
+    rows = clients.rows(1000, 20_000.0)
+    assert [row["lost"] for row in rows.values() if row["received_index"] == 500] == [0]
+    assert clients.behind(1000, silent=True) == 500, "the end still waits for it"
+    recorder.tell(1000, lost=0, done=True)
+    assert clients.behind(1000, silent=True) == 0
+
+
+def test_whoever_goes_back_and_forth_does_not_get_on(clients: Clients, time_: Time) -> None:
+    for tick in range(100):
+        time_.now_s = 0.1 * tick
+        for number in range(80):
+            report(clients, f"made up {number}", received_index=tick % 2)
+        if tick > 40 and tick % 5 == 0:
+            report(clients, "recorder", received_index=2000 * tick)
+    assert next(iter(clients.rows(200_000, 20_000.0))) == "recorder"
 
 
 class Links:
