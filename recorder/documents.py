@@ -83,6 +83,7 @@ class _Fields(_Document):
 
     parameters: str = ""
     set: dict[str, _Finite | str] = {}
+    sensors: dict[str, Any] = {}
 
 
 class _Mapping(_Document):

@@ -162,7 +162,8 @@ def event_text(event: dict[str, Any]) -> tuple[int, str]:
     kind = str(event.get("event", "event"))
     reason = str(event.get("reason", ""))
     if kind == "note":
-        tags = "".join(f" #{tag}" for tag in event.get("tags") or ())
+        tags = event.get("tags")
+        tags = "".join(f" #{tag}" for tag in tags) if isinstance(tags, list) else ""
         return LOG_INFO, f"note: {event.get('text', '')}{tags}"
     if kind == "warning":
         return LOG_WARN, str(event.get("text", "warning"))

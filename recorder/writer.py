@@ -687,8 +687,12 @@ class RecordingWriter:
             self._chunks += 1
             self._chunk_bytes = 0
 
+    def _time_ns(self, tick: int) -> int:
+        """Simulated time of a tick as a message can have it: of one that no clock has, the last one there is [ns]."""
+        return max(0, min(tick * NS // self.tick_rate_hz, 1 << 62))
+
     def _write_block(self, topic: _Topic, key: str, payload: bytes, block: Block, wall_ns: int) -> None:
-        time_ns = max(0, block.tick * NS // self.tick_rate_hz)
+        time_ns = self._time_ns(block.tick)
         rows = len(block.values)
         if self._from_start and key not in self.continuity.next:
             self.continuity.follow(key, 0, 0)
@@ -721,7 +725,7 @@ class RecordingWriter:
 
     def _write_document(self, topic: _Topic, key: str, payload: bytes, document: dict[str, Any], wall_ns: int) -> None:
         tick = tick_in(document)
-        time_ns = self.last_time_ns if tick is None else max(0, tick * NS // self.tick_rate_hz)
+        time_ns = self.last_time_ns if tick is None else self._time_ns(tick)
         self._add(topic, payload, time_ns, wall_ns)
         if key == EVENTS and self.view_rate_hz:
             level, text = schemas.event_text(document)

@@ -168,7 +168,7 @@ def _beside(path: Path) -> Path:
 
 
 def _rated(path: Path, table: Table, selection: Selection) -> Path:
-    alike = [other for other in selection.tables if other.rate_hz == table.rate_hz]
+    alike = [other for other in selection.tables if f"{other.rate_hz:g}" == f"{table.rate_hz:g}"]
     more = f"-{alike.index(table) + 1}" if len(alike) > 1 else ""
     return path.with_name(f"{path.stem}-{table.rate_hz:g}Hz{more}{path.suffix}")
 
