@@ -106,10 +106,10 @@ def run(
             socketcand=can_socketcand,
             slcan=can_slcan,
         )
-        notice = "preparing" if compiled_before() else COMPILE_NOTICE
-        echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
         simulation = Simulation(loaded)
         block_ticks = _block_ticks(block_ms, simulation)
+        notice = "preparing" if compiled_before() else COMPILE_NOTICE
+        echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
         # Before anybody can connect: whoever does is answered at once.
         simulation.warm_up()
     paced = pace is Pace.REAL_TIME

@@ -246,7 +246,10 @@ CASES = [
     Case("no such pace", ("run", "drop", "--pace", "warp"), "--pace", "lockstep"),
     Case("listen without port", ("run", "drop", "--listen", "abc"), "listen", "HOST:PORT with a port of 1 to 65535"),
     Case(
-        "listen on another host", ("run", "drop", "--listen", "0.0.0.0:7460"), "listen", "on 127.0.0.1 (from elsewhere"
+        "listen on another host",
+        ("run", "drop", "--listen", "0.0.0.0:7460"),
+        "listen",
+        "on 127.0.0.1, since",
     ),
     Case(
         "connect to no port", ("hammer", "--connect", "127.0.0.1:0"), "connect", "HOST:PORT with a port of 1 to 65535"

@@ -28,7 +28,7 @@ def let_through(limit: CommandLimit, sender: str, count: int) -> int:
 
 def test_a_flood_is_refused_at_once_but_for_a_burst_and_a_rate() -> None:
     clock = Clock()
-    limit = CommandLimit(now_s=clock)
+    limit = CommandLimit(20.0, 50, now_s=clock)
     assert let_through(limit, "a", 2000) == 50
     assert limit.refused == 1950
     clock.now_s = 1.0
@@ -46,7 +46,7 @@ def test_a_flood_is_refused_at_once_but_for_a_burst_and_a_rate() -> None:
 
 def test_one_sender_does_not_shut_out_another_and_made_up_names_meet_the_common_bound() -> None:
     clock = Clock()
-    limit = CommandLimit(now_s=clock)
+    limit = CommandLimit(20.0, 50, now_s=clock)
     assert let_through(limit, "loud", 2000) == 50
     assert let_through(limit, "quiet", 50) == 50
     clock.now_s = 100.0
