@@ -139,7 +139,8 @@ class Recording:
         self._attachments, self._chunks, self._topics = found.attachments, found.chunks, found.topics
         self._told_rows: dict[str, int] = {}
         with contextlib.suppress(InputError):
-            end = documents.told(documents.End, found.metadata.get("end", {}), field="end")
+            told = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
+            end = documents.told(documents.End, told, field="end")
             self._told_rows = read_json(end.rows.encode())
         self.messages = {self._topics[number]: count for number, count in sorted(found.counts.items())}
         if len(set(self._topics.values())) < len(self._topics):

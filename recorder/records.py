@@ -73,7 +73,8 @@ class Contents:
     """What stands in a file outside its chunks, and where these are.
 
     Attributes:
-        complete: The file was finished.
+        complete: The file was finished, and is taken for it.
+        finished: It has an end, whatever is damaged before that.
         damaged: Records that are not what was written, and are passed over.
         unchecked: What no checksum covers.
         metadata: Metadata by name.
@@ -84,6 +85,7 @@ class Contents:
     """
 
     complete: bool = False
+    finished: bool = False
     damaged: int = 0
     unchecked: tuple[str, ...] = ()
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -108,6 +110,7 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
     if footer is None or salvage:
         found = _walked(file, size)
         if footer is not None:
+            found.finished = True
             with contextlib.suppress(DamagedError):  # a chunk with channels may be among the damaged ones
                 found.topics = _summary(file, size, footer)[0].topics | found.topics
         return _counted(file, found)
@@ -122,7 +125,7 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
             raise DamagedError("the checksum of the whole does not fit")
     else:
         found.unchecked = ("its metadata (by an earlier version, without a checksum of the whole)",)
-    found.complete = True
+    found.complete = found.finished = True
     return found
 
 
