@@ -273,9 +273,9 @@ class Recording:
         found = list(self.short)
         for key, stream in streams.items():
             if stream.odd:
-                found.append(f"{stream.odd} payloads of {key} are no blocks, or do not fit the catalogue")
+                found.append(f"payloads of {key} that are no blocks, or do not fit the catalogue: {stream.odd}")
             if stream.back:
-                found.append(f"{stream.back} blocks of {key} repeat row numbers, or go back")
+                found.append(f"blocks of {key} that repeat row numbers, or go back: {stream.back}")
             if stream.rows > (told := self._told_rows.get(key, stream.rows)):
                 found.append(f"{key} has {stream.rows} rows where the file says {told}")
             if stream.rows and key not in self._widths:

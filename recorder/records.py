@@ -23,6 +23,8 @@ _MOST_ATTACHED = 64 << 20
 """Attachments of a file, together [bytes]."""
 _MOST_METADATA = 16 << 20
 """Metadata of a file, together [bytes]."""
+_HEAD_BYTES = 1 << 10
+"""What one of them takes at least, as reading it costs time."""
 _MOST_SUMMARY = 256 << 20
 """Largest summary: that of some 600 GB [bytes]."""
 _MOST_PACKED = 1000
@@ -177,9 +179,10 @@ class _Room:
             start = file.tell()
             head = file.read(_CHUNK.size)
             file.seek(start)
-            self.unpacked += _CHUNK.unpack(head)[2] if len(head) == _CHUNK.size else 0
+            unpacked = _CHUNK.unpack(head)[2] if len(head) == _CHUNK.size else 0
+            self.unpacked += unpacked if unpacked <= MOST_CHUNK_BYTES else 0  # a larger one is not unpacked
         elif opcode in self._kept:
-            self._kept[opcode] -= length
+            self._kept[opcode] -= length + _HEAD_BYTES
             if self._kept[opcode] < 0:
                 raise DamagedError(f"a record of {length} bytes")
         if self._records < 0 or self.unpacked > self._most:
