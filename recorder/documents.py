@@ -113,6 +113,7 @@ class Event(_Document):
     text: str = ""
     reason: str = ""
     tags: list[str] | None = None
+    rows: dict[str, Count] | None = None
 
 
 class Command(Taken):
@@ -166,11 +167,18 @@ class Rig(_Text):
     parameter_set: str
 
 
+def _rows(text: str) -> str:
+    """Rows by key, as JSON."""
+    if not all(type(rows) is int and rows >= 0 for rows in read_json(text.encode(), field="rows").values()):
+        raise ValueError("numbers of rows by key")
+    return text
+
+
 class End(_Text):
     """Metadata `end`, which closes it."""
 
     reason: str = "unknown"
-    rows: str = "{}"
+    rows: Annotated[str, AfterValidator(_rows)] = "{}"
     first_time_s: float | None = None
     last_time_s: float | None = None
 

@@ -199,6 +199,9 @@ class _Watch:
 
     def _judge(self, health: ChannelHealth, channel: Channel, column: int) -> None:
         say = health.findings.append
+        if not health.rows:
+            say("no rows that fit the catalogue")
+            return
         if health.limited_rows:
             limited_s = health.limited_rows / self._group.rate_hz
             say(f"at its limit for {limited_s:.4g} s ({health.limited_rows} rows)")
@@ -285,7 +288,8 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth], misplace
         [str(event.get("text", "")) for event in recording.events if event.get("event") == "warning"]
         + [str(text) for text in last.get("warnings", [])]
     )
-    findings = [
+    findings = list(recording.doubts)
+    findings += [
         f"{count} blocks of {key} have a time that does not fit their row number" for key, count in misplaced.items()
     ]
     dropped = last.get("queue", {}).get("dropped", 0)

@@ -18,7 +18,7 @@ from recorder import documents, schemas
 from recorder.payload import block_in
 from recorder.records import COPY, MAGIC, Chunk, DamagedError, messages, read_contents, unpack
 from rig.errors import InputError
-from rig.outside import read_json
+from rig.outside import open_file, read_json
 from rig.wire import (
     EDGES,
     EVENTS,
@@ -33,6 +33,8 @@ from rig.wire import (
 
 _MOST_KEPT = 64 << 20
 """Documents of one kind that are kept in memory [bytes]."""
+_LEAST_SPAN_S = 0.5
+"""A stream without rows in a recording of this length is told; in a shorter one it may not have begun."""
 _OURS = "a recording made by `rig record`"
 
 
@@ -79,13 +81,23 @@ class Stream:
         lost: Number of rows missing between them, counted anew from the row numbers.
         first_time_s: Simulated time of the first row [s].
         last_time_s: Simulated time of the last row [s].
+        first: Number of the first row.
+        due: Number of the row after the last one.
+        odd: Number of payloads that are no blocks, or do not fit the catalogue.
+        back: Number of blocks that begin before the row that was due.
+        missing: Rows that the file says it has, or the rig that it made, and that are not there.
     """
 
-    messages: int
-    rows: int
-    lost: int
-    first_time_s: float
-    last_time_s: float
+    messages: int = 0
+    rows: int = 0
+    lost: int = 0
+    first_time_s: float = 0.0
+    last_time_s: float = 0.0
+    first: int = 0
+    due: int = 0
+    odd: int = 0
+    back: int = 0
+    missing: int = 0
 
 
 class Recording:
@@ -114,7 +126,7 @@ class Recording:
         """
         self.path = path
         try:
-            with path.open("rb") as file, self._intact():
+            with open_file(path) as file, self._intact():
                 if file.read(len(MAGIC)) != MAGIC:
                     raise InputError("file", _OURS, f"{path}, which is no MCAP file")
                 found = read_contents(file, path.stat().st_size, salvage=salvage)
@@ -125,6 +137,11 @@ class Recording:
         self.damaged += found.damaged
         self.unchecked = found.unchecked
         self._attachments, self._chunks, self._topics = found.attachments, found.chunks, found.topics
+        self._told_rows: dict[str, int] = {}
+        with contextlib.suppress(InputError):
+            told = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
+            end = documents.told(documents.End, told, field="end")
+            self._told_rows = read_json(end.rows.encode())
         self.messages = {self._topics[number]: count for number, count in sorted(found.counts.items())}
         if len(set(self._topics.values())) < len(self._topics):
             raise InputError("file", "a recording with each channel once", str(path))
@@ -241,29 +258,87 @@ class Recording:
     @cached_property
     def streams(self) -> dict[str, Stream]:
         """Extent of every block stream by key, counted from the blocks."""
+        return self._survey[0]
+
+    @cached_property
+    def short(self) -> tuple[str, ...]:
+        """Rows that the file says it has, and that are not there though all of it is as it was written."""
+        found = [f"{one.missing} rows of {key} are missing" for key, one in self._survey[0].items() if one.missing]
+        return tuple(found)
+
+    @cached_property
+    def doubts(self) -> tuple[str, ...]:
+        """What in the file does not fit the rest of it though every checksum holds, in a line each."""
+        streams, counted = self._survey
+        found = list(self.short)
+        for key, stream in streams.items():
+            if stream.odd:
+                found.append(f"payloads of {key} that are no blocks, or do not fit the catalogue: {stream.odd}")
+            if stream.back:
+                found.append(f"blocks of {key} that repeat row numbers, or go back: {stream.back}")
+            if stream.rows > (told := self._told_rows.get(key, stream.rows)):
+                found.append(f"{key} has {stream.rows} rows where the file says {told}")
+            if stream.rows and key not in self._widths:
+                found.append(f"{key} is not in the catalogue")
+        for topic in sorted(set(self.messages) | set(counted)):
+            if (is_there := counted.get(topic, 0)) != (told := self.messages.get(topic, 0)):
+                found.append(f"{is_there} messages of {topic} where the file says {told}")
+        filled = [stream for stream in streams.values() if stream.rows]
+        span_s = max((one.last_time_s for one in filled), default=0.0) - min(
+            (one.first_time_s for one in filled), default=0.0
+        )
+        for key in sorted(set(self._widths) - {EDGES} - {key for key, one in streams.items() if one.rows}):
+            if span_s > max(_LEAST_SPAN_S, 2.0 / self._rates[key]):
+                found.append(f"no rows of {key}, which the catalogue promises")
+        return tuple(found)
+
+    @cached_property
+    def _survey(self) -> tuple[dict[str, Stream], dict[str, int]]:
+        """Extent of every block stream by key, and messages by topic, counted from what is there."""
         continuity = Continuity()
+        streams: dict[str, Stream] = {}
+        counted: dict[str, int] = {}
         extents: dict[str, list[float]] = {}
-        counts: dict[str, int] = {}
-        keys = {key for key in self.messages if schema_of(key) is not None}
-        for key, _, payload in self._messages(keys):
+        starts: dict[str, int] = {}
+        for key, _, payload in self._messages(set(self._topics.values())):
+            counted[key] = counted.get(key, 0) + 1
+            if schema_of(key) is None:
+                continue
+            stream = streams.setdefault(key, Stream())
             block = self._block(key, payload)
             if block is None:
+                streams[key] = replace(stream, odd=stream.odd + 1)
                 continue
-            counts[key] = counts.get(key, 0) + 1
-            continuity.follow(key, block.index, len(block.values))
+            starts.setdefault(key, block.index)
+            gap = continuity.follow(key, block.index, len(block.values))
+            back = gap is not None and gap.size < 0
+            streams[key] = replace(stream, messages=stream.messages + 1, back=stream.back + back)
             if len(block.values):
                 times_s = self._row_times_s(key, block)
                 extents.setdefault(key, [times_s[0], times_s[-1]])[1] = times_s[-1]
-        return {
-            key: Stream(
-                messages=counts[key],
-                rows=continuity.received[key],
-                lost=continuity.lost[key],
-                first_time_s=float(extents.get(key, [0.0, 0.0])[0]),
-                last_time_s=float(extents.get(key, [0.0, 0.0])[1]),
-            )
-            for key in sorted(counts)
-        }
+        told = self._told_rows
+        ends = self._published_rows()
+        for key in set(streams) | {key for key, rows in told.items() if rows}:
+            rows, due = continuity.received.get(key, 0), continuity.next.get(key, 0)
+            first_s, last_s = extents.get(key, (0.0, 0.0))
+            short = ends.get(key, due) - due if key in continuity.next else 0
+            streams[key] = replace(
+                streams.get(key, Stream()), rows=rows, lost=continuity.lost.get(key, 0), first_time_s=float(first_s),
+                last_time_s=float(last_s), first=starts.get(key, 0), due=due,
+                missing=max(0, told.get(key, rows) - rows, short),
+            )  # fmt: skip
+        return dict(sorted(streams.items())), counted
+
+    def _published_rows(self) -> dict[str, int]:
+        """Number of the row after the last one that the rig published, by key; without losses that are noted.
+
+        Empty where the file does not go to the end of a run.
+        """
+        runs = [event for event in self.events if event["event"] in ("start", "end")]
+        if not runs or runs[-1]["event"] == "start" or {"trigger", "cut"} & set(self.metadata):
+            return {}
+        noted = {(gap.key, gap.index + gap.size) for gap in self.gaps if gap.index >= 0}
+        return {key: due for key, due in (runs[-1].get("rows") or {}).items() if (key, due) not in noted}
 
     def samples(self, group: str) -> Samples:
         """A sensor group in engineering units, in order of arrival.
@@ -395,6 +470,15 @@ class Recording:
         truth = self.catalogue.get("truth", {})
         return {**widths, **{truth_key(name): len(table["columns"]) for name, table in truth.items()}, EDGES: 1}
 
+    @cached_property
+    def _rates(self) -> dict[str, float]:
+        """Rows a second of the same, edges aside [Hz]."""
+        rates = {sensor_key(name): float(group.rate_hz) for name, group in self.table.groups.items()}
+        return {
+            **rates,
+            **{truth_key(name): table["rate_hz"] for name, table in self.catalogue.get("truth", {}).items()},
+        }
+
     def _block(self, key: str, payload: bytes) -> Block | None:
         if schema_of(key) is None:
             raise InputError("key", "a key of blocks (sensors or truth)", key)
@@ -449,7 +533,7 @@ class Recording:
     def _read(self, chunks: list[Chunk], wanted: dict[int, str]) -> Iterator[tuple[str, int, int, bytes]]:
         """The messages on some channels, of some chunks of this file."""
         try:
-            file = self.path.open("rb")
+            file = open_file(self.path)
         except OSError as error:
             raise _unreadable(self.path, error) from None
         with file, self._intact():
@@ -506,9 +590,45 @@ class Joined(Recording):
         """Why the recording ended."""
         return self._parts[-1].end_reason
 
+    @cached_property
+    def streams(self) -> dict[str, Stream]:
+        """Extent of every block stream by key, over all files."""
+        streams: dict[str, Stream] = {}
+        for part in self._parts:
+            for key, later in part.streams.items():
+                earlier = streams.get(key, later)
+                streams[key] = later if earlier is later else _behind(earlier, later)
+        return dict(sorted(streams.items()))
+
+    @cached_property
+    def short(self) -> tuple[str, ...]:
+        """Of each file, the rows that it says it has and that are not there."""
+        return tuple(f"{part.path.name}: {text}" for part in self._parts for text in part.short)
+
+    @cached_property
+    def doubts(self) -> tuple[str, ...]:
+        """Of each file, what does not fit together."""
+        return tuple(f"{part.path.name}: {text}" for part in self._parts for text in part.doubts)
+
     def _stamped(self, topics: set[str]) -> Iterator[tuple[str, int, int, bytes]]:
         for part in self._parts:
             yield from part._stamped(topics)
+
+
+def _behind(earlier: Stream, later: Stream) -> Stream:
+    """A stream that goes on in another file."""
+    if not (earlier.rows and later.rows):
+        kept = earlier if earlier.rows else later
+        first_s, last_s, first, due, between = kept.first_time_s, kept.last_time_s, kept.first, kept.due, 0
+    else:
+        first_s, last_s, first, due = earlier.first_time_s, later.last_time_s, earlier.first, later.due
+        between = max(0, later.first - earlier.due)
+    sums = {
+        name: getattr(earlier, name) + getattr(later, name)
+        for name in ("messages", "rows", "lost", "odd", "back", "missing")
+    }
+    sums["lost"] += between
+    return Stream(**sums, first_time_s=first_s, last_time_s=last_s, first=first, due=due)
 
 
 def join(paths: list[Path]) -> Recording:
@@ -529,10 +649,9 @@ def join(paths: list[Path]) -> Recording:
         numbers = [part.metadata["series"]["number"] for part in parts]
         if len(set(numbers)) < len(numbers):
             raise InputError("files", "different parts of a recording", ", ".join(str(part.path) for part in parts))
+        _check_one_run(parts)
         return Joined(tuple(parts))
-    for part in parts[1:]:
-        if _run_of(part) != _run_of(parts[0]):
-            raise InputError("files", "recordings of one run", f"{parts[0].path} and {part.path}")
+    _check_one_run(parts)
     parts.sort(key=lambda part: _extent_s(part)[0])
     for earlier, later in pairwise(parts):
         if _extent_s(later)[0] < _extent_s(earlier)[1]:
@@ -540,8 +659,14 @@ def join(paths: list[Path]) -> Recording:
     return Joined(tuple(parts))
 
 
+def _check_one_run(parts: list[Recording]) -> None:
+    for part in parts[1:]:
+        if _run_of(part) != _run_of(parts[0]):
+            raise InputError("files", "recordings of one run", f"{parts[0].path} and {part.path}")
+
+
 def _run_of(recording: Recording) -> tuple[Any, ...]:
-    scene = {name: value for name, value in recording.scene.items() if name != "taken"}
+    scene = {name: value for name, value in recording.scene.items() if name not in ("taken", "forgotten")}
     return scene, recording.parameters, recording.catalogue
 
 

@@ -19,6 +19,18 @@ COPY = "metadata.json"
 """Attachment that repeats the metadata at the start of a file: a record of metadata has no checksum of its own."""
 MOST_CHUNK_BYTES = 64 << 20
 """Largest chunk, unpacked: a writer closes one at 1 MiB, and the message that it closes with may be long."""
+_MOST_ATTACHED = 64 << 20
+"""Attachments of a file, together [bytes]."""
+_MOST_METADATA = 16 << 20
+"""Metadata of a file, together [bytes]."""
+_HEAD_BYTES = 1 << 10
+"""What one of them takes at least, as reading it costs time."""
+_MOST_SUMMARY = 256 << 20
+"""Largest summary: that of some 600 GB [bytes]."""
+_MOST_PACKED = 1000
+"""Chunks unpack to at most so many times the file, and to `MOST_CHUNK_BYTES` of a small one."""
+_LEAST_RECORD = 24
+"""A file of records shorter than this, on the whole, is none of a recorder's [bytes]."""
 _RECORD = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
@@ -63,7 +75,8 @@ class Contents:
     """What stands in a file outside its chunks, and where these are.
 
     Attributes:
-        complete: The file was finished.
+        complete: The file was finished, and is taken for it.
+        finished: It has an end, whatever is damaged before that.
         damaged: Records that are not what was written, and are passed over.
         unchecked: What no checksum covers.
         metadata: Metadata by name.
@@ -74,6 +87,7 @@ class Contents:
     """
 
     complete: bool = False
+    finished: bool = False
     damaged: int = 0
     unchecked: tuple[str, ...] = ()
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -98,19 +112,12 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
     if footer is None or salvage:
         found = _walked(file, size)
         if footer is not None:
+            found.finished = True
             with contextlib.suppress(DamagedError):  # a chunk with channels may be among the damaged ones
                 found.topics = _summary(file, size, footer)[0].topics | found.topics
         return _counted(file, found)
-    found, places, data_end = _summary(file, size, footer)
-    for offset, length in places:
-        if offset + length > data_end:
-            raise DamagedError("an index that points nowhere")
-        file.seek(offset)
-        opcode, rest = _RECORD.unpack(file.read(_RECORD.size))
-        if rest != length - _RECORD.size or not _take(found, opcode, file.read(rest)):
-            raise DamagedError("an index that points to something else")
-    if any(chunk.offset + chunk.length > data_end for chunk in found.chunks):
-        raise DamagedError("an index that points nowhere")
+    found, indexed, data_end = _summary(file, size, footer)
+    _take_data(file, found, indexed, data_end)
     file.seek(data_end)
     opcode, length, expected = _DATA_END.unpack(file.read(_DATA_END.size))
     if (opcode, length) != (_op().DATA_END, 4):
@@ -120,8 +127,71 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
             raise DamagedError("the checksum of the whole does not fit")
     else:
         found.unchecked = ("its metadata (by an earlier version, without a checksum of the whole)",)
-    found.complete = True
+    found.complete = found.finished = True
     return found
+
+
+def _take_data(file: BinaryIO, found: Contents, indexed: set[tuple[int, int]], data_end: int) -> None:
+    """Hold the records of the data against their index, and take metadata and attachments."""
+    opcodes = _op()
+    position, room, chunks = len(MAGIC), _Room(data_end), set()
+    for chunk in found.chunks:
+        indexed.add((chunk.offset, chunk.length + _RECORD.size))
+    found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # one without an index has no messages
+    while position < data_end:
+        file.seek(position)
+        opcode, length = _head(file)
+        end = position + _RECORD.size + length
+        if end > data_end or opcode == opcodes.MESSAGE:
+            raise DamagedError("records that do not end with the data, or messages outside of chunks")
+        room.take(opcode, file, length)
+        if opcode in (opcodes.CHUNK, opcodes.METADATA, opcodes.ATTACHMENT):
+            chunks.add((position, end - position))
+            if opcode != opcodes.CHUNK:
+                _take(found, opcode, file.read(length))
+        position = end
+    if chunks != indexed:
+        raise DamagedError("an index that does not fit what is there")
+    if sum(found.counts.values()) > room.unpacked // (_RECORD.size + MESSAGE.size):
+        raise DamagedError("more messages counted than there is room for")
+    counted = {number for number, count in found.counts.items() if count}
+    if counted != set().union(*(chunk.channels or () for chunk in found.chunks)):
+        raise DamagedError("counts that do not fit the index")
+
+
+class _Room:
+    """What the records of a file may take, so that a small file costs neither memory nor time."""
+
+    def __init__(self, size: int) -> None:
+        self.unpacked = 0
+        self._most = _MOST_PACKED * size + MOST_CHUNK_BYTES
+        self._records = size // _LEAST_RECORD + 10_000
+        self._kept = {_op().ATTACHMENT: _MOST_ATTACHED, _op().METADATA: _MOST_METADATA}
+
+    def take(self, opcode: int, file: BinaryIO, length: int) -> None:
+        """Count a record; the file is where its body begins, and stays there.
+
+        Raises:
+            DamagedError: It is too large, or there are too many of them.
+        """
+        self._records -= 1
+        if opcode == _op().CHUNK:
+            start = file.tell()
+            head = file.read(_CHUNK.size)
+            file.seek(start)
+            unpacked = _CHUNK.unpack(head)[2] if len(head) == _CHUNK.size else 0
+            self.unpacked += unpacked if unpacked <= MOST_CHUNK_BYTES else 0  # a larger one is not unpacked
+        elif opcode in self._kept:
+            self._kept[opcode] -= length + _HEAD_BYTES
+            if self._kept[opcode] < 0:
+                raise DamagedError(f"a record of {length} bytes")
+        if self._records < 0 or self.unpacked > self._most:
+            raise DamagedError("more records, or more packed into them, than a recorder makes of a file of that size")
+
+
+def _head(file: BinaryIO) -> tuple[int, int]:
+    """Opcode and length of the record that begins here."""
+    return _RECORD.unpack(file.read(_RECORD.size))
 
 
 def _op() -> type:
@@ -150,7 +220,7 @@ def _footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
     return (start, checksum) if whole else None
 
 
-def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Contents, list[tuple[int, int]], int]:
+def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Contents, set[tuple[int, int]], int]:
     """Channels, counts and chunks by the summary; where metadata and attachments are; where the data end."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import AttachmentIndex, Channel, MetadataIndex, Statistics
@@ -160,12 +230,16 @@ def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Conten
     data_end, end = start - _DATA_END.size, size - len(MAGIC) - _FOOTER.size
     if data_end < len(MAGIC) or start > end:
         raise DamagedError("a footer that points nowhere")
+    if size - start > _MOST_SUMMARY:
+        raise DamagedError(f"a summary of {size - start} bytes")
     file.seek(start)
     data = file.read(size - len(MAGIC) - 4 - start)
     if zlib.crc32(data) != expected:
         raise DamagedError("the checksum of the summary does not fit")
-    found, places = Contents(), []
+    found, places = Contents(), set()
+    room = _Room(len(data))
     for opcode, at, stop in records(data[: end - start]):
+        room.take(opcode, file, 0)
         if opcode == opcodes.CHUNK_INDEX:
             found.chunks.append(_chunk_indexed(data[at:stop]))
             continue
@@ -177,14 +251,13 @@ def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Conten
             found.counts = dict(Statistics.read(body).channel_message_counts)
         elif opcode in (opcodes.ATTACHMENT_INDEX, opcodes.METADATA_INDEX):
             index = (AttachmentIndex if opcode == opcodes.ATTACHMENT_INDEX else MetadataIndex).read(body)
-            places.append((index.offset, index.length))
+            places.add((index.offset, index.length))
     for earlier, later in pairwise(found.chunks):
         if later.offset < earlier.offset + earlier.length:
             raise DamagedError("chunks that lie upon each other")
     used = set(found.counts).union(*(chunk.channels or () for chunk in found.chunks))
     if not used <= set(found.topics):
         raise DamagedError("messages on a channel that is not there")
-    found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # one without an index has no messages
     return found, places, data_end
 
 
@@ -202,8 +275,8 @@ def _add_topic(found: Contents, channel: Channel) -> None:
         raise DamagedError("one number for two channels")
 
 
-def _take(found: Contents, opcode: int, body: bytes) -> bool:
-    """Take a record of metadata or an attachment; False for others.
+def _take(found: Contents, opcode: int, body: bytes) -> None:
+    """Take a record of metadata or an attachment.
 
     Raises:
         DamagedError: It is not what was written, or its name comes twice.
@@ -220,17 +293,14 @@ def _take(found: Contents, opcode: int, body: bytes) -> bool:
                 raise DamagedError("an attachment whose checksum does not fit")
             attachment = Attachment.read(stream)
             kept, name, value = found.attachments, attachment.name, attachment.data
-        elif opcode == opcodes.METADATA:
+        else:
             metadata = Metadata.read(stream)
             kept, name, value = found.metadata, metadata.name, metadata.metadata
-        else:
-            return False
     except (McapError, struct.error, UnicodeDecodeError):
         raise DamagedError("a record that does not end where it should") from None
     if stream.count != len(body) or name in kept:
         raise DamagedError(f"{name} twice" if name in kept else "a record that does not end where it should")
     kept[name] = value  # type: ignore[assignment]
-    return True
 
 
 def _walked(file: BinaryIO, size: int) -> Contents:
@@ -240,10 +310,10 @@ def _walked(file: BinaryIO, size: int) -> Contents:
     """
     opcodes = _op()
     found = Contents()
-    position = len(MAGIC)
+    position, room = len(MAGIC), _Room(size)
     while position + _RECORD.size <= size:
         file.seek(position)
-        opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+        opcode, length = _head(file)
         end = position + _RECORD.size + length
         if opcode == 0 or end > size:
             # Cut off, or zeros where a power cut left unwritten pages; else its length is not what was written.
@@ -254,13 +324,16 @@ def _walked(file: BinaryIO, size: int) -> Contents:
             break
         if opcode == opcodes.DATA_END and length == 4:
             break
+        room.take(opcode, file, length)
         if opcode == opcodes.CHUNK:
             found.chunks.append(Chunk(position, length))
-        elif opcode not in (opcodes.HEADER, opcodes.MESSAGE_INDEX):
+        elif opcode in (opcodes.METADATA, opcodes.ATTACHMENT):
             try:
-                found.damaged += length > size or not _take(found, opcode, file.read(length))
+                _take(found, opcode, file.read(length))
             except DamagedError:
                 found.damaged += 1
+        elif opcode not in (opcodes.HEADER, opcodes.MESSAGE_INDEX):
+            found.damaged += 1
         position = end
     return found
 

@@ -23,6 +23,7 @@ from recorder.records import COPY
 from recorder.series import Commands
 from recorder.writer import Counts, RecordingWriter, check_destination, part_of
 from rig.errors import InputError
+from rig.outside import open_file
 from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_document, encode_block, schema_of
 
 _TELL_EVERY = 5000
@@ -39,12 +40,14 @@ class Rewritten:
         counts: What stands in it.
         damaged: Records of the source that are not what was written, and are left out.
         unchecked: What of the source no checksum covers.
+        short: What the source lacks by its own account.
     """
 
     path: Path
     counts: Counts
     damaged: int
     unchecked: tuple[str, ...] = ()
+    short: tuple[str, ...] = ()
 
 
 def recovered_path(source: Path) -> Path:
@@ -54,7 +57,7 @@ def recovered_path(source: Path) -> Path:
 
 
 def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None) -> bool:
-    """Whether there is nothing to recover: a finished file under its final name, of which all can be read.
+    """Whether there is nothing to recover: a finished file under its final name, of which all is there and can be read.
 
     Args:
         source: The file.
@@ -72,9 +75,9 @@ def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None
             for number, _ in enumerate(recording.everything() if recording.complete else ()):
                 if on_progress is not None and number % _TELL_EVERY == 0:
                     on_progress(number / total)
+            return recording.complete and not recording.short
         except InputError:
             return False
-        return recording.complete
 
 
 def recover(
@@ -106,6 +109,7 @@ def recover(
             "source_bytes": str(source.stat().st_size),
             "damaged_records": str(recording.damaged),
             "unchecked": "; ".join(recording.unchecked),
+            "short": "; ".join(recording.short),
         }
         counts = _write(
             recording,
@@ -118,7 +122,7 @@ def recover(
             change=lambda _, payload: payload,
             on_progress=on_progress,
         )
-    return Rewritten(output, counts, recording.damaged, recording.unchecked)
+    return Rewritten(output, counts, recording.damaged, recording.unchecked, recording.short)
 
 
 def cut(
@@ -199,7 +203,7 @@ def cut(
         change=change,
         on_progress=on_progress,
     )
-    return Rewritten(output, counts, recording.damaged)
+    return Rewritten(output, counts, recording.damaged, short=recording.short)
 
 
 def _write(
@@ -268,7 +272,7 @@ def _unlocked(path: Path) -> Iterator[None]:
     import fcntl
 
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:

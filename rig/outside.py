@@ -6,13 +6,16 @@ fields with ranges and no others. What has passed is believed behind the door, a
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 import re
+import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, BinaryIO, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -88,6 +91,23 @@ def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUM
     return document
 
 
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file to read it; a pipe or a device, which may never end or never begin, is none.
+
+    Raises:
+        OSError: It cannot be read, or is something else.
+    """
+
+    def opener(name: str, flags: int) -> int:
+        number = os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            os.close(number)
+            raise OSError(errno.EINVAL, "not a regular file", name)
+        return number
+
+    return open(path, "rb", opener=opener)
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file that somebody wrote: a scene, a set, a mapping, criteria, a channel table.
 
@@ -95,7 +115,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         InputError: The file cannot be read, is not TOML, or is out of bounds (see `parse_toml`).
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             data = file.read(TOML_BYTES + 1)
         return parse_toml(data.decode("utf-8"), field=str(path))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -134,6 +134,7 @@ class Validation:
         parts: What was recorded.
         nominal: What was foretold.
         files: Number of files that the recording was in.
+        doubts: What in the recording does not fit the rest of it: then nothing that is left of it is good.
     """
 
     path: Path
@@ -156,11 +157,12 @@ class Validation:
     parts: dict[str, Measured] = field(repr=False, default_factory=dict)
     nominal: Prediction | None = field(repr=False, default=None)
     files: int = 1
+    doubts: tuple[str, ...] = ()
 
     @property
     def good(self) -> bool:
-        """Bit-exact, or within every criterion."""
-        return (self.bit_exact and not self.declared) or not self.failures
+        """Bit-exact, or within every criterion, and all of it is there."""
+        return not self.doubts and ((self.bit_exact and not self.declared) or not self.failures)
 
     @property
     def failures(self) -> list[Failure]:
@@ -222,6 +224,9 @@ class Validation:
         if self.good:
             basis = "bit by bit" if self.bit_exact and not self.declared else f"by the criteria: {self.criteria}"
             return f"good, {basis}"
+        if self.doubts:
+            more = f", and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
+            return f"NOT GOOD, the recording does not fit together: {self.doubts[0]}{more}"
         channels = [one.channel for one in self.residuals if one.good is False]
         tables = [one.table for one in self.truth if not one.good]
         phases = [one.phase for one in self.statistics if one.good is False]
@@ -246,6 +251,7 @@ class Validation:
                 "bit_exact": self.bit_exact,
                 "bits": {key: {**asdict(one), "equal": one.equal} for key, one in self.bits.items()},
                 "rows_lost": self.skipped,
+                "doubts": list(self.doubts),
                 "fitted": list(self.fitted),
                 "calibration": list(self.calibration),
                 "window": {"from_s": self.window_s[0], "to_s": self.window_s[1], "reason": self.window_reason},
@@ -303,9 +309,10 @@ def validate(
         calibration=tuple(_calibration(recording)), skipped=sum(stream.lost for stream in recording.streams.values()),
         explained=None, fitted=tuple(one.line for one in again.tuned.fitted) if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
+        doubts=recording.doubts,
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
-    if validation.good or not firsts:
+    if validation.good or validation.doubts or not firsts:
         return validation
     step("what explains the difference")
     return replace(validation, explained=_explained(again, from_s=min(firsts), step=step))

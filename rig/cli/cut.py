@@ -48,6 +48,8 @@ def cut(
             force=force,
             on_progress=lambda done: report.part(done, f"writing {output}"),
         )
+    for line in made.short:
+        echo(f"rig: {line}", err=True)
     counts = made.counts
     echo(
         f"{output}: {(counts.first_time_ns or 0) / 1e9:.4f} s to {counts.last_time_ns / 1e9:.4f} s, "

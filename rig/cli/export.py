@@ -56,6 +56,8 @@ def export(
             reporter.part(part, f"exporting {recording.path.name}")
 
         written = write(selection, output, rate_hz=rate_hz, method=method, force=force, progress=tell)
+    for line in recording.doubts:  # what is exported is not all, or not sure
+        echo(f"rig: {line}", err=True)
     for made in written:
         size = made.path.stat().st_size / 1e6
         echo(f"{made.path}: {made.columns} columns, {size:.1f} MB, {unit}")

@@ -136,14 +136,19 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
 
 def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
     """What is lost and what is in doubt, in a line each."""
-    lost = sum(stream["lost"] for stream in document["streams"].values())
+    streams = document["streams"]
+    noted = bool(document["gaps"])  # what is missing and not noted is told once
+    lost = sum(each["lost"] if noted else max(0, each["lost"] - each["missing"]) for each in streams.values())
     health = document["health"]
     doubtful = [channel["name"] for channel in health["channels"] if channel["findings"]]
     doubts = len(health["findings"]) + len(health["warnings"])
     found = [f"doubts in {', '.join(doubtful)}"] if doubtful else []
     found += [f"{doubts} {'doubt' if doubts == 1 else 'doubts'} on the whole"] if doubts else []
+    gone = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or document["gaps"] else []
+    missing = {key: stream["missing"] for key, stream in streams.items() if stream["missing"]}
+    gone += [f"{rows} rows of {key} are missing" for key, rows in missing.items()]
     return [
-        ("lost", f"{lost} rows in {len(document['gaps'])} gaps" if lost or document["gaps"] else "nothing"),
+        ("lost", "; ".join(gone) or "nothing"),
         ("health", "; ".join(found) or f"{len(health['channels'])} channels without a doubt"),
     ]
 
@@ -178,7 +183,8 @@ def _print_streams(console: Console, streams: dict[str, dict[str, Any]]) -> None
     for key, stream in streams.items():
         times = (f"{stream['first_time_s']:.4f}", f"{stream['last_time_s']:.4f}")
         counts = (str(stream["messages"]), str(stream["rows"]))
-        table.add_row(key, *counts, *times, str(stream["lost"]), style="red" if stream["lost"] else None)
+        lost = max(stream["lost"], stream["missing"])
+        table.add_row(key, *counts, *times, str(lost), style="red" if lost else None)
     console.print(table)
 
 

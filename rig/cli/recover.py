@@ -65,4 +65,5 @@ def _recover(file: Path, new: Path, *, force: bool) -> None:
         + (f"; {made.damaged} damaged records passed over" if made.damaged else "")
         + "".join(f"; {text}: no checksum covers them" for text in made.unchecked)
         + (f"; {lost} rows are missing in it" if lost else "")
+        + "".join(f"; {text}" for text in made.short)
     )

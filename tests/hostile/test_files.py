@@ -6,21 +6,28 @@ Truth here is the recording before it was spoilt. RIG_FUZZ_INPUTS sets the numbe
 from __future__ import annotations
 
 import contextlib
+import copy
+import json
+import os
+import re
 import struct
 import time
 import tracemalloc
 import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from recorder.reader import Recording
+from recorder.reader import Recording, join
+from recorder.records import MAGIC
 from recorder.rewrite import is_whole, recover
 from rig.cli.main import main
 from rig.errors import InputError
 from tests.hostile import Door, inputs, tell
-from tests.hostile.files import Layout, attachments_of, contents, far_block, spoil_bytes, uses, write
+from tests.hostile.files import PROBES, SESSIONS, Layout, attachments_of, contents, far_block, spoil_bytes, uses, write
 
 pytestmark = pytest.mark.filterwarnings("default::RuntimeWarning")
 
@@ -198,3 +205,162 @@ def test_a_packed_chunk_of_4_gb_is_refused_before_it_is_unpacked(
     tracemalloc.stop()
     assert peak < 200e6
     assert time.monotonic() - begin < 10.0
+
+
+def _of(layout: Layout, key: str = PROBES) -> list[int]:
+    return [at for at, (topic, _, _) in enumerate(layout.messages) if topic == key]
+
+
+def _without(layout: Layout, gone: set[int]) -> None:
+    layout.messages = [message for at, message in enumerate(layout.messages) if at not in gone]
+
+
+def _odd(layout: Layout, at: int) -> None:
+    topic, payload, time_ns = layout.messages[at]
+    layout.messages[at] = (topic, payload[:-4], time_ns)
+
+
+def _catalogue(change: Callable[[dict[str, Any]], object]) -> Callable[[Layout], None]:
+    def spoil(layout: Layout) -> None:
+        document = json.loads(layout.attachments["catalogue.json"])
+        change(document)
+        layout.attachments["catalogue.json"] = json.dumps(document).encode()
+
+    return spoil
+
+
+_LIES: dict[str, tuple[Callable[[Layout], object], str]] = {
+    "first": (lambda layout: _without(layout, {_of(layout)[0]}), f"20 rows of {PROBES} are missing"),
+    "middle": (lambda layout: _without(layout, {_of(layout)[1]}), f"20 rows of {PROBES} are missing"),
+    "last": (lambda layout: _without(layout, {_of(layout)[-1]}), f"20 rows of {PROBES} are missing"),
+    "all": (lambda layout: _without(layout, set(_of(layout))), f"60 rows of {PROBES} are missing"),
+    "undecodable": (lambda layout: _odd(layout, _of(layout)[0]), "are no blocks, or do not fit the catalogue: 1"),
+    "twice": (
+        lambda layout: layout.messages.insert(0, layout.messages[_of(layout)[0]]),
+        f"blocks of {PROBES} that repeat row numbers, or go back: 1",
+    ),
+    "channel": (
+        _catalogue(lambda document: document["table"]["groups"]["probes"]["channels"].pop()),
+        f"payloads of {PROBES} that are no blocks, or do not fit the catalogue: 3",
+    ),
+    "ticks": (
+        _catalogue(lambda document: document.update(tick_rate_hz=1000.0)),
+        f"payloads of {PROBES} that are no blocks, or do not fit the catalogue: 3",
+    ),
+    "group": (
+        _catalogue(lambda document: document["table"]["groups"].pop("probes")),
+        f"{PROBES} is not in the catalogue",
+    ),
+}
+
+
+def _rig(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(list(arguments))
+    assert isinstance(end.value.code, int)
+    return end.value.code
+
+
+@pytest.mark.parametrize("lie", _LIES)
+def test_rows_that_are_gone_or_do_not_fit_are_told_though_every_checksum_holds(
+    lie: str, layout: Layout, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changed = copy.deepcopy(layout)
+    spoil, told = _LIES[lie]
+    assert Recording.open(changed.write(tmp_path / "same.mcap")).doubts == ()
+    spoil(changed)
+    path = changed.write(tmp_path / "x.mcap")
+    assert any(told in line for line in Recording.open(path).doubts)
+    assert _rig("info", str(path)) == 0
+    printed = capsys.readouterr().out
+    assert told in printed
+    if "missing" in told:
+        assert re.search(f"^lost .*{told}", printed, re.MULTILINE)
+        assert not is_whole(path)
+        assert recover(path, tmp_path / "new.mcap").short == (told,)
+        assert told in Recording.open(tmp_path / "new.mcap").metadata["recovered"]["short"]
+        assert _rig("export", str(path), "-o", str(tmp_path / "y.parquet")) == 0
+        assert told in capsys.readouterr().err
+    if lie in ("channel", "ticks"):
+        assert _rig("info", "--json", str(path)) == 0
+        channels = json.loads(capsys.readouterr().out)["health"]["channels"]
+        assert next(one for one in channels if one["name"] == "disk_x")["findings"]
+
+
+def test_a_validation_of_what_is_not_all_there_is_not_good(tmp_path: Path) -> None:
+    from replays.validation import validate
+
+    changed = Layout(Recording.open(SESSIONS / "hammer-5.2.mcap"))
+    whole = changed.write(tmp_path / "same.mcap")
+    assert validate(Recording.open(whole)).good
+    _without(changed, {_of(changed)[-1]})
+    found = validate(Recording.open(changed.write(tmp_path / "x.mcap")))
+    assert not found.good
+    assert re.search(r"NOT GOOD.* rows of rig/sensors/probes are missing", found.verdict_line)
+
+
+def test_a_chunk_or_a_count_that_the_index_leaves_out_is_told(path: Path, tmp_path: Path) -> None:
+    data = path.read_bytes()
+    start, checksum_at = struct.unpack_from("<Q", data, len(data) - 28)[0], len(data) - 12
+    spoilt = tmp_path / "x.mcap"
+    for opcode, match in ((8, "does not fit what is there"), (11, "do not fit the index")):
+        summary, position, gone = b"", start, False
+        while position < len(data) - 37:
+            one, length = struct.unpack_from("<BQ", data, position)
+            record = data[position : position + 9 + length]
+            summary += b"" if one == opcode and not gone else record
+            gone |= one == opcode
+            position += 9 + length
+        end = summary + data[len(data) - 37 : checksum_at]
+        spoilt.write_bytes(data[:start] + end + struct.pack("<I", zlib.crc32(end)) + MAGIC)
+        with pytest.raises(InputError, match=match):
+            Recording.open(spoilt)
+
+
+def test_parts_of_a_series_with_another_calibration_are_not_joined(layout: Layout, tmp_path: Path) -> None:
+    first, second = copy.deepcopy(layout), copy.deepcopy(layout)
+    second.metadata["series"]["number"] = "1"
+    paths = [first.write(tmp_path / "0.mcap"), second.write(tmp_path / "1.mcap")]
+    assert len(join(paths).parts) == 2
+    _catalogue(lambda document: document["reference"].update(disk_zero="elsewhere"))(second)
+    second.write(paths[1])
+    with pytest.raises(InputError, match="recordings of one run"):
+        join(paths)
+
+
+@pytest.mark.parametrize("opcode", [6, 9, 12, 0x80, 2])
+def test_a_record_of_3_gb_is_not_read_into_memory(part: Path, tmp_path: Path, opcode: int) -> None:
+    spoilt = tmp_path / "x.mcap.part"
+    head = part.read_bytes()
+    for data in (MAGIC, head):
+        with spoilt.open("wb") as file:
+            file.write(data + struct.pack("<BQ", opcode, 3 << 30))
+            file.truncate(len(data) + 9 + (3 << 30))
+        tracemalloc.start()
+        with contextlib.suppress(InputError):
+            Recording.open(spoilt)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 100e6
+
+
+@pytest.mark.parametrize("record", [struct.pack("<BQ", 0x80, 0), struct.pack("<BQII", 12, 8, 0, 0)])
+def test_millions_of_tiny_records_are_refused_soon(record: bytes, tmp_path: Path) -> None:
+    spoilt = tmp_path / "x.mcap"
+    spoilt.write_bytes(MAGIC + record * 500_000)
+    begin = time.monotonic()
+    with pytest.raises(InputError, match="file must be"):
+        Recording.open(spoilt)
+    assert time.monotonic() - begin < 10.0
+
+
+@pytest.mark.parametrize("command", ["info", "validate", "recover", "run"])
+def test_a_pipe_or_a_folder_is_refused_at_once(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suffix = ".toml" if command == "run" else ".mcap"
+    os.mkfifo(tmp_path / f"pipe{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    for name in ("pipe", "folder"):
+        assert _rig(command, str(tmp_path / f"{name}{suffix}")) == 2
+        assert capsys.readouterr().err.count("\n") == 1
