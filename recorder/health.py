@@ -185,7 +185,7 @@ class _Watch:
                 name=channel.name,
                 unit=channel.unit,
                 rows=self._n,
-                mean=self._total[column] / max(self._n, 1) * scale + offset,
+                mean=self._total[column] / self._n * scale + offset if self._n else math.nan,
                 low=float(ends[0]),
                 high=float(ends[1]),
                 noise=float(quiet[column] * abs(scale)),

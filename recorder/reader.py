@@ -35,6 +35,8 @@ _MOST_KEPT = 64 << 20
 """Documents of one kind that are kept in memory [bytes]."""
 _LEAST_SPAN_S = 0.5
 """A stream without rows in a recording of this length is told; in a shorter one it may not have begun."""
+_OFF_RATE = 1e-3
+"""Part by which the rate of a block may be off that of its stream: an import's is a whole number."""
 _OURS = "a recording made by `rig record`"
 
 
@@ -85,6 +87,7 @@ class Stream:
         due: Number of the row after the last one.
         odd: Number of payloads that are no blocks, or do not fit the catalogue.
         back: Number of blocks that begin before the row that was due.
+        off: Number of blocks at another rate than the catalogue says.
         missing: Rows that the file says it has, or the rig that it made, and that are not there.
     """
 
@@ -97,6 +100,7 @@ class Stream:
     due: int = 0
     odd: int = 0
     back: int = 0
+    off: int = 0
     missing: int = 0
 
 
@@ -276,6 +280,8 @@ class Recording:
                 found.append(f"payloads of {key} that are no blocks, or do not fit the catalogue: {stream.odd}")
             if stream.back:
                 found.append(f"blocks of {key} that repeat row numbers, or go back: {stream.back}")
+            if stream.off:
+                found.append(f"blocks of {key} at another rate than the catalogue says: {stream.off}")
             if stream.rows > (told := self._told_rows.get(key, stream.rows)):
                 found.append(f"{key} has {stream.rows} rows where the file says {told}")
             if stream.rows and key not in self._widths:
@@ -312,7 +318,9 @@ class Recording:
             starts.setdefault(key, block.index)
             gap = continuity.follow(key, block.index, len(block.values))
             back = gap is not None and gap.size < 0
-            streams[key] = replace(stream, messages=stream.messages + 1, back=stream.back + back)
+            off = stream.off + (abs(block.rate_hz / self._rates.get(key, block.rate_hz or 1.0) - 1.0) > _OFF_RATE)
+            off = 0 if key == EDGES else off
+            streams[key] = replace(stream, messages=stream.messages + 1, back=stream.back + back, off=off)
             if len(block.values):
                 times_s = self._row_times_s(key, block)
                 extents.setdefault(key, [times_s[0], times_s[-1]])[1] = times_s[-1]
@@ -625,7 +633,7 @@ def _behind(earlier: Stream, later: Stream) -> Stream:
         between = max(0, later.first - earlier.due)
     sums = {
         name: getattr(earlier, name) + getattr(later, name)
-        for name in ("messages", "rows", "lost", "odd", "back", "missing")
+        for name in ("messages", "rows", "lost", "odd", "back", "off", "missing")
     }
     sums["lost"] += between
     return Stream(**sums, first_time_s=first_s, last_time_s=last_s, first=first, due=due)

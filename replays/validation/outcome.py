@@ -207,7 +207,8 @@ class Validation:
         cut = [f"{key.rpartition('/')[2]} {one.picked}" for key, one in self.bits.items() if one.picked]
         lost += f"; of the channels, by name: {', '.join(cut)}" if cut else ""
         if self.bit_exact:
-            return f"bit-exact: all payloads of {len(self.bits)} streams, {rows} rows{lost}"
+            there = " that are there" if self.doubts else ""
+            return f"bit-exact: all payloads{there} of {len(self.bits)} streams, {rows} rows{lost}"
         off = [(key, one) for key, one in self.bits.items() if not one.equal]
         if not off:
             return f"bits: nothing to compare{lost}"

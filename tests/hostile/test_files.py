@@ -229,6 +229,12 @@ def _catalogue(change: Callable[[dict[str, Any]], object]) -> Callable[[Layout],
     return spoil
 
 
+def _slower(document: dict[str, Any]) -> None:
+    group = document["table"]["groups"]["probes"]
+    for each in (group, *group["channels"]):
+        each["rate_hz"] = 10_000
+
+
 _LIES: dict[str, tuple[Callable[[Layout], object], str]] = {
     "first": (lambda layout: _without(layout, {_of(layout)[0]}), f"20 rows of {PROBES} are missing"),
     "middle": (lambda layout: _without(layout, {_of(layout)[1]}), f"20 rows of {PROBES} are missing"),
@@ -246,6 +252,10 @@ _LIES: dict[str, tuple[Callable[[Layout], object], str]] = {
     "ticks": (
         _catalogue(lambda document: document.update(tick_rate_hz=1000.0)),
         f"payloads of {PROBES} that are no blocks, or do not fit the catalogue: 3",
+    ),
+    "rate": (
+        _catalogue(_slower),
+        f"blocks of {PROBES} at another rate than the catalogue says: 3",
     ),
     "group": (
         _catalogue(lambda document: document["table"]["groups"].pop("probes")),
