@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import re
 import sys
 from typing import Annotated, Any, NoReturn
 
@@ -150,6 +152,8 @@ def start(arguments: list[str] | None = None) -> None:
         _fail(str(error))
     except (SimulationError, DiskError) as error:
         _fail(str(error), status=1)
+    except typer.BadParameter as error:
+        _fail(error.format_message() if error.param is None else _wrong_value(error.param, error.message))
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx is not None else "rig"
         _fail(f"{error.format_message()} (see `{command} --help`)")
@@ -160,11 +164,22 @@ def start(arguments: list[str] | None = None) -> None:
         sys.stderr.close()
         sys.exit(141)
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            _fail(str(InputError("file name", "one that the system accepts", error.filename)))
         # A disk that is full, a file system that refuses: not a fault of the program.
         _fail(f"{error.filename or 'the system'}: {error.strerror or error}", status=1)
     if code == _INTERRUPTED:
         print("rig: interrupted", file=sys.stderr)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _wrong_value(parameter: Any, said: str) -> str:
+    """A value of another type, in the form of every other wrong value."""
+    field = max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.human_readable_name
+    found = re.match(r"'?(.*?)'? is not (.*?)\.?$", said, re.DOTALL)
+    if found is None:
+        return f"{field} must be another value: {said}"
+    return str(InputError(field, found[2], found[1]))
 
 
 def _fail(message: str, *, status: int = 2) -> NoReturn:
