@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -93,7 +92,7 @@ def check_not_among(sources: list[Path], output: Path, *, field: str = "output")
     for taken in (output, output.with_name(output.name + PART_SUFFIX)):
         for source in sources:
             with suppress(OSError):  # one of them is not there
-                if os.path.samefile(source, taken):
+                if source.samefile(taken):
                     raise InputError(field, "another file than those that are read", str(output))
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import re
 import sys
 from typing import Annotated, Any, NoReturn
 
@@ -153,7 +152,7 @@ def start(arguments: list[str] | None = None) -> None:
     except (SimulationError, DiskError) as error:
         _fail(str(error), status=1)
     except typer.BadParameter as error:
-        _fail(error.format_message() if error.param is None else _wrong_value(error.param, error.message))
+        _fail(error.format_message() if error.param is None else _wrong_value(error))
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx is not None else "rig"
         _fail(f"{error.format_message()} (see `{command} --help`)")
@@ -173,13 +172,17 @@ def start(arguments: list[str] | None = None) -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _wrong_value(parameter: Any, said: str) -> str:
+def _wrong_value(error: Any) -> str:
     """A value of another type, in the form of every other wrong value."""
-    field = max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.human_readable_name
-    found = re.match(r"'?(.*?)'? is not (.*?)\.?$", said, re.DOTALL)
-    if found is None:
-        return f"{field} must be another value: {said}"
-    return str(InputError(field, found[2], found[1]))
+    from pydantic import ValidationError
+
+    options = [name for name in error.param.opts if name.startswith("-")]
+    field = max(options, key=len) if options else error.param.metavar or error.param.name
+    if not isinstance(error.__cause__, ValidationError):
+        return f"{field}: {error.message}"
+    first = error.__cause__.errors()[0]
+    must = first["msg"].removeprefix("Input should be ").partition(", unable")[0]
+    return str(InputError(field, must, first["input"]))
 
 
 def _fail(message: str, *, status: int = 2) -> NoReturn:
