@@ -110,7 +110,11 @@ def whole_file(path: Path) -> Iterator[Path]:
     except (InputError, SimulationError, DiskError, *_FAULTS):
         raise
     except Exception as error:
-        reason = getattr(error, "strerror", None) or error
+        # A library that closes what has failed may fail again: the system's own word came first.
+        reason, earlier = str(error) or type(error).__name__, error
+        while earlier is not None:
+            reason = (isinstance(earlier, OSError) and earlier.strerror) or reason
+            earlier = earlier.__context__
         raise DiskError(f"{path} could not be written: {reason}; nothing of it is kept") from error
     finally:
         with suppress(OSError):

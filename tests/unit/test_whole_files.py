@@ -19,7 +19,7 @@ from rig.transport.certificates import holder_in, make
 def test_whatever_a_library_raises_is_one_line_that_names_the_file(error: Exception, tmp_path: Path) -> None:
     path = tmp_path / "a.wav"
     path.write_text("old")
-    with pytest.raises(DiskError, match="a.wav could not be written"), whole_file(path) as draft:
+    with pytest.raises(DiskError, match=r"a\.wav could not be written"), whole_file(path) as draft:  # noqa: PT012
         draft.write_text("half")
         raise error
     assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("a.wav", "old")]
@@ -66,7 +66,7 @@ def test_names_of_the_file_are_named_and_branches_of_a_union_are_not(document: d
 
 
 def test_long_numbers_are_placed_and_not_printed(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="^seed must be without whole numbers") as wrong:
+    with pytest.raises(InputError, match=r"^seed must be without whole numbers") as wrong:
         load_scene("hammer", {"seed": "9" * 5000})
     assert "999" not in str(wrong.value)
     path = tmp_path / "a.toml"
