@@ -14,10 +14,6 @@ PART_SUFFIX = ".part"
 _LONGEST_LINE = 5000
 
 
-_FAULTS = (AssertionError, AttributeError, LookupError, MemoryError, NameError, TypeError)
-"""What no disk is to blame for."""
-
-
 class InputError(ValueError):
     """A field has a value it must not have.
 
@@ -107,9 +103,9 @@ def whole_file(path: Path) -> Iterator[Path]:
     try:
         yield draft
         draft.replace(path)
-    except (InputError, SimulationError, DiskError, *_FAULTS):
+    except (InputError, SimulationError, DiskError):
         raise
-    except Exception as error:
+    except (OSError, RuntimeError, ValueError) as error:  # what libraries make of it; all else is a fault of ours
         # A library that closes what has failed may fail again: the system's own word came first.
         reason, earlier = str(error) or type(error).__name__, error
         while earlier is not None:

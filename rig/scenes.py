@@ -42,6 +42,12 @@ class _Part(BaseModel):
         for name, value in data.items() if isinstance(data, dict) else ():
             if isinstance(value, bool) and name in cls.model_fields and cls.model_fields[name].annotation is not bool:
                 raise InputError(name, "something else than true or false", value)
+            if (
+                isinstance(value, str)
+                and name in cls.model_fields
+                and cls.model_fields[name].annotation in (int, float)
+            ):
+                raise InputError(name, "a number", value)
         return data
 
 

@@ -92,3 +92,9 @@ def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "keys" / "server" / "key.pem").chmod(0o640)
     with pytest.raises(InputError, match=r"chmod 600 .*key.pem"):
         holder_in(tmp_path / "keys", server=True)
+
+
+def test_a_number_in_quotes_is_none() -> None:
+    assert parse_scene({"duration_s": 1}).duration_s == 1.0
+    with pytest.raises(InputError, match="duration_s must be a number; instead received '1'"):
+        parse_scene({"duration_s": "1"})
