@@ -209,7 +209,7 @@ def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10
 
 
 # What pydantic puts into the place of an error beside the names that stand in the file: branches of a union.
-_BRANCH = re.compile(r"(function-\w+|tuple|list|dict|set|literal|nullable|chain|constrained-\w+)(\[.*\])?", re.DOTALL)
+_BRANCH = re.compile(r"(function-\w+|tuple|list|dict|set|literal|nullable|chain)\[.*\]|constrained-\w+", re.DOTALL)
 _PLAIN_BRANCH = {"float": ("float", "finite", "greater", "less"), "int": ("int", "greater", "less"), "str": ("string",)}
 
 
