@@ -21,8 +21,8 @@ from recorder.payload import block_in, tick_in
 from recorder.reader import Recording
 from recorder.records import COPY
 from recorder.series import Commands
-from recorder.writer import Counts, RecordingWriter, check_destination, part_of
-from rig.errors import InputError
+from recorder.writer import Counts, RecordingWriter, check_destination
+from rig.errors import InputError, check_not_among
 from rig.outside import open_file
 from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_document, encode_block, schema_of
 
@@ -101,7 +101,7 @@ def recover(
         RecordingError: The disk refused.
     """
     output = output or recovered_path(source)
-    _check_not_among([source], output)
+    check_not_among([source], output)
     with _unlocked(source):
         recording = Recording(source, salvage=True)
         about = {
@@ -159,7 +159,7 @@ def cut(
         raise InputError("from and to", "times, one before the other", f"{from_s:g} and {to_s:g}")
     if only not in (None, "sensors", "truth"):
         raise InputError("only", "sensors or truth", only)
-    _check_not_among([part.path for part in recording.parts], output)
+    check_not_among([part.path for part in recording.parts], output)
     catalogue, columns = _narrowed(recording, channels, only)
     tick_rate_hz = recording.catalogue["tick_rate_hz"]
     from_tick, to_tick = (_tick(at_s, tick_rate_hz) for at_s in (from_s, to_s))
@@ -254,12 +254,6 @@ def _write(
                 writer.write(key, changed, wall_ns)
         writer.finish(reason)
     return writer.counts()
-
-
-def _check_not_among(sources: list[Path], output: Path) -> None:
-    taken = {output.absolute(), part_of(output).absolute()}  # while it is written, it is a .part
-    if any(source.absolute() in taken for source in sources):
-        raise InputError("output", "another name than that of what is read", str(output))
 
 
 @contextlib.contextmanager

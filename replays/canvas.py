@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from rig.errors import InputError
+from rig.errors import InputError, whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,7 +81,7 @@ def save(figure: Figure, *paths: Path, dpi: int = 110, colours: int | None = Non
 
     Raises:
         InputError: A file is neither .png nor .svg.
-        OSError: The disk refused; what stood in the file before stands there still.
+        DiskError: The disk refused; what stood in the file before stands there still.
     """
     for path in paths:
         check_suffix(path)
@@ -114,9 +114,5 @@ def _png(figure: Figure, dpi: int, colours: int | None) -> bytes:
 
 
 def _write(path: Path, data: bytes) -> None:
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_bytes(data)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(path) as draft:
+        draft.write_bytes(data)

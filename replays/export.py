@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -19,6 +20,7 @@ import numpy as np
 from replays.formats import columnar, delimited
 from replays.formats.export import check_output
 from rig import wire
+from rig.errors import whole_file
 from rig.kernels.signals import ROW
 from rig.service import blocks_of
 from rig.simulation import Frame, Simulation
@@ -103,31 +105,23 @@ class _TableRun:
 
     def __init__(self, path: Path, simulation: Simulation, open_table: Callable[[Path, Any], Any]) -> None:
         self.path = path
-        self.part = path.with_name(path.name + ".part")
         self.simulation = simulation
         self._open_table = open_table
         self._background = _Background()
 
     def __enter__(self) -> Self:
         schema = columnar.float_schema(table_columns(self.simulation))
-        self._writer = self._open_table(self.part, schema)
+        with ExitStack() as stack:
+            self._writer = self._open_table(stack.enter_context(whole_file(self.path)), schema)
+            stack.callback(self._writer.close)
+            stack.callback(self._background.finish)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        whole = False
-        try:
-            try:
-                self._background.finish()
-            finally:
-                self._writer.close()
-            whole = kind is None
-        finally:
-            if whole:
-                self.part.replace(self.path)
-            else:
-                self.part.unlink(missing_ok=True)
+        self._stack.__exit__(kind, error, trace)
 
     def write(self, frame: Frame) -> None:
         """Take the next frame."""

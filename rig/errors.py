@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from rig.text import printable, shown
 
+PART_SUFFIX = ".part"
+"""What a file's name ends in while it is being written."""
 _LONGEST_LINE = 5000
 
 
@@ -54,6 +58,10 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
     Raises:
         InputError: Another ending, a folder that is missing or read-only, or an existing file.
     """
+    try:
+        path.with_name(path.name + PART_SUFFIX).exists()
+    except OSError as error:  # a name that is too long
+        raise InputError(field, "a file name that the system accepts", f"{path} ({error.strerror})") from None
     if path.suffix not in suffixes:
         *others, last = suffixes
         endings = f"{', '.join(others)} or {last}" if others else last
@@ -69,3 +77,41 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
         raise InputError(field, "in a folder that can be written", f"{path} ({error.strerror})") from None
+
+
+def check_not_among(sources: list[Path], output: Path, *, field: str = "output") -> None:
+    """Refuse to write over what is read, by whatever name.
+
+    Raises:
+        InputError: The file, or the one that it is while it is written, is among the sources.
+    """
+    for taken in (output, output.with_name(output.name + PART_SUFFIX)):
+        for source in sources:
+            with suppress(OSError):  # one of them is not there
+                if source.samefile(taken):
+                    raise InputError(field, "another file than those that are read", str(output))
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A draft beside a file, which takes its place where the block ends well and is removed where it does not.
+
+    Raises:
+        DiskError: The disk refused, in whatever words the library that wrote has for it.
+    """
+    draft = path.with_name(path.name + PART_SUFFIX)
+    try:
+        yield draft
+        draft.replace(path)
+    except (InputError, SimulationError, DiskError):
+        raise
+    except (OSError, RuntimeError, ValueError) as error:  # what libraries make of it; all else is a fault of ours
+        # A library that closes what has failed may fail again: the system's own word came first.
+        reason, earlier = str(error) or type(error).__name__, error
+        while earlier is not None:
+            reason = (isinstance(earlier, OSError) and earlier.strerror) or reason
+            earlier = earlier.__context__
+        raise DiskError(f"{path} could not be written: {reason}; nothing of it is kept") from error
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)

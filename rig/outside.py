@@ -117,7 +117,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         with open_file(path) as file:
             data = file.read(TOML_BYTES + 1)
-        return parse_toml(data.decode("utf-8"), field=str(path))
+        return parse_toml(data.decode("utf-8-sig"), field=str(path))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(str(path), "a TOML file", printable(str(error), 200)) from None
     except OSError as error:
@@ -147,7 +147,11 @@ def parse_toml(text: str, *, field: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError:
         raise
     except ValueError as error:  # digits beyond Python's own limit
-        raise InputError(field, f"without whole numbers beyond +-{LARGEST}", printable(str(error), 100)) from None
+        number = _LONG_NUMBER.search(text)
+        if number is not None and "\n" in text:
+            field += f", line {text.count(chr(10), 0, number.start()) + 1}"
+        received = printable(str(error), 100) if number is None else "one of thousands of digits"
+        raise InputError(field, f"without whole numbers beyond +-{LARGEST}", received) from None
     check_depth(document, field=field)
     return document
 
@@ -174,6 +178,7 @@ def check_depth(document: Any, *, field: str) -> None:
     raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper")
 
 
+_LONG_NUMBER = re.compile(r"\d[\d_]{4000,}")
 _DOTTED = re.compile(r"\.[ \t]*[\w\"'-]")
 
 
@@ -223,8 +228,23 @@ def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10
         raise input_error(error, field) from None
 
 
-# What pydantic puts into the place of an error beside the names that stand in the file.
-_NOT_IN_A_FILE = {"request", "float", "int", "str", "constrained-float"}
+# What pydantic puts into the place of an error beside the names that stand in the file: branches of a union.
+_BRANCH = re.compile(r"(function-\w+|tuple|list|dict|set|literal|nullable|chain)\[.*\]|constrained-\w+", re.DOTALL)
+_PLAIN_BRANCH = {"float": ("float", "finite", "greater", "less"), "int": ("int", "greater", "less"), "str": ("string",)}
+
+
+def _place(parts: tuple[str | int, ...], kind: str) -> list[str]:
+    """The names that stand in the file, of the place of an error of that kind."""
+    named = kind in ("extra_forbidden", "missing")
+    found = []
+    for number, part in enumerate(parts):
+        name, last = str(part), number == len(parts) - 1
+        branch = _BRANCH.fullmatch(name) or (last and kind.startswith(_PLAIN_BRANCH.get(name, ("\0",))))
+        # A timed command's own fields stand beside its time.
+        inner = name == "request" and number > 0 and isinstance(parts[number - 1], int)
+        if (last and named) or not (branch or inner):
+            found.append(printable(name, 100) or '""')
+    return found
 
 
 def input_error(error: ValidationError, where: str) -> InputError:
@@ -233,9 +253,7 @@ def input_error(error: ValidationError, where: str) -> InputError:
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, InputError):  # a rule over several fields names its own
         return cause
-    # Only what stands in the file: not the branches of a union, nor the part that holds a timed command's own fields.
-    place = ".".join(str(part) for part in first["loc"] if str(part) not in _NOT_IN_A_FILE and "[" not in str(part))
-    field = ".".join(part for part in (where, place) if part)
+    field = ".".join(part for part in (where, *_place(first["loc"], first["type"])) if part)
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
     if first["type"] == "union_tag_invalid":

@@ -26,7 +26,6 @@ from rig.errors import InputError
 from rig.levels import ModelLevels
 from rig.outside import check, parse_toml, read_toml
 from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
-from rig.text import printable
 
 SCENES = Path(__file__).with_name("scenes")
 _APART_S = 0.01
@@ -43,6 +42,12 @@ class _Part(BaseModel):
         for name, value in data.items() if isinstance(data, dict) else ():
             if isinstance(value, bool) and name in cls.model_fields and cls.model_fields[name].annotation is not bool:
                 raise InputError(name, "something else than true or false", value)
+            if (
+                isinstance(value, str)
+                and name in cls.model_fields
+                and cls.model_fields[name].annotation in (int, float)
+            ):
+                raise InputError(name, "a number", value)
         return data
 
 
@@ -421,7 +426,7 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
     path = scene_path(name_or_path)
     data = {"name": path.stem, **read_toml(path)}
     for key, value in (overrides or {}).items():
-        _override(data, key, read_value(value) if isinstance(value, str) else value)
+        _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
     scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
     if data.get("fidelity") == "auto":
         scene = _with_pick(scene, data, [] if overrides is None else list(overrides))
@@ -540,10 +545,10 @@ def _scene_keys() -> list[str]:
     return keys
 
 
-def read_value(text: str) -> Any:
+def read_value(text: str, *, field: str = "value") -> Any:
     """A value from the command line: TOML where it is such, else the text itself."""
     try:
-        return parse_toml(f"value = {text}", field=printable(text, 60))["value"]
+        return parse_toml(f"value = {text}", field=field)["value"]
     except tomllib.TOMLDecodeError:
         return text
 

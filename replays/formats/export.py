@@ -5,17 +5,16 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from recorder.schemas import PART_SUFFIX
 from replays.formats import clock
 from replays.formats.selection import ROWS, Chunk, Selection, Table
-from rig.errors import InputError, check_new_file
+from rig.errors import InputError, check_new_file, check_not_among, whole_file
 
 _WRITERS = {
     ".mf4": "mdf", ".tdms": "tdms", ".uff": "uff", ".csv": "delimited", ".parquet": "columnar", ".wav": "wav",
@@ -119,6 +118,7 @@ def export(
     for target, part in jobs:
         for made in [target, *([_beside(target)] if hasattr(kind, "sidecar") else [])]:
             check_output(made, force=force, suffixes=(*SUFFIXES, ".json"))
+            check_not_among([each.path for each in selection.recording.parts], made)
         for table in part.tables:
             names = [column.name for column in table.columns]
             if len(set(names)) < len(names):
@@ -128,12 +128,9 @@ def export(
                 raise InputError("range", must, f"{missing} rows missing in {table.name}")
     done = 0
     written = []
-    finished: list[tuple[Path, Path]] = []
-    try:
+    with ExitStack() as stack:
         for target, part in jobs:
-            draft = target.with_name(target.name + PART_SUFFIX)
-            finished.append((draft, target))
-            writer: Writer = kind(draft, part)
+            writer: Writer = kind(stack.enter_context(whole_file(target)), part)
             whole = False
             try:
                 for table in part.tables:
@@ -148,18 +145,10 @@ def export(
                     with suppress(Exception):
                         writer.abandon()
             if hasattr(kind, "sidecar"):
-                beside = _beside(target)
                 text = json.dumps(part.sidecar(), indent=1, ensure_ascii=False)
-                note = beside.with_name(beside.name + PART_SUFFIX)
-                finished.append((note, beside))
-                note.write_text(text + "\n", encoding="utf-8")
+                stack.enter_context(whole_file(_beside(target))).write_text(text + "\n", encoding="utf-8")
             tables = tuple((t.name, t.rate_hz, t.rows, part.missing[t.name]) for t in part.tables)
             written.append(Written(target, tables, sum(len(table.columns) for table in part.tables)))
-        for draft, target in finished:
-            draft.replace(target)
-    finally:
-        for draft, _ in finished:
-            draft.unlink(missing_ok=True)
     return written
 
 

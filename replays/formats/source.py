@@ -149,7 +149,13 @@ def open_source(path: Path, options: FileOptions) -> Source:
         entry if entry.rate_hz is None or 0.0 < entry.rate_hz <= _MOST_HZ else replace(entry, rate_hz=None)
         for entry in source.entries
     )
-    return replace(source, entries=_distinct(entries), read=read)
+    distinct = _distinct(entries)
+    twice = [
+        f"several are named {one.name!r}: this one is {new.name!r}"
+        for one, new in zip(entries, distinct, strict=True)
+        if one.name != new.name
+    ]
+    return replace(source, entries=distinct, read=read, remarks=(*source.remarks, *twice))
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rig.errors import InputError, check_new_file
+from rig.errors import InputError, check_new_file, whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -117,19 +117,16 @@ class Report:
 
         Raises:
             InputError: The file is neither .html nor .pdf.
-            OSError: The disk refused; what stood in the file before stands there still.
+            DiskError: The disk refused; what stood in the file before stands there still.
         """
         check_suffix(path)
         if path.suffix == ".html":
             from replays.report.html import render
         else:
             from replays.report.pdf import render
-        part = path.with_name(path.name + ".part")
-        try:
-            part.write_bytes(render(self))
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        data = render(self)
+        with whole_file(path) as draft:
+            draft.write_bytes(data)
 
 
 def check_suffix(path: Path) -> None:

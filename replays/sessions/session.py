@@ -15,6 +15,7 @@ from recorder.reader import Recording
 from replays.export import McapRun
 from replays.validation import validate
 from replays.validation.outcome import Validation
+from rig.errors import whole_file
 from rig.offline import frames
 from rig.scenes import load_scene
 from rig.simulation import Simulation
@@ -62,12 +63,8 @@ def make(session: Session, folder: Path, *, step: Callable[[str], None] = lambda
     step(session.name)
     _record(session, recording)
     found = validate(Recording.open(recording), declared=True)
-    part = text.with_name(text.name + ".part")
-    try:
-        part.write_text(quantities_text(session, found), encoding="utf-8")
-        part.replace(text)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(text) as draft:
+        draft.write_text(quantities_text(session, found), encoding="utf-8")
     return recording, text
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from typing import Annotated, Any, NoReturn
 
@@ -150,6 +151,8 @@ def start(arguments: list[str] | None = None) -> None:
         _fail(str(error))
     except (SimulationError, DiskError) as error:
         _fail(str(error), status=1)
+    except typer.BadParameter as error:
+        _fail(error.format_message() if error.param is None else _wrong_value(error))
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx is not None else "rig"
         _fail(f"{error.format_message()} (see `{command} --help`)")
@@ -160,11 +163,26 @@ def start(arguments: list[str] | None = None) -> None:
         sys.stderr.close()
         sys.exit(141)
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            _fail(str(InputError("file name", "one that the system accepts", error.filename)))
         # A disk that is full, a file system that refuses: not a fault of the program.
         _fail(f"{error.filename or 'the system'}: {error.strerror or error}", status=1)
     if code == _INTERRUPTED:
         print("rig: interrupted", file=sys.stderr)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _wrong_value(error: Any) -> str:
+    """A value of another type, in the form of every other wrong value."""
+    from pydantic import ValidationError
+
+    options = [name for name in error.param.opts if name.startswith("-")]
+    field = max(options, key=len) if options else error.param.metavar or error.param.name
+    if not isinstance(error.__cause__, ValidationError):
+        return f"{field}: {error.message}"
+    first = error.__cause__.errors()[0]
+    must = first["msg"].removeprefix("Input should be ").partition(", unable")[0]
+    return str(InputError(field, must, first["input"]))
 
 
 def _fail(message: str, *, status: int = 2) -> NoReturn:

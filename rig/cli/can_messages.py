@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.can_output import CanBitrate, CanClassic, CanFd, CanRate, plan
 from rig.cli.tables import echo
+from rig.errors import whole_file
 
 
 def dbc(
@@ -21,7 +22,8 @@ def dbc(
     if out is None:
         echo(text(), nl=False)
         return
-    out.write_text(text(), encoding="utf-8")
+    with whole_file(out) as draft:
+        draft.write_text(text(), encoding="utf-8")
     echo(f"{out} written")
 
 

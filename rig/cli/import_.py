@@ -9,7 +9,7 @@ import typer
 
 from rig.cli.options import Force
 from rig.cli.tables import echo
-from rig.errors import InputError
+from rig.errors import InputError, check_not_among, whole_file
 
 if TYPE_CHECKING:
     from replays.formats.conversion import Conversion
@@ -58,6 +58,7 @@ def import_(
     from rig.cli.progress import reporting
 
     check_destination(output, force=force)
+    check_not_among([*files, mapping], output)
     checked = load_mapping(mapping)
     with reporting() as reporter:
         try:
@@ -80,10 +81,10 @@ def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
     from replays.formats.template import CHECK, example, template
 
     check_output(path, force=force, suffixes=(".toml",))
+    check_not_among(files, path)
     text = template(files) if files else example()
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    with whole_file(path) as draft:
+        draft.write_text(text, encoding="utf-8")
     guesses = text.count(CHECK)
     told = "a mapping to start from" if files else "an example with every option"
     told += f"; {guesses} {'line' if guesses == 1 else 'lines'} with {CHECK}" if guesses else ""

@@ -10,6 +10,7 @@ import typer
 from rig.cli.options import Changes, SceneName
 from rig.cli.progress import reporting
 from rig.cli.tables import echo, new_table, table_console
+from rig.errors import whole_file
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -72,7 +73,8 @@ def ladder(
     if output is not None:
         paths = draw(found, output)
         paths.append(output / "ladder.json")
-        paths[-1].write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        with whole_file(paths[-1]) as draft:
+            draft.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     if write is not None:
         write_pick(write, scene, pick_of(found))
     if json_output:

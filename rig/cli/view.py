@@ -13,7 +13,7 @@ import typer
 from rig.cli.connection import Connect, Tls
 from rig.cli.options import Force, OptionalRecordingFiles
 from rig.cli.tables import echo
-from rig.errors import InputError, RefusedError, check_new_file
+from rig.errors import DiskError, InputError, RefusedError, check_new_file, whole_file
 from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
@@ -206,17 +206,17 @@ def _saved(
         plan: The blueprint.
         until_interrupted: Ctrl-C is how it ends, not a reason to throw it away.
     """
-    part = path.with_name(path.name + ".part")
-    try:
-        try:
-            stream.save(part, default_blueprint=plan)
-            with suppress(*([KeyboardInterrupt] if until_interrupted else [])):
-                yield
-        finally:
-            _close(stream)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(path) as part:
+        stream.save(part, default_blueprint=plan)
+        with suppress(*([KeyboardInterrupt] if until_interrupted else [])):
+            yield
+        stream.flush(timeout_sec=60.0)  # raises where the disk has refused, and then nothing is left to disconnect
+        stream.disconnect()
+        # The library itself only logs what the disk refuses: a file that is whole ends with its table of contents.
+        with part.open("rb") as file:
+            file.seek(max(0, part.stat().st_size - 64))
+            if b"RRF2FOOT" not in file.read():
+                raise DiskError(f"{path} could not be written to its end; nothing of it is kept")
 
 
 @contextmanager

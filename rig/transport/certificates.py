@@ -7,6 +7,7 @@ itself (`authority.pem`, `certificate.pem`, `key.pem`), so that it can be copied
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 import shutil
 import socket
@@ -106,6 +107,11 @@ def holder_in(folder: Path | str, *, server: bool) -> Holder:
     wanted = ExtendedKeyUsageOID.SERVER_AUTH if server else ExtendedKeyUsageOID.CLIENT_AUTH
     if not whole or wanted not in usage:
         raise InputError("--tls", must, str(folder))
+    key = where / _KEY
+    if os.name == "posix" and key.stat().st_mode & 0o077:
+        raise InputError(
+            "--tls", f"a folder whose key is its owner's alone (chmod 600 {key})", "one that others may read"
+        )
     expires = certificate.not_valid_after_utc
     if expires <= datetime.now(UTC):
         raise InputError("--tls", "a certificate that is valid (rig keys init makes new ones)", f"{where}, expired")

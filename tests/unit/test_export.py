@@ -11,7 +11,7 @@ import pytest
 from recorder.reader import Recording
 from replays.export import SUFFIXES, check_run_output, table_columns, writer_for
 from rig.cli.main import main
-from rig.errors import InputError
+from rig.errors import DiskError, InputError
 from rig.kernels.signals import ROW, TRUTH
 from rig.offline import Run, frames, simulate
 from rig.scenes import load_scene
@@ -194,7 +194,7 @@ def test_a_disk_that_refuses_is_told_and_leaves_nothing(
     def refuse(rows: np.ndarray) -> None:
         raise OSError(28, "No space left on device")
 
-    with pytest.raises(OSError, match="No space left"), writer_for(path, simulation) as writer:  # noqa: PT012
+    with pytest.raises(DiskError, match="No space left"), writer_for(path, simulation) as writer:  # noqa: PT012
         monkeypatch.setattr(writer, "_append", refuse)
         for frame in frames(simulation, chunk_s=0.01):
             writer.write(frame)

@@ -1,0 +1,100 @@
+"""Files that commands make are whole or not there, whatever a library says of the disk; what is read is never lost."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rig.cli.app import start
+from rig.errors import DiskError, InputError, check_new_file, check_not_among, whole_file
+from rig.outside import read_toml
+from rig.scenes import load_scene, parse_scene
+from rig.transport.certificates import holder_in, make
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("System error."), ValueError()])
+def test_whatever_a_library_raises_is_one_line_that_names_the_file(error: Exception, tmp_path: Path) -> None:
+    path = tmp_path / "a.wav"
+    path.write_text("old")
+    with pytest.raises(DiskError, match=r"a\.wav could not be written"), whole_file(path) as draft:  # noqa: PT012
+        draft.write_text("half")
+        raise error
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("a.wav", "old")]
+
+
+def test_a_fault_of_the_program_is_not_blamed_on_the_disk(tmp_path: Path) -> None:
+    with pytest.raises(TypeError), whole_file(tmp_path / "a.wav"):
+        raise TypeError
+
+
+def test_what_is_read_is_not_written_to_by_another_name(tmp_path: Path) -> None:
+    source = tmp_path / "a.mcap"
+    source.touch()
+    (tmp_path / "other").symlink_to(tmp_path)
+    os.link(source, tmp_path / "b.mcap")
+    for output in (tmp_path / "other" / "a.mcap", tmp_path / "b.mcap"):
+        with pytest.raises(InputError, match="output must be another file"):
+            check_not_among([source], output)
+    check_not_among([source], tmp_path / "c.mcap")
+
+
+def test_names_that_are_too_long_are_wrong_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError, match="output must be a file name"):
+        check_new_file(tmp_path / ("x" * 300 + ".csv"), field="output", suffixes=(".csv",), force=True)
+    for command in ("run", "recover"):
+        with pytest.raises(SystemExit) as ended:
+            start([command, "x" * 300 + ".mcap"])
+        assert ended.value.code == 2
+        assert "must be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("document", "field"),
+    [
+        ({"\x1b[2J": 1}, r"\x1b[2J"), ({"request": 1}, "request"), ({"float": 1}, "float"), ({"": 1}, '""'),
+        ({"commands": [{"at_s": 1, "command": "hammer", "a[b]": 1}]}, "commands.0.hammer.a[b]"),
+        ({"commands": [{"at_s": 1, "command": "hammer", "direction": [1]}]}, "commands.0.hammer.direction"),
+    ],
+)  # fmt: skip
+def test_names_of_the_file_are_named_and_branches_of_a_union_are_not(document: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError) as wrong:
+        parse_scene(document)
+    assert str(wrong.value).startswith(f"{field} must be ")
+
+
+def test_long_numbers_are_placed_and_not_printed(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^seed must be without whole numbers") as wrong:
+        load_scene("hammer", {"seed": "9" * 5000})
+    assert "999" not in str(wrong.value)
+    path = tmp_path / "a.toml"
+    path.write_text(f"\ufefftitle = 'x'\nseed = {'9' * 5000}\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"line 2 must be without") as wrong:
+        read_toml(path)
+    assert "999" not in str(wrong.value)
+
+
+@pytest.mark.parametrize(("words", "field"), [(["hammer", "--force-n", "abc"], "--force-n"), (["speed", "abc"], "")])
+def test_a_value_of_another_type_is_shown(words: list[str], field: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        start(words)
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"rig: {field}")
+    assert said.endswith("must be a valid number; instead received 'abc'\n")
+
+
+def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    make(tmp_path / "keys")
+    holder_in(tmp_path / "keys", server=True)
+    (tmp_path / "keys" / "server" / "key.pem").chmod(0o640)
+    with pytest.raises(InputError, match=r"chmod 600 .*key.pem"):
+        holder_in(tmp_path / "keys", server=True)
+
+
+def test_a_number_in_quotes_is_none() -> None:
+    assert parse_scene({"duration_s": 1}).duration_s == 1.0
+    with pytest.raises(InputError, match="duration_s must be a number; instead received '1'"):
+        parse_scene({"duration_s": "1"})
