@@ -44,6 +44,8 @@ class _Part(BaseModel):
                 raise InputError(name, "something else than true or false", value)
             if (
                 isinstance(value, str)
+                and value[:1].isdigit()
+                and not cls.model_config.get("strict")
                 and name in cls.model_fields
                 and cls.model_fields[name].annotation in (int, float)
             ):

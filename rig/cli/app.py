@@ -179,7 +179,7 @@ def _wrong_value(error: Any) -> str:
     options = [name for name in error.param.opts if name.startswith("-")]
     field = max(options, key=len) if options else error.param.metavar or error.param.name
     if not isinstance(error.__cause__, ValidationError):
-        return f"{field}: {error.message}"
+        return f"{error.format_message()} (see `{error.ctx.command_path if error.ctx else 'rig'} --help`)"
     first = error.__cause__.errors()[0]
     must = first["msg"].removeprefix("Input should be ").partition(", unable")[0]
     return str(InputError(field, must, first["input"]))
