@@ -22,7 +22,7 @@ from recorder.reader import Recording
 from recorder.records import COPY
 from recorder.series import Commands
 from recorder.writer import Counts, RecordingWriter, check_destination
-from rig.errors import InputError, check_not_among
+from rig.errors import PART_SUFFIX, InputError, check_not_among
 from rig.outside import open_file
 from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_document, encode_block, schema_of
 
@@ -52,7 +52,7 @@ class Rewritten:
 
 def recovered_path(source: Path) -> Path:
     """Where `recover` writes to unless told otherwise: beside NAME.mcap.part or NAME.mcap, to NAME.recovered.mcap."""
-    name = source.name.removesuffix(schemas.PART_SUFFIX).removesuffix(".mcap")
+    name = source.name.removesuffix(PART_SUFFIX).removesuffix(".mcap")
     return source.with_name(f"{name}.recovered.mcap")
 
 
@@ -66,7 +66,7 @@ def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None
     Raises:
         InputError: The file is being written, or cannot be read.
     """
-    if source.name.endswith(schemas.PART_SUFFIX):
+    if source.name.endswith(PART_SUFFIX):
         return False
     with _unlocked(source):
         try:

@@ -15,7 +15,6 @@ from rig.wire import EVENTS, STATUS
 
 FORMAT = "rig-recording"
 VERSION = "1"
-PART_SUFFIX = ".part"
 GAPS = "recorder/gaps"
 CLOCK = "recorder/clock"
 VIEW = "view"

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from recorder.payload import block_in
-from recorder.schemas import PART_SUFFIX
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination, remove
-from rig.errors import InputError
+from rig.errors import PART_SUFFIX, InputError
 from rig.wire import EDGES, EVENTS, schema_of
 
 MB = 1_000_000

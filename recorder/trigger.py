@@ -20,11 +20,10 @@ from typing import Any, Literal
 import numpy as np
 
 from recorder.payload import block_in, document_in, tick_in
-from recorder.schemas import PART_SUFFIX
 from recorder.series import Commands, Limits, Room
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_destination, remove
 from rig.channels import ChannelTable
-from rig.errors import InputError
+from rig.errors import PART_SUFFIX, InputError
 from rig.wire import EDGES, EVENTS, SENSORS, Block, Continuity, schema_of
 
 EVENT_NAMES = ("hammer", "speed", "release", "note", "warning")

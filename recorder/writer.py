@@ -19,7 +19,7 @@ from recorder.payload import block_in, document_in, tick_in
 from recorder.records import COPY
 from recorder.views import Messages, View, Views
 from rig.channels import ChannelTable, Group
-from rig.errors import DiskError, InputError, check_new_file
+from rig.errors import PART_SUFFIX, DiskError, InputError, check_new_file
 from rig.wire import (
     EDGES,
     EVENTS,
@@ -183,7 +183,7 @@ def check_view_rate(view_rate_hz: float) -> None:
 
 def part_of(path: Path) -> Path:
     """Name of a recording while it is being written."""
-    return path.with_name(path.name + schemas.PART_SUFFIX)
+    return path.with_name(path.name + PART_SUFFIX)
 
 
 @dataclass(slots=True)

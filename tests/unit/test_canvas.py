@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from replays.canvas import check_suffix, new_figure, save
-from rig.errors import InputError
+from rig.errors import DiskError, InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +69,7 @@ def test_disk_that_fills_up_leaves_the_former_picture(tmp_path: Path, monkeypatc
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self))
 
     monkeypatch.setattr(Path, "write_bytes", half)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(DiskError, match="could not be written: No space left on device"):
         save(lines(), path)
     assert path.read_bytes() == b"former"
     assert list(tmp_path.iterdir()) == [path]
