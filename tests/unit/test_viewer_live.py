@@ -116,8 +116,9 @@ def test_heartbeat_tells_what_was_received(recording: Synthetic, tmp_path: Path)
     assert client.reports
     assert {key for key, _ in client.reports} == {f"{wire.CLIENTS}/viewer"}
     assert [document["done"] for _, document in client.reports[:-1]] == [False] * (len(client.reports) - 1)
-    last = {"name": "viewer", "received_index": len(recording.times_s), "lost": 0, "wall_s": 42.0, "done": True}
-    assert client.reports[-1][1] == last
+    last = {"name": "viewer", "received_index": len(recording.times_s), "lost": 0, "done": True}
+    assert client.reports[-1][1].items() >= last.items()
+    assert len({document["secret"] for _, document in client.reports}) == 1
 
 
 def test_a_killed_rig_is_noticed(recording: Synthetic, tmp_path: Path) -> None:
