@@ -51,8 +51,12 @@ _VERBS = {
 
 def page() -> str:
     """The page as Markdown."""
+    parts = (_blocks, _truth, _documents, _slow_subscribers, _access, _ports)
+    return "\n".join(line for part in parts for line in part())
+
+
+def _blocks() -> list[str]:
     table = default_table()
-    truth_hz = SensorChoice().truth_rate_hz
     lines = [
         "# Keys, messages and units",
         "",
@@ -89,7 +93,12 @@ def page() -> str:
             *(_channel_row(column, channel) for column, channel in enumerate(group.channels)),
             "",
         ]
-    lines += [
+    return lines
+
+
+def _truth() -> list[str]:
+    truth_hz = SensorChoice().truth_rate_hz
+    lines = [
         f"### `{wire.EDGES}`: exact keyphasor edges",
         "",
         f"`{wire.TRUTH_SCHEMA}` of one column: ticks from the block's `tick`, with their fraction. "
@@ -114,7 +123,11 @@ def page() -> str:
             f"| {n} | `{column}` | {known[column].unit} | {known[column].label} |" for n, column in enumerate(columns)
         ]
         lines.append("")
-    lines += [
+    return lines
+
+
+def _documents() -> list[str]:
+    lines = [
         "## Documents (JSON)",
         "",
         "| key | what |",
@@ -143,6 +156,12 @@ def page() -> str:
         "",
         f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.",
         "",
+    ]
+    return lines
+
+
+def _slow_subscribers() -> list[str]:
+    return [
         "## What a slow subscriber misses",
         "",
         "The rig does not wait for subscribers: what finds a link full is dropped for that link, so a plain zenoh "
@@ -166,6 +185,11 @@ def page() -> str:
         "cache answers, the publisher of that key waits. Take messages only where `source_info.source_id.zid` is the "
         "session that `session.info.peers_zid()` names, as a session of another client can publish on these keys too.",
         "",
+    ]
+
+
+def _access() -> list[str]:
+    return [
         "## Who may do what",
         "",
         "What is not in this table is denied to everybody: no client can put a block, an event or a status, answer a "
@@ -190,6 +214,11 @@ def page() -> str:
         "to tell that from a rig that is not there. Instruments and CAN buses are served on the loopback alone "
         "(from elsewhere: `ssh -L 7462:127.0.0.1:7462 HOST`).",
         "",
+    ]
+
+
+def _ports() -> list[str]:
+    return [
         "## Other ports",
         "",
         "`rig twins` listens on 127.0.0.1:7462: requests to an instrument are queries, its data is published, under "
@@ -207,7 +236,6 @@ def page() -> str:
         "another machine they are reached by `ssh -L PORT:127.0.0.1:PORT USER@HOST`.",
         "",
     ]
-    return "\n".join(lines)
 
 
 def _channel_row(column: int, channel: Channel) -> str:

@@ -109,6 +109,7 @@ class Simulation:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.tick_rate_hz = TICK_RATE_HZ
+        self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
         self._engine = load_engine(scene.engine.name)
         self._method = ENGINES[scene.engine.name]
@@ -227,8 +228,10 @@ class Simulation:
 
     def warm_up(self) -> None:
         """Compile (or load) every kernel that `advance` will call, without moving on."""
-        twin = Simulation(self.scene)
-        twin.advance(twin.block_ticks)
+        if not self._warm:
+            twin = Simulation(self.scene)
+            twin.advance(twin.block_ticks)
+            self._warm = True
 
     def health(self) -> dict[str, Any]:
         """Spin, energy ledger and doubts at the present tick, for the status."""

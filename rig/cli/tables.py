@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
+def _lines(text: str) -> str:
+    """The same text, each of its lines fit to be shown."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
 def echo(text: object = "", *, err: bool = False, nl: bool = True) -> None:
     """Print lines.
 
@@ -28,7 +33,7 @@ def echo(text: object = "", *, err: bool = False, nl: bool = True) -> None:
     """
     # Who reads what happens may have gone; what happens goes on.
     with contextlib.suppress(*([OSError] if err else [])):
-        typer.echo("\n".join(map(printable, str(text).split("\n"))), err=err, nl=nl)
+        typer.echo(_lines(str(text)), err=err, nl=nl)
 
 
 def shown(document: Any) -> Any:
@@ -66,8 +71,7 @@ def table_console(*, width: int | None = 200, highlight: bool = True, stderr: bo
         """Markup is off for every kind of string, and no text leaves unescaped."""
 
         def render_str(self, text: str, **options: Any) -> Text:
-            lines = "\n".join(map(printable, text.split("\n")))
-            return super().render_str(lines, **{**options, "markup": False, "emoji": False})
+            return super().render_str(_lines(text), **{**options, "markup": False, "emoji": False})
 
         def render(self, renderable: Any, options: Any = None) -> Any:
             for segment in super().render(renderable, options):
@@ -75,7 +79,7 @@ def table_console(*, width: int | None = 200, highlight: bool = True, stderr: bo
                 if segment.control or text == "\n" or text.isprintable():
                     yield segment
                 else:
-                    yield Segment("\n".join(map(printable, text.split("\n"))), segment.style)
+                    yield Segment(_lines(text), segment.style)
 
     terminal = Console(stderr=stderr).is_terminal
     return Screen(width=None if terminal else width, highlight=highlight, markup=False, emoji=False, stderr=stderr)
