@@ -1,1 +1,1 @@
-"""What is made of runs and recordings: verdicts, figures, exports."""
+"""Two products: what is made of recordings (`recordings`, `player`), and studies of the methods (`studies`)."""

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from recorder.reader import Recording
-from replays.export import McapRun
-from replays.validation import validate
-from replays.validation.outcome import Validation
+from replays.recordings.export import McapRun
+from replays.recordings.validation import validate
+from replays.recordings.validation.outcome import Validation
 from rig.errors import whole_file
 from rig.offline import frames
 from rig.scenes import load_scene

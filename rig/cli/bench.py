@@ -22,7 +22,7 @@ def bench(
     """Measure simulated over processor time with the error beside it; medians of several runs, compile time apart."""
     import json
 
-    from replays.bench import measure
+    from replays.studies.bench import measure
 
     def progress(text: str) -> None:
         echo(text, err=True)

@@ -29,7 +29,7 @@ def chart(
     fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of going on where a run ended.")] = False,
 ) -> None:
     """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
-    from replays.chart.session import Progress, make_chart
+    from replays.studies.chart.session import Progress, make_chart
     from rig.errors import InputError
     from rig.kernels import COMPILE_NOTICE, compiled_before
 

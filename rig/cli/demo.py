@@ -14,7 +14,7 @@ from rig.cli.tables import echo, table_console
 if TYPE_CHECKING:
     import subprocess
 
-    from replays.verdict import Verdict
+    from replays.recordings.verdict import Verdict
 
     Process = subprocess.Popen[bytes]
 
@@ -56,8 +56,8 @@ def demo(
 
     say("reading the recording")
     from recorder.reader import Recording
-    from replays.picture import draw
-    from replays.verdict import judge
+    from replays.recordings.picture import draw
+    from replays.recordings.verdict import judge
 
     recording = Recording.open(file)
     verdict = judge(recording)

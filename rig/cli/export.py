@@ -36,9 +36,9 @@ def export(
     several make as many files, or --rate-hz brings them to one.
     """
     from recorder.reader import join
-    from replays.formats.export import check_output, merged
-    from replays.formats.export import export as write
-    from replays.formats.selection import select
+    from replays.recordings.formats.export import check_output, merged
+    from replays.recordings.formats.export import export as write
+    from replays.recordings.formats.selection import select
     from rig.cli.progress import reporting
 
     if unit not in ("engineering", "volts", "counts"):

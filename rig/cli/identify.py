@@ -25,8 +25,8 @@ from rig.cli.tables import echo, new_table, table_console
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
-    from replays.experiment import Experiment
-    from replays.identification import Identification
+    from replays.recordings.experiment import Experiment
+    from replays.recordings.identification import Identification
 
 
 def identify(
@@ -80,11 +80,11 @@ def identify(
     import json
 
     from recorder.reader import join
-    from replays.identification import ask
-    from replays.identification import identify as run
-    from replays.identification.document import check_set, fitted_set, identification_document, write_set
-    from replays.identification.nuisance import asked_along, check_begin, is_imported, shortly_before, turned
-    from replays.identification.summary import report_of
+    from replays.recordings.identification import ask
+    from replays.recordings.identification import identify as run
+    from replays.recordings.identification.document import check_set, fitted_set, identification_document, write_set
+    from replays.recordings.identification.nuisance import asked_along, check_begin, is_imported, shortly_before, turned
+    from replays.recordings.identification.summary import report_of
     from replays.report import check_report
     from rig.kernels import COMPILE_NOTICE, compiled_before
 
@@ -137,7 +137,7 @@ def identify(
 
 
 def _experiment(recording: Recording, *, parameters: str | None, scene: str | None, engine: str | None) -> Experiment:
-    from replays.experiment import Experiment
+    from replays.recordings.experiment import Experiment
     from rig.scenes import load_scene
 
     experiment = Experiment(scene=load_scene(scene)) if scene is not None else Experiment.of(recording)
@@ -167,7 +167,7 @@ def _two(option: str, text: str, between: str) -> tuple[float, float]:
 def _show(found: Identification, name: str) -> None:
     from rich.text import Text
 
-    from replays.identification.summary import HEADINGS, cells, fit_line, spread_line, window_line
+    from replays.recordings.identification.summary import HEADINGS, cells, fit_line, spread_line, window_line
 
     console = table_console(width=200, highlight=False)
     table = new_table(f"{name}: what it tells")

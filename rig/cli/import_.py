@@ -12,7 +12,7 @@ from rig.cli.tables import echo
 from rig.errors import InputError, check_not_among, whole_file
 
 if TYPE_CHECKING:
-    from replays.formats.conversion import Conversion
+    from replays.recordings.formats.conversion import Conversion
 
 
 def import_(
@@ -52,9 +52,9 @@ def import_(
     if output is None or mapping is None:
         raise InputError("--output", "given: a recording to write, such as -o log.mcap", "none")
     from recorder.writer import check_destination
-    from replays.formats.conversion import convert
-    from replays.formats.imported import write_recording
-    from replays.formats.mapping import Mapping, load_mapping
+    from replays.recordings.formats.conversion import convert
+    from replays.recordings.formats.imported import write_recording
+    from replays.recordings.formats.mapping import Mapping, load_mapping
     from rig.cli.progress import reporting
 
     check_destination(output, force=force)
@@ -77,8 +77,8 @@ def import_(
 
 
 def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
-    from replays.formats.export import check_output
-    from replays.formats.template import CHECK, example, template
+    from replays.recordings.formats.export import check_output
+    from replays.recordings.formats.template import CHECK, example, template
 
     check_output(path, force=force, suffixes=(".toml",))
     check_not_among(files, path)

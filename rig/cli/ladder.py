@@ -43,11 +43,11 @@ def ladder(
     """Go down the ladder of models: what does each level cost, what does it err by, what is good enough here?"""
     import json
 
-    from replays.ladder.chart import draw
-    from replays.ladder.document import ladder_document, pick_of
-    from replays.ladder.pick import check_target, write_pick
-    from replays.ladder.quantity import parse_quantities
-    from replays.ladder.search import search
+    from replays.studies.ladder.chart import draw
+    from replays.studies.ladder.document import ladder_document, pick_of
+    from replays.studies.ladder.pick import check_target, write_pick
+    from replays.studies.ladder.quantity import parse_quantities
+    from replays.studies.ladder.search import search
     from rig.cli.run import scene_overrides
     from rig.kernels import COMPILE_NOTICE, compiled_before
     from rig.scenes import load_scene

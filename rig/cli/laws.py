@@ -28,7 +28,7 @@ def laws(
     json_output: Json = False,
 ) -> None:
     """Compare all normal contact laws: restitution asked for and returned, force, time of contact, stiffness."""
-    from replays.laws import compare, draw
+    from replays.studies.laws import compare, draw
     from rig.cli.params import changed_parameters
 
     also = {} if restitution is None else {"contact.restitution": restitution}

@@ -20,7 +20,7 @@ def magnets(
     json_output: Json = False,
 ) -> None:
     """Compare the magnet models: spring, far-field sum, exact cylinders, and the maps that stand for them in a run."""
-    from replays.magnets import compare, draw
+    from replays.studies.magnets import compare, draw
     from rig.cli.params import changed_parameters
     from rig.model import build_model
 

@@ -30,7 +30,7 @@ def simulate(
     from rig.pacing import rare_collections
 
     with rare_collections():
-        from replays.export import check_run_output, writer_for
+        from replays.recordings.export import check_run_output, writer_for
         from rig.cli.run import scene_overrides
         from rig.scenes import load_scene
 
@@ -66,7 +66,7 @@ def simulate(
     )
     warnings = health["warnings"]
     if check:
-        from replays.check import check as check_scene
+        from replays.studies.check import check as check_scene
 
         checked = check_scene(loaded)
         if checked.wrong_branch:

@@ -15,7 +15,7 @@ from rig.cli.tables import echo, new_table, table_console
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from replays.stability.cell import Cell
+    from replays.studies.stability.cell import Cell
 
 
 def stability(
@@ -38,7 +38,7 @@ def stability(
     """Test where integration methods fail; exit status 1 if any does not do what theory expects."""
     import json
 
-    from replays.stability.table import chosen_engines, chosen_trials, run_trials
+    from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
 
     trials, names = chosen_trials(only), chosen_engines(engines)
     cells: list[Cell] = []
@@ -48,7 +48,7 @@ def stability(
             cells.append(cell)
             reporter.step(f"{cell.trial} {cell.case}, {cell.method}")
         if output is not None:
-            from replays.stability.figure import draw_all
+            from replays.studies.stability.figure import draw_all
 
             reporter.say("pictures")
             pictures = draw_all(output, names, quick=not full)
@@ -71,7 +71,7 @@ def stability(
 def _show(cells: list[Cell], names: list[str]) -> None:
     from rich.text import Text
 
-    from replays.stability.trials import TRIALS
+    from replays.studies.stability.trials import TRIALS
 
     console = table_console()
     ours = [cell for cell in cells if cell.method in names]

@@ -15,8 +15,8 @@ from rig.cli.tables import echo, new_table, shown, table_console
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from replays.validation import Validation
-    from replays.validation.attribution import Explained, Explanation
+    from replays.recordings.validation import Validation
+    from replays.recordings.validation.attribution import Explained, Explanation
 
 _SAID = {True: "good", False: "FAILS", None: ""}
 _TELLING = 0.01
@@ -28,7 +28,9 @@ def validate(
     *,
     criteria: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Criteria of your own; start from replays/validation/default.toml."),
+        typer.Option(
+            metavar="FILE", help="Criteria of your own; start from replays/recordings/validation/default.toml"
+        ),
     ] = None,
     changes: Changes = None,
     engine: Engine = None,
@@ -46,9 +48,9 @@ def validate(
     import json
 
     from recorder.reader import join
+    from replays.recordings.validation import load_criteria
+    from replays.recordings.validation import validate as hold
     from replays.report import check_report
-    from replays.validation import load_criteria
-    from replays.validation import validate as hold
     from rig.cli.run import scene_overrides
     from rig.kernels import COMPILE_NOTICE, compiled_before
     from rig.scenes import read_value
@@ -63,7 +65,7 @@ def validate(
     with reporting() as reporter:
         found = hold(recording, criteria=rules, changes=overrides, declared=declared, step=reporter.step)
         if report is not None:
-            from replays.validation.report import make_report
+            from replays.recordings.validation.report import make_report
 
             reporter.step("report")
             make_report(found).write(report)

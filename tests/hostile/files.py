@@ -285,11 +285,11 @@ def uses() -> dict[str, Use]:
     """What is done with a recording, each through the door that a command uses."""
     from recorder.reader import join
     from recorder.rewrite import cut, recover
-    from replays.experiment import Experiment
-    from replays.formats.export import export, merged
-    from replays.formats.selection import select
     from replays.player.tape import Tape
     from replays.player.timeline import By, Timeline
+    from replays.recordings.experiment import Experiment
+    from replays.recordings.formats.export import export, merged
+    from replays.recordings.formats.selection import select
     from rig.cli import info
 
     def told(path: Path, _: Path) -> object:

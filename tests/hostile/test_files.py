@@ -298,7 +298,7 @@ def test_rows_that_are_gone_or_do_not_fit_are_told_though_every_checksum_holds(
 
 
 def test_a_validation_of_what_is_not_all_there_is_not_good(tmp_path: Path) -> None:
-    from replays.validation import validate
+    from replays.recordings.validation import validate
 
     changed = Layout(Recording.open(SESSIONS / "hammer-5.2.mcap"))
     whole = changed.write(tmp_path / "same.mcap")

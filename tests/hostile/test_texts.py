@@ -22,14 +22,14 @@ import pytest
 
 import rig.cli
 from recorder.reader import Recording
-from replays.formats.conversion import convert
-from replays.formats.export import export
-from replays.formats.imported import write_recording
-from replays.formats.mapping import FileOptions, Mapping, load_mapping
-from replays.formats.selection import select
-from replays.formats.source import open_source
-from replays.formats.template import example
-from replays.validation.criteria import DEFAULT, Criteria, load_criteria
+from replays.recordings.formats.conversion import convert
+from replays.recordings.formats.export import export
+from replays.recordings.formats.imported import write_recording
+from replays.recordings.formats.mapping import FileOptions, Mapping, load_mapping
+from replays.recordings.formats.selection import select
+from replays.recordings.formats.source import open_source
+from replays.recordings.formats.template import example
+from replays.recordings.validation.criteria import DEFAULT, Criteria, load_criteria
 from rig.channels import TABLE, parse_table
 from rig.cli import tables
 from rig.cli.main import main

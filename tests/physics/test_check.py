@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from replays.check import Check, check
-from replays.peers.problem import scaled_error
+from replays.studies.check import Check, check
+from replays.studies.peers.problem import scaled_error
 from rig.kernels.signals import N_STATE
 from rig.offline import simulate
 from rig.scenes import load_scene

@@ -19,10 +19,10 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.experiment import Experiment
-from replays.export import writer_for
-from replays.identification import Identification, ask, identify
-from replays.sensitivity import value_of
+from replays.recordings.experiment import Experiment
+from replays.recordings.export import writer_for
+from replays.recordings.identification import Identification, ask, identify
+from replays.recordings.sensitivity import value_of
 from rig.offline import frames
 from rig.scenes import load_scene
 from rig.simulation import Simulation

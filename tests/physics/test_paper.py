@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.paper import condition
-from replays.paper.blow import Blow, Outcome, outcome
-from replays.paper.question import fall, weight_at_ring
-from replays.paper.reproduction import drop_impact, drop_impulse
-from replays.stability.motion import base_model, move, quiet_inputs
+from replays.studies.paper import condition
+from replays.studies.paper.blow import Blow, Outcome, outcome
+from replays.studies.paper.question import fall, weight_at_ring
+from replays.studies.paper.reproduction import drop_impact, drop_impulse
+from replays.studies.stability.motion import base_model, move, quiet_inputs
 from rig.levels import ModelLevels
 from rig.offline import Run, simulate
 from rig.parameters import load_parameters

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from recorder.reader import Recording
+from replays.recordings.validation import validate
+from replays.recordings.whirl import parameter_si
 from replays.sessions import FOLDER, SESSIONS, make
-from replays.validation import validate
-from replays.whirl import parameter_si
 
 AGAIN = "make them anew by `rig sessions -o replays/sessions --force` if physics has changed on purpose, and review it"
 

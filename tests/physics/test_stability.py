@@ -16,11 +16,11 @@ import math
 import numpy as np
 import pytest
 
-from replays.stability.atlas import GROWN, LIMITS, contact_ratio, house_ratio
-from replays.stability.cell import Cell
-from replays.stability.closed_forms import impact, runge_kutta_4_gain
-from replays.stability.motion import bare_shaft, base_model, pivoted_mass
-from replays.stability.trials import TRIALS
+from replays.studies.stability.atlas import GROWN, LIMITS, contact_ratio, house_ratio
+from replays.studies.stability.cell import Cell
+from replays.studies.stability.closed_forms import impact, runge_kutta_4_gain
+from replays.studies.stability.motion import bare_shaft, base_model, pivoted_mass
+from replays.studies.stability.trials import TRIALS
 from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.levels import ModelLevels
@@ -113,7 +113,7 @@ def test_rk4_damps_as_theory_says():
 
 
 def test_unknown_names_are_refused():
-    from replays.stability.table import chosen_engines, chosen_trials
+    from replays.studies.stability.table import chosen_engines, chosen_trials
 
     assert chosen_trials("t3, T7") == ["T3", "T7"]
     with pytest.raises(InputError, match="T99"):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from replays.canvas import check_suffix, new_figure, save
+from replays.report.canvas import check_suffix, new_figure, save
 from rig.errors import DiskError, InputError
 
 if TYPE_CHECKING:

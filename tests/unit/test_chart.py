@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.chart import measure, session
-from replays.chart.figure import draw
-from replays.chart.measure import OFF, Budget, Run, block_statistics, elastic_forces, point, run_engine
-from replays.chart.methods import Rung, competitors
-from replays.chart.phases import PANELS, plan, problem_of
-from replays.chart.profile import draw_scene, shares
-from replays.chart.session import make_chart
-from replays.chart.store import COLUMNS, KEY, Store
-from replays.peers import PEERS, Setting
-from replays.peers.problem import Problem
-from replays.peers.reference import Reference
-from replays.peers.solution import Journal
+from replays.studies.chart import measure, session
+from replays.studies.chart.figure import draw
+from replays.studies.chart.measure import OFF, Budget, Run, block_statistics, elastic_forces, point, run_engine
+from replays.studies.chart.methods import Rung, competitors
+from replays.studies.chart.phases import PANELS, plan, problem_of
+from replays.studies.chart.profile import draw_scene, shares
+from replays.studies.chart.session import make_chart
+from replays.studies.chart.store import COLUMNS, KEY, Store
+from replays.studies.peers import PEERS, Setting
+from replays.studies.peers.problem import Problem
+from replays.studies.peers.reference import Reference
+from replays.studies.peers.solution import Journal
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.kernels.signals import N_STATE

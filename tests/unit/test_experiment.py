@@ -13,8 +13,8 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.session import RecordingSession
-from replays.experiment import Experiment
-from replays.export import writer_for
+from replays.recordings.experiment import Experiment
+from replays.recordings.export import writer_for
 from rig import wire
 from rig.errors import InputError
 from rig.offline import SentCommand, frames

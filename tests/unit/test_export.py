@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.export import SUFFIXES, check_run_output, table_columns, writer_for
+from replays.recordings.export import SUFFIXES, check_run_output, table_columns, writer_for
 from rig.cli.main import main
 from rig.errors import DiskError, InputError
 from rig.kernels.signals import ROW, TRUTH

@@ -15,10 +15,10 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from replays.export import writer_for
-from replays.formats import clock
-from replays.formats.export import SUFFIXES, Written, export
-from replays.formats.selection import Selection, Unit, select
+from replays.recordings.export import writer_for
+from replays.recordings.formats import clock
+from replays.recordings.formats.export import SUFFIXES, Written, export
+from replays.recordings.formats.selection import Selection, Unit, select
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.offline import frames
@@ -361,7 +361,7 @@ def test_parts_of_a_rotation_are_exported_as_one(recording: Recording, tmp_path:
 def test_tables_are_made_without_pandas() -> None:
     """Its import takes longer than a table of a second does; in a process of its own, as others import it here."""
     code = (
-        "import sys, numpy as np; from replays.formats.columnar import arrow_table, float_schema; "
+        "import sys, numpy as np; from replays.recordings.formats.columnar import arrow_table, float_schema; "
         "t = arrow_table([np.arange(3.0), np.arange(6.0)[::2]], float_schema(['a', 'b'])); "
         "print(t.to_pydict(), 'pandas' in sys.modules)"
     )

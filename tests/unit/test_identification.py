@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.experiment import Experiment
-from replays.export import writer_for
-from replays.identification import ask, identify
-from replays.identification.horizon import horizon
-from replays.identification.question import measured_noise
-from replays.identification.window import Window
+from replays.recordings.experiment import Experiment
+from replays.recordings.export import writer_for
+from replays.recordings.identification import ask, identify
+from replays.recordings.identification.horizon import horizon
+from replays.recordings.identification.question import measured_noise
+from replays.recordings.identification.window import Window
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.offline import frames

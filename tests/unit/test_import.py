@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.experiment import Experiment
-from replays.formats import clock, unit
-from replays.formats import mapping as mappings
-from replays.formats.conversion import Conversion, convert
-from replays.formats.imported import write_recording
-from replays.formats.mapping import FileOptions
-from replays.formats.source import open_source
-from replays.formats.template import example, template
+from replays.recordings.experiment import Experiment
+from replays.recordings.formats import clock, unit
+from replays.recordings.formats import mapping as mappings
+from replays.recordings.formats.conversion import Conversion, convert
+from replays.recordings.formats.imported import write_recording
+from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats.source import open_source
+from replays.recordings.formats.template import example, template
 from rig.cli.main import main
 from rig.errors import InputError
 
@@ -988,8 +988,8 @@ def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsy
 
 
 def test_a_comment_that_is_json_is_told_by_its_label(tmp_path: Path) -> None:
-    from replays.formats.source import Entry
-    from replays.formats.template import _label
+    from replays.recordings.formats.source import Entry
+    from replays.recordings.formats.template import _label
 
     assert _label(Entry("x", "", "mm", 1, None, label=json.dumps({"name": "x", "label": "Ring"}))) == "Ring"
     assert _label(Entry("x", "", "mm", 1, None, label="{not json")) == "{not json"

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from replays.ladder.chart import draw
-from replays.ladder.document import ladder_document, pick_of
-from replays.ladder.pick import with_pick, write_pick
-from replays.ladder.quantity import QUANTITIES, Trace, parse_quantities
-from replays.ladder.search import LEVELS, Ladder, search
+from replays.studies.ladder.chart import draw
+from replays.studies.ladder.document import ladder_document, pick_of
+from replays.studies.ladder.pick import with_pick, write_pick
+from replays.studies.ladder.quantity import QUANTITIES, Trace, parse_quantities
+from replays.studies.ladder.search import LEVELS, Ladder, search
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN, N_ROW

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from replays.laws import compare, draw, over_speed
+from replays.studies.laws import compare, draw, over_speed
 from rig.cli.main import main
 from rig.contacts import DAMPING, KELVIN_VOIGT, STIFFNESS
 from rig.parameters import load_parameters

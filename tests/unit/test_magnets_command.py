@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from replays.magnets import compare, draw
+from replays.studies.magnets import compare, draw
 from rig.cli.main import main
 from rig.model import build_model
 from rig.parameters import load_parameters

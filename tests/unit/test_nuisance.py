@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.experiment import Experiment
-from replays.formats.conversion import convert
-from replays.formats.imported import write_recording
-from replays.formats.mapping import load_mapping
-from replays.identification.nuisance import check_begin, is_imported, nuisances_of, tune
-from replays.sensitivity import ANGLE, value_of, with_values
+from replays.recordings.experiment import Experiment
+from replays.recordings.formats.conversion import convert
+from replays.recordings.formats.imported import write_recording
+from replays.recordings.formats.mapping import load_mapping
+from replays.recordings.identification.nuisance import check_begin, is_imported, nuisances_of, tune
+from replays.recordings.sensitivity import ANGLE, value_of, with_values
 from rig.errors import InputError
 from rig.offline import simulate
 from rig.scenes import load_scene

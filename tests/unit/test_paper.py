@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.paper.blow import BLOW_AT, Blow, Outcome, outcome, outcomes
-from replays.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
-from replays.paper.document import Findings, all_questions, find, planned_groups, steps, write_up
-from replays.paper.figure import first_impacts
-from replays.paper.spread import (
+from replays.report.document import Heading, Picture, Report, Table
+from replays.studies.paper.blow import BLOW_AT, Blow, Outcome, outcome, outcomes
+from replays.studies.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
+from replays.studies.paper.document import Findings, all_questions, find, planned_groups, steps, write_up
+from replays.studies.paper.figure import first_impacts
+from replays.studies.paper.spread import (
     assumed_values,
     changes,
     free_values,
@@ -27,8 +28,7 @@ from replays.paper.spread import (
     phases,
     rank_correlation,
 )
-from replays.paper.statement import SETS, Statement, claims, number, printed_values, statements
-from replays.report.document import Heading, Picture, Report, Table
+from replays.studies.paper.statement import SETS, Statement, claims, number, printed_values, statements
 from rig.cli.main import main
 from rig.parameters import load_parameters
 
@@ -225,7 +225,7 @@ def test_two_processes_give_what_one_gives():
 
 _POOL = """
 import os, signal
-from replays.paper.blow import Blow, outcomes
+from replays.studies.paper.blow import Blow, outcomes
 blows = [Blow(force_n=20.0, duration_s=0.05)] * 400
 for n, _ in enumerate(outcomes(blows, processes=2)):
     if n == 0:
@@ -269,7 +269,7 @@ def test_number():
 
 
 def test_terminal_tells_the_total_and_the_rule(findings: Findings, capsys, monkeypatch):
-    monkeypatch.setattr("replays.paper.document.find", lambda **_: findings)
+    monkeypatch.setattr("replays.studies.paper.document.find", lambda **_: findings)
     with pytest.raises(SystemExit) as end:
         main(["paper", "--quick"])
     assert end.value.code == 0
@@ -285,9 +285,9 @@ def test_terminal_tells_the_total_and_the_rule(findings: Findings, capsys, monke
 
 
 def test_a_folder_for_pictures_is_made_beside_others(findings: Findings, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("replays.paper.document.find", lambda **_: findings)
+    monkeypatch.setattr("replays.studies.paper.document.find", lambda **_: findings)
     drawn: list[Path] = []
-    monkeypatch.setattr("replays.paper.document.draw_pictures", lambda _, folder: drawn.append(folder) or [])
+    monkeypatch.setattr("replays.studies.paper.document.draw_pictures", lambda _, folder: drawn.append(folder) or [])
     (tmp_path / "file").write_text("")
     for name, code in (("new", 0), ("new", 0), ("no/new", 2), ("file", 2)):
         with pytest.raises(SystemExit) as end:

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replays.peers import ERROR_SCALE, PEERS, Peer, Problem, Setting, scaled_error
-from replays.peers.plain_python import PlainPython
-from replays.peers.reference import find_reference
-from replays.peers.right_hand_side import derivative, pack, switching
-from replays.peers.solution import MISSED_HAMMER
+from replays.studies.peers import ERROR_SCALE, PEERS, Peer, Problem, Setting, scaled_error
+from replays.studies.peers.plain_python import PlainPython
+from replays.studies.peers.reference import find_reference
+from replays.studies.peers.right_hand_side import derivative, pack, switching
+from replays.studies.peers.solution import MISSED_HAMMER
 from rig.errors import InputError
 from rig.kernels.contact import FLIGHT, FORWARD, ROLLING, TOUCHING
 from rig.kernels.signals import STATE_SCALE
@@ -88,7 +88,7 @@ def test_compiled_and_plain_python_are_the_same_equations(changes: dict, phase: 
 def test_heyoka_has_the_same_equations(changes: dict, phase: int) -> None:
     # The direction vector of the axis against the angles: compared through the flow, by a difference quotient.
     hy = pytest.importorskip("heyoka", reason="needs the extra `peers`")
-    from replays.peers import taylor
+    from replays.studies.peers import taylor
 
     given = replace(problem(0.03, changes=changes), phase=phase, onset_speed=0.1)
     parameters = pack(given)

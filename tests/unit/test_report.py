@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from replays.canvas import new_figure
 from replays.report import Report, Row, check_report
+from replays.report.canvas import new_figure
 from rig.errors import InputError
 
 

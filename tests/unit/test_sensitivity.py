@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.experiment import Experiment
-from replays.prediction import Measured, sampled
-from replays.sensitivity import Predictor, value_of, with_values
+from replays.recordings.experiment import Experiment
+from replays.recordings.prediction import Measured, sampled
+from replays.recordings.sensitivity import Predictor, value_of, with_values
 from rig.channels import Channel, default_table
 from rig.errors import InputError
 from rig.offline import SentCommand, simulate

@@ -12,12 +12,12 @@ import pytest
 from recorder.reader import Recording, join
 from recorder.rewrite import cut
 from recorder.writer import RecordingWriter
-from replays.experiment import Experiment
-from replays.prediction import Measured, Prediction, bare, measured, predict
-from replays.validation import load_criteria, outcome, validate
-from replays.validation.attribution import Explained, Explanation, _conclude, attribute
-from replays.validation.criteria import DEFAULT
-from replays.validation.phases import View, find_phases, quantities, spectrum_distance
+from replays.recordings.experiment import Experiment
+from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
+from replays.recordings.validation import load_criteria, outcome, validate
+from replays.recordings.validation.attribution import Explained, Explanation, _conclude, attribute
+from replays.recordings.validation.criteria import DEFAULT
+from replays.recordings.validation.phases import View, find_phases, quantities, spectrum_distance
 from rig.errors import InputError
 from rig.offline import frames
 from rig.scenes import load_scene

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from replays.export import writer_for
-from replays.picture import draw, full_spectrum
-from replays.verdict import Verdict, hammer_time_s, judge
-from replays.whirl import parameter_si, whirl_figures, whirl_frequency
+from replays.recordings.export import writer_for
+from replays.recordings.picture import draw, full_spectrum
+from replays.recordings.verdict import Verdict, hammer_time_s, judge
+from replays.recordings.whirl import parameter_si, whirl_figures, whirl_frequency
 from rig import wire
 from rig.errors import InputError
 from rig.offline import frames

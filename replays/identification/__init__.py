@@ -1,9 +1,0 @@
-"""Numbers of the rig from a recording, with what they are worth."""
-
-from __future__ import annotations
-
-from replays.identification.fit import PRECISION, SPREAD, Identification, identify
-from replays.identification.judgement import Finding, Judgement
-from replays.identification.question import Question, Unknown, ask
-
-__all__ = ["PRECISION", "SPREAD", "Finding", "Identification", "Judgement", "Question", "Unknown", "ask", "identify"]

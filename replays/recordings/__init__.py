@@ -1,0 +1,1 @@
+"""What is made of recordings: validation, identification, other formats, exports, verdicts."""

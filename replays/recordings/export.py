@@ -1,0 +1,213 @@
+"""Runs as files for other tools: MCAP, Parquet, CSV, by the suffix.
+
+Tables have one row a sample: `time [s]`, every signal of the model as `truth.NAME [unit]` (SI), and every sensor as
+`NAME [unit]`. A file is written beside its place and moved there when it is whole.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+from replays.recordings.formats import columnar, delimited
+from replays.recordings.formats.export import check_output
+from rig import wire
+from rig.errors import whole_file
+from rig.kernels.signals import ROW
+from rig.service import blocks_of
+from rig.simulation import Frame, Simulation
+
+SUFFIXES = (".mcap", ".parquet", ".csv")
+
+
+class RunWriter(Protocol):
+    """Takes the frames of one run, in order; whole on a clean exit, nothing left behind on an error."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def write(self, frame: Frame) -> None:
+        """Take the next frame."""
+        ...
+
+
+def check_run_output(path: Path, *, force: bool) -> None:
+    """Refuse a file that cannot be written, before anything is simulated.
+
+    Raises:
+        InputError: Another suffix, a folder that is missing or read-only, or an existing file.
+    """
+    check_output(path, force=force, suffixes=SUFFIXES)
+
+
+def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> RunWriter:
+    """The writer that the suffix asks for."""
+    check_run_output(path, force=force)
+    if path.suffix == ".mcap":
+        return McapRun(path, simulation, force=force)
+    return _TableRun(path, simulation, columnar.Rows if path.suffix == ".parquet" else delimited.Rows)
+
+
+def table_columns(simulation: Simulation) -> list[str]:
+    """Column headings of a table of a run."""
+    channels = simulation.table.channels.values()
+    return [
+        "time [s]",
+        *(f"truth.{signal.name} [{signal.unit}]" for signal in ROW),
+        *(f"{channel.name} [{channel.unit}]" for channel in channels),
+    ]
+
+
+def table_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
+    """The rows of one frame, shape (samples, columns)."""
+    rate = simulation.scene.sensors.rate_hz
+    every = simulation.tick_rate_hz // rate // simulation.row_ticks
+    truth = frame.rows[::every]
+    first = frame.tick * rate // simulation.tick_rate_hz
+    times = (first + np.arange(len(truth)))[:, None] / rate
+    sensors = [simulation.table.groups[group].engineering(block.values) for group, block in frame.samples.items()]
+    return np.hstack([times, truth, *sensors])
+
+
+class _Background:
+    """One thread that formats and writes while the simulation goes on, a few frames behind at most."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1)
+        self._due: deque[Future[None]] = deque()
+
+    def call(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Do this next; raises what an earlier call raised."""
+        self._due.append(self._pool.submit(function, *arguments))
+        while len(self._due) > 4:
+            self._due.popleft().result()
+
+    def finish(self) -> None:
+        """Wait for everything; raises what a call raised."""
+        self._pool.shutdown()
+        while self._due:
+            self._due.popleft().result()
+
+
+class _TableRun:
+    """A table that grows frame by frame in a file of its own until it is whole."""
+
+    def __init__(self, path: Path, simulation: Simulation, open_table: Callable[[Path, Any], Any]) -> None:
+        self.path = path
+        self.simulation = simulation
+        self._open_table = open_table
+        self._background = _Background()
+
+    def __enter__(self) -> Self:
+        schema = columnar.float_schema(table_columns(self.simulation))
+        with ExitStack() as stack:
+            self._writer = self._open_table(stack.enter_context(whole_file(self.path)), schema)
+            stack.callback(self._writer.close)
+            stack.callback(self._background.finish)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def write(self, frame: Frame) -> None:
+        """Take the next frame."""
+        self._background.call(self._append, table_rows(self.simulation, frame))
+
+    def _append(self, rows: np.ndarray) -> None:
+        self._writer.write(list(rows.T))
+
+
+class McapRun:
+    """The same file as `rig record` would have made, with the simulated clock for the wall clock."""
+
+    def __init__(
+        self,
+        path: Path,
+        simulation: Simulation,
+        *,
+        force: bool = False,
+        view_rate_hz: float = 500.0,
+        epoch_ns: int | None = None,
+    ) -> None:
+        """Prepare; the file begins where the context does.
+
+        Args:
+            path: The file, ends in .mcap.
+            simulation: What is run.
+            force: Replace an existing file.
+            view_rate_hz: Rate of the plottable messages [Hz of simulated time]; 0 writes none.
+            epoch_ns: Wall time at which the run begins [unix ns], at which the recorder's clocks stand still: the same
+                run gives the same bytes. None for now.
+        """
+        self.path, self.simulation, self._force = path, simulation, force
+        self._view_rate_hz, self._epoch_ns = view_rate_hz, epoch_ns
+        self._background = _Background()
+
+    def __enter__(self) -> Self:
+        from recorder.writer import RecordingWriter
+
+        epoch_ns = self._epoch_ns
+        self._wall_ns = time.time_ns() if epoch_ns is None else epoch_ns
+        simulation = self.simulation
+        self._writer = RecordingWriter(
+            self.path,
+            catalogue=simulation.catalogue(),
+            parameters=simulation.parameters_document(),
+            scene=simulation.scene_document(),
+            view_rate_hz=self._view_rate_hz,
+            from_start=True,
+            force=self._force,
+            wall_ns=time.time_ns if epoch_ns is None else lambda: epoch_ns,
+            monotonic_s=time.monotonic if epoch_ns is None else lambda: 0.0,
+        )
+        self._rows = wire.Continuity()
+        self._event({"event": "start", "scene": simulation.scene.name, "seed": simulation.scene.seed, "pace": "none"})
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        whole = False
+        try:
+            self._background.finish()
+            if kind is None and not self._writer.closed:
+                self._event({"event": "end", "reason": "completed"})
+                self._writer.finish("completed")
+                whole = True
+        finally:
+            if not whole:
+                self._writer.abandon()
+
+    def write(self, frame: Frame) -> None:
+        """Take the next frame."""
+        self._background.call(self._write, frame)
+
+    def _write(self, frame: Frame) -> None:
+        for event in frame.events:
+            self._event(event)
+        for key, block in blocks_of(frame):
+            self._writer.write(key, wire.encode_block(block), self._wall(frame.tick))
+            self._rows.follow(key, block.index, len(block.values))
+
+    def _event(self, event: dict[str, Any]) -> None:
+        tick = int(event.get("tick", self.simulation.tick))  # a frame's own: the simulation is further on by now
+        stamp = {"tick": tick, "time_s": tick / self.simulation.tick_rate_hz}
+        payload = wire.encode_document(self._rows.tell({**stamp, **event}))
+        self._writer.write(wire.EVENTS, payload, self._wall(tick))
+
+    def _wall(self, tick: int) -> int:
+        return self._wall_ns + tick * 1_000_000_000 // self.simulation.tick_rate_hz

@@ -1,0 +1,197 @@
+"""Parquet, by pyarrow."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from replays.recordings.formats.dialect import parse_heading, time_column
+from replays.recordings.formats.source import Entry, Signal, Source, even_rate_hz
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.mapping import FileOptions
+    from replays.recordings.formats.selection import Chunk, Column, Selection, Table
+
+
+def open_file(path: Path, options: FileOptions) -> Source:
+    """Look into a Parquet file.
+
+    Raises:
+        InputError: It is none, or has no column of numbers.
+    """
+    from pyarrow import parquet
+
+    file = parquet.ParquetFile(path)
+    schema = file.schema_arrow
+    headings = [parse_heading(field.name) for field in schema]
+    names = [name for name, _ in headings]
+    stamps = time_column(names, options.time_column, path=path)
+    if stamps is None and options.time_column is None:  # as pandas names an index of instants
+        stamps = next((c for c in range(len(names)) if _is_clock(schema.field(c).type)), None)
+
+    def column(c: int) -> np.ndarray:
+        return numbers(file.read(columns=[schema.field(c).name]).column(0))
+
+    times_s, start = None, None
+    if stamps is not None:
+        times_s = column(stamps) * options.time_scale(headings[stamps][1])
+        start = first_instant(file.read_row_group(0, columns=[schema.field(stamps).name]).column(0))
+    rate = None if times_s is None else even_rate_hz(times_s)
+    about = schema.metadata or {}
+    entries = []
+    for c, (name, unit) in enumerate(headings):
+        field = schema.field(c)
+        if c != stamps and _numeric(field.type):
+            told = {key.decode(): text.decode(errors="replace") for key, text in (field.metadata or {}).items()}
+            entries.append(
+                Entry(name, "", unit or told.get("unit", ""), file.metadata.num_rows, rate, c, told.get("label", ""))
+            )
+
+    def read(entry: Entry) -> Signal:
+        return Signal(values=column(entry.place), times_s=times_s)
+
+    kept = {key.decode(): text.decode(errors="replace") for key, text in about.items() if key != b"ARROW:schema"}
+    return Source(path=path, format="Parquet", entries=tuple(entries), read=read, about=kept, start=start)
+
+
+def _numeric(kind: Any) -> bool:
+    import pyarrow.types as types
+
+    return types.is_integer(kind) or types.is_floating(kind)
+
+
+def _is_clock(kind: Any) -> bool:
+    import pyarrow.types as types
+
+    return types.is_timestamp(kind) or types.is_duration(kind)
+
+
+def numbers(column: Any) -> np.ndarray:
+    """A column of pyarrow as numbers, integers where they are and none is missing; times in seconds, missing: nan."""
+    import pyarrow
+    import pyarrow.compute as compute
+    import pyarrow.types as types
+
+    if _is_clock(column.type):
+        zoned = types.is_timestamp(column.type)
+        ns = column.cast(pyarrow.timestamp("ns", tz=column.type.tz) if zoned else pyarrow.duration("ns"))
+        whole = ns.cast(pyarrow.int64()).to_numpy()
+        if column.null_count:
+            return np.asarray(whole, dtype=float) / 1e9
+        # Instants count from the second of the first, which `first_instant` tells; durations from their own zero.
+        base = whole[0] - whole[0] % 1_000_000_000 if zoned else 0
+        return (whole - base) / 1e9
+    if column.null_count or not types.is_integer(column.type):
+        return np.array(compute.cast(column, pyarrow.float64()).to_numpy(), dtype=float)
+    return np.array(column.to_numpy())
+
+
+def first_instant(column: Any) -> datetime | None:
+    """The second in which a column of instants begins; None for other columns."""
+    import pyarrow
+    import pyarrow.types as types
+
+    if not types.is_timestamp(column.type) or not len(column):
+        return None
+    told = column[0].cast(pyarrow.timestamp("us", tz=column.type.tz)).as_py()
+    return None if told is None else told.replace(microsecond=0)
+
+
+class RowsFile(Protocol):
+    """A file that grows by rows."""
+
+    def write(self, columns: Sequence[np.ndarray]) -> None:
+        """Take rows, column by column, each shape (n,)."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left."""
+        ...
+
+
+class Rows:
+    """A Parquet file that grows by rows."""
+
+    def __init__(self, path: Path, schema: Any) -> None:
+        from pyarrow import parquet
+
+        self._schema = schema
+        # Dictionaries would be tried in vain on every column of a continuous quantity.
+        self._writer = parquet.ParquetWriter(path, schema, compression="lz4", use_dictionary=False)
+
+    def write(self, columns: Sequence[np.ndarray]) -> None:
+        """Take rows, column by column, each shape (n,)."""
+        self._writer.write_table(arrow_table(columns, self._schema))
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._writer.close()
+
+
+def float_schema(names: Sequence[str]) -> Any:
+    """Columns of float64."""
+    import pyarrow
+
+    return pyarrow.schema([(name, pyarrow.float64()) for name in names])
+
+
+def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
+    """Columns as pyarrow has them; nan in a column of integers is null."""
+    import pyarrow
+
+    arrays = []
+    for values, field in zip(columns, schema, strict=True):
+        if field.type == pyarrow.int32():
+            missing = np.isnan(values)
+            array = pyarrow.array(np.where(missing, 0.0, values).astype(np.int32), mask=missing)
+        else:
+            # Not pyarrow.array: it imports pandas to see what it was given, which takes as long as a second's rows.
+            whole = np.ascontiguousarray(values, dtype=float)
+            array = pyarrow.Array.from_buffers(pyarrow.float64(), len(whole), [None, pyarrow.py_buffer(whole)])
+        arrays.append(array)
+    return pyarrow.Table.from_arrays(arrays, schema=schema)
+
+
+class Writer:
+    """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata."""
+
+    merged = True
+    sparse = True
+    rows: Callable[[Path, Any], RowsFile] = Rows
+    """What takes the rows."""
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        import pyarrow
+
+        table = selection.tables[0]
+        kind = pyarrow.int32() if selection.unit == "counts" else pyarrow.float64()
+        fields = [pyarrow.field("time [s]", pyarrow.float64())]
+        for column in table.columns:
+            told = {key: str(value) for key, value in column.metadata.items()}
+            fields.append(pyarrow.field(column.heading, _type(column, kind), metadata=told))
+        whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz})}
+        self._rows = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
+
+    def write(self, table: Table, chunk: Chunk) -> None:
+        """Take rows; those that no stream has are left out."""
+        values = [table.exported(c, chunk)[chunk.present] for c in range(len(table.columns))]
+        self._rows.write([chunk.times_s[chunk.present], *values])
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._rows.close()
+
+    def abandon(self) -> None:
+        """Let go of the file."""
+        self._rows.close()
+
+
+def _type(column: Column, kind: Any) -> Any:
+    import pyarrow
+
+    return pyarrow.float64() if column.source is None else kind

@@ -1,0 +1,213 @@
+"""Text with delimiters: CSV in all its dialects, and LabVIEW's measurement files (.lvm). Parsed by pyarrow."""
+
+from __future__ import annotations
+
+import io
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from replays.recordings.formats import columnar
+from replays.recordings.formats.dialect import MISSING, Layout, find_layout, instant, time_column
+from replays.recordings.formats.source import Entry, Signal, Source, damaged, even_rate_hz
+from rig.errors import InputError
+from rig.text import printable
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.mapping import FileOptions
+
+
+def open_file(path: Path, options: FileOptions) -> Source:
+    """Look into a text file and read its columns.
+
+    Raises:
+        InputError: It cannot be understood; the message names what is missing or the line.
+    """
+    layout = find_layout(path, options)
+    names = list(layout.names)
+    stamps = None if layout.empty_first else time_column(names, options.time_column, path=path)
+    if stamps is None and options.time_column is None and not layout.empty_first:
+        stamps = _column_of_instants(path, layout, options)
+    table = _parse(path, layout, options, stamps)
+    columns = [columnar.numbers(column) for column in table.columns]
+    times_s, start = None, layout.start
+    if stamps is not None:
+        start = start or columnar.first_instant(table.column(stamps))
+        times_s = columns[stamps] * options.time_scale(layout.units[stamps])
+        if np.isnan(times_s).any():
+            line = layout.first + int(np.argmax(np.isnan(times_s))) + 1
+            raise InputError("file.time_column", "a column without holes", f"{path}, line {line}")
+    rate = layout.rate_hz if times_s is None else even_rate_hz(times_s)
+    entries = tuple(
+        Entry(name, "", layout.units[c], len(columns[c]), rate, c) for c, name in enumerate(names) if c != stamps
+    )
+
+    def read(entry: Entry) -> Signal:
+        values = columns[entry.place]
+        return Signal(values=values, times_s=times_s, rate_hz=layout.rate_hz, first_s=layout.first_s)
+
+    dialect = layout.dialect
+    told: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
+    told |= {"thousands": dialect.thousands} if dialect.thousands else {}
+    told["first_line"] = layout.first + 1
+    if stamps is not None:
+        told["time_column"] = names[stamps] or stamps + 1
+    return Source(
+        path=path, format="text", entries=entries, read=read, start=start, remarks=layout.remarks, options=told
+    )
+
+
+def _first_fields(path: Path, layout: Layout) -> list[str]:
+    with path.open(encoding=layout.encoding) as file:
+        return layout.dialect.fields([file.readline() for _ in range(layout.first + 1)][layout.first])
+
+
+def _column_of_instants(path: Path, layout: Layout, options: FileOptions) -> int | None:
+    """The column that has dates and times instead of numbers, whatever its name."""
+    for c, text in enumerate(_first_fields(path, layout)[: len(layout.names)]):
+        if not layout.dialect.is_number(text) and instant(text, options.time_format) is not None:
+            return c
+    return None
+
+
+def _parse(path: Path, layout: Layout, options: FileOptions, stamps: int | None) -> Any:
+    import pyarrow
+    from pyarrow import csv
+
+    numbered = [f"c{c}" for c in range(layout.width)]
+    kept = numbered[layout.empty_first : layout.empty_first + len(layout.names)]
+    bad: list[Any] = []
+
+    def note(row: Any) -> str:
+        bad.append(row)
+        return "skip"
+
+    kinds: dict[str, Any] = dict.fromkeys(kept, pyarrow.float64())
+    source, skipped, encoding = _body(path, layout)
+    if stamps is not None and options.time_unit in (None, "datetime"):
+        kinds[kept[stamps]] = _time_kind(_first_fields(path, layout)[stamps], layout, options)
+    try:
+        table = csv.read_csv(
+            source,
+            read_options=csv.ReadOptions(
+                column_names=numbered, skip_rows=skipped, use_threads=False, encoding=encoding
+            ),
+            parse_options=csv.ParseOptions(
+                delimiter=layout.dialect.delimiter, invalid_row_handler=note, ignore_empty_lines=True
+            ),
+            convert_options=csv.ConvertOptions(
+                column_types=kinds, include_columns=kept, decimal_point=layout.dialect.decimal,
+                null_values=[*MISSING, *options.missing], strings_can_be_null=True,
+            ),
+        )  # fmt: skip
+    except pyarrow.ArrowInvalid as error:
+        raise damaged(path, "text", error) from None
+    if bad:
+        row = bad[0]
+        line = f"line {row.number + layout.first - skipped}: " if row.number else ""
+        raise InputError(
+            "file", f"a text file of {layout.width} columns throughout",
+            f"{path}, where {len(bad)} lines are not so ({line}{row.actual_columns} columns, {row.text[:40]!r})",
+        )  # fmt: skip
+    if not table.num_rows:
+        raise InputError("file", "a text file with lines of numbers", str(path))
+    if stamps is not None and pyarrow.types.is_string(table.column(stamps).type):
+        table = table.set_column(stamps, kept[stamps], _instants(path, table.column(stamps), options))
+    return table
+
+
+def _body(path: Path, layout: Layout) -> tuple[Any, int, str]:
+    """What pyarrow parses, how many of its lines to skip, and its encoding: the file, or a copy with lines mended."""
+    dialect = layout.dialect
+    if not (dialect.delimiter == " " or dialect.thousands or layout.encoding == "utf-16" or layout.ragged):
+        return str(path), layout.first, layout.encoding.replace("-sig", "")
+    mended = []
+    for line in path.read_text(encoding=layout.encoding).splitlines()[layout.first :]:
+        fields = [dialect.plain(text) if dialect.is_number(text) else text for text in dialect.fields(line)]
+        if layout.ragged and not any(fields[layout.width :]):
+            fields = (fields + [""] * layout.width)[: layout.width] if any(fields) else fields
+        mended.append(dialect.delimiter.join(fields))
+    return io.BytesIO("\n".join(mended).encode()), 0, "utf8"
+
+
+def _time_kind(text: str, layout: Layout, options: FileOptions) -> Any:
+    """The type as which pyarrow reads a column of times; what it cannot is read as texts."""
+    import pyarrow
+
+    if options.time_format is None and layout.dialect.is_number(text):
+        return pyarrow.float64()
+    found = instant(text, options.time_format)
+    if found is None:
+        must = "given for times that are no numbers (such as %d.%m.%Y %H:%M:%S)"
+        raise InputError("file.time_format", must if options.time_format is None else "that of the times", text)
+    if options.time_format is not None or "," in text or not isinstance(found, datetime):
+        return pyarrow.string()
+    return pyarrow.timestamp("ns", tz=None if found.tzinfo is None else "UTC")
+
+
+def _instants(path: Path, column: Any, options: FileOptions) -> Any:
+    """Texts as instants, or as times of day."""
+    import pyarrow
+
+    found: list[Any] = []
+    for text in column.to_pylist():
+        moment = instant(str(text), options.time_format)
+        if moment is None:
+            raise InputError("file.time_format", f"that of the times in {path.name}", str(text))
+        found.append(moment)
+    kind = pyarrow.float64()
+    if isinstance(found[0], datetime):
+        zoned = getattr(found[0], "tzinfo", None) is not None
+        kind = pyarrow.timestamp("us", tz="UTC" if zoned else None)
+    return pyarrow.chunked_array([pyarrow.array(found, kind)])
+
+
+def _quoted(name: str) -> str:
+    return printable(name).replace('"', '""')
+
+
+class Rows:
+    """A CSV file that grows by rows: numbers in the fewest digits that give them back, on two threads."""
+
+    def __init__(self, path: Path, schema: Any) -> None:
+        from pyarrow import csv
+
+        self._csv = csv
+        self._schema = schema
+        self._file = path.open("wb")
+        self._file.write((",".join(f'"{_quoted(name)}"' for name in schema.names) + "\n").encode())
+        # Formatting a number takes ten times as long as simulating it, and needs no lock.
+        self._pool = ThreadPoolExecutor(max_workers=2)
+        self._due: deque[Future[bytes]] = deque()
+
+    def write(self, columns: Sequence[np.ndarray]) -> None:
+        """Take rows, column by column, each shape (n,)."""
+        self._due.append(self._pool.submit(self._format, columnar.arrow_table(columns, self._schema)))
+        while len(self._due) > 4:
+            self._file.write(self._due.popleft().result())
+
+    def _format(self, table: Any) -> bytes:
+        buffer = io.BytesIO()
+        self._csv.write_csv(table, buffer, self._csv.WriteOptions(include_header=False))
+        return buffer.getvalue()
+
+    def close(self) -> None:
+        """Write what is left."""
+        try:
+            while self._due:
+                self._file.write(self._due.popleft().result())
+        finally:
+            self._pool.shutdown(cancel_futures=True)
+            self._file.close()
+
+
+class Writer(columnar.Writer):
+    """A CSV file: `time [s]` and a column a channel."""
+
+    sidecar = True
+    rows = Rows

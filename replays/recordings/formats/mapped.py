@@ -1,0 +1,270 @@
+"""Mapped signals: found in their files, on their time axes, aligned, and in the channel's unit."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+
+import numpy as np
+
+from replays.recordings.formats import clock
+from replays.recordings.formats import unit as units
+from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalName
+from replays.recordings.formats.source import Entry, Signal, Source, even_rate_hz
+from rig.channels import Channel, default_table
+from rig.errors import InputError
+
+BITS = 32
+"""Of the counts of an imported channel."""
+_ROUNDING = 0.01
+"""Part by which a file may round its rate; a mapping that says another one is wrong."""
+
+
+@dataclass
+class MappedSignal:
+    """A mapped signal on its way."""
+
+    name: str
+    mapping: ChannelMapping
+    source: Source
+    entry: Entry
+    signal: Signal
+    axis: clock.Axis
+    target: Channel
+    gain: float
+    """Channel unit per source unit, with sign and factor."""
+    volts: float | None
+    """Volts per source unit, where it is a voltage."""
+    bias: float = 0.0
+    values: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """Engineering values, shape (rows of the axis,)."""
+    touched: list[str] = field(default_factory=list)
+    """What was done that changes samples."""
+    missing: int = 0
+    overrange: int = 0
+
+
+def find_signal(wanted: SignalName, sources: Sequence[Source], field_name: str) -> tuple[Source, Entry]:
+    """The one signal that a name means."""
+    if wanted.file is not None and all(source.path.name != wanted.file for source in sources):
+        raise InputError(f"{field_name}.file", f"one of {', '.join(s.path.name for s in sources)}", wanted.file)
+    inside = [
+        (source, entry)
+        for source in sources
+        if wanted.file in (None, source.path.name)
+        for entry in source.entries
+        if wanted.group in (None, entry.group)
+    ]
+    found = [pair for pair in inside if pair[1].name == wanted.source]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in found)
+        raise InputError(f"{field_name}.group", f"given, as {wanted.source} stands in {places}", wanted.group or "none")
+    if not inside:
+        groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
+        raise InputError(f"{field_name}.group", f"one of {', '.join(groups)}", wanted.group)
+    names = list(dict.fromkeys(entry.name for _, entry in inside))
+    close = difflib.get_close_matches(wanted.source, names, n=3, cutoff=0.4) or names[:12]
+    more = f" ({len(names)} in all)" if len(names) > len(close) else ""
+    raise InputError(f"{field_name}.source", f"a signal of the file, such as {', '.join(close)}{more}", wanted.source)
+
+
+def axis_of(source: Source, entry: Entry, signal: Signal, mapping: Mapping) -> clock.Axis:
+    """The time axis of a signal, as the file or the mapping tells it.
+
+    Raises:
+        InputError: Neither does, or the time stamps do not ascend.
+    """
+    rows, time = len(signal.values), mapping.time
+    what = f"{entry.name} in {source.path.name}"
+    if time.rate_hz is not None:
+        told = signal.rate_hz if signal.times_s is None else even_rate_hz(signal.times_s)
+        if told is not None and abs(told / time.rate_hz - 1.0) > _ROUNDING:
+            must = f'within {_ROUNDING:.0%} of the {told:.6g} Hz that {what} has (or file.time_column = "none")'
+            raise InputError("time.rate_hz", must, time.rate_hz)
+        first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
+        axis = clock.Axis(first_s, time.rate_hz, rows, note="rate from the mapping")
+    elif signal.times_s is not None:
+        axis = clock.axis_of_stamps(signal.times_s, line=time.stamps == "line", what=what)
+    elif signal.rate_hz is not None:
+        axis = clock.Axis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
+    else:
+        raise InputError("time.rate_hz", f"given, as the file tells no rate of {what}", "none")
+    return axis
+
+
+def take(name: str, wanted: ChannelMapping, sources: Sequence[Source], mapping: Mapping) -> MappedSignal:
+    """Find and read the signal of a channel.
+
+    Raises:
+        InputError: There is none, or its unit does not become the channel's.
+    """
+    where = f"channels.{name}"
+    source, entry = find_signal(wanted, sources, where)
+    target = default_table().channels.get(name)
+    if target is None:
+        if wanted.to is None or wanted.to_unit is None:
+            close = difflib.get_close_matches(name, list(default_table().channels), n=1)
+            hint = f" (such as {close[0]})" if close else ""
+            must = f"a channel of the rig{hint}, or given with `to` (a group) and `to_unit`"
+            raise InputError(where, must, name)
+        if "/" in wanted.to or "/" in name or not wanted.to:
+            raise InputError(f"{where}.to", "a plain name", wanted.to)
+        target = _foreign(name, wanted.to, units.canonical(wanted.to_unit))
+    elif wanted.to is not None or wanted.to_unit is not None:
+        raise InputError(
+            f"{where}.to", f"left out, as {name} is one of the rig's channels", wanted.to or wanted.to_unit
+        )
+    unit = entry.unit if wanted.unit is None else wanted.unit
+    volts = units.size_si(unit) if units.kind(unit) == "voltage" else None
+    if wanted.sensitivity is not None:
+        per_unit_v = units.sensitivity_v(wanted.sensitivity, target.unit, field=f"{where}.sensitivity")
+        if volts is None:
+            raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit or "none")
+        gain = volts / per_unit_v
+    else:
+        if wanted.unit is None and not entry.unit and target.unit != "1":
+            raise InputError(f"{where}.unit", f"given, as {source.path.name} tells none", "none")
+        # A pulse may stay in volts: only when it passes its level matters.
+        pulse = volts is not None and target.unit == "1"
+        gain = volts if pulse and volts is not None else units.factor(unit, target.unit, field=f"{where}.unit")
+    signal = source.read(entry)
+    if not len(signal.values):
+        raise InputError(where, "a signal with values", f"{entry.name}, which is empty")
+    axis = axis_of(source, entry, signal, mapping)
+    if axis.numbers is not None:
+        signal = replace(signal, values=axis.placed(signal.values.astype(float)))
+    return MappedSignal(
+        name=name, mapping=wanted, source=source, entry=entry, signal=signal, axis=axis, target=target,
+        gain=gain * wanted.sign * wanted.factor, volts=volts,
+    )  # fmt: skip
+
+
+def _foreign(name: str, group: str, unit: str) -> Channel:
+    """A channel that is none of the rig's."""
+    return Channel(
+        name=name, label=name, group=group, signal="", unit=unit, si=units.size_si(unit), sensitivity_v=1.0,
+        bias_v=0.0, range_v=(-1.0, 1.0), bandwidth_hz=1.0, highpass_hz=0.0, noise_v=0.0, adc_v=1.0, adc_bits=BITS,
+        rate_hz=1, kind="imported",
+    )  # fmt: skip
+
+
+Moves = list[tuple[str, str | None, clock.Shift]]
+
+
+def align(sources: Sequence[Source], mapping: Mapping, remarks: list[str]) -> Moves:
+    """Find how the clocks of files and groups move, in the order of the mapping.
+
+    Raises:
+        InputError: What they have in common is not to be found.
+    """
+    moves = _starts(sources, remarks)
+    for number, wanted_align in enumerate(mapping.align):
+        where = f"align.{number}"
+        pairs, places = [], []
+        for wanted, side in ((wanted_align.reference, "reference"), (wanted_align.moved, "moved")):
+            source, entry = find_signal(wanted, sources, f"{where}.{side}")
+            signal = source.read(entry)
+            axis = axis_of(source, entry, signal, mapping)
+            if axis.numbers is not None:
+                signal = replace(signal, values=axis.placed(signal.values.astype(float)))
+            pairs.append((signal.physical, shifted(axis, source, entry, moves)))
+            places.append((source, entry))
+        (source, entry), (base, base_entry) = places[1], places[0]
+        group = entry.group if wanted_align.scope == "group" else None
+        if source is base and (group is None or group == base_entry.group):
+            must = 'of another file than the reference (or of another group: scope "group")'
+            raise InputError(f"{where}.moved", must, wanted_align.moved.source)
+        if wanted_align.method == "edge":
+            shift = clock.shift_by_edges(
+                pairs[0], pairs[1], threshold=wanted_align.threshold, within_s=wanted_align.within_s
+            )
+        else:
+            shift = clock.shift_by_correlation(pairs[0], pairs[1], within_s=wanted_align.within_s)
+        moves.append((source.path.name, group, shift))
+        what = source.path.name if group is None else f"{source.path.name}, group {group}"
+        remarks.append(f"{what}: moved by {shift.offset_s * 1e3:+.4f} ms, {shift.note} of {wanted_align.moved.source}")
+    return moves
+
+
+def _starts(sources: Sequence[Source], remarks: list[str]) -> Moves:
+    """How the files lie by the wall clocks that started them."""
+    moves: Moves = []
+    base = sources[0].start
+    for source in sources[1:]:
+        if base is None or source.start is None:
+            remarks.append(f"{source.path.name}: taken to start with {sources[0].path.name}, before any alignment")
+            continue
+        late_s = (_utc(source.start) - _utc(base)).total_seconds()
+        moves.append((source.path.name, None, clock.Shift(late_s, 1.0, "")))
+        zones = {source.start.tzinfo is None, base.tzinfo is None}
+        unsure = " (one of them without a time zone, taken as UTC)" if len(zones) > 1 else ""
+        remarks.append(f"{source.path.name}: {late_s:+.6f} s by the times of day in the files{unsure}")
+    return moves
+
+
+def _utc(moment: datetime) -> datetime:
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+
+
+def shifted(axis: clock.Axis, source: Source, entry: Entry, moves: Moves) -> clock.Axis:
+    """A time axis on the common clock."""
+    for file, group, shift in moves:
+        if file == source.path.name and group in (None, entry.group):
+            axis = axis.moved(shift.offset_s, shift.stretch)
+    return axis
+
+
+def check_rows(taken: Sequence[MappedSignal]) -> None:
+    """Refuse signals without a span.
+
+    Raises:
+        InputError: The first one.
+    """
+    for entry in taken:
+        if entry.axis.rows < 2:
+            raise InputError(f"channels.{entry.name}", "a signal of two or more values", entry.axis.rows)
+
+
+def _inside(axis: clock.Axis, mapping: Mapping) -> np.ndarray:
+    times_s = axis.instants()
+    low, high = mapping.time.from_s, mapping.time.to_s
+    return (times_s >= (-math.inf if low is None else low)) & (times_s <= (math.inf if high is None else high))
+
+
+def engineering(entry: MappedSignal, mapping: Mapping) -> None:
+    """Values in the channel's unit, with what is missing or overrange counted and seen to."""
+    wanted, where = entry.mapping, f"channels.{entry.name}"
+    physical = entry.signal.physical
+    bad = ~np.isfinite(physical)
+    entry.missing = int(bad.sum())
+    if wanted.full_scale is not None:
+        entry.overrange = int((np.abs(physical) >= wanted.full_scale).sum())
+    elif entry.signal.rails is not None:
+        low, high = entry.signal.rails
+        entry.overrange = int(((entry.signal.values <= low) | (entry.signal.values >= high)).sum())
+    if bad.all():
+        raise InputError(where, "a signal with numbers in it", entry.entry.name)
+    if entry.missing:
+        at = int(np.argmax(bad))
+        if wanted.missing == "refuse":
+            time_s = float(entry.axis.instants()[at])
+            raise InputError(where, 'free of missing values (missing = "gap" or "hold")',
+                             f"{entry.missing} of them, the first in row {at + 1} at {time_s:g} s")  # fmt: skip
+        if wanted.missing == "hold":
+            last = np.maximum.accumulate(np.where(bad, -1, np.arange(len(bad))))
+            last[last < 0] = int(np.argmax(~bad))
+            physical = physical[last]
+            entry.touched.append(f"{entry.missing} missing values held")
+        else:
+            physical = np.where(bad, np.nan, physical)
+    if wanted.bias == "mean":
+        inside = physical[_inside(entry.axis, mapping)]
+        entry.bias = float(np.nanmean(inside)) if len(inside) else 0.0
+    else:
+        entry.bias = float(wanted.bias)
+    entry.values = entry.gain * (physical - entry.bias)

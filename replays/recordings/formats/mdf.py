@@ -1,0 +1,198 @@
+"""MDF4, as measuring systems in vehicles and test rigs write it, by asammdf."""
+
+from __future__ import annotations
+
+import gc
+import re
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from replays.recordings.formats import unit as units
+from replays.recordings.formats.source import Entry, Signal, Source, damaged, even_rate_hz, library
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.mapping import FileOptions
+    from replays.recordings.formats.selection import Chunk, Selection, Table
+
+_TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
+"""The text in a comment that is XML."""
+_SYNC_NONE, _SYNC_TIME = 0, 1
+"""Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
+_IDENTITY, _LINEAR = 0, 1
+"""Types of the conversion of a channel in MDF4; no conversion is the identity, too."""
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Deprecations inside asammdf, and of what it calls in numpy and pandas, are not ours to mend."""
+    with warnings.catch_warnings():
+        for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
+            warnings.simplefilter("ignore", category)
+        yield
+
+
+def open_file(path: Path, options: FileOptions) -> Source:
+    """Look into an MDF file (version 3 or 4).
+
+    Raises:
+        InputError: It is none, or asammdf is missing.
+    """
+    mdf = _open(path)
+    with _quiet():
+        entries, texts = _entries(mdf)
+
+    def read(entry: Entry) -> Signal:
+        group, index = entry.place
+        with _quiet():
+            return _signal(mdf, group, index)
+
+    remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
+    about = {"version": str(mdf.version), "comment": str(mdf.header.description or "")}
+    return Source(
+        path=path, format=f"MDF {mdf.version}", entries=tuple(entries), read=read, start=mdf.header.start_time,
+        about={key: text for key, text in about.items() if text}, remarks=remarks,
+    )  # fmt: skip
+
+
+def _open(path: Path) -> Any:
+    asammdf = library("asammdf")
+    failure, hook = "", sys.unraisablehook
+    # Of a file that it cannot open, asammdf's half-made object complains on its own when it goes: let it go here.
+    sys.unraisablehook = lambda _: None
+    try:
+        with _quiet():
+            return asammdf.MDF(path)
+    except Exception as error:
+        failure = f"{type(error).__name__}: {error}"
+    finally:
+        gc.collect()
+        sys.unraisablehook = hook
+    raise damaged(path, "MDF", failure)
+
+
+def _entries(mdf: Any) -> tuple[list[Entry], int]:
+    entries, texts = [], 0
+    for number, group in enumerate(mdf.groups):
+        rows = int(group.channel_group.cycles_nr)
+        if not rows:
+            continue
+        name = str(getattr(group.channel_group, "acq_name", "") or f"group {number}")
+        scale = _second(mdf, number)
+        rate = None if scale is None else even_rate_hz(mdf.get_master(number) * scale)
+        master = mdf.masters_db.get(number)
+        for index, channel in enumerate(group.channels):
+            if index == master:
+                continue
+            if not _numeric(mdf, number, index):
+                texts += 1
+                continue
+            unit = str(channel.unit or getattr(channel.conversion, "unit", "") or "")
+            text = _TEXT.search(str(channel.comment or ""))
+            label = (text[1] or "") if text else str(channel.comment or "")
+            entries.append(Entry(str(channel.name), name, unit, rows, rate, (number, index), label, number))
+    return entries, texts
+
+
+def _second(mdf: Any, group: int) -> float | None:
+    """One unit of a group's master channel [s]; None where it has none, or one of an angle, a length or an index.
+
+    The format asks for seconds; some writers have other units all the same.
+    """
+    index = mdf.masters_db.get(group)
+    if index is None:
+        return None
+    master = mdf.groups[group].channels[index]
+    if getattr(master, "sync_type", _SYNC_TIME) not in (_SYNC_NONE, _SYNC_TIME):
+        return None
+    unit = str(master.unit or getattr(master.conversion, "unit", "") or "")
+    return units.size_si(unit) if units.kind(unit) == "time" else 1.0
+
+
+def _numeric(mdf: Any, group: int, index: int) -> bool:
+    try:
+        few = mdf.get(group=group, index=index, record_offset=0, record_count=2, ignore_invalidation_bits=True).samples
+    except Exception:  # what cannot be decoded is no number for us
+        return False
+    return few.ndim == 1 and few.dtype.kind in "iufb"
+
+
+def _signal(mdf: Any, group: int, index: int) -> Signal:
+    raw = mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
+    kind = _IDENTITY if raw.conversion is None else raw.conversion.conversion_type
+    scale, offset = 1.0, 0.0
+    if raw.samples.dtype.kind in "iu" and kind in (_IDENTITY, _LINEAR):
+        values = raw.samples
+        if kind == _LINEAR and raw.conversion is not None:
+            scale, offset = float(raw.conversion.a), float(raw.conversion.b)
+    else:
+        values = mdf.get(group=group, index=index, ignore_invalidation_bits=True).samples.astype(float)
+    invalid = raw.invalidation_bits
+    if invalid is not None and np.any(invalid):
+        values = values.astype(float)
+        values[np.asarray(invalid, dtype=bool)] = np.nan
+    second = _second(mdf, group)
+    times_s = None if second is None else np.asarray(raw.timestamps, dtype=float) * second
+    return Signal(values=values, scale=scale, offset=offset, times_s=times_s)
+
+
+class Writer:
+    """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion."""
+
+    merged = False
+    sparse = True
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        asammdf = library("asammdf")
+        self._path = path
+        self._selection = selection
+        self._signal = asammdf.Signal
+        self._groups: dict[str, int] = {}
+        with _quiet():
+            self._mdf = asammdf.MDF(version="4.10")
+            self._mdf.header.start_time = selection.start
+            self._mdf.header.description = selection.summary()
+
+    def write(self, table: Table, chunk: Chunk) -> None:
+        """Take rows."""
+        present = chunk.present
+        times_s = chunk.times_s[present]
+        if not len(times_s):
+            return
+        columns: Sequence[np.ndarray] = [table.raw(c, chunk)[present] for c in range(len(table.columns))]
+        with _quiet():
+            if table.name in self._groups:
+                pairs = [(times_s, None), *((values, None) for values in columns)]
+                self._mdf.extend(self._groups[table.name], pairs)
+                return
+            signals = [
+                self._signal(
+                    samples=values, timestamps=times_s, name=column.name, unit=column.unit, comment=column.about(),
+                    conversion=None if column.linear is None else dict(zip("ab", column.linear, strict=True)),
+                )
+                for column, values in zip(table.columns, columns, strict=True)
+            ]  # fmt: skip
+            number = self._mdf.append(signals, acq_name=table.name, comment=table.title, common_timebase=True)
+        self._groups[table.name] = number
+
+    def close(self) -> None:
+        """Write the file."""
+        # asammdf insists on its own suffix: what it wrote gets the name that was asked for.
+        own = self._path.with_name(self._path.name + ".mf4")
+        try:
+            with _quiet():
+                self._mdf.save(own, overwrite=True)
+                self._mdf.close()
+            own.replace(self._path)
+        finally:
+            own.unlink(missing_ok=True)
+
+    def abandon(self) -> None:
+        """Let go of what it holds."""
+        with _quiet():
+            self._mdf.close()

@@ -1,0 +1,227 @@
+"""Files of other measuring systems as signals: what is in them, and the values of each, whatever the format."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rig.errors import InputError
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.mapping import FileOptions
+
+_READERS = {
+    ".mf4": "mdf", ".mdf": "mdf", ".dat": "mdf", ".tdms": "tdms", ".uff": "uff", ".unv": "uff", ".csv": "delimited",
+    ".txt": "delimited", ".asc": "delimited", ".tsv": "delimited", ".lvm": "delimited", ".parquet": "columnar",
+    ".wav": "wav",
+}  # fmt: skip
+
+
+_FORMATS = {
+    "mdf": "MDF", "tdms": "TDMS", "uff": "universal (UFF)", "delimited": "text", "columnar": "Parquet", "wav": "WAV",
+}  # fmt: skip
+_MOST_HZ = 1e9
+_MOST_S = 1e12
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One signal in a file, before its values are read.
+
+    Attributes:
+        name: Its name in the file.
+        group: The file's group that it stands in; empty where there are none.
+        unit: Unit as the file spells it; empty where it tells none.
+        rows: Number of values.
+        rate_hz: Rate that the file tells, or that its time stamps have [Hz]; None where it tells neither.
+        place: Where the reader finds it.
+        label: What the file says about it.
+        group_number: Number of the group in the file, from 0.
+    """
+
+    name: str
+    group: str
+    unit: str
+    rows: int
+    rate_hz: float | None
+    place: Any = None
+    label: str = ""
+    group_number: int = 0
+
+
+@dataclass(frozen=True)
+class Signal:
+    """The values of one signal.
+
+    Attributes:
+        values: Numbers as they stand in the file, integer or float64, shape (n,).
+        scale: Physical value of one of them, ...
+        offset: ... and physical value of zero: `physical` applies both.
+        times_s: Time stamp of each from the file's start [s], shape (n,); None for an even rate.
+        rate_hz: The even rate [Hz], if the file tells one.
+        first_s: Time of the first value from the file's start [s].
+        rails: Numbers at which the converter was at its end, where the file tells.
+    """
+
+    values: np.ndarray
+    scale: float = 1.0
+    offset: float = 0.0
+    times_s: np.ndarray | None = None
+    rate_hz: float | None = None
+    first_s: float = 0.0
+    rails: tuple[float, float] | None = None
+
+    @property
+    def physical(self) -> np.ndarray:
+        """Values in the file's unit, float64, shape (n,)."""
+        values = self.values.astype(float)
+        if (self.scale, self.offset) != (1.0, 0.0):
+            values = values * self.scale + self.offset
+        return values
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file of another measuring system.
+
+    Attributes:
+        path: The file.
+        format: What it is, in words.
+        entries: Its signals.
+        read: Reads the values of one of them.
+        start: When its time zero was, if it tells.
+        about: What it tells of itself.
+        remarks: What had to be assumed to read it.
+        options: What the mapping has to say of the file so that it is read so again.
+    """
+
+    path: Path
+    format: str
+    entries: tuple[Entry, ...]
+    read: Callable[[Entry], Signal]
+    start: datetime | None = None
+    about: dict[str, str] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    options: dict[str, str | int] = field(default_factory=dict)
+
+
+def open_source(path: Path, options: FileOptions) -> Source:
+    """Look into a file.
+
+    Raises:
+        InputError: It cannot be read, is no such file, or the library for it is missing.
+    """
+    name = _READERS.get(path.suffix.lower())
+    if name is None:
+        raise InputError("file", f"a file that ends in {', '.join(_READERS)}", str(path))
+    try:
+        with path.open("rb") as file:
+            empty = not file.read(1)
+    except OSError as error:
+        raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
+    if empty:
+        raise InputError("file", "a file with something in it", str(path))
+    if name != "delimited":
+        options.only_for_text(path)
+    what = _FORMATS[name]
+    module = importlib.import_module(f"replays.recordings.formats.{name}")
+    with _parsing(path, what):
+        source: Source = module.open_file(path, options)
+    if not source.entries:
+        raise InputError("file", "a file with signals in it", str(path))
+
+    def read(entry: Entry) -> Signal:
+        where = f"{what} (signal {entry.name})"
+        with _parsing(path, where):
+            signal = source.read(entry)
+            _check(signal)
+        return signal
+
+    entries = tuple(
+        entry if entry.rate_hz is None or 0.0 < entry.rate_hz <= _MOST_HZ else replace(entry, rate_hz=None)
+        for entry in source.entries
+    )
+    distinct = _distinct(entries)
+    twice = [
+        f"several are named {one.name!r}: this one is {new.name!r}"
+        for one, new in zip(entries, distinct, strict=True)
+        if one.name != new.name
+    ]
+    return replace(source, entries=distinct, read=read, remarks=(*source.remarks, *twice))
+
+
+@contextmanager
+def _parsing(path: Path, what: str) -> Iterator[None]:
+    """Whatever a library raises on a file that it cannot read, for want of memory too, becomes the one line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise damaged(path, what, error) from None
+
+
+def _check(signal: Signal) -> None:
+    """See that the numbers of a signal are such that a measurement can have.
+
+    Raises:
+        ValueError: They are not.
+    """
+    values, times_s = signal.values, signal.times_s
+    if values.ndim != 1 or values.dtype.kind not in "iufb":
+        raise ValueError(f"values of {values.dtype} in {values.ndim} dimensions")
+    if signal.rate_hz is not None and not 0.0 < signal.rate_hz <= _MOST_HZ:
+        raise ValueError(f"a rate of {signal.rate_hz} Hz")
+    if not (math.isfinite(signal.scale) and signal.scale and math.isfinite(signal.offset)):
+        raise ValueError(f"a scale of {signal.scale}, an offset of {signal.offset}")
+    if not abs(signal.first_s) <= _MOST_S:
+        raise ValueError(f"a beginning at {signal.first_s} s")
+    if times_s is not None and not (times_s.shape == values.shape and bool((np.abs(times_s) <= _MOST_S).all())):
+        raise ValueError("time stamps that are none")
+
+
+def _distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    """The same with a number behind a name that a group has twice."""
+    seen: dict[tuple[str, str], int] = {}
+    found = []
+    for entry in entries:
+        key = (entry.group, entry.name)
+        seen[key] = seen.get(key, 0) + 1
+        found.append(entry if seen[key] == 1 else replace(entry, name=f"{entry.name} #{seen[key]}"))
+    return tuple(found)
+
+
+def library(name: str, module: str | None = None) -> Any:
+    """An optional library.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        return importlib.import_module(module or name)
+    except ImportError:
+        raise InputError(
+            "this format",
+            f"asked for with the library {name} installed (pip install 'rotor-stator-rig[formats]')",
+            name,
+        ) from None
+
+
+def damaged(path: Path, what: str, error: Exception | str) -> InputError:
+    """The one line for whatever a library raises on a file that it cannot read."""
+    text = error if isinstance(error, str) else f"{type(error).__name__}: {error}"
+    return InputError("file", f"an intact {what} file", f"{path} ({text})"[:300])
+
+
+def even_rate_hz(times_s: np.ndarray) -> float | None:
+    """Mean rate of time stamps [Hz]; None where there is no span."""
+    span = float(times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
+    return (len(times_s) - 1) / span if span > 0.0 else None

@@ -1,0 +1,167 @@
+"""Universal files of dataset 58 (a function of time at a degree of freedom), the format of modal analysis.
+
+Read by pyuff, binary or text. Written here, binary (58b) in float64, block by block: pyuff packs each value alone. The
+layout is that of the SDRC test data exchange documentation, dataset 58.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from replays.recordings.formats import unit as units
+from replays.recordings.formats.source import Entry, Signal, Source, damaged, library
+from rig.errors import InputError
+from rig.text import printable
+
+if TYPE_CHECKING:
+    from replays.recordings.formats.mapping import FileOptions
+    from replays.recordings.formats.selection import Chunk, Column, Selection, Table
+
+_TIME_RESPONSE = (0, 1)
+"""Function types that are time histories: general, time response."""
+_REAL = (2, 4)
+"""Ordinates in single or double precision; 5 and 6 are complex."""
+_DELIMITER, _BLANK = b"    -1", b"\0\x1a\r\n "
+"""What stands before and behind a dataset, and what may follow it."""
+_TAIL = 4096
+"""Bytes at the end of a file in which that is looked for."""
+_EXACT_RATE = re.compile(r"rate_hz=([0-9.eE+-]+)")
+_START = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S")
+_TIME, _GENERAL, _UNKNOWN = 17, 1, 0
+_ORDINATE = {
+    "length": (8, 1, 0),
+    "force": (9, 0, 1),
+    "acceleration": (12, 1, 0),
+    "speed of rotation": (_GENERAL, 0, 0),
+}
+"""Specific data type, and exponents of length and force, by what a unit measures (9: reaction force)."""
+
+
+def open_file(path: Path, options: FileOptions) -> Source:
+    """Look into a universal file.
+
+    Raises:
+        InputError: It is none, is cut off, has no time history, or pyuff is missing.
+    """
+    pyuff = library("pyuff")
+    if not _ends(path):
+        raise damaged(path, "universal (UFF)", "it is cut off")
+    file = pyuff.UFF(str(path))
+    kinds = list(np.atleast_1d(file.get_set_types()).astype(int))
+    heads = {n: file.read_sets(n, header_only=True) for n, kind in enumerate(kinds) if kind == 58}
+    entries: list[Entry] = []
+    for n, head in heads.items():
+        if head["func_type"] not in _TIME_RESPONSE or head["ord_data_type"] not in _REAL:
+            continue
+        name = next((text for text in (head["id1"].strip(), head["rsp_ent_name"].strip()) if text not in ("", "NONE")),
+                    f"set {n + 1}")  # fmt: skip
+        unit = head["ordinate_axis_units_lab"].strip()
+        label = " ".join(head[f"id{k}"].strip() for k in (2, 5) if head[f"id{k}"].strip() not in ("", "NONE"))
+        unit = "" if unit == "NONE" else unit
+        entries.append(Entry(name, "", unit, int(head["num_pts"]), _rate_hz(head), n, label))
+    if not entries:
+        raise InputError("file", "a universal file with time histories (dataset 58, real)", str(path))
+
+    def read(entry: Entry) -> Signal:
+        data = file.read_sets(entry.place)
+        values = np.array(data["data"], dtype=float)[: entry.rows]
+        if len(values) < entry.rows:
+            raise ValueError(f"{len(values)} of {entry.rows} values")
+        if int(data["abscissa_spacing"]) == 0:
+            return Signal(values=values, times_s=np.array(data["x"], dtype=float)[: entry.rows])
+        return Signal(values=values, rate_hz=_rate_hz(data), first_s=float(data["abscissa_min"]))
+
+    others = len(kinds) - len(entries)
+    remarks = (f"{others} datasets that are no time history are passed over",) if others else ()
+    start = _start([str(head["id3"]) for head in heads.values()])
+    return Source(path=path, format="UFF58", entries=tuple(entries), read=read, remarks=remarks, start=start)
+
+
+def _ends(path: Path) -> bool:
+    """Whether the file ends with the close of a dataset; pyuff passes over one that does not end."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _TAIL))
+        end = file.read().rstrip(_BLANK)
+    # Binary numbers are followed by it without a new line; after one that closes, another opens the next dataset.
+    return end.endswith(_DELIMITER) and not end.removesuffix(_DELIMITER).rstrip(_BLANK).endswith(_DELIMITER)
+
+
+def _rate_hz(head: dict) -> float | None:
+    exact = _EXACT_RATE.search(str(head.get("id4", "")))
+    if exact:
+        return float(exact[1])  # the header has six digits of the step only
+    step = float(head["abscissa_inc"])
+    return 1.0 / step if head["abscissa_spacing"] and step > 0.0 else None
+
+
+def _start(texts: list[str]) -> datetime | None:
+    for text in texts:
+        for form in _START:
+            try:
+                return datetime.strptime(text.strip(), form)
+            except ValueError:
+                continue
+    return None
+
+
+class Writer:
+    """A universal file: a binary dataset 58 a channel, in float64."""
+
+    merged = False
+    sparse = False
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        self._file = path.open("wb")
+        self._at: dict[str, list[int]] = {}
+        for table in selection.tables:
+            for column in table.columns:
+                self._file.write(_header(table, column, selection))
+                self._at.setdefault(table.name, []).append(self._file.tell())
+                self._file.seek(8 * table.rows, 1)
+                self._file.write(b"\n    -1\n")
+
+    def write(self, table: Table, chunk: Chunk) -> None:
+        """Take rows; a missing one is nan, for the format has a start and a step and no times."""
+        for c, at in enumerate(self._at[table.name]):
+            self._file.seek(at + 8 * chunk.index)
+            self._file.write(table.exported(c, chunk).astype("<f8").tobytes())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Let go of the file."""
+        self._file.close()
+
+
+def _header(table: Table, column: Column, selection: Selection) -> bytes:
+    kind, length, force = _ORDINATE.get(units.kind(column.unit), (_UNKNOWN, 0, 0))
+    about = selection.metadata
+    texts = (
+        column.name,
+        column.label or "NONE",
+        selection.start.strftime("%d-%b-%y %H:%M:%S"),
+        f"rate_hz={table.rate_hz:.17g} scene={about['scene']} seed={about['seed']}",
+        f"parameters={about['parameter_set']} group={table.name}",
+    )
+    lines = [
+        f"{-1:6d}",
+        f"{58:6d}b{1:6d}{2:6d}{11:12d}{8 * table.rows:12d}{0:6d}{0:6d}{0:12d}{0:12d}",
+        *(f"{_ascii(text, 80):<80}" for text in texts),
+        f"{1:5d}{0:10d}{0:5d}{0:10d} {_ascii(column.name, 10):<10}{0:10d}{0:4d} {'NONE':<10}{0:10d}{0:4d}",
+        f"{4:10d}{table.rows:10d}{1:10d}{table.first_s:13.5E}{1.0 / table.rate_hz:13.5E}{0.0:13.5E}",
+        f"{_TIME:10d}{0:5d}{0:5d}{0:5d} {'Time':<20} {'s':<20}",
+        f"{kind:10d}{length:5d}{force:5d}{0:5d} {_ascii(column.name, 20):<20} {_ascii(column.unit, 20):<20}",
+        *(f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':<20} {'NONE':<20}" for _ in range(2)),
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def _ascii(text: str, width: int) -> str:
+    return printable(text).encode("ascii", "replace").decode()[:width]

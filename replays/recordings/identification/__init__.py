@@ -1,0 +1,9 @@
+"""Numbers of the rig from a recording, with what they are worth."""
+
+from __future__ import annotations
+
+from replays.recordings.identification.fit import PRECISION, SPREAD, Identification, identify
+from replays.recordings.identification.judgement import Finding, Judgement
+from replays.recordings.identification.question import Question, Unknown, ask
+
+__all__ = ["PRECISION", "SPREAD", "Finding", "Identification", "Judgement", "Question", "Unknown", "ask", "identify"]

@@ -1,0 +1,126 @@
+"""A fit as a parameter set that a run takes, and as a JSON document."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from replays.recordings.identification.fit import Identification
+from rig.errors import check_new_file
+from rig.parameters import DEFAULT_SET, Parameter, load_parameters, set_names
+
+
+def fitted_set(found: Identification, *, recording: str) -> str:
+    """The parameter set, TOML: what the experiment ran on, with what was identified in its place.
+
+    Only identified values are results. What the recording does not tell stays as it was; of values that it tells only
+    together, all are written as the fit left them, which says so.
+    """
+    scene = found.question.experiment.scene
+    base = scene.parameters if scene.parameters in set_names() else DEFAULT_SET
+    span = f"{found.from_s:.4f} to {found.window.end_s:.4f} s"
+    lines = [
+        f"# Made by `rig identify`; the model's verdict: {found.judgement.verdict}.",
+        f"title = {_quoted(f'Fitted to {recording}, {span}')}",
+        f"base = {_quoted(base)}",
+    ]
+    before = load_parameters(base).entries
+    fitted = {finding.unknown.key: finding for finding in found.judgement.findings}
+    for key, entry in scene.load_parameters().entries.items():
+        finding = fitted.get(key)
+        if finding is None:
+            if entry != before[key]:
+                lines += _entry(key, entry)
+            continue
+        if finding.standing == "not seen":
+            if finding.unknown.rule is None and finding.unknown.start != before[key].value:
+                source = f"not seen in {recording}, {span}: as the search began"
+                lines += _entry(key, entry, value=finding.unknown.start, kind="assumed", source=source)
+            continue
+        unit = "" if entry.unit == "1" else f" {entry.unit}"
+        told = f"95 % interval +-{finding.half_width:.3g}{unit}" if math.isfinite(finding.half_width) else ""
+        told = told or f"no interval of its own, {finding.words}"
+        source = f"rig identify, {recording}, {span}: {told}"
+        lines += _entry(key, entry, value=finding.value, kind="fitted", source=source)
+    other = [finding for key, finding in fitted.items() if key not in before]
+    if other:
+        lines += ["", "# No parameters, and so not part of the set:"]
+        lines += [f"# {one.unknown.key} = {one.value:.8g} {one.unknown.unit}: {one.words}" for one in other]
+    return "\n".join(lines) + "\n"
+
+
+def check_set(path: Path, *, force: bool) -> None:
+    """Refuse a file that no set can be written to, before anything is computed.
+
+    Raises:
+        InputError: Another suffix, a folder that is missing, or an existing file.
+    """
+    check_new_file(path, field="output", suffixes=(".toml",), force=force)
+
+
+def write_set(text: str, path: Path) -> None:
+    """Write a set to a file that is whole and can be loaded, or not there."""
+    part = path.with_name(f"{path.stem}.part.toml")
+    try:
+        part.write_text(text, encoding="utf-8")
+        load_parameters(str(part))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def identification_document(found: Identification, *, recording: str) -> dict[str, Any]:
+    """Everything found, as a JSON document; what is no number there is null."""
+    judgement = found.judgement
+    return {
+        "recording": recording,
+        "window_s": [found.from_s, found.window.end_s],
+        "window_ends_because": found.why,
+        "verdict": judgement.verdict,
+        "fits": judgement.fits,
+        "white": judgement.white,
+        "chi2_per_degree_of_freedom": judgement.chi2,
+        "degrees_of_freedom": judgement.freedom,
+        "simultaneous_over_single_intervals": judgement.together,
+        "interval_inflation": judgement.inflation,
+        "values": {
+            finding.unknown.key: {
+                "standing": finding.standing,
+                "value": finding.value if finding.standing == "identified" else None,
+                "half_width_95": finding.half_width if math.isfinite(finding.half_width) else None,
+                "unit": finding.unknown.unit,
+                "start": finding.unknown.start,
+                "words": finding.words,
+            }
+            for finding in judgement.findings
+        },
+        "correlation": [[None if math.isnan(c) else float(c) for c in row] for row in judgement.correlation],
+        "singular_values": judgement.singular_values.tolist(),
+        "channels": [vars(channel) for channel in judgement.channels],
+        "stages": [
+            {
+                "end_s": stage.end_s,
+                "why": stage.why,
+                "values": stage.values.tolist(),
+                "half_widths_95": stage.half_widths.tolist(),
+                "chi2": stage.chi2,
+                "chi2_of_new_samples": stage.fresh,
+            }
+            for stage in found.stages
+        ],
+        "simulations": found.runs,
+        "spread_made_smaller": found.narrowed,
+    }
+
+
+def _entry(key: str, entry: Parameter, **changes: Any) -> list[str]:
+    value, kind, source = (changes.get(name, getattr(entry, name)) for name in ("value", "kind", "source"))
+    shown = _quoted(value) if isinstance(value, str) else repr(float(value))
+    return ["", f"[{key}]", f"value = {shown}", f"kind = {_quoted(kind)}", f"source = {_quoted(source)}"]
+
+
+def _quoted(text: str) -> str:
+    # A JSON string without escapes beyond ASCII is a basic string of TOML.
+    return json.dumps(text, ensure_ascii=False)

@@ -1,0 +1,317 @@
+"""What a log of another system does not tell exactly: its clock, the shaft's angle, the speed, the force of the blow.
+
+A recording of this rig has all of that to the tick. Of an imported log it is fitted along with whatever is asked, so
+that it neither spoils other values nor passes for a fault of the model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from recorder.reader import Recording
+from replays.recordings.experiment import Experiment
+from replays.recordings.identification.question import first_command_s, observe
+from replays.recordings.prediction import Measured, Prediction
+from replays.recordings.sensitivity import ANGLE, Predictor, on_the_models_clock, value_of, with_values
+from rig.errors import InputError
+
+NUISANCES = (
+    "clock.offset_s",
+    "clock.rate_ppm",
+    ANGLE,
+    "drive.speed_hz",
+    "hammer.1.force_n",
+    "hammer.1.duration_ms",
+)
+"""In place of the time of the first blow stand the clock and the angle: a simulation has blows only at its own rows."""
+_BLOW = "hammer.1.at_s"
+_DEVIATIONS = {"clock.rate_ppm": 50.0}
+"""What is known before: the standard deviation of a crystal, in ppm; ..."""
+_RELATIVE = {"drive.speed_hz": 1e-4}
+"""... and of a speed read off the log, as a part of it."""
+_ANGLES = 8
+_ROUNDS = 2
+_LOOK_S = 0.5
+"""So much before the blow tells angle and speed [s] ..."""
+_MARGIN_S = 2e-3
+"""... up to here, as the time of the blow is not known better ..."""
+_BEFORE_S = 0.03
+"""... and so much of it is in the fit of all [s]."""
+_WINDOWS_S = (6e-3, 9e-3, 13e-3, 20e-3, 30e-3)
+"""How far behind the begin of the blow the fits look [s]."""
+_WORSE = 1.5
+"""A longer window is given up where it leaves more by this factor."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One fitted number: where it began, where it ended, and half of its 95 % interval, in its unit."""
+
+    key: str
+    start: float
+    value: float
+    half_width: float
+
+    @property
+    def line(self) -> str:
+        """In words."""
+        if self.key == "clock.offset_s":
+            return f"time: shifted by {self.value * 1e6:+.1f} +-{1.0e6 * self.half_width:.2g} us, fitted"
+        if self.key == _BLOW:
+            late = 1e6 * (self.value - self.start)
+            return f"time: blow shifted by {late:+.1f} +-{1e6 * self.half_width:.2g} us, fitted"
+        if self.key == "clock.rate_ppm":
+            return f"clock: {self.value:+.1f} +-{self.half_width:.2g} ppm fast, fitted"
+        change = self.value - self.start
+        return f"{self.key}: {self.value:.6g} +-{self.half_width:.2g}, fitted ({change:+.2g} on what the log tells)"
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """An imported log and its experiment, brought together.
+
+    Attributes:
+        begun: The experiment before the fit.
+        experiment: With the fitted numbers, those of a blow as its rows can have them.
+        fitted: What was fitted.
+        values: The same, by key.
+        aside: Values as far off as the fit leaves open, drawn once from what it says.
+        about_s: Where the clocks differ by the offset alone [s].
+        end_s: End of the samples that it rests on [s].
+        chi2: Sum of squares of what is left over the noise, a sample.
+    """
+
+    begun: Experiment
+    experiment: Experiment
+    fitted: tuple[Fitted, ...]
+    values: dict[str, float]
+    aside: dict[str, float]
+    about_s: float
+    end_s: float
+    chi2: float
+
+    def on_time(self, parts: dict[str, Measured]) -> dict[str, Measured]:
+        """Channels of the log on the model's clock."""
+        return on_the_models_clock(parts, self.values, about_s=self.about_s)
+
+    def predict(self, parts: dict[str, Measured], *, aside: bool = False) -> Prediction:
+        """What is foretold for channels of the log, on its own clock; a blow may lie between two rows.
+
+        Args:
+            parts: The channels.
+            aside: As far off as the fit leaves open.
+        """
+        values = self.aside if aside else self.values
+        predictor = Predictor(self.begun, tuple(values), parts, about_s=self.about_s)
+        return predictor.predict(tuple(values.values()))
+
+
+def is_imported(recording: Recording) -> bool:
+    """Whether a recording is a log of another system."""
+    return "import" in recording.scene
+
+
+def nuisances_of(
+    experiment: Experiment, keys: Sequence[str] = NUISANCES, *, besides: Sequence[str] = ()
+) -> dict[str, tuple[float, float] | None]:
+    """Nuisances that an experiment has, and what is known of each before: mean and standard deviation, or None.
+
+    Args:
+        experiment: The experiment.
+        keys: The nuisances.
+        besides: What is asked anyway.
+    """
+    if experiment.first_s == 0.0:  # it has run from the scene's own start: the blow is late, and not the clock
+        keys = [_BLOW if key == "clock.offset_s" else key for key in keys]
+    found: dict[str, tuple[float, float] | None] = {}
+    for key in keys:
+        if key in besides:
+            continue
+        try:
+            value = value_of(experiment, key)
+        except InputError:
+            continue  # no blow
+        deviation = _DEVIATIONS.get(key) or _RELATIVE.get(key, 0.0) * abs(value)
+        found[key] = (value, deviation) if deviation else None
+    return found
+
+
+def turned(recording: Recording, experiment: Experiment) -> Experiment:
+    """With the angle and the speed of the shaft that explain the motion before the first blow best.
+
+    The steady motion is a constant and a vector that turns along with the angle: a sum of squares over the angle is a
+    constant, a cosine and a sine. From its least place on, Gauss and Newton's method.
+    """
+    first_s = first_command_s(experiment)
+    try:
+        window = (first_s - _LOOK_S, first_s - _MARGIN_S) if first_s > 0.0 else (None, None)
+        parts = observe(recording, experiment, window=window).parts
+    except InputError:
+        return experiment  # no samples before the blow
+    predictor = Predictor(experiment, (ANGLE, "drive.speed_hz"), parts)
+
+    def off(prediction: Prediction) -> np.ndarray:
+        # What a probe's zero is, the angle does not tell.
+        z = [(part.values - prediction.values[name]) / part.floor for name, part in parts.items()]
+        return np.concatenate([(part - part.mean(axis=0)).ravel() for part in z])
+
+    angles = 2.0 * math.pi * np.arange(_ANGLES) / _ANGLES
+    squares = np.array([float(np.sum(off(predictor.predict((a, predictor.start[1]))) ** 2)) for a in angles])
+    values = np.array([math.atan2(-squares @ np.sin(angles), -squares @ np.cos(angles)), predictor.start[1]])
+    for _ in range(_ROUNDS):
+        found = predictor.derivatives(values, check=False)
+        slopes = np.column_stack(
+            [
+                np.concatenate(
+                    [((s := slope[name] / part.floor) - s.mean(axis=0)).ravel() for name, part in parts.items()]
+                )
+                for slope in found.slopes
+            ]
+        )
+        z = off(found.base)
+        # Where the model is wrong, its errors do not outweigh the speed that the log tells.
+        held = math.sqrt(float(z @ z) / len(z)) / (_RELATIVE["drive.speed_hz"] * max(predictor.start[1], 1e-3))
+        slopes = np.vstack([slopes, [0.0, held]])
+        z = np.append(z, held * (predictor.start[1] - values[1]))
+        values = values + np.linalg.lstsq(slopes, z, rcond=None)[0]
+    return with_values(experiment, dict(zip(predictor.keys, values.tolist(), strict=True)))
+
+
+def asked_along(experiment: Experiment, keys: Sequence[str]) -> dict[str, tuple[float, float] | None]:
+    """Nuisances that are fitted along with what is asked of an imported log: those that a search can take.
+
+    The speed is known before the blow, and the length of a blow only in rows of the simulation.
+    """
+    few = tuple(key for key in NUISANCES if key not in ("drive.speed_hz", "hammer.1.duration_ms"))
+    return nuisances_of(experiment, few, besides=keys)
+
+
+def check_begin(experiment: Experiment, to_s: float | None) -> None:
+    """Refuse a search through the impacts of a log that begins in the middle of a run.
+
+    Every simulation would have to run through the seconds before it, in which small errors of stiffness and unbalance
+    turn the motion away from the recorded one before the first impact: minutes of search that end in a wrong valley.
+
+    Args:
+        experiment: What was done.
+        to_s: Where the samples end [s]; None for the log's end.
+
+    Raises:
+        InputError: It is such a log, and the samples go beyond the first blow.
+    """
+    blow_s = first_command_s(experiment)
+    if experiment.first_s > 0.0 and blow_s > 0.0 and (to_s is None or to_s > blow_s):
+        must = "a log that begins with the run, at rest (lead_s = 0 in its mapping), to be fitted through impacts; of "
+        must += f"one from the middle of a run, only what is before the blow: --to {blow_s - _MARGIN_S:.3f}"
+        raise InputError("file", must, f"{experiment.first_s:g} s of the run are before its first sample")
+
+
+def shortly_before(experiment: Experiment) -> float | None:
+    """Where the window of a search begins in an imported log [s]; None for its start."""
+    first_s = first_command_s(experiment)
+    return first_s - _BEFORE_S if first_s > 0.0 else None
+
+
+def tune(
+    recording: Recording,
+    experiment: Experiment,
+    keys: Sequence[str] = NUISANCES,
+    *,
+    progress: Callable[[str], None] = lambda _text: None,
+) -> Tuned:
+    """Fit what a log does not tell exactly, and nothing else: Gauss-Newton's method on windows that grow from the blow.
+
+    Args:
+        recording: The log.
+        experiment: What was done, as far as it is known.
+        keys: What is fitted of it.
+        progress: Told what is being done.
+
+    Raises:
+        InputError: There are no samples to do it by.
+    """
+    progress("angle and speed of the shaft before the blow")
+    begun = turned(recording, experiment) if ANGLE in keys else experiment
+    wanted = nuisances_of(begun, keys)
+    first_s = first_command_s(begun)
+    whole = observe(recording, begun, window=(max(0.0, first_s - _BEFORE_S), first_s + _WINDOWS_S[-1]))
+    start = np.array([value_of(begun, key) for key in wanted])
+    values, covariance, chi2, end_s = start, np.eye(len(start)), math.inf, first_s
+    for length in _WINDOWS_S:
+        progress(f"{', '.join(wanted)}: to {first_s + length:.3f} s")
+        line = _Line(begun, wanted, whole.parts_until(whole.until(first_s + length)))
+        found = line.fit(values)
+        if math.isfinite(chi2) and found[2] > max(_WORSE * chi2, _WORSE):
+            break  # the model no longer explains it: that is to be judged, and not to be fitted away
+        values, covariance, chi2 = found
+        end_s = first_s + length
+    half = 1.96 * math.sqrt(max(1.0, chi2)) * np.sqrt(np.diag(covariance))
+    draw = values + np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(len(values))
+    told = dict(zip(wanted, values.tolist(), strict=True))
+    return Tuned(
+        begun=begun,
+        experiment=with_values(begun, told),
+        fitted=tuple(
+            Fitted(key, value_of(experiment, key), value, float(width))
+            for (key, value), width in zip(told.items(), half, strict=True)
+        ),
+        values=told,
+        aside=dict(zip(wanted, draw.tolist(), strict=True)),
+        about_s=min(float(part.times_s[0]) for part in whole.parts.values()),
+        end_s=end_s,
+        chi2=chi2,
+    )
+
+
+class _Line:
+    """Residuals over the noise as a function of the nuisances, with what is known of them before."""
+
+    def __init__(
+        self, experiment: Experiment, wanted: dict[str, tuple[float, float] | None], parts: dict[str, Measured]
+    ) -> None:
+        self._predictor = Predictor(experiment, tuple(wanted), parts)
+        means = [prior[0] if prior is not None else 0.0 for prior in wanted.values()]
+        self._means = np.array(means)
+        # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
+        self._weights = np.array(
+            [
+                1.0 / (prior[1] if prior is not None else scale)
+                for prior, scale in zip(wanted.values(), self._predictor.scales, strict=True)
+            ]
+        )
+        self._means = np.where([prior is None for prior in wanted.values()], self._predictor.start, self._means)
+
+    def fit(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """The values, their covariance by the noise, and the mean square of what is left."""
+        z = self._residuals(values)
+        slopes = self._slopes(values)
+        for number in range(_ROUNDS):
+            slopes = slopes if number == 0 else self._slopes(values)
+            step = np.linalg.lstsq(slopes, -z, rcond=None)[0]
+            for part in (1.0, 0.3, 0.1):
+                ahead = self._residuals(values + part * step)
+                if ahead @ ahead < z @ z:
+                    values, z = values + part * step, ahead
+                    break
+            else:
+                break
+        triangle = np.linalg.qr(slopes, mode="r")
+        root = np.linalg.inv(triangle)
+        return values, root @ root.T, float(z @ z) / len(z)
+
+    def _residuals(self, values: np.ndarray) -> np.ndarray:
+        found = self._predictor.predict(values).values
+        z = [((found[name] - part.values) / part.floor).ravel() for name, part in self._predictor.parts.items()]
+        return np.concatenate([*z, (values - self._means) * self._weights])
+
+    def _slopes(self, values: np.ndarray) -> np.ndarray:
+        found = self._predictor.derivatives(values, check=False)
+        parts = self._predictor.parts
+        columns = [
+            np.concatenate([(s[name] / part.floor).ravel() for name, part in parts.items()]) for s in found.slopes
+        ]
+        return np.vstack([np.column_stack(columns), np.diag(self._weights)])

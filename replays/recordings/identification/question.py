@@ -1,0 +1,333 @@
+"""What is asked of a recording: which numbers of its experiment, from where, within what, by which channels."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from recorder.reader import Recording
+from replays.recordings.experiment import Experiment
+from replays.recordings.prediction import Measured, measured
+from replays.recordings.sensitivity import ANGLE, CLOCK, scale_of, value_of, with_values
+from rig.channels import Channel
+from rig.errors import InputError
+from rig.kernels.signals import COLUMN
+from rig.parameters import load_parameters
+from rig.scenes import COMMANDS, HammerCommand, Scene
+from rig.simulation import TICK_RATE_HZ
+from rig.wire import sensor_key
+
+NOT_FITTED = ("keyphasor",)
+"""Pulses say where an edge is, which a difference of samples does not."""
+MOST_ROWS = 20_000
+"""A longer window is thinned out."""
+_SCENE_KEYS = ("drive.speed_hz", "initial.x_mm", "initial.y_mm")
+"""Of a scene, what was done to the rig; the rest is how it is simulated."""
+_QUIET_S = 0.5
+"""The window begins this long before the first command: enough to see where the shaft runs."""
+_COMMAND_BOUNDS = {"force_n": (1.0, 1000.0), "duration_ms": (0.5, 50.0), "direction": (-360.0, 360.0)}
+_COMMAND_UNITS = {"force_n": "N", "duration_ms": "ms", "direction": "degrees", "at_s": "s", "speed_hz": "Hz"}
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A number that is asked for.
+
+    Attributes:
+        key: Its dotted key.
+        unit: Its unit.
+        start: Where the search begins.
+        scale: What counts as a change of size 1.
+        low: Least value.
+        high: Largest value.
+        bounded: Whether these bounds were asked for, and are not only what the model takes.
+        prior: Mean and standard deviation known from elsewhere, or None.
+        rule: The rule that gave the start, if one did.
+        along: Whether it is only fitted along: nobody waits for it to be known finely.
+    """
+
+    key: str
+    unit: str
+    start: float
+    scale: float
+    low: float
+    high: float
+    bounded: bool
+    prior: tuple[float, float] | None
+    rule: str | None
+    along: bool = False
+
+    @property
+    def reach(self) -> float:
+        """Half of the interval that is believed before the recording is looked at: beyond it a value says nothing.
+
+        Of the prior (95 %), or of the bounds that were asked for, or else as much as the scale.
+        """
+        if self.prior is not None:
+            return 1.96 * self.prior[1]
+        return (self.high - self.low) / 2.0 if self.bounded and math.isfinite(self.high - self.low) else self.scale
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The samples that are explained.
+
+    Attributes:
+        names: Channels.
+        units: Their units.
+        times_s: Time of the rows of all groups together [s], shape (n,).
+        values: In each channel's unit, nan where there is no sample, shape (n, channels).
+        noise: Standard deviation of each channel's noise, in its unit, shape (channels,).
+        noise_from: Where it is from, by channel: "table", or "measured" where the table tells none.
+        parts: The same by group, with the recording's own calibration and filters.
+        rows: Where in `times_s` the rows of each group are.
+        every: A long window is thinned out to one sample in so many.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    times_s: np.ndarray
+    values: np.ndarray
+    noise: np.ndarray
+    noise_from: tuple[Literal["table", "measured"], ...]
+    parts: dict[str, Measured]
+    rows: dict[str, np.ndarray]
+    every: int = 1
+
+    def until(self, end_s: float) -> int:
+        """Number of rows before a time."""
+        return int(np.searchsorted(self.times_s, end_s - 1e-9))
+
+    def parts_until(self, rows: int) -> dict[str, Measured]:
+        """The groups in the first rows."""
+        ends = {name: int(np.searchsorted(self.rows[name], rows)) for name in self.parts}
+        return {name: self.parts[name].first(end) for name, end in ends.items() if end}
+
+    def placed(self, values: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
+        """Values by group as one table, nan where there is no sample, shape (rows, channels)."""
+        found = np.full((rows, len(self.names)), np.nan)
+        for name, held in values.items():
+            columns = np.array([self.names.index(channel) for channel in self.parts[name].names])
+            found[self.rows[name][: len(held), None], columns] = held
+        return found
+
+
+@dataclass(frozen=True)
+class Question:
+    """A recording, and what is asked of it.
+
+    Attributes:
+        experiment: What was done, on the values from which the search begins.
+        unknowns: What is asked for.
+        observation: The samples.
+    """
+
+    experiment: Experiment
+    unknowns: tuple[Unknown, ...]
+    observation: Observation
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Keys of the unknowns."""
+        return tuple(unknown.key for unknown in self.unknowns)
+
+
+def ask(
+    recording: Recording,
+    experiment: Experiment,
+    keys: Sequence[str],
+    *,
+    start: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    along: Collection[str] = (),
+    channels: Sequence[str] | None = None,
+    window: tuple[float | None, float | None] = (None, None),
+) -> Question:
+    """Put a question to a recording.
+
+    Args:
+        recording: Whose samples are explained; its truth is not looked at.
+        experiment: What was done.
+        keys: What is asked for.
+        start: Where the search begins, by key; else the experiment's own values.
+        bounds: Least and largest value by key.
+        priors: Mean and standard deviation by key.
+        along: Those of the keys that are only fitted along.
+        channels: By which channels; None for all that it has, but for the keyphasor's pulses.
+        window: Simulated times between which samples are used [s]; None: from shortly before the first command, to the
+            end.
+
+    Raises:
+        InputError: An unknown or doubled key, channel or value, or no samples.
+    """
+    if not keys or len(set(keys)) < len(keys):
+        raise InputError("fit", "different keys, at least one", ", ".join(keys))
+    for option, given in (("start", start), ("bounds", bounds), ("prior", priors)):
+        for key in given or {}:
+            if key not in keys:
+                raise InputError(option, f"of a key that is fitted ({', '.join(keys)})", key)
+    for key in keys:
+        _check_key(experiment, key)
+    rules = {key: experiment.scene.load_parameters().rule(key) for key in keys if key in load_parameters().entries}
+    centres = {key: mean for key, (mean, _) in (priors or {}).items()} | dict(start or {})
+    values = {key: centres.get(key, value_of(experiment, key)) for key in keys}
+    begun = with_values(experiment, values)
+    unknowns = []
+    for key in keys:
+        low, high = (bounds or {}).get(key) or _accepted(key)
+        if not low < high or not low <= values[key] <= high:
+            raise InputError(f"bounds of {key}", f"ascending and around the start {values[key]:g}", [low, high])
+        prior = (priors or {}).get(key)
+        if prior is not None and not prior[1] > 0.0:
+            raise InputError(f"prior of {key}", "with a standard deviation above 0", prior[1])
+        unknowns.append(
+            Unknown(
+                key=key,
+                unit=_unit(key),
+                start=values[key],
+                scale=scale_of(begun, key),
+                low=low,
+                high=high,
+                bounded=key in (bounds or {}),
+                prior=prior,
+                rule=rules.get(key),
+                along=key in along,
+            )
+        )
+    return Question(begun, tuple(unknowns), observe(recording, begun, channels=channels, window=window))
+
+
+def observe(
+    recording: Recording,
+    experiment: Experiment,
+    *,
+    channels: Sequence[str] | None = None,
+    window: tuple[float | None, float | None] = (None, None),
+) -> Observation:
+    """Samples of a recording.
+
+    Raises:
+        InputError: It has none of these channels, or no samples in the window.
+    """
+    groups = {
+        channel.name: group.name
+        for group in recording.table.groups.values()
+        for channel in group.channels
+        if channel.signal in COLUMN and recording.messages.get(sensor_key(group.name))
+    }
+    usable = [name for name in groups if name not in NOT_FITTED]
+    wanted = list(channels) if channels else usable
+    missing = [name for name in wanted if name not in usable]
+    if missing or not wanted:
+        raise InputError("channels", f"some that the recording has: {', '.join(usable)}", ", ".join(missing))
+    whole = measured(recording, experiment.scene.sensors)
+    whole = {name: whole[name].only(wanted) for name in dict.fromkeys(groups[name] for name in wanted)}
+    first_s = max(float(part.times_s[0]) for part in whole.values())
+    last_s = min(float(part.times_s[-1]) for part in whole.values())
+    start_s, end_s = window
+    start_s = max(first_s, first_command_s(experiment) - _QUIET_S) if start_s is None else start_s
+    end_s = math.inf if end_s is None else end_s
+    period_s = max(1.0 / part.channels[0].rate_hz for part in whole.values())
+    parts, every = {}, 1
+    for name, part in whole.items():
+        kept = (part.times_s >= max(start_s, first_s) - 1e-9) & (part.times_s < min(end_s, last_s + period_s) - 1e-9)
+        step = -(-int(kept.sum()) // MOST_ROWS) or 1
+        parts[name] = part.chosen(np.flatnonzero(kept)[::step])
+        every = max(every, step)
+    if min(len(part.times_s) for part in parts.values()) < 10:
+        must = f"a window with samples in it; the recording goes from {first_s:.3f} to {last_s:.3f} s"
+        raise InputError("window", must, [start_s, end_s])
+    parts = {name: _with_noise(part) for name, part in parts.items()}
+    # Of a thousandth of a microsecond, equal times of two groups are the same row.
+    stamps = {name: np.rint(part.times_s * 1e9).astype(np.int64) for name, part in parts.items()}
+    union, first = np.unique(np.concatenate(list(stamps.values())), return_index=True)
+    own = {channel.name: (part, c) for part in parts.values() for c, channel in enumerate(part.channels)}
+    observation = Observation(
+        names=tuple(wanted),
+        units=tuple(own[name][0].channels[own[name][1]].unit for name in wanted),
+        times_s=np.concatenate([part.times_s for part in parts.values()])[first],
+        values=np.empty(0),
+        noise=np.array([own[name][0].floor[own[name][1]] for name in wanted]),
+        noise_from=tuple("table" if _told(*own[name]) else "measured" for name in wanted),
+        parts=parts,
+        rows={name: np.searchsorted(union, held) for name, held in stamps.items()},
+        every=every,
+    )
+    values = observation.placed({name: part.values for name, part in parts.items()}, len(union))
+    return replace(observation, values=values)
+
+
+def _told(part: Measured, column: int) -> bool:
+    return part.channels[column].noise_v > 0.0
+
+
+def _with_noise(part: Measured) -> Measured:
+    """With the noise of the table and its rounding as white noise; measured where the table tells none."""
+    floor = np.array(
+        [
+            channel_noise(channel) if _told(part, c) else measured_noise(part.values[:, c])
+            for c, channel in enumerate(part.channels)
+        ]
+    )
+    return replace(part, floor=floor)
+
+
+def measured_noise(values: np.ndarray) -> float:
+    """Noise of a smooth signal from its third differences, of which impacts spoil only a few."""
+    differences = np.diff(values[np.isfinite(values)], 3)
+    spread = float(np.median(np.abs(differences))) / (0.6745 * math.sqrt(20.0)) if len(differences) else 0.0
+    return spread or max(1e-9, 1e-6 * float(np.nanmax(np.abs(values), initial=0.0)))
+
+
+def channel_noise(channel: Channel) -> float:
+    """Noise of a channel of the table, with what rounding in the converter adds, in its unit."""
+    return math.hypot(channel.noise_v, channel.lsb_v / math.sqrt(12.0)) / abs(channel.sensitivity_v)
+
+
+def first_command_s(experiment: Experiment) -> float:
+    """When the first blow comes [s]; 0 without one."""
+    times = [timed.at_s for timed in experiment.scene.commands if isinstance(timed.request, HammerCommand)]
+    times += [command.tick / TICK_RATE_HZ for command in experiment.commands if command.name == "hammer"]
+    return min(times, default=0.0)
+
+
+def _check_key(experiment: Experiment, key: str) -> None:
+    """Refuse at once what is no number of the rig or of what was done to it."""
+    parameters = load_parameters().entries
+    own = [name for name, entry in parameters.items() if entry.unit != "count"]
+    own += [*_SCENE_KEYS, *CLOCK, ANGLE]
+    if key in own:
+        return
+    if len(key.split(".")) == 3 and key.split(".")[0] in COMMANDS:
+        value_of(experiment, key)
+        return
+    close = difflib.get_close_matches(key, own, n=3, cutoff=0.6)
+    must = "of a parameter, a number of the scene ("
+    must += f"{', '.join(_SCENE_KEYS)}) or of a command (hammer.1.force_n)"
+    if close:
+        must += f", such as {', '.join(close)}"
+    elif key in parameters or key.split(".")[0] in Scene.model_fields:
+        must += ", all properties of the rig or of what was done to it and none of the simulation"
+    raise InputError("fit", must, key)
+
+
+def _accepted(key: str) -> tuple[float, float]:
+    entries = load_parameters().entries
+    if key in entries:
+        return entries[key].range
+    return _COMMAND_BOUNDS.get(key.split(".")[-1], (-math.inf, math.inf))
+
+
+def _unit(key: str) -> str:
+    if key in CLOCK:
+        return CLOCK[key][0]
+    if key == ANGLE:
+        return "rad"
+    entries = load_parameters().entries
+    return entries[key].unit if key in entries else _COMMAND_UNITS.get(key.split(".")[-1], "")

@@ -1,0 +1,185 @@
+"""A fit as a report: what was found, what it is worth, and pictures of it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from replays.recordings.identification.fit import Identification
+from replays.recordings.identification.judgement import Finding
+from replays.report import Mark, Report, Row
+from replays.report.canvas import BLUE, ORANGE, RED, draw_grid, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+HEADINGS = ("key", "start", "result", "95 % interval", "unit", "what the recording tells")
+_MARKS: dict[str, Mark] = {"identified": "good", "not seen": "open", "only together": "open", "at its bound": "bad"}
+_MOST_PANELS = 16
+_KICK = 0.02
+"""An impact begins where the samples bend by this part of the most they bend, ..."""
+_QUIET = 50.0
+"""... which must be so many times what is usual, or there is none."""
+
+
+def cells(finding: Finding) -> tuple[str, ...]:
+    """One row of the table of values; a number only where it is a result."""
+    unknown = finding.unknown
+    unit = "" if unknown.unit == "1" else unknown.unit
+    start = f"{unknown.start:.6g}" + (f" ({unknown.rule})" if unknown.rule else "")
+    if finding.standing != "identified":
+        return (unknown.key, start, "-", "-", unit, finding.words)
+    digits = max(3, 2 + math.ceil(math.log10(max(abs(finding.value), 1e-30) / finding.half_width)))
+    return (
+        unknown.key, start, f"{finding.value:.{min(digits, 12)}g}", f"+-{finding.half_width:.2g}", unit, finding.words
+    )  # fmt: skip
+
+
+def window_line(found: Identification) -> str:
+    """Which samples were used, and why no more."""
+    names = found.question.observation.names
+    return (
+        f"window {found.from_s:.4f} to {found.window.end_s:.4f} s, {found.window.rows} rows of {len(names)} channels"
+        f"{_thinned(found)}, grown in {len(found.stages)} stages; it ends there: {found.why}"
+    )
+
+
+def spread_line(found: Identification) -> str:
+    """What the search began with where the usual spread was too wide; empty where it was not."""
+    if not found.narrowed:
+        return ""
+    told = ", ".join(f"{key} {part:.2g}" for key, part in found.narrowed.items())
+    return f"spread made smaller, as the first samples already bend with more (parts of each value's scale): {told}"
+
+
+def _thinned(found: Identification) -> str:
+    every = found.question.observation.every
+    return f" (thinned out: one sample in {every})" if every > 1 else ""
+
+
+def fit_line(found: Identification) -> str:
+    """Goodness of the fit."""
+    judgement = found.judgement
+    line = f"chi2 {judgement.chi2:.4g} a degree of freedom ({judgement.freedom}); {judgement.verdict}"
+    if judgement.inflation > 1.1:
+        line += f"; intervals up to {judgement.inflation:.2g} times as wide as by noise alone"
+    if judgement.together > 1.0:
+        line += f"; each interval holds by itself, all hold at once if {judgement.together:.2f} times as wide"
+    return line
+
+
+def report_of(found: Identification, *, recording: str) -> Report:
+    """The report of a fit."""
+    question, judgement = found.question, found.judgement
+    report = Report(f"Identification from {recording}", f"{fit_line(found)}. {window_line(found)}.")
+    if found.narrowed:
+        report.text(f"The {spread_line(found)}.")
+    report.heading("Values")
+    rows = [Row(cells(finding), _MARKS[finding.standing]) for finding in judgement.findings]
+    report.table(HEADINGS, rows, caption="Intervals of 95 %, of each value by itself, by the slopes at the optimum.")
+    report.text(
+        "The intervals hold for this model and engine "
+        f"({question.experiment.scene.engine.name}, {question.experiment.scene.engine.step_us} us) with all other "
+        "parameters as they stand in the set, many of which are assumed, and for sensors as the channel table says: an "
+        "error of those is not in them."
+    )
+    if len(judgement.findings) > 1:
+        keys = question.keys
+        report.heading("Correlation", level=2)
+        told = [[("" if math.isnan(c) else f"{c:+.4f}") for c in row] for row in judgement.correlation]
+        report.table(("", *keys), [(key, *row) for key, row in zip(keys, told, strict=True)])
+        report.text(
+            "Singular values of the Jacobian, in units of the noise and of what was believed of each value before "
+            "(below 2, the direction is not seen): " + ", ".join(f"{s:.3g}" for s in judgement.singular_values)
+        )
+    report.heading("How well the samples are explained")
+    report.table(
+        ("channel", "residual over noise", "correlation of neighbours", "noise from", "verdict"),
+        [
+            Row(
+                (
+                    channel.name, f"{channel.rms:.3f}", f"{channel.correlation:+.3f}", source,
+                    "white" if channel.white else "not white",
+                ),
+                "good" if channel.white and channel.rms < 1.1 else "bad",
+            )
+            for channel, source in zip(judgement.channels, question.observation.noise_from, strict=True)
+        ],
+    )  # fmt: skip
+    report.picture(overlay(found), "Recorded samples (dots) and the fitted model (line); beside each, their difference "
+                   "in units of the sensor's noise, from shortly before the first impact on.")  # fmt: skip
+    report.heading("How the window grew")
+    report.table(
+        ("to [s]", "chi2", *question.keys, "because"),
+        [
+            (
+                f"{stage.end_s:.4f}", f"{stage.chi2:.3g}",
+                *(f"{value:.6g} +-{half:.1g}" for value, half in zip(stage.values, stage.half_widths, strict=True)),
+                stage.why,
+            )
+            for stage in found.stages
+        ],
+        caption="Values are held loosely to the start here: an interval as wide as the start's own says nothing.",
+    )  # fmt: skip
+    report.picture(
+        growth(found),
+        "95 % intervals over the end of the window, in parts of each value's scale; correlation of what is identified.",
+    )
+    return report
+
+
+def overlay(found: Identification) -> Figure:
+    """Samples, fit and residuals of the channels."""
+    observation, window = found.question.observation, found.window
+    predicted = window.predicted(found.z) * observation.noise
+    residuals = window.residuals(found.z)
+    moved = np.argsort(-np.ptp(predicted / observation.noise, axis=0), kind="stable")[:_MOST_PANELS]
+    shown = sorted(int(place) for place in moved)
+    figure = new_figure((12.0, 1.5 * len(shown) + 0.6))
+    panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
+    times_s = observation.times_s[: window.rows]
+    panels[0][0].set_xlim(_shown_from_s(times_s, predicted / observation.noise), times_s[-1])
+    for (left, right), place in zip(panels, shown, strict=True):
+        left.plot(times_s, observation.values[: window.rows, place], ".", color=ORANGE, ms=2.5, label="recorded")
+        left.plot(times_s, predicted[:, place], color=BLUE, lw=0.9, label="fitted")
+        left.set_ylabel(f"{observation.names[place]} [{observation.units[place]}]")
+        right.plot(times_s, residuals[:, place], ".", color=RED, ms=1.5)
+        right.set_ylabel("residual / noise")
+        draw_grid(left, right)
+    panels[0][0].legend(loc="best", fontsize=8)
+    for axes in panels[-1]:
+        axes.set_xlabel("simulated time [s]")
+    return figure
+
+
+def _shown_from_s(times_s: np.ndarray, predicted: np.ndarray) -> float:
+    """A little before the first impact in what is predicted [s]; where there is none, the first sample."""
+    bends = np.nan_to_num(np.abs(np.diff(predicted, 2, axis=0))).max(axis=1)
+    if not len(bends) or bends.max() < _QUIET * max(float(np.median(bends[: len(bends) // 4 + 1])), 1e-12):
+        return float(times_s[0])
+    first_s = float(times_s[int(np.argmax(bends > _KICK * bends.max())) + 1])
+    return max(float(times_s[0]), first_s - 0.15 * (float(times_s[-1]) - first_s))
+
+
+def growth(found: Identification) -> Figure:
+    """How the intervals shrank as the window grew, and how the values hang together in the end."""
+    keys = found.question.keys
+    figure = new_figure((12.0, 4.2))
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
+    ends = [stage.end_s for stage in found.stages]
+    for place, unknown in enumerate(found.question.unknowns):
+        left.semilogy(
+            ends, [stage.half_widths[place] / unknown.scale for stage in found.stages], "o-", ms=3, label=unknown.key
+        )
+    left.set_xlabel("end of the window [s]")
+    left.set_ylabel("half of the 95 % interval / scale")
+    left.legend(fontsize=8)
+    draw_grid(left)
+    image = right.imshow(found.judgement.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+    # Names once, at the side: below the picture long ones would run off it.
+    right.set_xticks(range(len(keys)), [str(place + 1) for place in range(len(keys))], fontsize=8)
+    right.set_yticks(range(len(keys)), [f"{key}  {place + 1}" for place, key in enumerate(keys)], fontsize=8)
+    figure.colorbar(image, ax=right, label="correlation")
+    return figure

@@ -1,0 +1,363 @@
+"""What the sensors would show without noise, and how that changes with any number of the experiment.
+
+A value goes by its dotted key: a parameter (`contact.friction`, in its own unit), a number of the scene
+(`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first blow; `at_s`, `duration_ms` and `direction`
+[degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its clock,
+`shaft.angle_rad` where it begins).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from replays.recordings.experiment import Experiment
+from replays.recordings.prediction import Measured, Prediction, bare, lagrange, predict
+from rig.errors import InputError, SimulationError
+from rig.model import build_model
+from rig.parameters import load_parameters
+from rig.scenes import Scene, TimedCommand, change_scene, parse_command, parse_scene
+from rig.simulation import ROW_TICKS, TICK_RATE_HZ
+
+CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
+"""How late the recording's clock is where its samples begin, and how much faster it goes: unit, change of size 1."""
+ANGLE = "shaft.angle_rad"
+"""Angle of the shaft where the samples begin, on what the experiment has [rad]: whatever the speed before was."""
+SAME_SLOPE = 0.05
+"""Two step sizes may differ by this part before a derivative is called doubtful."""
+_STEP = 1e-5
+"""Step of a difference quotient, as a part of the value's scale, ..."""
+_LEAST_STEP = 1e-8
+"""... and this is as far as it is shortened where the contacts are not the same ones on both sides."""
+_KEPT = 8
+"""Predictions that are kept."""
+_MARGIN_S = 1e-4
+"""The model is followed so far behind the last row, which may lie between two of its own."""
+_ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
+_COMMAND_KEY = re.compile(r"(hammer|speed|release)\.([1-9][0-9]*)\.(\w+)")
+_GRIDS = {"at_s": ROW_TICKS / TICK_RATE_HZ, "duration_ms": ROW_TICKS / TICK_RATE_HZ * 1e3}
+"""A simulation rounds these to its rows, by field of a command, in the field's unit."""
+_SCALES = {"at_s": 1e-3, "direction": 10.0}
+"""What counts as a change of size 1 where the value itself may be 0 [s], [degrees]."""
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """How channels change with values of the experiment.
+
+    Attributes:
+        base: The channels at the values themselves.
+        keys: The values' keys.
+        slopes: d channel / d value, in their units, by group, each shape (rows, channels); one a key.
+        steps: Step of each difference quotient, in the value's unit, shape (keys,).
+        differences: By how large a part quotients of this step and of half of it differ (root mean square over the
+            window, channels weighted by their noise), shape (keys,).
+        smooth: Whether the contacts were the same ones on both sides, shape (keys,).
+    """
+
+    base: Prediction
+    keys: tuple[str, ...]
+    slopes: tuple[dict[str, np.ndarray], ...]
+    steps: np.ndarray
+    differences: np.ndarray
+    smooth: np.ndarray
+
+    @property
+    def good(self) -> np.ndarray:
+        """Which derivatives can be relied on, shape (keys,)."""
+        return self.smooth & (self.differences < SAME_SLOPE)
+
+
+def value_of(experiment: Experiment, key: str) -> float:
+    """The number that a key stands for, in its own unit; of a rule, what the rule gives.
+
+    Raises:
+        InputError: No such number.
+    """
+    if key in CLOCK or key == ANGLE:
+        return 0.0
+    match = _COMMAND_KEY.fullmatch(key)
+    if match is not None:
+        command = _commands(experiment)[_place(experiment, key)]
+        field = match[3]
+        if field == "at_s":
+            return float(command.at_s)
+        value = getattr(command.request, field, None)
+        if field == "direction":
+            return math.degrees(math.atan2(*reversed(getattr(command.request, "cosines", (1.0, 0.0)))))
+        if isinstance(value, int | float):
+            return float(value)
+        raise InputError(key, f"a number of the command {match[1]}", field)
+    if key in load_parameters().entries:
+        value = experiment.scene.load_parameters().entries[key].value
+        return _resolved(experiment.scene)[key] if isinstance(value, str) else float(value)
+    value: Any = experiment.scene
+    for part in key.split("."):
+        value = getattr(value, part, None)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        keys = "a parameter, a number of the scene, or of a command such as hammer.1.force_n"
+        raise InputError("key", keys, key)
+    return float(value)
+
+
+def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experiment:
+    """The experiment with other numbers; a rule gives way to the number. Those of the clock are none of the experiment.
+
+    Raises:
+        InputError: An unknown key, or a value that it must not have.
+    """
+    values = {key: value for key, value in values.items() if key not in CLOCK}
+    if ANGLE in values:
+        ahead = values.get("drive.speed_hz", experiment.scene.drive.speed_hz) - experiment.scene.drive.speed_hz
+        phase = value_of(experiment, "shaft.unbalance_phase") + values[ANGLE]
+        phase -= 2.0 * math.pi * ahead * experiment.first_s
+        values = {key: value for key, value in values.items() if key != ANGLE}
+        values["shaft.unbalance_phase"] = math.remainder(phase, 2.0 * math.pi)
+    changes = {key: value for key, value in values.items() if _COMMAND_KEY.fullmatch(key) is None}
+    scene = change_scene(experiment.scene, changes) if changes else experiment.scene
+    changed = replace(experiment, scene=scene)
+    own = {_place(experiment, key): {} for key in values if key not in changes}
+    for key, value in values.items():
+        if key not in changes:
+            own[_place(experiment, key)][key.split(".")[2]] = value
+    if not own:
+        return changed
+    # A changed command becomes one of the scene, which may come at any row and not only between two blocks.
+    timed, sent = list(scene.commands), list(experiment.commands)
+    commands = _commands(experiment)
+    kept = [command for place, command in enumerate(timed) if place not in own]
+    for place, fields in own.items():
+        command = commands[place]
+        request = command.request.model_dump(exclude={"command"}) | {k: v for k, v in fields.items() if k != "at_s"}
+        at_s = fields.get("at_s", command.at_s)
+        kept.append(TimedCommand(at_s=at_s, request=parse_command(command.request.command, request)))
+    left = tuple(entry for place, entry in enumerate(sent, start=len(timed)) if place not in own)
+    data = scene.model_dump() | {"commands": [entry.model_dump() for entry in kept]}
+    return replace(changed, scene=parse_scene(data), commands=left)
+
+
+def scale_of(experiment: Experiment, key: str) -> float:
+    """What counts as a change of size 1 in a value, in its unit: the value itself, or a length or time like it."""
+    if key in ("ring.offset_x", "ring.offset_y"):
+        return value_of(experiment, "ring.clearance")
+    if key in ("shaft.unbalance_phase", ANGLE):
+        return 1.0
+    if key in CLOCK:
+        return CLOCK[key][1]
+    value = abs(value_of(experiment, key))
+    return _SCALES.get(key.split(".")[-1], value if value > 0.0 else 1.0)
+
+
+class Predictor:
+    """The channels of a recording as a function of some values of its experiment.
+
+    Attributes:
+        keys: Keys of the values.
+        start: The values as the experiment has them, shape (keys,).
+        scales: What counts as a change of size 1, shape (keys,).
+        parts: The channels and the rows wanted, by group.
+        runs: How many simulations there have been.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        keys: Sequence[str],
+        parts: Mapping[str, Measured],
+        *,
+        about_s: float | None = None,
+    ) -> None:
+        self.keys = tuple(keys)
+        self.parts = dict(parts)
+        self.start = np.array([value_of(experiment, key) for key in self.keys])
+        self.scales = np.array([scale_of(experiment, key) for key in self.keys])
+        self.runs = 0
+        first_s = min(float(part.times_s[0]) for part in self.parts.values())
+        self._about_s = first_s if about_s is None else about_s
+        self._last_s = max(float(part.times_s[-1]) for part in self.parts.values())
+        self._experiment = bare(experiment)
+        self._cache: dict[tuple[float, ...], Prediction] = {}
+
+    def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
+        """The channels at some values, shape (keys,).
+
+        What a simulation rounds to its rows (times and durations of blows) is interpolated between simulations.
+
+        Raises:
+            InputError: A value that the model does not take.
+            SimulationError: The state became non-finite.
+        """
+        values = tuple(float(value) for value in values)
+        for place, (key, value) in enumerate(zip(self.keys, values, strict=True)):
+            grid = _grid(key)
+            if grid and not self._later(key):
+                below = math.floor(value / grid + 1e-6)
+                if value - below * grid > 1e-6 * grid:
+                    return self._between(values, place, below, grid)
+        if values not in self._cache:
+            if len(self._cache) > _KEPT:
+                self._cache.pop(next(iter(self._cache)))
+            self._cache[values] = self._run(dict(zip(self.keys, values, strict=True)))
+        return self._cache[values]
+
+    def derivatives(
+        self,
+        values: Sequence[float] | np.ndarray,
+        *,
+        steps: Mapping[str, float] | None = None,
+        check: bool = True,
+    ) -> Derivatives:
+        """How the channels change with the values, by central differences; one-sided at the edge of what is possible.
+
+        A step over which the number of contacts changes, or the slope does, is shortened.
+
+        Args:
+            values: Where, shape (keys,).
+            steps: By key, in the value's unit, where others than the usual ones are wanted.
+            check: Also try half the step and tell the difference; else the differences are 0.
+        """
+        values = np.asarray(values, dtype=float)
+        base = self.predict(values)
+        chosen = np.array([self._step(place, steps) for place in range(len(self.keys))])
+        found: list[dict[str, np.ndarray]] = []
+        differences, smooth = np.zeros(len(self.keys)), np.zeros(len(self.keys), dtype=bool)
+        for place, key in enumerate(self.keys):
+            grid = _grid(key)
+            for step in _shorter(chosen[place], grid or _LEAST_STEP * self.scales[place]):
+                slope, smooth[place] = self._quotient(values, place, step, base)
+                chosen[place] = step
+                if check and grid is None:
+                    half, same = self._quotient(values, place, step / 2.0, base)
+                    differences[place] = self._difference(half, slope)
+                    if same:  # Richardson: the error of both goes with the square of the step
+                        slope = {name: half[name] + (half[name] - slope[name]) / 3.0 for name in half}
+                if smooth[place] and differences[place] < SAME_SLOPE:
+                    break
+            found.append(slope)  # pyright: ignore[reportPossiblyUnboundVariable]
+        return Derivatives(base, self.keys, tuple(found), chosen, differences, smooth)
+
+    def _later(self, key: str) -> bool:
+        """Whether a command comes only behind the last row: nothing of it is seen."""
+        kind, number, _ = key.split(".")
+        return value_of(self._experiment, f"{kind}.{number}.at_s") > self._last_s + _MARGIN_S
+
+    def _between(self, values: tuple[float, ...], place: int, below: int, grid: float) -> Prediction:
+        """The channels where one value lies between what can be simulated, by the cubic through four neighbours."""
+        for nodes in (np.arange(-1, 3), np.arange(2)):
+            try:
+                # Rounded, so that what was simulated before is found.
+                ends = [round((below + node) * grid, 9) for node in nodes]
+                found = [self.predict((*values[:place], end, *values[place + 1 :])) for end in ends]
+            except InputError:
+                continue  # at the edge of what it may be: a straight line
+            weights = lagrange(np.array([values[place] / grid - below]), nodes)[:, 0]
+            both = {
+                name: sum(weight * one.values[name] for weight, one in zip(weights, found, strict=True))
+                for name in found[0].values
+            }
+            return replace(found[0], values=both)  # pyright: ignore[reportArgumentType]
+        raise InputError(self.keys[place], "a value that can be simulated, with its neighbours", values[place])
+
+    def _difference(self, quotient: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> float:
+        def size(slopes: dict[str, np.ndarray]) -> float:
+            return math.hypot(*(float(np.linalg.norm(v / self.parts[name].floor)) for name, v in slopes.items()))
+
+        whole = size(quotient)
+        return size({name: quotient[name] - other[name] for name in quotient}) / whole if whole > 0.0 else 0.0
+
+    def _step(self, place: int, steps: Mapping[str, float] | None) -> float:
+        own = (steps or {}).get(self.keys[place])
+        return own or _grid(self.keys[place]) or _STEP * self.scales[place]
+
+    def _quotient(
+        self, values: np.ndarray, place: int, step: float, base: Prediction
+    ) -> tuple[dict[str, np.ndarray], bool]:
+        """A difference quotient, and whether the contacts were the same ones on both sides."""
+        sides: list[tuple[float, Prediction]] = []
+        for sign in (1.0, -1.0):
+            moved = values.copy()
+            moved[place] += sign * step
+            try:
+                sides.append((moved[place], self.predict(moved)))
+            except (InputError, SimulationError):
+                sides.append((values[place], base))
+        (above, up), (below, down) = sides
+        if above == below:
+            raise InputError(self.keys[place], "a value with room for a change on one side", float(values[place]))
+        same = up.contacts == down.contacts == base.contacts
+        return {name: (up.values[name] - down.values[name]) / (above - below) for name in up.values}, same
+
+    def _run(self, values: dict[str, float]) -> Prediction:
+        self.runs += 1
+        parts = on_the_models_clock(self.parts, values, about_s=self._about_s)
+        last_s = max(float(part.times_s[-1]) for part in parts.values())
+        changed = with_values(self._experiment, values)
+        # Nothing behind the window: contacts that begin there are none of it.
+        end_s = math.ceil(round((last_s + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
+        return predict(replace(changed, scene=change_scene(changed.scene, {"duration_s": end_s})), parts)
+
+
+def on_the_models_clock(
+    parts: Mapping[str, Measured], values: Mapping[str, float], *, about_s: float
+) -> dict[str, Measured]:
+    """Channels of a recording whose own clock is off by `clock.offset_s` and `clock.rate_ppm`.
+
+    Args:
+        parts: The channels.
+        values: Values, of which only these two count.
+        about_s: Where both clocks differ by the offset alone [s].
+    """
+    shift, rate = values.get("clock.offset_s", 0.0), values.get("clock.rate_ppm", 0.0) * 1e-6
+    if shift == rate == 0.0:
+        return dict(parts)
+    return {name: part.later(shift, rate, about_s=about_s) for name, part in parts.items()}
+
+
+def _grid(key: str) -> float | None:
+    return _GRIDS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
+
+
+def _shorter(step: float, least: float) -> Iterator[float]:
+    yield step
+    while step / 4.0 >= least:
+        step /= 4.0
+        yield step
+
+
+def _commands(experiment: Experiment) -> list[TimedCommand]:
+    """Every command: the scene's own, then those that were sent."""
+    sent = [
+        TimedCommand(at_s=command.tick / TICK_RATE_HZ, request=parse_command(command.name, command.request))
+        for command in experiment.commands
+    ]
+    return [*experiment.scene.commands, *sent]
+
+
+def _place(experiment: Experiment, key: str) -> int:
+    """Where in `_commands` the command of a key stands: they are numbered by time, each kind from 1."""
+    kind, number, field = key.split(".")
+    commands = _commands(experiment)
+    places = [place for place, command in enumerate(commands) if command.request.command == kind]
+    places.sort(key=lambda place: commands[place].at_s)
+    if int(number) > len(places):
+        raise InputError(key, f"a command of the experiment, which has {len(places)} of {kind}", int(number))
+    known = ["at_s", *(name for name in type(commands[places[int(number) - 1]].request).model_fields)]
+    if field not in known or field == "command":
+        raise InputError(key, f"a field of {kind}: {', '.join(name for name in known if name != 'command')}", field)
+    return places[int(number) - 1]
+
+
+@cache
+def _resolved_by(scene: str) -> dict[str, float]:
+    whole = Scene.model_validate_json(scene)
+    return build_model(whole.load_parameters(), whole.model).resolved
+
+
+def _resolved(scene: Scene) -> dict[str, float]:
+    return _resolved_by(scene.model_dump_json())

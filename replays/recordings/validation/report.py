@@ -1,0 +1,270 @@
+"""The report of a validation: tables, and pictures of what was recorded over what was foretold."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from replays.recordings.prediction import Measured
+from replays.recordings.validation.outcome import Validation
+from replays.recordings.validation.phases import PHASES
+from replays.report import Mark, Report, Row
+from replays.report.canvas import BLUE, ORANGE, RED, draw_grid, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_POINTS = 6000
+"""Points of a line; of more, each is the extremes of a few."""
+_BEFORE_S, _AFTER_S = 5e-3, 60e-3
+"""A closer look begins and ends so long before and behind what is of interest."""
+_MARKS: dict[bool | None, Mark] = {True: "good", False: "bad", None: "plain"}
+_WORDS = {True: "good", False: "fails", None: "not asked"}
+
+
+def make_report(found: Validation) -> Report:
+    """All of a validation as a report."""
+    report = Report(f"Validation of {found.title}", f"{_sentence(found.verdict_line)}.")
+    _conclusion(report, found)
+    _bits(report, found)
+    _trajectory(report, found)
+    _phases(report, found)
+    if found.calibration:
+        report.heading("Calibration")
+        report.text("The recording's own calibration is used throughout. Against the rig's own channel table it has:")
+        report.table(("channel", "differs in"), [tuple(line.partition(": ")[::2]) for line in found.calibration])
+    return report
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:]
+
+
+def _conclusion(report: Report, found: Validation) -> None:
+    """What comes out of it: first what explains the difference, then every criterion that fails."""
+    one = found.explained
+    if one is not None:
+        report.text(f"The first difference is at {one.from_s:.4f} s. {_sentence(one.conclusion)}.")
+    report.text(f"{_sentence(found.bits_line)}.")
+    report.table(("what", "is"), _about(found))
+    if found.failures and not found.good:
+        report.heading("Criteria that fail")
+        report.table(
+            ("criterion", "recorded", "foretold", "limit", "verdict"),
+            [Row((f.criterion, f.recorded, f.foretold, f.limit, "fails"), "bad") for f in found.failures],
+            caption="Of a residual the first measure beyond its limit; +- is the largest difference.",
+        )
+    if one is None or not one.ranked:
+        return
+    report.heading("What explains the difference")
+    report.table(
+        ("kind", "what", "change", "explains", "left", "seen to [s]", "verdict"),
+        [
+            Row((e.kind, e.name, e.change, f"{e.explained:.2%}", f"{e.left:.3g}", f"{e.to_s:.3f}",
+                 "named" if e.name in one.best else ""), "good" if e.name in one.best else "plain")
+            for e in one.ranked[:20]
+        ],
+        caption="Each candidate alone, fitted to the recorded channels over their noise; `explains` is the part of "
+        "the residual's sum of squares beyond noise that it takes away, `left` the RMS of the residual that remains "
+        "over the noise: 1 where only noise is left.",
+    )  # fmt: skip
+
+
+def _bits(report: Report, found: Validation) -> None:
+    if not found.bits:
+        return
+    report.heading("Bits")
+    report.table(
+        ("stream", "columns", "rows", "payloads that differ", "first difference [s]", "largest", "lost rows",
+         "verdict"),
+        [
+            Row((key, b.picked or "all", str(b.rows), str(b.different),
+                 "" if b.first_s is None else f"{b.first_s:.6f}", f"{b.largest:.3g}",
+                 str(b.skipped), "equal" if b.equal else "differs"), "good" if b.equal else "open")
+            for key, b in found.bits.items()
+        ],
+        caption="Largest difference in counts of the converter, or SI for truth.",
+    )  # fmt: skip
+
+
+def _trajectory(report: Report, found: Validation) -> None:
+    report.heading("Trajectory")
+    begin, end = found.window_s
+    report.text(f"Compared sample by sample from {begin:.4f} to {end:.4f} s: {found.window_reason}.")
+    report.table(
+        ("channel", "noise", "RMS", "limit", "largest", "drift", "reason of the limit", "verdict"),
+        [
+            Row((r.channel, f"{r.floor:.3g} {r.unit}".rstrip(), f"{r.rms:.3f}",
+                 "" if math.isinf(r.limit) else f"{r.limit:.3f}", f"{r.peak:.2f}", f"{r.drift:.2f}", r.reason,
+                 _WORDS[r.good]), _MARKS[r.good])
+            for r in found.residuals
+        ],
+        caption="Residual over the noise of the recording's own channel table; drift: largest mean of 128 samples, in "
+        "standard errors.",
+    )  # fmt: skip
+    if found.truth:
+        report.table(
+            ("truth", "column that is off most", "off by", "limit", "verdict"),
+            [
+                Row((t.table, t.column, f"{t.relative:.2e}", f"{t.limit:.2e}", _WORDS[t.good]), _MARKS[t.good])
+                for t in found.truth
+            ],
+        )
+    zooms = _zooms(found)
+    told = "".join(f" and from {begin:.3f} to {end:.3f} s ({why})" for why, begin, end in zooms)
+    for part in found.parts.values():
+        caption = f"{part.group}: recorded over foretold as a whole{told}, and the residual over its noise."
+        report.picture(_group(found, part, zooms), caption)
+
+
+def _phases(report: Report, found: Validation) -> None:
+    report.heading("Phases")
+    report.table(
+        ("phase", "quantity", "recorded", "foretold", "spread", "limit", "verdict"),
+        [
+            Row((s.phase, s.title, f"{s.recorded:.6g}", f"{s.foretold:.6g}", f"{s.spread:.2g}",
+                 "" if s.limit is None else f"+- {s.limit:.2g}", _WORDS[s.good]), _MARKS[s.good])
+            for s in found.statistics
+        ],
+        caption="Foretold is the median, spread the standard deviation over perturbed re-simulations with noise; "
+        f"phases are read off the recording ({', '.join(PHASES)}).",
+    )  # fmt: skip
+    names = {name for part in found.parts.values() for name in part.names}
+    pairs = [pair for pair in (("ring_x", "ring_y"), ("disk_x", "disk_y")) if names.issuperset(pair)]
+    if pairs:
+        report.picture(
+            _orbits(found, pairs), "Orbits and full spectra (two-sided, of x + j y), over the whole recording."
+        )
+
+
+def _about(found: Validation) -> list[Row]:
+    rows = [
+        Row(("recording", found.title)),
+        Row(("scene", found.scene)),
+        Row(("criteria", found.criteria)),
+        Row(("phases", "; ".join(f"{p.name} {p.from_s:.3f} to {p.to_s:.3f} s" for p in found.phases))),
+        Row(("rows lost", str(found.skipped))),
+    ]
+    rows += [Row(("changed", f"{key} = {value}")) for key, value in found.changes.items()]
+    rows += [Row(("fitted first", line)) for line in found.fitted]
+    if found.calibration:
+        rows.append(Row(("calibration", found.calibration_line.removesuffix("; the report says how"))))
+    return rows
+
+
+def _foretold(found: Validation, part: Measured) -> np.ndarray:
+    assert found.nominal is not None
+    return found.nominal.values[part.group]
+
+
+def _zooms(found: Validation) -> list[tuple[str, float, float]]:
+    """Windows that are worth a closer look: why, begin and end [s]; of two that overlap, one for both."""
+    last_s = max(float(part.times_s[-1]) for part in found.parts.values())
+    starts = []
+    if found.explained is not None:
+        starts.append(("the first difference", found.explained.from_s))
+    contacts = [phase.from_s for phase in found.phases if phase.name not in ("free run", "decay")]
+    if contacts:
+        starts.append(("the first contact", contacts[0]))
+    starts.sort(key=lambda start: start[1])
+    zooms: list[tuple[str, float, float]] = []
+    for why, start in starts:
+        if zooms and start < zooms[-1][2]:
+            before, begin, _ = zooms.pop()
+            zooms.append((f"{before}, {why}", begin, start + _AFTER_S))
+        else:
+            zooms.append((why, start - _BEFORE_S, start + _AFTER_S))
+    return [(why, begin, min(end, last_s)) for why, begin, end in zooms if begin < last_s]
+
+
+def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, float]]) -> Figure:
+    """Overlay of every channel of a group as a whole; overlay and residual of each closer look."""
+    n, columns = len(part.channels), 1 + 2 * max(1, len(zooms))
+    figure = new_figure((5.0 * columns, 1.9 * n + 0.6), layout="constrained")
+    panels = figure.subplots(n, columns, squeeze=False, sharex="col")
+    values = _foretold(found, part)
+    whole = ("", float(part.times_s[0]), float(part.times_s[-1]))
+    for c, channel in enumerate(part.channels):
+        _overlay(panels[c][0], part, values, c, whole)
+        panels[c][0].set_ylabel(channel.name if channel.unit == "1" else f"{channel.name} [{channel.unit}]")
+        for k, window in enumerate(zooms or [whole]):
+            left, right = panels[c][1 + 2 * k : 3 + 2 * k]
+            _overlay(left, part, values, c, window)
+            _residual(right, part, values, c, window)
+    for column, axes in enumerate(panels[0]):
+        _, begin, end = whole if column == 0 or not zooms else zooms[(column - 1) // 2]
+        if begin < found.window_s[1] < end - 1e-6:
+            for row in panels[:, column]:
+                row.axvline(found.window_s[1], color="0.6", lw=0.8, ls=":")
+            axes.set_title("dotted: end of the sample by sample comparison", fontsize=9)
+        if end > begin:
+            axes.set_xlim(begin, end)
+    panels[0][0].legend(loc="upper right", fontsize=8)
+    draw_grid(*panels.ravel())
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]")
+    return figure
+
+
+def _rows(part: Measured, window: tuple[str, float, float]) -> slice:
+    _, begin, end = window
+    first, last = np.searchsorted(part.times_s, (begin, end + 1e-9))
+    return slice(int(first), int(last))
+
+
+def _overlay(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tuple[str, float, float]) -> None:
+    rows = _rows(part, window)
+    times = part.times_s[rows]
+    axes.plot(*_thin(times, part.values[rows, c]), color=BLUE, lw=1.0, label="recorded")
+    axes.plot(*_thin(times, values[rows, c]), color=ORANGE, lw=0.8, ls="--", label="foretold")
+
+
+def _residual(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tuple[str, float, float]) -> None:
+    rows = _rows(part, window)
+    off = (part.values[rows, c] - values[rows, c]) / part.floor[c]
+    axes.plot(*_thin(part.times_s[rows], off), color=RED, lw=0.7)
+    axes.set_ylabel("residual / noise")
+
+
+def _thin(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A line that looks the same with fewer points: lowest and highest of every few."""
+    every = len(times) // (_POINTS // 2)
+    if every < 2:
+        return times, values
+    whole = len(times) // every * every
+    folded = values[:whole].reshape(-1, every)
+    ends = np.column_stack([folded.min(axis=1), folded.max(axis=1)]).ravel()
+    return np.repeat(times[:whole:every], 2), ends
+
+
+def _orbits(found: Validation, pairs: list[tuple[str, str]]) -> Figure:
+    figure = new_figure((10.0, 4.2 * len(pairs)))
+    panels = figure.subplots(len(pairs), 2, squeeze=False)
+    for (left, right), pair in zip(panels, pairs, strict=True):
+        part = next(part for part in found.parts.values() if pair[0] in part.names)
+        columns = [part.names.index(name) for name in pair]
+        signals = [
+            values[:, columns[0]] + 1j * values[:, columns[1]] for values in (part.values, _foretold(found, part))
+        ]
+        rate = 1.0 / float(np.median(np.diff(part.times_s)))
+        for signal, colour, label, style in zip(
+            signals, (BLUE, ORANGE), ("recorded", "foretold"), ("-", "--"), strict=True
+        ):
+            left.plot(signal.real, signal.imag, style, color=colour, lw=0.5, label=label, rasterized=True)
+            window = np.hanning(len(signal))
+            spectrum = np.abs(np.fft.fft((signal - signal.mean()) * window)) / window.sum()
+            frequency = np.fft.fftfreq(len(signal), 1.0 / rate)
+            shown = np.fft.fftshift(np.abs(frequency) < 250.0)
+            right.semilogy(np.fft.fftshift(frequency)[shown], np.fft.fftshift(spectrum)[shown] + 1e-12, style,
+                           color=colour, lw=0.8)  # fmt: skip
+        left.set_aspect("equal")
+        left.set_xlabel(f"{pair[0]} [mm]")
+        left.set_ylabel(f"{pair[1]} [mm]")
+        left.legend(loc="upper right", fontsize=8)
+        right.set_xlabel("frequency [Hz], negative is backward")
+        right.set_ylabel("amplitude [mm]")
+        draw_grid(left, right)
+    return figure

@@ -1,0 +1,264 @@
+"""Speed of the rig with its error beside it: simulated over processor time, cases in turn in one process.
+
+The processor time of the thread that simulates: other load on the machine does not count. Frames are timed by the wall
+clock, because real time is what they are for.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from replays.studies.peers import PEERS, Problem, Setting, scaled_error
+from replays.studies.peers.reference import find_reference
+from rig.kernels import compiled_before
+from rig.kernels.signals import COLUMN, N_STATE
+from rig.pacing import short_collections
+from rig.scenes import Scene, load_scene
+from rig.simulation import Simulation
+
+ALONE = {
+    "sensors.chain": "ideal",
+    "sensors.groups": ["hammer"],
+    "sensors.rate_hz": 1000,
+    "sensors.truth_rate_hz": 1000,
+    "model.friction": "exact",
+}
+"""The engine alone: a row every 1 ms, no sensor chain to speak of."""
+_BLOCK_TICKS = 10_000
+_FRAME_TICKS = 1000
+
+
+@dataclass(frozen=True)
+class Case:
+    """One line of the table.
+
+    Attributes:
+        name: What is measured.
+        scene: Scene.
+        changes: Changes to it.
+        simulated_s: Length of a run [s].
+        goal: Times real time that it is meant to reach; None: no goal.
+        error_goal: Largest total error against exact Coulomb that counts as reaching it; None: not compared.
+        blocks: Whole run in one call, or in blocks of 10 ms as the service makes them.
+    """
+
+    name: str
+    scene: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    simulated_s: float = 1.0
+    goal: float | None = None
+    error_goal: float | None = None
+    blocks: bool = False
+
+
+def _engine(name: str, step_us: int, **changes: Any) -> dict[str, Any]:
+    return {**ALONE, "engine.name": name, "engine.step_us": step_us, **changes}
+
+
+SPARSE = {"sensors.rate_hz": 100, "sensors.truth_rate_hz": 100}
+_DIES_OUT = [{"at_s": 0.02, "command": "hammer", "force_n": 100.0, "duration_ms": 2.0}]
+
+CASES = (
+    Case("split 50 us, hammer", "hammer", _engine("split", 50), goal=300, error_goal=2e-3),
+    Case("split 25 us, hammer", "hammer", _engine("split", 25), goal=150, error_goal=6e-4),
+    Case("split 20 us, hammer", "hammer", _engine("split", 20), goal=75, error_goal=1.6e-4),
+    Case("tsit5 1e-6, hammer", "hammer", _engine("tsit5", 500, **{"engine.tolerance": 1e-6})),
+    Case("rk8 1e-8, hammer", "hammer", _engine("rk8", 25)),
+    Case("taylor 1e-8, hammer", "hammer", _engine("taylor", 25, **{"engine.tolerance": 1e-8}), error_goal=1e-6),
+    Case(
+        "split 100 us, free flight, a row every 10 ms", "stable-run", _engine("split", 100, **SPARSE), 20.0, goal=5000
+    ),
+    Case("split 25 us, 60 s: bounces, then free", "hammer", _engine("split", 25, commands=_DIES_OUT), 60.0, goal=500),
+    Case("split 100 us, 60 s: bounces, then whirl", "hammer", _engine("split", 100), 60.0, goal=500),
+    Case("split 25 us, hammer, all sensors at 20 kHz", "hammer", {}, goal=60, blocks=True),
+    Case("split 25 us, stable run, all sensors at 20 kHz", "stable-run", {}, blocks=True),
+    Case("rk8 25 us, hammer, all sensors at 20 kHz", "hammer", {"engine.name": "rk8"}, blocks=True),
+)
+"""The first is what the others are compared with."""
+
+PEER_CASES = (("cvode-bdf", 2e-3), ("cvode-adams", 2e-3), ("heyoka", 2e-3), ("heyoka", 1e-6))
+"""Peer, and the total error at which it is timed: at the cheapest setting of its ladder that reaches it."""
+
+
+def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    """Run every case several times, one after the other in turn.
+
+    Args:
+        runs: Runs of each case.
+        peers: Time other people's solvers in the same rounds, where they are installed.
+        frames: How many frames of 1 ms are timed one by one; 0 for none.
+        progress: Told what is measured.
+
+    Returns:
+        A JSON document: machine, time until the kernels were ready [s], per case times real time (median, min, max,
+        all), error, energy residual, goal and whether it is reached, and the median ratio to the first case of the
+        same round; per peer the same; the time of a frame.
+    """
+    cached = compiled_before()
+    begin = time.perf_counter()
+    progress("loading or compiling the kernels")
+    scenes = {case.name: load_scene(case.scene, {**case.changes, "duration_s": case.simulated_s}) for case in CASES}
+    for scene in scenes.values():
+        Simulation(scene).warm_up()
+    ready_s = time.perf_counter() - begin
+
+    progress("reference")
+    problem = Problem.from_scene(
+        scenes[CASES[0].name], start_s=0.0, end_s=CASES[0].simulated_s, sample_s=1e-3, friction="exact"
+    )
+    reference, reference_error, source = _reference(problem)
+    chosen: list[tuple[str, float, Setting, float]] = []
+    missing = sorted({name for name, _ in PEER_CASES if not PEERS[name].installed}) if peers else []
+    for name, wanted in PEER_CASES if peers else ():
+        if PEERS[name].installed:
+            progress(f"{name}: which setting has an error of {wanted:g}")
+            chosen += _cheapest(name, wanted, problem, reference)
+
+    speeds: dict[str, list[float]] = {case.name: [] for case in CASES}
+    peer_speeds: list[list[float]] = [[] for _ in chosen]
+    ends: dict[str, tuple[np.ndarray, Simulation]] = {}
+    for turn in range(runs):
+        progress(f"round {turn + 1} of {runs}")
+        for case in CASES:
+            speed, rows, simulation = _run(scenes[case.name], case)
+            speeds[case.name].append(speed)
+            ends[case.name] = (rows, simulation)
+        for (name, _, setting, _), values in zip(chosen, peer_speeds, strict=True):
+            solution = PEERS[name].solve(problem, setting, budget_s=60.0)
+            values.append(problem.duration_s / solution.cpu_s)
+
+    first = CASES[0].name
+    cases = []
+    for case in CASES:
+        rows, simulation = ends[case.name]
+        error = None
+        if case.scene == "hammer" and not case.blocks and case.simulated_s == CASES[0].simulated_s:
+            count = min(len(rows), len(reference))
+            error = scaled_error(rows[:count, :N_STATE], reference[:count])
+        summary = _summary(case.name, speeds[case.name], speeds[first])
+        reached = case.goal is None or summary["median"] >= case.goal
+        if case.error_goal is not None:
+            reached = reached and error is not None and error <= case.error_goal
+        cases.append(
+            summary
+            | {
+                "error": error,
+                "residual_share": simulation.health()["energy"]["residual_share"],
+                "spin_hz": float(rows[-1, COLUMN["theta_rate"]] / (2.0 * np.pi)),
+                "goal": case.goal,
+                "error_goal": case.error_goal,
+                "reached": reached if case.goal is not None or case.error_goal is not None else None,
+            }
+        )
+    return {
+        "machine": {
+            "processor": platform.processor() or platform.machine(),
+            "cores": os.cpu_count(),
+            "python": platform.python_version(),
+        },
+        "runs": runs,
+        "ready_s": ready_s,
+        "cached": cached,
+        "reference": {"of": source, "error": reference_error},
+        "cases": cases,
+        "peers": [
+            _summary(f"{PEERS[name].title}, {setting.label}", values, speeds[first])
+            | {"error": error, "wanted": wanted}
+            for (name, wanted, setting, error), values in zip(chosen, peer_speeds, strict=True)
+        ],
+        "missing_peers": missing,
+        "frame": _frames(frames, progress) if frames else None,
+    }
+
+
+def _run(scene: Scene, case: Case) -> tuple[float, np.ndarray, Simulation]:
+    """Times real time, the observed rows (of the last block where there are blocks), and the simulation at its end."""
+    simulation = Simulation(scene)
+    _ = simulation.first_row
+    end = round(case.simulated_s * simulation.tick_rate_hz)
+    block = _BLOCK_TICKS if case.blocks else end
+    frame = None
+    begin = time.thread_time()
+    while simulation.tick < end:
+        frame = simulation.advance(block)
+    cpu_s = time.thread_time() - begin
+    assert frame is not None
+    return case.simulated_s / cpu_s, frame.rows, simulation
+
+
+def _reference(problem: Problem) -> tuple[np.ndarray, float | None, str]:
+    """States at every 1 ms, the distance of the two codes behind it, and which they are."""
+    found = find_reference(problem, quick=True)
+    if found is not None:
+        return found.solution.states, found.error, " and ".join(found.names)
+    rk8 = {"engine.tolerance": 1e-13}
+    scene = load_scene("hammer", {**_engine("rk8", 5, **rk8), "duration_s": problem.duration_s})
+    rows = _run(scene, Case("reference", "hammer"))[1]
+    return rows[:, :N_STATE].copy(), None, "rk8 alone (install the extra `peers` for two independent codes)"
+
+
+def _cheapest(
+    name: str, wanted: float, problem: Problem, reference: np.ndarray
+) -> list[tuple[str, float, Setting, float]]:
+    """The quickest setting of a peer's ladder, with steps between, whose error is at most the one wanted, if any."""
+    found: tuple[float, Setting, float] | None = None
+    for setting in _with_steps_between(PEERS[name].ladder):
+        solution = PEERS[name].solve(problem, setting, budget_s=30.0)
+        if solution.failure is not None:
+            continue
+        error = scaled_error(solution.states, reference[: len(solution.states)])
+        if error <= wanted and (found is None or solution.cpu_s < found[0]):
+            found = (solution.cpu_s, setting, error)
+    return [] if found is None else [(name, wanted, found[1], found[2])]
+
+
+def _with_steps_between(ladder: tuple[Setting, ...]) -> list[Setting]:
+    """A ladder of tolerances with three steps a decade: a coarse one would hold a peer to a rung below the goal."""
+    finer = list(ladder)
+    for above, below in pairwise(ladder):
+        if above.absolute is None and below.absolute is None:
+            steps = round(3.0 * math.log10(above.tolerance / below.tolerance))
+            for n in range(1, steps):
+                tolerance = above.tolerance * (below.tolerance / above.tolerance) ** (n / steps)
+                finer.append(Setting(f"{tolerance:.1e}".replace("e-0", "e-"), tolerance))
+    return finer
+
+
+def _summary(name: str, values: list[float], base: list[float]) -> dict[str, Any]:
+    return {
+        "name": name,
+        "median": statistics.median(values),
+        "min": min(values),
+        "max": max(values),
+        "all": values,
+        "ratio": statistics.median(value / other for value, other in zip(values, base, strict=True)),
+    }
+
+
+def _frames(frames: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    """Wall time of single frames of 1 ms in a whirl [us]: engine alone, and with all sensors."""
+    report = {}
+    for name, changes in (("engine alone", _engine("split", 25)), ("all sensors at 20 kHz", {})):
+        progress(f"{frames} frames of 1 ms, {name}")
+        simulation = Simulation(load_scene("hammer", {**changes, "duration_s": 3600.0}))
+        walls = np.empty(frames)
+        with short_collections():  # as in every paced run
+            for _ in range(100):
+                simulation.advance(_FRAME_TICKS)
+            for n in range(frames):
+                begin = time.perf_counter()
+                simulation.advance(_FRAME_TICKS)
+                walls[n] = time.perf_counter() - begin
+        low, high, worst = np.quantile(walls, [0.5, 0.999, 1.0]) * 1e6
+        report[name] = {"median_us": float(low), "p999_us": float(high), "worst_us": float(worst), "frames": frames}
+    return report

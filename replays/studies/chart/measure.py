@@ -1,0 +1,303 @@
+"""One point of a chart: a method at one setting on one problem, timed and held against the reference."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replays.studies.chart.methods import Competitor, Rung
+from replays.studies.peers import PEERS
+from replays.studies.peers.problem import Problem, scaled_error
+from replays.studies.peers.reference import Reference
+from replays.studies.peers.solution import MISSED_HAMMER, Solution
+from rig.engines import load_engine
+from rig.engines.memory import CONTACTS, EVALUATIONS, MEMORY, STEPS
+from rig.kernels.contact import normal_force
+from rig.kernels.dynamics import gap
+from rig.kernels.signals import N_ROW, N_STATE, N_VECTOR
+from rig.simulation import energy_balance
+
+OFF = 0.5
+"""Scaled error from which a run is on another branch: as far from the reference as the motion is large."""
+_SLACK, _SLACK_SHARE = 2, 0.2
+"""A contact count may be off by this many, or this share, before it is called wrong."""
+_ENOUGH_S = 0.12
+"""Short runs are repeated until they have taken this long together [s] ..."""
+_MOST = 25
+"""... or so often."""
+
+
+class Budget(NamedTuple):
+    """What a point may cost."""
+
+    solve_s: float
+    """Wall time of one run [s]."""
+    runs: int = 3
+    single_s: float = np.inf
+    """A run longer than this [s] is not repeated."""
+
+
+@dataclass
+class Run:
+    """What a method made of a problem."""
+
+    states: np.ndarray
+    """At the problem's instants, nan from where it stopped, shape (n, 14)."""
+    costs: list[float]
+    """Processor time of each run [s]: other load on the machine does not count."""
+    contacts: int
+    steps: int
+    evaluations: int
+    reached_s: float
+    """Simulated time that was got through [s]."""
+    failure: str = ""
+    """Kind: "", nan, hammer, budget, error, contacts or branch."""
+    message: str = ""
+    compile_s: float = 0.0
+    energy_residual: float | None = None
+    worst_frame_s: float | None = None
+    onsets: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """Times at which contacts began, to a frame [s]."""
+
+
+def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
+    """Run an engine of ours: first frame by frame, then in one go for the clock."""
+    engine, constants, inputs = load_engine(name), problem.constants, problem.inputs
+    times = problem.times
+    frame_ticks = round((times[1] - times[0]) / inputs.tick_s)
+    if frame_ticks % rung.step_us:
+        raise ValueError(f"frames of {frame_ticks} us are no whole number of steps of {rung.step_us} us")
+    stride, n = frame_ticks // rung.step_us, len(times) - 1
+    first = np.zeros(N_VECTOR)
+    first[:N_STATE] = problem.y0
+    step = float(rung.step_us)
+
+    def begin() -> tuple[np.ndarray, np.ndarray]:
+        y, memory = first.copy(), np.zeros(MEMORY)
+        engine.start(constants, inputs, y, memory, step, rung.tolerance)
+        return y, memory
+
+    rows = np.full((n + 1, N_ROW), np.nan)
+    clock = time.perf_counter()
+    y, memory = begin()
+    engine.advance(constants, inputs, y, memory, problem.start_tick, rung.step_us, 1, 1, rows[:1])
+    compile_s = time.perf_counter() - clock
+    frames = np.empty(n)
+    counts = np.zeros(n + 1)
+    best = np.full(n, np.inf)
+    failure, message, reached = "", "", n
+    begun_cpu = 0.0
+    for turn in range(budget.runs):
+        y, memory = begin()
+        begun, begun_cpu = time.perf_counter(), time.thread_time()
+        for i in range(n):
+            before = time.perf_counter()
+            engine.advance(
+                constants, inputs, y, memory, problem.start_tick + i * frame_ticks, rung.step_us, stride, stride,
+                rows[i : i + 1],
+            )  # fmt: skip
+            after = time.perf_counter()
+            frames[i] = after - before
+            counts[i + 1] = memory[CONTACTS]
+            if after - begun > budget.solve_s:
+                failure, message, reached = "budget", f"over the budget of {budget.solve_s:g} s", i + 1
+                break
+        if failure:
+            break
+        best = np.minimum(best, frames)
+        if turn == 0 and frames.sum() > 0.1 * budget.solve_s:
+            break
+    cost = time.thread_time() - begun_cpu
+    last, note = y.copy(), memory.copy()
+    costs = [cost]
+    if not failure:
+        # One more row, at the window's end.
+        end = problem.start_tick + n * frame_ticks
+        engine.advance(constants, inputs, last, note, end, rung.step_us, 1, 1, rows[n:])
+        whole, costs = np.empty((n, N_ROW)), []
+        while len(costs) < budget.runs or (sum(costs) < _ENOUGH_S and len(costs) < _MOST):
+            clock = time.thread_time()
+            again, kept = begin()
+            engine.advance(constants, inputs, again, kept, problem.start_tick, rung.step_us, n * stride, stride, whole)
+            costs.append(time.thread_time() - clock)
+            if costs[-1] > budget.single_s:
+                break
+    else:
+        rows[reached:] = np.nan
+    states = rows[:, :N_STATE].copy()
+    if not failure and not np.isfinite(states).all():
+        failure, message = "nan", "the state is not finite"
+    residual = None
+    if not failure:
+        balance = energy_balance(rows, rows[0])
+        residual = float(np.max(np.abs(balance["residual"])) / max(float(balance["dissipated"][-1]), 1e-6))
+    return Run(
+        states=states,
+        costs=costs,
+        contacts=int(memory[CONTACTS]),
+        steps=int(memory[STEPS]),
+        evaluations=int(memory[EVALUATIONS]),
+        reached_s=float(times[reached]),
+        failure=failure,
+        message=message,
+        compile_s=compile_s,
+        energy_residual=residual,
+        worst_frame_s=None if failure else float(best.max()),
+        onsets=np.repeat(times, np.diff(counts, prepend=0.0).clip(0).astype(int)),
+    )
+
+
+def run_peer(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
+    """Run a peer; the first run counts only where it is long, as it may load what the others find loaded."""
+    peer, costs, compile_s = PEERS[name], [], 0.0
+    solution: Solution | None = None
+    while solution is None or len(costs) < budget.runs:
+        fresh = solution is None
+        solution = peer.solve(problem, rung.setting, budget_s=budget.solve_s)
+        compile_s = max(compile_s, solution.compile_s)
+        if not fresh or solution.failure is not None or solution.cpu_s > 0.2 or solution.cpu_s > budget.single_s:
+            costs.append(solution.cpu_s)
+        if solution.failure is not None or solution.cpu_s > budget.single_s:
+            break
+    good: np.ndarray = np.isfinite(solution.states.sum(axis=1))
+    reached = len(good) if good.all() else int(np.argmin(good))
+    message = solution.failure or ""
+    failure = ""
+    if message:
+        over = message.startswith(("over the budget", "more than"))
+        kinds = (("hammer", message == MISSED_HAMMER), ("budget", over), ("nan", "not finite" in message))
+        failure = next((kind for kind, holds in kinds if holds), "error")
+    return Run(
+        states=solution.states,
+        costs=costs,
+        contacts=solution.contacts,
+        steps=solution.steps,
+        evaluations=solution.evaluations,
+        reached_s=float(problem.times[max(reached - 1, 0)]),
+        failure=failure,
+        message=message,
+        compile_s=compile_s,
+        onsets=np.array([time_s for time_s, _ in solution.onsets]),
+    )
+
+
+def run(contender: Competitor, rung: Rung, problem: Problem, budget: Budget) -> Run:
+    """Run a method."""
+    return (run_engine if contender.ours else run_peer)(contender.name, rung, problem, budget)
+
+
+def point(contender: Competitor, rung: Rung, problem: Problem, reference: Reference, budget: Budget) -> dict[str, Any]:
+    """Measure a point with a pointwise error, as columns of the store."""
+    done = run(contender, rung, problem, budget)
+    wanted = reference.solution.contacts
+    error = scaled_error(done.states, reference.solution.states) if not done.failure else None
+    failure, message = done.failure, done.message
+    if error is not None and error > OFF:
+        failure, message = "branch", f"scaled error {error:.2g}: another branch of the motion"
+    elif error is not None and abs(done.contacts - wanted) > max(_SLACK, _SLACK_SHARE * wanted):
+        failure, message = "contacts", f"{done.contacts} contacts instead of {wanted}"
+    return {
+        **_cost(done, problem),
+        "error": error,
+        "reference": " / ".join(reference.names) + ("" if reference.independent else " (one right-hand side)"),
+        "reference_error": reference.error,
+        "contacts_reference": wanted,
+        "failure": failure,
+        "message": message,
+    }
+
+
+STATISTICS = ("contact_fraction", "rms_force", "impacts_per_s")
+
+
+def statistics_point(
+    contender: Competitor, rung: Rung, problem: Problem, budget: Budget, *, settle_s: float = 1.0
+) -> dict[str, Any]:
+    """Measure a point of chaotic motion: means over blocks of time, with 95 % bootstrap bars."""
+    done = run(contender, rung, problem, budget)
+    columns: dict[str, Any] = {**_cost(done, problem), "failure": done.failure, "message": done.message}
+    if done.failure:
+        return columns
+    force = elastic_forces(problem, done.states)
+    for name, (mean, low, high) in block_statistics(problem.times, force, done.onsets, settle_s=settle_s).items():
+        columns |= {name: mean, f"{name}_low": low, f"{name}_high": high}
+    return columns
+
+
+def elastic_forces(problem: Problem, states: np.ndarray) -> np.ndarray:
+    """Elastic part of the normal force [N], shape (n,): the part that a state alone tells, the same for every method.
+
+    Args:
+        problem: The problem.
+        states: Shape (n, 14).
+    """
+    contact = problem.constants.contact
+    forces = np.zeros(len(states))
+    for i, state in enumerate(states):
+        depth = gap(problem.constants, state)[0]
+        if depth > 0.0:
+            forces[i] = normal_force(depth, 0.0, contact.speed_floor, contact)[1]
+    return forces
+
+
+def block_statistics(
+    times: np.ndarray, force: np.ndarray, onsets: np.ndarray, *, settle_s: float, block_s: float = 0.5, draws: int = 400
+) -> dict[str, tuple[float, float, float]]:
+    """Contact fraction, RMS force [N] and impacts a second: mean and 95 % interval, by a bootstrap over blocks.
+
+    Args:
+        times: Shape (n,) [s].
+        force: Normal force, shape (n,) [N].
+        onsets: Times of impact [s].
+        settle_s: Left out at the start [s].
+        block_s: Length of a block [s], long against the memory of the motion.
+        draws: Bootstrap samples.
+    """
+    edges = np.arange(settle_s, times[-1] + 1e-9, block_s)
+    n = len(edges) - 1
+    if n < 2:
+        raise ValueError("statistics need two blocks of time")
+    which = np.searchsorted(edges, times, side="right") - 1
+    inside = (which >= 0) & (which < n)
+    size = np.bincount(which[inside], minlength=n)
+    touching = np.bincount(which[inside], (force[inside] > 0.0).astype(float), minlength=n) / size
+    square = np.bincount(which[inside], force[inside] ** 2, minlength=n) / size
+    rate = np.histogram(onsets, edges)[0] / block_s
+    picks = np.random.default_rng(0).integers(0, n, (draws, n))
+
+    def interval(values: np.ndarray, *, root: bool = False) -> tuple[float, float, float]:
+        means, mean = values[picks].mean(axis=1), values.mean()
+        means, mean = (np.sqrt(means), np.sqrt(mean)) if root else (means, mean)
+        low, high = np.quantile(means, (0.025, 0.975))
+        return float(mean), float(low), float(high)
+
+    return {
+        "contact_fraction": interval(touching),
+        "rms_force": interval(square, root=True),
+        "impacts_per_s": interval(rate),
+    }
+
+
+def _cost(done: Run, problem: Problem) -> dict[str, Any]:
+    costs = done.costs or [np.nan]
+    cost = statistics.median(costs)
+    return {
+        "simulated_s": problem.duration_s,
+        "runs": len(done.costs),
+        "cpu_s": cost,
+        "cpu_min_s": min(costs),
+        "cpu_max_s": max(costs),
+        "speed": done.reached_s / cost,
+        "speed_min": done.reached_s / max(costs),
+        "speed_max": done.reached_s / min(costs),
+        "compile_s": done.compile_s,
+        "steps": done.steps,
+        "evaluations": done.evaluations,
+        "contacts": done.contacts,
+        "energy_residual": done.energy_residual,
+        "worst_frame_ms": None if done.worst_frame_s is None else done.worst_frame_s * 1e3,
+    }

@@ -1,0 +1,167 @@
+"""What is compared: windows of scenes, contact laws, and the list of points that make a chart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from replays.studies.chart.methods import Competitor, Rung
+from replays.studies.peers.problem import Problem
+from rig.errors import InputError
+from rig.scenes import load_scene, parse_scene
+
+Mode = Literal["quick", "full"]
+FRAME_S = 1e-3
+"""Instants at which states are compared, and the frame that is timed [s]."""
+SMOOTHING = 5e-3
+"""v_s of the smoothed law [m/s]."""
+FLOORS = (5e-3, 5e-4, 1e-4)
+"""v_s whose distance from exact Coulomb is drawn [m/s]."""
+RUB = "rub"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One window of a scene, from its start."""
+
+    name: str
+    title: str
+    end_s: float
+    scene: str = "hammer"
+    changes: dict[str, Any] = field(default_factory=dict)
+
+
+_ALL = (
+    Phase("first-impacts", "first impacts, 0.05 s", 0.05),
+    Phase("transient", "transient, 0.2 s", 0.2),
+    Phase("whirl", "impacts to whirl, 1 s", 1.0),
+    Phase("drop", "drop to rest, 0.5 s", 0.5, scene="drop"),
+    Phase(
+        RUB, "chaotic partial rub", 20.0, scene="",
+        changes={"ring.offset_x": 0.8, "shaft.unbalance_eccentricity": 0.3},
+    ),
+)  # fmt: skip
+PHASES = {phase.name: phase for phase in _ALL}
+RUB_SAMPLE_S = 5e-4
+"""Instants that its statistics are taken at [s]."""
+RUB_SPEED_HZ = 12.0
+"""With these changes two runs that begin 5e-10 rad apart are fully apart after 0.4 s, and stay so."""
+
+PANELS = {
+    "exact": "total error against exact Coulomb friction",
+    "smoothed": f"all on the smoothed law, v_s = {SMOOTHING * 1e3:g} mm/s, against its own reference",
+    "memory": "Lankarani-Nikravesh contact with its memory of the impact speed, and without; no friction",
+    RUB: "chaotic partial rub: statistics only",
+    "profile": "performance profile over random scenes",
+}
+_WINDOWS = ("whirl", "transient", "first-impacts", "drop")
+_PANEL_PHASES = {
+    "exact": _WINDOWS,
+    "smoothed": ("transient", "whirl", "first-impacts"),
+    "memory": ("first-impacts",),
+    RUB: (RUB,),
+    "profile": (),
+}
+MEMORY_CASES = ("memory", "no memory")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One point to measure.
+
+    `case` tells apart laws within a panel: "" for the panel's own, "smoothed" for a smoothed law measured against
+    exact Coulomb, one of `MEMORY_CASES`, or "floor" and "reference", which no method runs.
+    """
+
+    panel: str
+    phase: str
+    case: str
+    method: str
+    rung: Rung
+    smoothing_speed: float = SMOOTHING
+
+
+def select(only: str | None, panels: list[str] | None) -> tuple[list[str], str | None]:
+    """Check a choice of phase and panels.
+
+    Raises:
+        InputError: No such phase or panel, or none that has both.
+    """
+    if only is not None and only not in PHASES:
+        raise InputError("only", f"one of {', '.join(PHASES)}", only)
+    for panel in panels or ():
+        if panel not in PANELS:
+            raise InputError("panel", f"one of {', '.join(PANELS)}", panel)
+    chosen = [panel for panel in PANELS if not panels or panel in panels]
+    if only is not None:
+        chosen = [panel for panel in chosen if only in _PANEL_PHASES[panel]]
+        if not chosen:
+            raise InputError("panel", f"one that has the phase {only}", ", ".join(panels or ()))
+    return chosen, only
+
+
+def plan(contenders: dict[str, Competitor], *, mode: Mode, panels: list[str], only: str | None = None) -> list[Task]:
+    """All points of a chart but the profile's, those that tell most for their time first."""
+    tasks: list[tuple[int, Task]] = []
+    for panel in panels:
+        for turn, phase in enumerate(_PANEL_PHASES[panel]):
+            if only not in (None, phase):
+                continue
+            if mode == "quick" and panel == "smoothed" and phase != "transient" and only is None:
+                continue
+            cases = MEMORY_CASES if panel == "memory" else ("", "smoothed") if panel == "exact" else ("",)
+            for case in cases:
+                for contender in contenders.values():
+                    tasks += _points(contender, panel, phase, case, turn, mode)
+    return [task for _, task in sorted(tasks, key=lambda pair: pair[0])]
+
+
+def _points(contender: Competitor, panel: str, phase: str, case: str, turn: int, mode: Mode) -> list[tuple[int, Task]]:
+    friction = friction_of(panel, case)
+    if not contender.takes(friction):
+        return []
+    if case == "smoothed" and (contender.name != "tsit5" or phase not in ("whirl", "transient")):
+        return []
+    rungs = contender.rungs if mode == "full" else contender.quick
+    if panel == RUB:
+        rungs = tuple(rung for rung in rungs if not rung.step_us or round(RUB_SAMPLE_S * 1e6) % rung.step_us == 0)
+        rungs = rungs[1:-1:2] if contender.ours else rungs[len(rungs) // 2 : len(rungs) // 2 + 1]
+        if contender.known_failure or contender.family == "scipy":
+            return []
+    elif mode == "quick" and contender.known_failure and panel != "memory":
+        rungs = rungs[:2]
+    slow = contender.family in ("scipy", "MuJoCo")
+    rank = 10 * list(_PANEL_PHASES).index(panel) + turn + (0 if contender.ours else 200 if slow else 100)
+    return [(rank, Task(panel, phase, case, contender.name, rung)) for rung in rungs]
+
+
+def friction_of(panel: str, case: str) -> Literal["none", "smoothed", "exact"]:
+    """Friction law of a panel's case."""
+    if panel == "memory":
+        return "none"
+    return "smoothed" if panel == "smoothed" or case == "smoothed" else "exact"
+
+
+def problem_of(
+    panel: str, phase: str, case: str, *, smoothing_speed: float = SMOOTHING, end_s: float | None = None
+) -> Problem:
+    """The window that a point is measured on."""
+    window = PHASES[phase]
+    end = window.end_s if end_s is None else end_s
+    changes = dict(window.changes)
+    if panel == "memory":
+        changes["contact.damping_factor"] = "lankarani-nikravesh"
+    if window.scene:
+        scene = load_scene(window.scene, {**changes, "model.friction": "exact"})
+    else:
+        scene = parse_scene(
+            {"name": window.name, "duration_s": end, "drive": {"speed_hz": RUB_SPEED_HZ}, "set": changes}
+        )
+    return Problem.from_scene(
+        scene,
+        end_s=end,
+        sample_s=FRAME_S if panel != RUB else RUB_SAMPLE_S,
+        friction=friction_of(panel, case),
+        smoothing_speed=smoothing_speed,
+        memory=case != "no memory",
+    )

@@ -1,0 +1,308 @@
+"""One making of a chart: what is missing is measured, point by point, then everything is drawn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from replays.studies.chart import profile
+from replays.studies.chart.measure import Budget, point, run_engine, statistics_point
+from replays.studies.chart.methods import OURS, Competitor, Rung, competitors, missing_peers
+from replays.studies.chart.phases import (
+    FLOORS,
+    PHASES,
+    RUB,
+    SMOOTHING,
+    Mode,
+    Task,
+    friction_of,
+    plan,
+    problem_of,
+    select,
+)
+from replays.studies.chart.store import Row, Store
+from replays.studies.peers import PEERS, Setting
+from replays.studies.peers.problem import Problem, scaled_error
+from replays.studies.peers.reference import Reference, find_reference
+
+TOTAL_S = {"quick": 95.0, "full": 3300.0}
+"""Wall time for all points, compile time apart [s]; what does not fit is left to the next run."""
+BUDGETS = {"quick": Budget(2.0, 3, 0.4), "full": Budget(20.0, 3)}
+_PROFILE_SHARE = 0.35
+"""Share of the time that the profile may take where other panels are made as well."""
+_RUB_S = {"quick": 12.0, "full": 60.0}
+"""Simulated time of the chaotic rub [s]."""
+_RUB_BUDGET_S = {"quick": 4.0, "full": 120.0}
+
+
+@dataclass
+class Progress:
+    """Told what is under way; the command line shows it."""
+
+    begin: Callable[[int], None] = lambda _total: None
+    step: Callable[[str], None] = lambda _text: None
+
+
+@dataclass
+class Outcome:
+    """What a making of a chart came to."""
+
+    files: list[Path] = field(default_factory=list)
+    measured: int = 0
+    resumed: int = 0
+    outdated: int = 0
+    left: int = 0
+    """Points for which there was no time."""
+    failures: int = 0
+    missing: list[str] = field(default_factory=list)
+    """Libraries of peers that are not installed."""
+    interrupted: bool = False
+
+
+def make_chart(
+    folder: Path,
+    *,
+    mode: Mode = "quick",
+    only: str | None = None,
+    panels: list[str] | None = None,
+    peers: bool = True,
+    fresh: bool = False,
+    end_s: float | None = None,
+    methods: list[str] | None = None,
+    command: str = "rig chart",
+    progress: Progress | None = None,
+) -> Outcome:
+    """Measure what is missing and draw.
+
+    Args:
+        folder: Folder for pictures and data.
+        mode: How many points, and for how long.
+        only: One phase only.
+        panels: Panels; None for all.
+        peers: False leaves the peers out.
+        fresh: Start over instead of going on.
+        end_s: Shorten every window to this [s] (for tests).
+        methods: Only these methods.
+        command: Said in the figures.
+        progress: Told what is under way.
+
+    Raises:
+        InputError: Wrong choice, or a folder that cannot be written.
+    """
+    chosen, only = select(only, panels)
+    progress = progress or Progress()
+    store = Store(folder, fresh=fresh)
+    contenders = competitors(peers=peers)
+    if methods is not None:
+        contenders = {name: contenders[name] for name in methods}
+    outcome = Outcome(outdated=store.outdated, missing=missing_peers() if peers else [])
+    work = _Work(store, contenders, mode, end_s)
+    try:
+        _measure(work, chosen, only, outcome, progress)
+    except KeyboardInterrupt:
+        outcome.interrupted = True
+    rows = store.rows(mode)
+    outcome.failures = sum(bool(row["failure"]) for row in rows)
+    if rows:
+        from replays.studies.chart.figure import draw
+
+        note = ""
+        if not peers:
+            note = "peers left out on request"
+        elif outcome.missing:
+            note = f"not installed, so not drawn: {', '.join(outcome.missing)} (extra: peers)"
+        if outcome.left:
+            note += f"{'; ' if note else ''}{outcome.left} points not measured for want of time: run again to add them"
+        outcome.files = store.write(mode) + draw(rows, folder, chosen, command=command, note=note)
+    return outcome
+
+
+def _own_reference(problem: Problem) -> Reference | None:
+    """Where no second peer is installed: scipy's DOP853 and our rk8, which share the equations but not the code."""
+    first = PEERS["scipy-dop853"].solve(problem, Setting("1e-13", 1e-13), budget_s=300.0)
+    second = run_engine("rk8", Rung("1e-12", 25, 1e-12), problem, Budget(300.0, 1))
+    if first.failure is not None or second.failure:
+        return None
+    error = scaled_error(first.states, second.states)
+    other = replace(first, states=second.states, contacts=second.contacts)
+    return Reference(first, other, ("scipy-dop853", "rk8"), error, independent=False)
+
+
+@dataclass
+class _Work:
+    """What the points of one making share."""
+
+    store: Store
+    contenders: dict[str, Competitor]
+    mode: Mode
+    end_s: float | None
+    problems: dict[tuple[Any, ...], Problem] = field(default_factory=dict)
+    references: dict[tuple[Any, ...], Reference | None] = field(default_factory=dict)
+    compiled: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def compile_s(self) -> float:
+        """What compiling has taken so far [s], which no budget is charged with."""
+        return sum(self.compiled.values())
+
+    def compiling(self, what: str, seconds: float, *, again: bool) -> None:
+        """Note compile time; a library tells the same figure with every solve, an engine of ours each its own."""
+        before = self.compiled.get(what, 0.0)
+        self.compiled[what] = before + seconds if again else max(before, seconds)
+
+    def problem(self, panel: str, phase: str, case: str, smoothing_speed: float = SMOOTHING) -> Problem:
+        key = (panel, phase, case, smoothing_speed)
+        if key not in self.problems:
+            end = _RUB_S[self.mode] if phase == RUB else PHASES[phase].end_s
+            end = end if self.end_s is None else min(end, self.end_s)
+            self.problems[key] = problem_of(panel, phase, case, smoothing_speed=smoothing_speed, end_s=end)
+        return self.problems[key]
+
+    def reference(self, panel: str, phase: str, case: str) -> Reference | None:
+        # A smoothed law on the exact panel is held against exact Coulomb.
+        case = "" if panel == "exact" else case
+        key = (panel, phase, case)
+        if key not in self.references:
+            self.references[key] = self.solve(self.problem(panel, phase, case))
+        return self.references[key]
+
+    def solve(self, problem: Problem) -> Reference | None:
+        reference = find_reference(problem, quick=self.mode == "quick") or _own_reference(problem)
+        if reference is not None:
+            for name, solution in zip(reference.names, (reference.solution, reference.second), strict=True):
+                self.compiling(PEERS[name].family if name in PEERS else OURS, solution.compile_s, again=False)
+        return reference
+
+    def keep(self, row: Row, columns: Row) -> None:
+        self.store.add(row | columns)
+        self.compiling(row["family"], float(columns.get("compile_s") or 0.0), again=row["family"] == OURS)
+
+    def base(self, panel: str, phase: str, case: str, contender: Competitor, rung: Rung | None) -> Row:
+        tolerance = None
+        if rung is not None:
+            tolerance = rung.tolerance if rung.setting is None else rung.setting.tolerance
+        return {
+            "mode": self.mode,
+            "panel": panel,
+            "phase": phase,
+            "case": case,
+            "method": contender.name,
+            "rung": "" if rung is None else rung.label,
+            "title": contender.title,
+            "family": contender.family,
+            "known_failure": contender.known_failure,
+            "step_us": rung.step_us if rung is not None and rung.step_us else None,
+            "tolerance": tolerance,
+        }
+
+
+def _measure(work: _Work, panels: list[str], only: str | None, outcome: Outcome, progress: Progress) -> None:
+    tasks = plan(work.contenders, mode=work.mode, panels=panels, only=only)
+    scenes = profile.SCENES[work.mode] if "profile" in panels and only is None else 0
+    windows = {(task.panel, task.phase, task.case) for task in tasks if task.panel != RUB}
+    progress.begin(len(tasks) + len(windows) + scenes)
+    total = TOTAL_S[work.mode]
+    # The profile is one of several panels: it has its share of the time, and stands before the slow peers.
+    early = [task for task in tasks if work.contenders[task.method].ours]
+    late = [task for task in tasks if not work.contenders[task.method].ours]
+    for panel, phase, case in sorted(windows):
+        if case != "smoothed":
+            progress.step(f"reference of {panel}, {phase}")
+            _references(work, panel, phase, case)
+    clock = time.perf_counter() - work.compile_s
+    for task in early:
+        _point(work, task, outcome, progress, clock + total)
+    share = total * (_PROFILE_SHARE if tasks else 1.0)
+    _profile(work, scenes, outcome, progress, time.perf_counter() - work.compile_s + share)
+    for task in late:
+        _point(work, task, outcome, progress, clock + total)
+
+
+def _references(work: _Work, panel: str, phase: str, case: str) -> None:
+    """The reference and, on the exact panel, how far the smoothed laws are from it."""
+    base = {"mode": work.mode, "panel": panel, "phase": phase, "case": case or "exact", "family": "reference"}
+    if work.store.has((work.mode, panel, phase, case or "exact", "reference", "")):
+        return
+    reference = work.reference(panel, phase, case)
+    if reference is None:
+        return
+    columns = {
+        "title": " / ".join(reference.names),
+        "reference": " / ".join(reference.names),
+        "reference_error": reference.error,
+        "contacts": reference.solution.contacts,
+        "simulated_s": reference.solution.times[-1],
+    }
+    for speed in FLOORS if panel == "exact" and phase != "drop" else ():
+        smooth = work.solve(work.problem(panel, phase, "smoothed", speed))
+        if smooth is not None:
+            floor = scaled_error(smooth.solution.states, reference.solution.states)
+            work.store.add(
+                {**base, "case": "floor", "method": "floor", "rung": f"v_s = {speed * 1e3:g} mm/s", "error": floor,
+                 "smoothing_speed": speed, "reference_error": smooth.error}
+            )  # fmt: skip
+    work.store.add({**base, "method": "reference", **columns})
+
+
+def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadline: float) -> None:
+    contender = work.contenders[task.method]
+    progress.step(f"{task.panel}, {task.phase}: {contender.title}, {task.rung.label}")
+    row = work.base(task.panel, task.phase, task.case, contender, task.rung)
+    if work.store.has((work.mode, task.panel, task.phase, task.case, task.method, task.rung.label)):
+        outcome.resumed += 1
+        return
+    if time.perf_counter() > deadline + work.compile_s:
+        outcome.left += 1
+        return
+    budget = BUDGETS[work.mode]
+    row["friction"] = friction_of(task.panel, task.case)
+    row["smoothing_speed"] = task.smoothing_speed if row["friction"] == "smoothed" else None
+    problem = work.problem(task.panel, task.phase, task.case, task.smoothing_speed)
+    if task.panel == RUB:
+        budget = budget._replace(solve_s=_RUB_BUDGET_S[work.mode])
+        settle = min(1.0, 0.25 * problem.duration_s)
+        columns = statistics_point(contender, task.rung, problem, budget, settle_s=settle)
+    else:
+        reference = work.reference(task.panel, task.phase, task.case)
+        if reference is None:
+            outcome.left += 1
+            return
+        columns = point(contender, task.rung, problem, reference, budget)
+    work.keep(row, columns)
+    outcome.measured += 1
+
+
+def _profile(work: _Work, scenes: int, outcome: Outcome, progress: Progress, deadline: float) -> None:
+    rivals = [one for one in work.contenders.values() if not one.known_failure and one.takes("exact")]
+    rivals = [one for one in rivals if not (work.mode == "quick" and one.name in ("scipy-radau", "scipy-bdf"))]
+    budget = BUDGETS[work.mode]._replace(solve_s=1.0 if work.mode == "quick" else 5.0)
+    for seed in range(scenes):
+        progress.step(f"profile, scene {seed + 1} of {scenes}")
+        scene = f"scene-{seed:03d}"
+        keys = {one.name: (work.mode, "profile", scene, "", one.name) for one in rivals}
+        waiting = [one for one in rivals if not work.store.has((*keys[one.name], "cheapest"))]
+        if not waiting:
+            outcome.resumed += 1
+            continue
+        if time.perf_counter() > deadline + work.compile_s:
+            outcome.left += 1
+            continue
+        problem = profile.draw_problem(seed)
+        reference = work.solve(problem)
+        # A chaotic draw has no pointwise reference: it is told, and counts for nobody.
+        blunt = reference is None or reference.error > profile.SHARP * profile.TARGET
+        for one in waiting:
+            row = {**work.base("profile", scene, "", one, None), "friction": "exact"}
+            if reference is None or blunt:
+                columns: Row = {"failure": "reference", "message": "no reference sharp enough: a chaotic draw",
+                                "reference_error": None if reference is None else reference.error}  # fmt: skip
+            else:
+                columns = profile.cheapest(one, problem, reference, budget)
+            # The rung found is no part of the key: a scene and a method are one point.
+            found = columns.pop("rung", "")
+            message = columns.get("message") or f"cheapest rung {found}"
+            work.keep(row, {**columns, "rung": "cheapest", "message": message})
+            outcome.measured += 1

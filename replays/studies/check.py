@@ -1,0 +1,89 @@
+"""How far a run can be trusted: the same scene again by finer steps, held against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from replays.studies.peers.problem import scaled_error
+from rig.engines import ENGINES
+from rig.kernels.signals import N_STATE
+from rig.scenes import Scene, parse_scene
+from rig.simulation import Simulation
+
+ANOTHER_BRANCH = 0.1
+"""Scaled error from which the two runs are no longer the same motion."""
+_ADAPTIVE = 1e-2
+"""An adaptive engine's tolerance is multiplied by this."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Two runs of a scene, compared.
+
+    Attributes:
+        finer: What the second run was made with, in words.
+        error: RMS distance of the scaled states at the truth's rate, as in the charts.
+        parted_s: First instant at which a scaled state is off by `ANOTHER_BRANCH`, or None.
+        contacts: Contacts in the run and in the finer one.
+    """
+
+    finer: str
+    error: float
+    parted_s: float | None
+    contacts: tuple[int, int]
+
+    @property
+    def wrong_branch(self) -> bool:
+        """Whether the run must be suspected to follow another branch than the model."""
+        return self.error > ANOTHER_BRANCH or abs(self.contacts[0] - self.contacts[1]) > 0.2 * max(self.contacts)
+
+    def line(self) -> str:
+        """The result in one line."""
+        if self.wrong_branch:
+            since = f" after {self.parted_s:g} s" if self.parted_s is not None else ""
+            return (
+                f"a wrong branch is suspected{since}: {self.finer} goes another way "
+                f"(error {self.error:.1e}, {self.contacts[0]} against {self.contacts[1]} contacts)"
+            )
+        return f"error {self.error:.1e} of 1 against {self.finer}; {self.contacts[0]} and {self.contacts[1]} contacts"
+
+
+def check(scene: Scene) -> Check:
+    """Run a scene twice without sensors, as it is and finer.
+
+    Args:
+        scene: The scene.
+    """
+    engine, method = scene.engine, ENGINES[scene.engine.name]
+    if method.tolerance:
+        finer = {"tolerance": engine.tolerance * _ADAPTIVE, "step_us": engine.step_us}
+        words = f"{engine.name} at tolerance {finer['tolerance']:.0e}"
+    else:
+        sample_us = 1_000_000 // scene.sensors.truth_rate_hz
+        step = max(n for n in range(1, max(1, engine.step_us // 2) + 1) if sample_us % n == 0)
+        finer = {"tolerance": engine.tolerance, "step_us": step}
+        words = f"{engine.name} at {step} us"
+    coarse, fine = _states(scene, {}), _states(scene, finer)
+    n = min(len(coarse[0]), len(fine[0]))
+    errors = np.array([scaled_error(a[None, :], b[None, :]) for a, b in zip(coarse[0][:n], fine[0][:n], strict=True)])
+    parted = np.flatnonzero(errors > ANOTHER_BRANCH)
+    return Check(
+        finer=words,
+        error=float(np.sqrt(np.mean(errors**2))),
+        parted_s=float(parted[0]) / scene.sensors.truth_rate_hz if len(parted) else None,
+        contacts=(coarse[1], fine[1]),
+    )
+
+
+def _states(scene: Scene, changes: dict[str, float]) -> tuple[np.ndarray, int]:
+    """States at the truth's rate, shape (n, N_STATE), and the number of contacts."""
+    plain = {"chain": "ideal", "groups": ["hammer"], "rate_hz": scene.sensors.truth_rate_hz}
+    document = scene.model_dump()
+    document["sensors"] |= plain
+    document["engine"] |= changes
+    simulation = Simulation(parse_scene({**document, "fidelity": "given"}))
+    frame = simulation.advance(simulation.end_tick)
+    every = simulation.tick_rate_hz // scene.sensors.truth_rate_hz // simulation.row_ticks
+    return frame.rows[::every, :N_STATE].copy(), int(simulation.health()["contacts"])

@@ -1,0 +1,189 @@
+"""What a search has found, with its evidence: a JSON document, and the pick as a scene stores it."""
+
+from __future__ import annotations
+
+import math
+import platform
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from replays.studies.ladder.measurement import Measurement
+from replays.studies.ladder.quantity import QUANTITIES, Value
+from replays.studies.ladder.search import Errors, Ladder
+from rig.scenes import Pick, PickedQuantity, pick_digests
+
+_PACKAGES = ("numba", "numpy", "scipy")
+
+
+def ladder_document(ladder: Ladder) -> dict[str, Any]:
+    """The whole search as a JSON document; what is infinite or has no value is null."""
+    scene = ladder.scene
+    picked, given, full = ladder.picked, ladder.given, ladder.full
+    assert picked is not None
+    assert given is not None
+    assert full is not None
+    return {
+        "scene": scene.name,
+        "duration_s": scene.duration_s,
+        "quantities": [
+            {
+                "name": name,
+                "unit": QUANTITIES[name].unit,
+                "phase": QUANTITIES[name].phase,
+                "how": QUANTITIES[name].title,
+                "errors_are_parts_of": QUANTITIES[name].scale_title,
+                "tolerance": tolerance,
+                "reference": _number(ladder.reference.values[name]),
+                "unlike": _number(ladder.unlike.values[name]),
+                "reference_error": _number(ladder.reference_errors[name]),
+                "as_given": _number(given.values[name]),
+                "as_given_error": _number(ladder.given_errors.total[name]) if ladder.given_errors else None,
+            }
+            for name, tolerance in ladder.tolerances.items()
+        ],
+        "reference": {
+            "engine": ladder.reference.rung.method,
+            "unlike": ladder.unlike.rung.method,
+            "model": ladder.reference.rung.model,
+        },
+        "steps": [
+            {
+                "stage": step.stage,
+                "label": step.label,
+                "model": step.measured.rung.model,
+                **_run(step.measured, scene.duration_s),
+                "cost": _run(step.cost, scene.duration_s) if step.cost else None,
+                "errors": _errors(step.errors),
+                "passes": step.passes,
+                "note": step.note,
+            }
+            for step in ladder.steps
+        ],
+        "pick": pick_of(ladder).model_dump(mode="json"),
+        "picked": _run(picked, scene.duration_s),
+        "given": _run(given, scene.duration_s),
+        "full": _run(full, scene.duration_s),
+        "all_engines_tried": ladder.complete,
+        "spent_s": ladder.spent_s,
+        "versions": versions(),
+    }
+
+
+def pick_of(ladder: Ladder) -> Pick:
+    """The pick as a scene stores it."""
+    picked, errors, given, full = ladder.picked, ladder.picked_errors, ladder.given, ladder.full
+    assert picked is not None
+    assert errors is not None
+    assert given is not None
+    assert full is not None
+    scene, rung = ladder.scene, picked.rung
+    scene_digest, parameters_digest, code_digest = pick_digests(scene)
+    found = versions()
+    return Pick(
+        **rung.levels.model_dump(),
+        drive=rung.drive,  # pyright: ignore[reportArgumentType]
+        sensors=ladder.sensors,  # pyright: ignore[reportArgumentType]
+        engine=rung.engine,
+        step_us=rung.step_us,
+        engine_tolerance=rung.tolerance,
+        quantities=tuple(
+            PickedQuantity(
+                quantity=name,
+                unit=QUANTITIES[name].unit,
+                tolerance=tolerance,
+                value=_short(picked.values[name]),
+                reference=_short(ladder.reference.values[name]),
+                model_error=_digits(errors.model[name]),
+                numerical_error=_digits(errors.numerical[name]),
+                total_error=_digits(errors.total[name]),
+                reference_error=_digits(ladder.reference_errors[name]),
+            )
+            for name, tolerance in ladder.tolerances.items()
+        ),
+        wall_s=_digits(picked.wall_s),
+        wall_given_s=_digits(given.wall_s),
+        wall_full_s=_digits(full.wall_s),
+        reference_engine=ladder.reference.rung.method,
+        unlike_engine=ladder.unlike.rung.method,
+        date=found["date"],
+        rig=found["rig"],
+        commit=found["commit"],
+        machine=found["machine"],
+        seed=scene.seed,
+        scene_digest=scene_digest,
+        parameters_digest=parameters_digest,
+        code_digest=code_digest,
+    )
+
+
+def versions() -> dict[str, str]:
+    """Date, machine, commit, and the versions that figures hang on."""
+    return {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "rig": version("rotor-stator-rig"),
+        "commit": _commit(),
+        "machine": f"{platform.processor() or platform.machine()}, {platform.system()}",
+        "python": platform.python_version(),
+        **{name: version(name) for name in _PACKAGES},
+    }
+
+
+def _commit() -> str:
+    """Commit of the sources, "+" behind it where they have changed since; empty outside a repository."""
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(
+            ["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
+
+    try:
+        return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def _run(measured: Measurement, simulated_s: float) -> dict[str, Any]:
+    return {
+        "engine": measured.rung.method,
+        "values": {name: _number(value) for name, value in measured.values.items()},
+        "wall_s": _number(measured.wall_s),
+        "wall_least_s": _number(measured.spread_s[0]),
+        "wall_most_s": _number(measured.spread_s[1]),
+        "runs": measured.runs,
+        "steps": measured.steps,
+        "ns_a_step": _number(measured.step_ns(simulated_s)),
+        "energy_residual_share": _number(measured.residual_share),
+    }
+
+
+def _errors(errors: Errors) -> dict[str, dict[str, Value | None]]:
+    kinds = (("model", errors.model), ("numerical", errors.numerical), ("total", errors.total))
+    return {kind: {name: _number(value) for name, value in values.items()} for kind, values in kinds}
+
+
+def _number(value: Value) -> Value | None:
+    return value if isinstance(value, str) or math.isfinite(value) else None
+
+
+def _digits(value: float) -> float:
+    # The platform's last digits are no evidence.
+    return float(f"{value:.3g}")
+
+
+def _short(value: Value) -> Value:
+    return value if isinstance(value, str) else float(f"{value:.8g}")
+
+
+def python_line() -> str:
+    """The machine in one line, for the chart."""
+    found = versions()
+    packages = ", ".join(f"{name} {found[name]}" for name in _PACKAGES)
+    commit = f", commit {found['commit']}" if found["commit"] else ""
+    return (
+        f"rig {found['rig']}{commit}, {found['date']}; {found['machine']}; Python {sys.version.split()[0]}, {packages}"
+    )

@@ -1,0 +1,252 @@
+"""A hammer blow on a changed rig, and the numbers that come of it: what every scan of the report is made of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from replays.studies.ladder.quantity import QUANTITIES, Trace
+from rig.errors import InputError
+from rig.offline import Run, simulate
+from rig.parameters import DEFAULT_SET, load_parameters
+from rig.scenes import Scene, load_scene
+
+FORCE_N = 100.0
+"""Peak of the blow: the paper, section 6.2."""
+SPEED_HZ = 6.2
+CENTRED_BY = "ring.off_centre_y"
+"""A name of this report alone [mm]: the ring's height over where it is centred on the shaft at rest."""
+BANDWIDTH = "transducer.bandwidth"
+"""A name of this report alone [Hz]: corner of a low-pass of order 2 on the reactions; left out, there is none."""
+HAMMER_MS = "hammer.duration"
+"""A name of this report alone [ms]: length of the blow."""
+BLOW_AT = "hammer.at"
+"""A name of this report alone [s]: when it comes; the shaft's turn at the blow decides which bounces follow."""
+RATE_HZ = 10_000
+
+
+@dataclass(frozen=True)
+class Blow:
+    """What is run.
+
+    Attributes:
+        label: Names the run in a table.
+        parameters: The parameter set.
+        changes: Of scene or parameters by dotted key in their own units, or of the names above.
+        speed_hz: Speed of the drive [Hz].
+        force_n: Peak of the half-sine [N].
+        duration_s: Of the run [s].
+    """
+
+    label: str = ""
+    parameters: str = DEFAULT_SET
+    changes: dict[str, Any] = field(default_factory=dict)
+    speed_hz: float = SPEED_HZ
+    force_n: float = FORCE_N
+    duration_s: float = 1.2
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The numbers of a blow; those of the whirl are nan where it does not whirl.
+
+    Attributes:
+        outcome: The motion at the end, in a word.
+        whirl_hz: Phase slope of the shaft in the ring [Hz], backward negative.
+        spin_hz: Of the shaft while it whirls [Hz].
+        normal_n: Mean normal force while it whirls [N].
+        ripple_n: RMS of the normal force about that [N].
+        reaction_x_n: Amplitude of P_E - P_W while it whirls [N].
+        reaction_y_n: Amplitude of P_N - P_S while it whirls [N].
+        depth_m: Mean penetration while it whirls [m].
+        peak_normal_n: Largest normal force of the whole run, by the engine's own steps [N].
+        peak_x_n: Largest |P_E - P_W| of the whole run [N].
+        peak_y_n: Largest |P_N - P_S| of the whole run [N].
+        contacts: Contacts begun.
+        roll_s: From the blow until it rolls for good [s].
+        slope_n_s: Largest rate of P_E - P_W while it whirls [N/s].
+    """
+
+    outcome: str
+    whirl_hz: float = math.nan
+    spin_hz: float = math.nan
+    normal_n: float = math.nan
+    ripple_n: float = math.nan
+    reaction_x_n: float = math.nan
+    reaction_y_n: float = math.nan
+    depth_m: float = math.nan
+    peak_normal_n: float = math.nan
+    peak_x_n: float = math.nan
+    peak_y_n: float = math.nan
+    contacts: int = 0
+    roll_s: float = math.nan
+    slope_n_s: float = math.nan
+
+    @property
+    def whirls(self) -> bool:
+        """Whether it ends in full annular backward whirl."""
+        return self.outcome == "backward whirl"
+
+
+def blow_scene(blow: Blow) -> Scene:
+    """The scene of a blow: ideal sensors, few rows."""
+    changes = dict(blow.changes)
+    hammer_ms, at_s = float(changes.pop(HAMMER_MS, 5.0)), float(changes.pop(BLOW_AT, 0.02))
+    changes.pop(BANDWIDTH, None)
+    above_mm = changes.pop(CENTRED_BY, None)
+    if above_mm is not None:
+        changes["ring.offset_y"] = _centre_mm(blow, changes) + above_mm
+    return load_scene(
+        "hammer",
+        {
+            "parameters": blow.parameters,
+            "duration_s": blow.duration_s,
+            "drive.speed_hz": blow.speed_hz,
+            "sensors.chain": "ideal",
+            "sensors.groups": ["hammer"],
+            "sensors.rate_hz": RATE_HZ,
+            "commands": [
+                {"at_s": at_s, "command": "hammer", "force_n": blow.force_n, "duration_ms": hammer_ms, "direction": "x"}
+            ],
+            **changes,
+        },
+    )
+
+
+def _centre_mm(blow: Blow, changes: dict[str, Any]) -> float:
+    """Height at which the ring is centred on the shaft at rest [mm]."""
+    from rig.model import build_model
+
+    own = load_parameters(blow.parameters)
+    return build_model(own.override({key: v for key, v in changes.items() if key in own.entries})).sag * 1e3
+
+
+def outcome(blow: Blow) -> Outcome:
+    """Run a blow and read its numbers; a rig that cannot be built is an outcome of its own."""
+    try:
+        scene = blow_scene(blow)
+        run = simulate(scene)
+    except InputError:
+        return Outcome("cannot be built")
+    return read(run, at_s=scene.commands[0].at_s, bandwidth_hz=blow.changes.get(BANDWIDTH))
+
+
+def trace_of(run: Run) -> Trace:
+    """A run as the ladder's quantities read it."""
+    contact = run.simulation.model.constants.contact
+    return Trace(
+        times_s=run.times_s,
+        rows=run.signals,
+        peak_force=float(run.simulation.health()["peak_normal_force_n"]),
+        clearance=contact.clearance,
+        surface_radius=run.simulation.model.constants.shaft.radius,
+        first_impact_s=math.nan,
+    )
+
+
+def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome:
+    """The numbers of a finished run.
+
+    Args:
+        run: The run.
+        at_s: When the blow came [s].
+        bandwidth_hz: Corner of the low-pass on the reactions [Hz]; None: they are read as they are.
+    """
+    trace = trace_of(run)
+
+    def number(name: str) -> float:
+        return float(QUANTITIES[name].read(trace))
+
+    kind = str(QUANTITIES["outcome"].read(trace))
+    pair_x, pair_y = (reaction(run, a, b, bandwidth_hz=bandwidth_hz) for a, b in (("P_E", "P_W"), ("P_N", "P_S")))
+    whole = {
+        "peak_normal_n": trace.peak_force,
+        "peak_x_n": float(np.abs(pair_x).max()),
+        "peak_y_n": float(np.abs(pair_y).max()),
+        "contacts": int(run.simulation.health()["contacts"]),
+    }
+    if kind != "backward whirl":
+        return Outcome(kind, **whole)
+    settled = slice(-trace.settled_rows, None)
+    return Outcome(
+        kind,
+        whirl_hz=number("whirl_frequency"),
+        spin_hz=number("spin"),
+        normal_n=number("mean_normal_force"),
+        ripple_n=number("force_ripple"),
+        reaction_x_n=float(np.ptp(pair_x[settled]) / 2),
+        reaction_y_n=float(np.ptp(pair_y[settled]) / 2),
+        depth_m=float(trace.settled("penetration").mean()),
+        roll_s=number("time_to_roll") - at_s,
+        slope_n_s=float(np.abs(np.diff(pair_x[settled])).max() * RATE_HZ),
+        **whole,
+    )
+
+
+def reaction(run: Run, plus: str, minus: str, *, bandwidth_hz: float | None = None) -> np.ndarray:
+    """Reaction of a direction: the difference of its opposed transducers [N], shape (n,).
+
+    Args:
+        run: The run.
+        plus: One transducer.
+        minus: The opposed one.
+        bandwidth_hz: Corner of a Butterworth low-pass of order 2 [Hz], or None.
+    """
+    pair = run[plus] - run[minus]
+    if bandwidth_hz is None:
+        return pair
+    from scipy.signal import butter, sosfilt
+
+    rate_hz = 1.0 / (run.times_s[1] - run.times_s[0])
+    sections: Any = butter(2, bandwidth_hz, fs=rate_hz, output="sos")
+    return np.asarray(sosfilt(sections, pair))
+
+
+def outcomes(
+    blows: Iterable[Blow], *, processes: int, progress: Callable[[str], None] | None = None
+) -> Iterator[Outcome]:
+    """Run many blows, in order.
+
+    Args:
+        blows: What to run.
+        processes: How many at a time; 1 for this process alone.
+        progress: Told each label when it is done.
+    """
+    blows = list(blows)
+    tell = progress or (lambda _: None)
+    if processes == 1:
+        for blow in blows:
+            result = outcome(blow)
+            tell(blow.label)
+            yield result
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_end_with_parent)
+    try:
+        for blow, result in zip(blows, pool.map(outcome, blows, chunksize=4), strict=True):
+            tell(blow.label)
+            yield result
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """A worker would wait for work for ever when the process that started it was killed."""
+    import os
+    from multiprocessing import parent_process
+    from threading import Thread
+
+    parent = parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()

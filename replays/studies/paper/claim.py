@@ -1,0 +1,253 @@
+"""The paper's conclusion as a claim: what moves the force toward the measured one, and what does not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from replays.report.canvas import BLUE, GREEN, ORANGE, RED, SKY, draw_grid, new_figure
+from replays.studies.paper.blow import BANDWIDTH, Blow, Outcome
+from replays.studies.paper.spread import column, free_values, one_at_a_time, phases, rank_correlation
+from rig.parameters import load_parameters
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MEASURED_N = 500.0
+"""Where the axis of the measured forces ends, Fig. 15(c, d): the only number that the text has of them."""
+HOUSE_KEYS = (
+    "house.inner_beam_stiffness", "house.outer_beam_stiffness", "house.pair_stiffness_vertical",
+    "house.pair_stiffness_horizontal", "house.inner_beam_damping", "house.outer_beam_damping",
+)  # fmt: skip
+SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Factors on the stiffness and damping of the houses' supports: more is less mobile."""
+BANDWIDTHS_HZ = (50.0, 100.0, 200.0, 500.0, 1000.0, 4900.0)
+LAWS = ("exact", "lankarani-nikravesh", "none", "hunt-crossley", "flores", "kelvin-voigt")
+
+Groups = dict[str, list[Blow]]
+Results = dict[str, list[Outcome]]
+
+
+def correction_keys() -> list[str]:
+    """Parameters in which `corrected` differs from `as-printed`."""
+    printed, corrected = (load_parameters(name).entries for name in ("as-printed", "corrected"))
+    return [key for key, entry in corrected.items() if entry.value != printed[key].value]
+
+
+def claim_groups(*, ensemble: int) -> Groups:
+    """Every blow that the claim is tested with, by group; a group of one thing holds it at `ensemble` phases.
+
+    Args:
+        ensemble: Places of the shaft's turn.
+    """
+    corrected = load_parameters("corrected").entries
+    base = Blow(label="corrected")
+    groups: Groups = {
+        "base corrected": phases(base, ensemble),
+        "base as-printed": phases(Blow(label="as-printed", parameters="as-printed"), ensemble),
+    }
+    for key in correction_keys():
+        changed = Blow(label=key, parameters="as-printed", changes={key: corrected[key].value})
+        groups[f"correction {key}"] = phases(changed, ensemble)
+    for scale in SCALES:
+        changes = {key: float(corrected[key].value) * scale for key in HOUSE_KEYS}
+        groups[f"mobility {scale:g}"] = phases(replace(base, label=f"house x {scale:g}", changes=changes), ensemble)
+    for name, changed in alternatives().items():
+        groups[f"alternative {name}"] = phases(replace(changed, label=name), ensemble)
+    for law in LAWS:
+        changes = {"contact.damping_factor": law}
+        groups[f"law {law}"] = phases(replace(base, label=law, changes=changes), ensemble)
+    groups["bandwidth"] = [replace(base, label=f"{hz:g} Hz", changes={BANDWIDTH: hz}) for hz in BANDWIDTHS_HZ]
+    for entry, low, high in one_at_a_time():
+        # Where the blow falls in the turn is a value of its own: with phases it would be lost.
+        alone = entry.key == "hammer.at"
+        groups[f"low {entry.key}"] = [low] if alone else phases(low, ensemble)
+        groups[f"high {entry.key}"] = [high] if alone else phases(high, ensemble)
+    return groups
+
+
+def alternatives() -> dict[str, Blow]:
+    """Other readings of the model and of printed values."""
+    return {
+        "house rigid": Blow(changes={"model.stator": "rigid"}),
+        "outer house fixed": Blow(changes={"model.stator": "inner-house"}),
+        "houses of dtu-2019": Blow(parameters="dtu-2019"),
+        "restitution 0.5": Blow(changes={"contact.restitution": 0.5}),
+        "friction 0.15": Blow(changes={"contact.friction": 0.15}),
+        "drive held at 6.2 Hz": Blow(changes={"drive.mode": "ideal"}),
+    }
+
+
+def median(results: list[Outcome], name: str) -> float:
+    """Over a group, of the runs that have the number; nan where none has."""
+    values = column(results, name)
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else math.nan
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One line of the tornado: what the force becomes by a change, or at both ends of a range."""
+
+    name: str
+    kind: str
+    values: tuple[float, ...]
+
+    @property
+    def width(self) -> float:
+        """Between the ends and the base, given with them."""
+        there = [value for value in self.values if math.isfinite(value)]
+        return max(there) - min(there) if there else 0.0
+
+
+COLOURS = {"assumed value": ORANGE, "correction": BLUE, "house": GREEN, "other reading": SKY}
+
+
+def bars(results: Results, quantity: str) -> list[Bar]:
+    """All lines of the tornado for one number, widest first.
+
+    A correction goes from `as-printed` to it alone put right; all else from `corrected`.
+    """
+    base, printed = (median(results[f"base {name}"], quantity) for name in ("corrected", "as-printed"))
+
+    def of(group: str) -> float:
+        return median(results[group], quantity)
+
+    found = [
+        Bar(entry.key, "assumed value", (of(f"low {entry.key}"), base, of(f"high {entry.key}")))
+        for entry in free_values()
+    ]
+    found += [Bar(f"{key} put right", "correction", (printed, of(f"correction {key}"))) for key in correction_keys()]
+    found.append(Bar("all put right", "correction", (printed, base)))
+    found.append(Bar("house, 1/10 to 10 x as stiff", "house", (of("mobility 0.1"), base, of("mobility 10"))))
+    found += [Bar(name, "other reading", (base, of(f"alternative {name}"))) for name in alternatives()]
+    found.append(Bar("contact law", "other reading", tuple(of(f"law {law}") for law in LAWS)))
+    return sorted(found, key=lambda bar: -bar.width)
+
+
+def toward_measured(found: list[Bar]) -> list[Bar]:
+    """Lines of which an end is no higher than what was measured."""
+    return [bar for bar in found if any(value <= MEASURED_N for value in bar.values)]
+
+
+def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
+    """What each change makes of the force in whirl and of the highest reaction."""
+    figure = new_figure(
+        (14.0, 8.6), "What moves the force: one change at a time (ranges of assumed values are assumed)", title_size=12
+    )
+    panels = figure.subplots(1, 2)
+    shown = {
+        "reaction_x_n": ("E - W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
+        "peak_x_n": ("highest E - W in the impacts, median of the phases [N]", 5000.0, "end of the simulated axis"),
+    }
+    for axes, (quantity, (label, level, text)) in zip(panels, shown.items(), strict=True):
+        widest = bars(results, quantity)[:20][::-1]
+        for row, bar in enumerate(widest):
+            there = [value for value in bar.values if math.isfinite(value)]
+            if not there:
+                continue
+            # A hair of width for a bar that does not move at all.
+            axes.barh(row, max(bar.width, 0.5), left=min(there), height=0.62, color=COLOURS[bar.kind])
+            for end, mark in ((bar.values[0], "<"), (bar.values[-1], ">")):
+                if bar.kind != "other reading" and math.isfinite(end):
+                    axes.plot(end, row, marker="|" if mark == "<" else "o", color="0.2", ms=5, mew=1.6)
+        axes.set_yticks(range(len(widest)), [bar.name for bar in widest], fontsize=8.5)
+        values = column(spread, quantity)
+        values = values[np.isfinite(values)]
+        if len(values):
+            low, middle, high = np.percentile(values, [5, 50, 95])
+            axes.axvspan(
+                low,
+                high,
+                color="0.93",
+                zorder=0,
+                label=f"all assumed values at once: {low:.0f} to {high:.0f} N (5-95 %)",
+            )
+            axes.axvline(middle, color="0.6", lw=1.0, zorder=0)
+        axes.axvline(median(results["base corrected"], quantity), color="black", lw=1.0, label="corrected")
+        axes.axvline(median(results["base as-printed"], quantity), color=BLUE, lw=1.0, ls=":", label="as-printed")
+        axes.axvline(level, color=RED, lw=1.2, ls=(0, (4, 3)), label=f"{text}, {level:g} N")
+        axes.set(xlabel=label)
+        ends = [level, *(value for bar in widest for value in bar.values if math.isfinite(value))]
+        room = 0.05 * (max(ends) - min(ends))
+        axes.set_xlim(min(ends) - room, max(ends) + room)
+        draw_grid(axes)
+        # Below the picture, where it hides nothing.
+        axes.legend(fontsize=7.5, loc="upper center", bbox_to_anchor=(0.3, -0.08), ncols=2, frameon=False)
+    from matplotlib.patches import Patch
+
+    handles: list[Any] = [Patch(color=colour, label=kind) for kind, colour in COLOURS.items()]
+    handles += _end_marks()
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+    return figure
+
+
+def _end_marks() -> list[Any]:
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color="0.2", marker="|", ls="none", label="low end, or as printed"),
+        Line2D([], [], color="0.2", marker="o", ls="none", ms=5, label="high end, or put right"),
+    ]
+
+
+def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
+    """Distributions with all assumed values spread at once, and what each value has to do with them."""
+    figure = new_figure((14.0, 4.6), f"All assumed values at once: Latin hypercube, {len(spread)} runs", title_size=12)
+    panels = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.15))
+    shown = {
+        "reaction_x_n": ("E - W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
+        "peak_x_n": ("highest E - W [N]", None, ""),
+        "whirl_hz": ("whirl frequency [Hz]", -83.7, "the paper, Fig. 14"),
+    }
+    for axes, (name, (label, paper, text)) in zip(panels[:3], shown.items(), strict=True):
+        values = column(spread, name)
+        values = values[np.isfinite(values)]
+        if name != "peak_x_n":
+            values = values[[result.whirls for result in spread if math.isfinite(getattr(result, name))]]
+        axes.hist(values, bins=30, color=SKY)
+        if paper is not None:
+            axes.axvline(paper, color=RED, ls=(0, (4, 3)), lw=1.2, label=f"{text}, {paper:g}")
+            axes.legend(fontsize=8)
+        axes.set(xlabel=label, ylabel="runs")
+    entries = free_values()
+    force = rank_correlation(parts, column(spread, "reaction_x_n"))
+    peak = rank_correlation(parts, column(spread, "peak_x_n"))
+    rows = np.arange(len(entries))
+    panels[3].barh(rows + 0.2, np.nan_to_num(force), height=0.38, color=BLUE, label="force in whirl")
+    panels[3].barh(rows - 0.2, np.nan_to_num(peak), height=0.38, color=ORANGE, label="highest force")
+    panels[3].set_yticks(rows, [entry.key for entry in entries], fontsize=7.5)
+    panels[3].invert_yaxis()
+    panels[3].set(xlabel="rank correlation", xlim=(-1.05, 1.05))
+    panels[3].legend(fontsize=8, loc="lower left")
+    draw_grid(*panels)
+    return figure
+
+
+def draw_mobility(results: Results) -> Figure:
+    """Peak force, impacts, time to roll and whirl force over the stiffness of the houses' supports."""
+    figure = new_figure(
+        (14.0, 4.0), "Mobility of the houses: stiffness and damping of all supports scaled", title_size=12
+    )
+    panels = figure.subplots(1, 4)
+    shown = {
+        "peak_normal_n": "highest normal force [N]",
+        "contacts": "impacts until it whirls",
+        "roll_s": "from the blow until it rolls [s]",
+        "reaction_x_n": "E - W amplitude in whirl [N]",
+    }
+    for axes, (name, label) in zip(panels, shown.items(), strict=True):
+        for scale in SCALES:
+            values = column(results[f"mobility {scale:g}"], name)
+            axes.semilogx([scale] * len(values), values, "o", color=SKY, ms=4)
+        middle = [median(results[f"mobility {scale:g}"], name) for scale in SCALES]
+        axes.semilogx(SCALES, middle, color=BLUE, lw=1.6, label="median of the phases")
+        axes.axhline(median(results["alternative house rigid"], name), color="0.5", ls=":", lw=1.4, label="rigid")
+        axes.set(xlabel="support over the corrected one", ylabel=label)
+        axes.margins(y=0.25)
+        axes.legend(fontsize=8, loc="upper left")
+    draw_grid(*panels)
+    return figure

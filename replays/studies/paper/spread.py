@@ -1,0 +1,142 @@
+"""How far the assumed values may be off together: a Latin hypercube over all of them, and what comes of it."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from replays.studies.paper.blow import BLOW_AT, Blow, Outcome
+from rig.parameters import DEFAULT_SET, load_parameters
+
+SEED = 2013
+
+
+class Assumed(BaseModel):
+    """One assumed value and the range that it may be in, assumed as well."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    key: str
+    name: str = Field(default="", alias="as")
+    """What a blow takes it by, where that is not the key."""
+    low: float = math.nan
+    high: float = math.nan
+    log: bool = False
+    whole: bool = False
+    tied: str = ""
+    """Follows another value."""
+    ratio: float = 1.0
+    """That value over this one."""
+    unit: str = ""
+    value: float | None = None
+    """What the report takes elsewhere, where no parameter set says it."""
+    why: str
+
+    @property
+    def taken_as(self) -> str:
+        """The name in a blow's changes."""
+        return self.name or self.key
+
+    def at(self, part: float) -> float:
+        """The value at a part of the range, 0 to 1."""
+        if self.log:
+            return float(self.low * (self.high / self.low) ** part)
+        value = self.low + part * (self.high - self.low)
+        return float(min(self.high, math.floor(self.low + part * (self.high - self.low + 1)))) if self.whole else value
+
+
+@cache
+def assumed_values() -> tuple[Assumed, ...]:
+    """All of them, from the data file."""
+    import tomllib
+
+    document = tomllib.loads(files("replays.studies.paper").joinpath("spread.toml").read_text(encoding="utf-8"))
+    return tuple(Assumed.model_validate(entry) for entry in document["value"])
+
+
+def free_values() -> tuple[Assumed, ...]:
+    """Those that no other ties."""
+    return tuple(entry for entry in assumed_values() if not entry.tied)
+
+
+def present(entry: Assumed) -> str:
+    """What the default set, or this report, takes, with its unit."""
+    known = load_parameters(DEFAULT_SET).entries.get(entry.key)
+    value = known.value if known else entry.value
+    unit = known.unit if known and not entry.unit else entry.unit
+    return f"{value:g} {unit}".strip() if isinstance(value, float | int) else str(value)
+
+
+def changes(values: dict[str, float]) -> dict[str, Any]:
+    """The changes of a blow for free values by key, the tied ones with them."""
+    found: dict[str, Any] = {}
+    for entry in assumed_values():
+        if entry.tied and entry.tied in values:
+            found[entry.taken_as] = values[entry.tied] / entry.ratio
+        elif entry.key in values:
+            found[entry.taken_as] = values[entry.key]
+    return found
+
+
+def one_at_a_time() -> list[tuple[Assumed, Blow, Blow]]:
+    """Each value at both ends of its range, the others as they are."""
+    return [
+        (
+            entry,
+            Blow(label=f"{entry.key} low", changes=changes({entry.key: entry.at(0.0)})),
+            Blow(label=f"{entry.key} high", changes=changes({entry.key: entry.at(1.0)})),
+        )
+        for entry in free_values()
+    ]
+
+
+def hypercube(samples: int) -> tuple[np.ndarray, list[Blow]]:
+    """Latin hypercube over all free values: parts of their ranges, shape (samples, values), and the blows."""
+    from scipy.stats import qmc
+
+    entries = free_values()
+    parts = qmc.LatinHypercube(d=len(entries), rng=np.random.default_rng(SEED)).random(samples)
+    blows = [
+        Blow(
+            label=f"spread {number}",
+            changes=changes({entry.key: entry.at(float(part)) for entry, part in zip(entries, row, strict=True)}),
+        )
+        for number, row in enumerate(parts, 1)
+    ]
+    return parts, blows
+
+
+def phases(blow: Blow, count: int) -> list[Blow]:
+    """The same blow at `count` places of the shaft's turn: impacts are chaotic, one run of them says little."""
+    return [
+        Blow(
+            label=blow.label,
+            parameters=blow.parameters,
+            changes={**blow.changes, BLOW_AT: round(0.02 + k / count / blow.speed_hz, 4)},
+            speed_hz=blow.speed_hz,
+            force_n=blow.force_n,
+            duration_s=blow.duration_s,
+        )
+        for k in range(count)
+    ]
+
+
+def column(results: list[Outcome], name: str) -> np.ndarray:
+    """One number of many outcomes, nan where they have none, shape (n,)."""
+    return np.array([float(getattr(result, name)) for result in results])
+
+
+def rank_correlation(parts: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Spearman's rank correlation of each input with a number, over the runs that have one, shape (inputs,)."""
+    from scipy.stats import spearmanr
+
+    there = np.isfinite(values)
+    if there.sum() < 4 or np.ptp(values[there]) == 0.0:
+        return np.full(parts.shape[1], math.nan)
+    found: list[Any] = [spearmanr(parts[there, k], values[there]) for k in range(parts.shape[1])]
+    return np.array([float(each.statistic) for each in found])

@@ -1,0 +1,88 @@
+"""What the paper states, as data, and the verdict of a number on it."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from functools import cache
+from importlib.resources import files
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from rig.parameters import ParameterSet
+
+Verdict = Literal["agrees", "differs", "cannot be judged"]
+SETS = ("as-printed", "corrected")
+"""The parameter sets that are held against the paper, in the order of the tables."""
+_TEXT = 5e-3
+"""How far a printed value may be off as it is rounded."""
+
+
+class Statement(BaseModel):
+    """One thing that the paper states."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    quantity: str
+    place: str
+    says: str
+    kind: Literal["text", "axis", "claim"]
+    paper: str
+    unit: str
+    low: float = math.nan
+    high: float = math.nan
+    why: str = ""
+
+    def verdict(self, value: float) -> Verdict:
+        """Of one number on this."""
+        if not math.isfinite(self.low) or not math.isfinite(self.high):
+            return "cannot be judged"
+        return "agrees" if self.low <= value <= self.high else "differs"  # nan, a motion that did not come, differs
+
+
+class Printed(BaseModel):
+    """One printed value of a parameter, in SI."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    key: str
+    symbol: str
+    place: str
+    value: float
+    unit: str
+
+    def verdict(self, parameters: ParameterSet) -> Verdict:
+        """Whether a set takes the printed value."""
+        return "agrees" if abs(parameters[self.key] / self.value - 1.0) < _TEXT else "differs"
+
+
+@cache
+def _document() -> dict[str, list[dict[str, object]]]:
+    return tomllib.loads(files("replays.studies.paper").joinpath("statements.toml").read_text(encoding="utf-8"))
+
+
+def statements() -> tuple[Statement, ...]:
+    """All statements on figures and text."""
+    return tuple(Statement.model_validate(entry) for entry in _document()["statement"])
+
+
+def claims() -> tuple[Statement, ...]:
+    """Claims that scans of the corrected rig test."""
+    return tuple(Statement.model_validate(entry) for entry in _document()["claim"])
+
+
+def printed_values() -> tuple[Printed, ...]:
+    """Tables 1 and 2, and the values in the text."""
+    return tuple(Printed.model_validate(entry) for entry in _document()["printed"])
+
+
+def number(value: float) -> str:
+    """A number as the tables show it."""
+    if not math.isfinite(value):
+        return "none"
+    if value != 0.0 and not 1e-3 <= abs(value) < 1e5:
+        return f"{value:.3g}"
+    if abs(value) >= 1000.0:
+        return f"{value:.0f}"
+    return f"{value:.4g}"

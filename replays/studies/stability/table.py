@@ -1,0 +1,51 @@
+"""All trials of all engines, one cell after the other, with what is known of other people's solvers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from replays.studies.stability.cell import Cell
+from replays.studies.stability.peers import peer_cells
+from replays.studies.stability.trials import TRIALS
+from rig.engines import ENGINES
+from rig.errors import InputError
+
+
+def chosen_trials(only: str | None) -> list[str]:
+    """Trials by names joined by commas; None for all.
+
+    Raises:
+        InputError: There is no such trial.
+    """
+    return _chosen("--only", only, list(TRIALS))
+
+
+def chosen_engines(names: str | None) -> list[str]:
+    """Engines by names joined by commas; None for all.
+
+    Raises:
+        InputError: There is no such engine.
+    """
+    return _chosen("--engines", names, list(ENGINES))
+
+
+def run_trials(trials: list[str], engines: list[str], *, quick: bool) -> Iterator[Cell]:
+    """Cells as they come, trial by trial: first the engines, then the peers."""
+    for trial in trials:
+        for engine in engines:
+            yield from TRIALS[trial].run(engine, quick)
+        yield from peer_cells(trial)
+
+
+def _chosen(field: str, names: str | None, known: list[str]) -> list[str]:
+    if names is None:
+        return known
+    asked = [name.strip() for name in names.split(",") if name.strip()]
+    by_lower = {name.lower(): name for name in known}
+    for name in asked:
+        if name.lower() not in by_lower:
+            raise InputError(field, f"one or more of {', '.join(known)}", name)
+    wanted = {by_lower[name.lower()] for name in asked}
+    if not wanted:
+        raise InputError(field, f"one or more of {', '.join(known)}", names)
+    return [name for name in known if name in wanted]

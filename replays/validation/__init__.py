@@ -1,8 +1,0 @@
-"""A recording held against the model: bit by bit, then by declared criteria, and where they fail, what explains it."""
-
-from __future__ import annotations
-
-from replays.validation.criteria import Criteria, load_criteria
-from replays.validation.outcome import Validation, validate
-
-__all__ = ["Criteria", "Validation", "load_criteria", "validate"]
