@@ -43,6 +43,24 @@ def elastic_force(penetration, stiffness, exponent):
 
 
 @stage
+def damping_per_speed(onset_speed, contact):
+    """What the elastic force grows by, per speed of the penetration [s/m]; v0 [m/s], floored."""
+    return contact.damping_factor / onset_speed
+
+
+@stage
+def damping_ratio(rate, onset_speed, contact):
+    """Force without viscous damping over its elastic part, 1 + c delta'/v0 [1]."""
+    return 1.0 + contact.damping_factor * rate / onset_speed
+
+
+@stage
+def penetration_of(distance, contact):
+    """Penetration of the shaft into the ring [m] by the distance of their centres [m]; negative is the gap."""
+    return distance - contact.clearance
+
+
+@stage
 def normal_force(penetration, rate, onset_speed, contact):
     """Compliant normal force, eq. 44 and its family.
 
@@ -62,7 +80,7 @@ def normal_force(penetration, rate, onset_speed, contact):
     if penetration <= 0.0:
         return 0.0, 0.0
     elastic = elastic_force(penetration, contact.stiffness, contact.exponent)
-    force = elastic * (1.0 + contact.damping_factor * rate / onset_speed) + contact.viscous_damping * rate
+    force = elastic * damping_ratio(rate, onset_speed, contact) + contact.viscous_damping * rate
     return max(0.0, force), elastic
 
 
@@ -114,7 +132,7 @@ def ring_force(ex, ey, vx, vy, surface_speed, onset_speed, law, phase, contact):
         contact: Constants of the contact.
     """
     distance = math.sqrt(ex * ex + ey * ey)
-    penetration = distance - contact.clearance
+    penetration = penetration_of(distance, contact)
     if distance == 0.0:
         return RingForce(0.0, 0.0, 0.0, 0.0, 0.0, penetration, 0.0, 0.0, 1.0, 0.0)
     per_distance = 1.0 / distance

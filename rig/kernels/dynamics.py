@@ -44,6 +44,43 @@ class Motion(NamedTuple):
 
 
 @stage
+def turning_of(levels, state, pose):
+    """Gamma' beta', and Gamma'^2 sin b cos b, of large tilts [rad^2/s^2]."""
+    if levels.euler:
+        return state.dG * state.db, state.dG * state.dG * pose.sb * pose.cb
+    return 0.0, 0.0
+
+
+@stage
+def share_of(levels, pose, turning, ddG):
+    """Rate of Gamma' sin b, the share of Gamma' along the shaft, by which the spin differs from theta' [rad/s^2]."""
+    if levels.euler:
+        return ddG * pose.sb + turning * pose.cb
+    return 0.0
+
+
+@stage
+def spin_of(constants, inputs, share, drive, Ft):
+    """Acceleration of the spin [rad/s^2] and torque of the drive [N m]."""
+    shaft = constants.shaft
+    # Reciprocals of constants leave the loop; divisions would not.
+    per_Izz = 1.0 / shaft.polar_inertia
+    if inputs.ideal_drive:
+        dw = inputs.speed_slope + share
+        return dw, shaft.polar_inertia * dw + shaft.radius * Ft
+    return (drive - shaft.radius * Ft) * per_Izz, drive
+
+
+@stage
+def inner_house_of(constants, stator, Fx, Fy):
+    """Acceleration of the inner house, on which the ring's force acts as well [m/s^2]."""
+    if constants.levels.inner_house:
+        per_inner = 1.0 / constants.house.inner_mass
+        return stator.ax_ih - Fx * per_inner, stator.ay_ih - Fy * per_inner
+    return stator.ax_ih, stator.ay_ih
+
+
+@stage
 def accelerations(constants, inputs, state, pose, stator, Lx, Ly, drive, Fx, Fy, Ft):
     """Euler's equations, the spin's and the houses'.
 
@@ -60,33 +97,18 @@ def accelerations(constants, inputs, state, pose, stator, Lx, Ly, drive, Fx, Fy,
         Fy: The same, y [N].
         Ft: Friction force [N].
     """
-    shaft, house = constants.shaft, constants.house
-    Izz, lA, radius = shaft.polar_inertia, shaft.arm_ring, shaft.radius
-    # Reciprocals of constants leave the loop; divisions would not.
-    per_Ixx, per_Izz, per_inner = 1.0 / shaft.transverse_inertia, 1.0 / Izz, 1.0 / house.inner_mass
+    shaft = constants.shaft
+    Izz, per_Ixx = shaft.polar_inertia, 1.0 / shaft.transverse_inertia
     dG, db = state.dG, state.db
     cG, sb, cb, w = pose.cG, pose.sb, pose.cb, pose.w
-    Lx += lA * Fx
-    Ly += lA * Fy
-    turning = drag = share = 0.0
-    if constants.levels.euler:
-        turning = dG * db
-        drag = dG * dG * sb * cb
+    Lx += shaft.arm_ring * Fx
+    Ly += shaft.arm_ring * Fy
+    turning, drag = turning_of(constants.levels, state, pose)
     ddG = ((-cG * Ly - Izz * w * db) * per_Ixx + 2.0 * turning * sb) / cb
     ddb = (cb * Lx + pose.cross * Ly + Izz * w * dG * cb) * per_Ixx - drag
-    if constants.levels.euler:
-        # theta' differs from the spin by the share of Gamma' along the shaft.
-        share = ddG * sb + turning * cb
-    if inputs.ideal_drive:
-        dw = inputs.speed_slope + share
-        torque = Izz * dw + radius * Ft
-    else:
-        torque = drive
-        dw = (torque - radius * Ft) * per_Izz
-    ax_ih, ay_ih = stator.ax_ih, stator.ay_ih
-    if constants.levels.inner_house:
-        ax_ih -= Fx * per_inner
-        ay_ih -= Fy * per_inner
+    share = share_of(constants.levels, pose, turning, ddG)
+    dw, torque = spin_of(constants, inputs, share, drive, Ft)
+    ax_ih, ay_ih = inner_house_of(constants, stator, Fx, Fy)
     return Motion(ddG, ddb, dw - share, dw, torque, ax_ih, ay_ih, stator.ax_oh, stator.ay_oh)
 
 
@@ -109,12 +131,8 @@ def sliding_acceleration(constants, state, pose, e, ring, motion):
     """Rate of the sliding speed [m/s^2]."""
     arm, both = constants.shaft.arm_ring, constants.contact.gap_counts_outer
     ddux, dduy, _ = axis_acceleration(constants.levels, state, pose, motion.ddG, motion.ddb)
-    ax, ay = arm * ddux, arm * dduy
-    if constants.levels.inner_house:
-        ax -= motion.ax_ih
-        ay -= motion.ay_ih
-    ax -= both * motion.ax_oh
-    ay -= both * motion.ay_oh
+    ax = arm * ddux - motion.ax_ih - both * motion.ax_oh
+    ay = arm * dduy - motion.ay_ih - both * motion.ay_oh
     along = e.vy * ring.nx - e.vx * ring.ny
     distance = ring.delta + constants.contact.clearance
     return ay * ring.nx - ax * ring.ny - along * ring.rate / distance + constants.shaft.radius * motion.dw

@@ -108,23 +108,37 @@ def torques(constants, magnets, disk):
 
 
 @stage
+def inner_house_on(constants, state):
+    """North and south [N], force of the inner beam [N], its stretch [m] and slip [m/s], energy of the pair [J]."""
+    house = constants.house
+    if not constants.levels.inner_house:
+        return house.preload, house.preload, 0.0, 0.0, 0.0, 0.0
+    north, south, stored = pair_readings(state.y_ih - state.y_oh, house.pair_stiffness_vertical, house.preload)
+    stretch = state.x_ih - state.x_oh
+    slip = state.vx_ih - state.vx_oh
+    beam = house.inner_beam_stiffness * stretch + house.inner_beam_damping * slip
+    return north, south, beam, stretch, slip, stored
+
+
+@stage
+def outer_house_on(constants, state, north, south, beam_x):
+    """East and west [N], force of the outer beam [N], energy of the pair [J], its own acceleration x, y [m/s^2]."""
+    house = constants.house
+    if not constants.levels.outer_house:
+        return house.preload, house.preload, 0.0, 0.0, 0.0, 0.0
+    east, west, stored = pair_readings(state.x_oh, house.pair_stiffness_horizontal, house.preload)
+    beam_y = house.outer_beam_stiffness * state.y_oh + house.outer_beam_damping * state.vy_oh
+    ax = (beam_x - (east - west)) / house.outer_mass
+    return east, west, beam_y, stored, ax, ((north - south) - beam_y) / house.outer_mass
+
+
+@stage
 def stator_of(constants, state):
     """Beams and transducers. A house that does not move passes its force on."""
-    levels, house = constants.levels, constants.house
-    north = south = east = west = house.preload
-    beam_x = beam_y = stretch = slip = stored_v = stored_h = ax_ih = ay_ih = ax_oh = ay_oh = 0.0
-    if levels.inner_house:
-        north, south, stored_v = pair_readings(state.y_ih - state.y_oh, house.pair_stiffness_vertical, house.preload)
-        stretch = state.x_ih - state.x_oh
-        slip = state.vx_ih - state.vx_oh
-        beam_x = house.inner_beam_stiffness * stretch + house.inner_beam_damping * slip
-        ax_ih = -beam_x / house.inner_mass
-        ay_ih = -(north - south) / house.inner_mass
-    if levels.outer_house:
-        east, west, stored_h = pair_readings(state.x_oh, house.pair_stiffness_horizontal, house.preload)
-        beam_y = house.outer_beam_stiffness * state.y_oh + house.outer_beam_damping * state.vy_oh
-        ax_oh = (beam_x - (east - west)) / house.outer_mass
-        ay_oh = ((north - south) - beam_y) / house.outer_mass
+    inner_mass = constants.house.inner_mass
+    north, south, beam_x, stretch, slip, stored_v = inner_house_on(constants, state)
+    east, west, beam_y, stored_h, ax_oh, ay_oh = outer_house_on(constants, state, north, south, beam_x)
+    ax_ih, ay_ih = -beam_x / inner_mass, -(north - south) / inner_mass
     return Stator(
         north, south, east, west, beam_x, beam_y, stretch, slip, stored_v, stored_h, ax_ih, ay_ih, ax_oh, ay_oh
     )
