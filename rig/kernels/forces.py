@@ -109,15 +109,18 @@ def torques(constants, magnets, disk):
 
 @stage
 def inner_house_on(constants, state):
-    """North and south [N], force of the inner beam [N], its stretch [m] and slip [m/s], energy of the pair [J]."""
+    """North and south [N], force of the inner beam [N], its stretch [m] and slip [m/s], energy of the pair [J], ax, ay.
+
+    The acceleration [m/s^2] is without the ring's force.
+    """
     house = constants.house
     if not constants.levels.inner_house:
-        return house.preload, house.preload, 0.0, 0.0, 0.0, 0.0
+        return house.preload, house.preload, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     north, south, stored = pair_readings(state.y_ih - state.y_oh, house.pair_stiffness_vertical, house.preload)
     stretch = state.x_ih - state.x_oh
     slip = state.vx_ih - state.vx_oh
     beam = house.inner_beam_stiffness * stretch + house.inner_beam_damping * slip
-    return north, south, beam, stretch, slip, stored
+    return north, south, beam, stretch, slip, stored, -beam / house.inner_mass, -(north - south) / house.inner_mass
 
 
 @stage
@@ -135,10 +138,8 @@ def outer_house_on(constants, state, north, south, beam_x):
 @stage
 def stator_of(constants, state):
     """Beams and transducers. A house that does not move passes its force on."""
-    inner_mass = constants.house.inner_mass
-    north, south, beam_x, stretch, slip, stored_v = inner_house_on(constants, state)
+    north, south, beam_x, stretch, slip, stored_v, ax_ih, ay_ih = inner_house_on(constants, state)
     east, west, beam_y, stored_h, ax_oh, ay_oh = outer_house_on(constants, state, north, south, beam_x)
-    ax_ih, ay_ih = -beam_x / inner_mass, -(north - south) / inner_mass
     return Stator(
         north, south, east, west, beam_x, beam_y, stretch, slip, stored_v, stored_h, ax_ih, ay_ih, ax_oh, ay_oh
     )
