@@ -35,7 +35,8 @@ import math
 
 from numba import njit
 
-from rig.engines.taylor.place import EAST, NORTH, ONSET, ORDER, PHASE, SLACK
+from rig.engines.memory import ONSET, PHASE
+from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
 from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
@@ -49,7 +50,7 @@ def product(below, left_0, right_0, later, left, right):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def quotient(below, first, divisor, dividend, inverse):
-    """The k-th coefficient of a quotient that begins with `first` (given as 0 for k = 0), by the inverse of the divisor's."""
+    """The k-th coefficient of a quotient that begins with `first` (for k = 0: 0), by the inverse of the divisor's."""
     return (dividend - below - divisor * first) * inverse
 '''
 

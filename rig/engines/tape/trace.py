@@ -405,6 +405,10 @@ def record(phase: str) -> Tape:
     return tape
 
 
+_COMPARED = ("exponent", "gap_counts_outer")
+"""Numbers of the contact that laws are chosen by."""
+
+
 def _fields(kind: type, prefix: str, **given: Any) -> Any:
     return kind(**{name: given.get(name, named(f"{prefix}.{name}")) for name in kind._fields})
 
@@ -417,12 +421,7 @@ def _constants(tape: Tape) -> Constants:
         levels=Levels(**flags, friction=Choice(tape, "levels.friction", laws)),  # type: ignore[arg-type]
         shaft=_fields(Shaft, "shaft"),
         magnet=_fields(Magnet, "magnet", terms=Choice(tape, "magnet.terms", maps)),
-        contact=_fields(
-            Contact,
-            "contact",
-            exponent=Choice(tape, "contact.exponent"),
-            gap_counts_outer=Choice(tape, "contact.gap_counts_outer"),
-        ),  # fmt: skip
+        contact=_fields(Contact, "contact", **{name: Choice(tape, f"contact.{name}") for name in _COMPARED}),
         house=_fields(House, "house"),
         torque_gain=named("constants.torque_gain"),  # type: ignore[arg-type]
     )
