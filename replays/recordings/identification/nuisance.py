@@ -15,6 +15,7 @@ import numpy as np
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
 from replays.recordings.identification.question import first_command_s, observe
+from replays.recordings.least_squares import Fit, fit
 from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.sensitivity import ANGLE, Predictor, on_the_models_clock, value_of, with_values
 from rig.errors import InputError
@@ -144,7 +145,7 @@ def turned(recording: Recording, experiment: Experiment) -> Experiment:
     """With the angle and the speed of the shaft that explain the motion before the first blow best.
 
     The steady motion is a constant and a vector that turns along with the angle: a sum of squares over the angle is a
-    constant, a cosine and a sine. From its least place on, Gauss and Newton's method.
+    constant, a cosine and a sine. From its least place on, a fit.
     """
     first_s = first_command_s(experiment)
     try:
@@ -153,31 +154,18 @@ def turned(recording: Recording, experiment: Experiment) -> Experiment:
     except InputError:
         return experiment  # no samples before the blow
     predictor = Predictor(experiment, (ANGLE, "drive.speed_hz"), parts)
-
-    def off(prediction: Prediction) -> np.ndarray:
-        # What a probe's zero is, the angle does not tell.
-        z = [(part.values - prediction.values[name]) / part.floor for name, part in parts.items()]
-        return np.concatenate([(part - part.mean(axis=0)).ravel() for part in z])
-
+    speed_hz = float(predictor.start[1])
     angles = 2.0 * math.pi * np.arange(_ANGLES) / _ANGLES
-    squares = np.array([float(np.sum(off(predictor.predict((a, predictor.start[1]))) ** 2)) for a in angles])
-    values = np.array([math.atan2(-squares @ np.sin(angles), -squares @ np.cos(angles)), predictor.start[1]])
+    # What a probe's zero is, the angle does not tell: without each channel's mean.
+    squares = np.array([np.sum(_residuals(predictor, (angle, speed_hz), centred=True) ** 2) for angle in angles])
+    values = np.array([math.atan2(-squares @ np.sin(angles), -squares @ np.cos(angles)), speed_hz])
     for _ in range(_ROUNDS):
-        found = predictor.derivatives(values, check=False)
-        slopes = np.column_stack(
-            [
-                np.concatenate(
-                    [((s := slope[name] / part.floor) - s.mean(axis=0)).ravel() for name, part in parts.items()]
-                )
-                for slope in found.slopes
-            ]
-        )
-        z = off(found.base)
+        z = _residuals(predictor, values, centred=True)
         # Where the model is wrong, its errors do not outweigh the speed that the log tells.
-        held = math.sqrt(float(z @ z) / len(z)) / (_RELATIVE["drive.speed_hz"] * max(predictor.start[1], 1e-3))
-        slopes = np.vstack([slopes, [0.0, held]])
-        z = np.append(z, held * (predictor.start[1] - values[1]))
-        values = values + np.linalg.lstsq(slopes, z, rcond=None)[0]
+        weight = math.sqrt(float(z @ z) / len(z)) / (_RELATIVE["drive.speed_hz"] * max(speed_hz, 1e-3))
+        values = _fit(
+            predictor, values, predictor.start, weights=np.array([0.0, weight]), rounds=1, centred=True
+        ).values
     return with_values(experiment, dict(zip(predictor.keys, values.tolist(), strict=True)))
 
 
@@ -223,7 +211,7 @@ def tune(
     *,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Tuned:
-    """Fit what a log does not tell exactly, and nothing else: Gauss-Newton's method on windows that grow from the blow.
+    """Fit what a log does not tell exactly, and nothing else, on windows that grow from the blow.
 
     Args:
         recording: The log.
@@ -239,16 +227,22 @@ def tune(
     wanted = nuisances_of(begun, keys)
     first_s = first_command_s(begun)
     whole = observe(recording, begun, window=(max(0.0, first_s - _BEFORE_S), first_s + _WINDOWS_S[-1]))
-    start = np.array([value_of(begun, key) for key in wanted])
-    values, covariance, chi2, end_s = start, np.eye(len(start)), math.inf, first_s
+    values = np.array([value_of(begun, key) for key in wanted])
+    covariance, chi2, end_s = np.eye(len(values)), math.inf, first_s
     for length in _WINDOWS_S:
         progress(f"{', '.join(wanted)}: to {first_s + length:.3f} s")
-        line = _Line(begun, wanted, whole.parts_until(whole.until(first_s + length)))
-        found = line.fit(values)
-        if math.isfinite(chi2) and found[2] > max(_WORSE * chi2, _WORSE):
+        predictor = Predictor(begun, tuple(wanted), whole.parts_until(whole.until(first_s + length)))
+        # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
+        loose = zip(predictor.start, predictor.scales, strict=True)
+        known = [prior or held for prior, held in zip(wanted.values(), loose, strict=True)]
+        means, deviations = np.array(known).T
+        found = _fit(predictor, values, means, weights=1.0 / deviations, rounds=_ROUNDS)
+        left = found.squares / len(found.residuals)
+        if math.isfinite(chi2) and left > max(_WORSE * chi2, _WORSE):
             break  # the model no longer explains it: that is to be judged, and not to be fitted away
-        values, covariance, chi2 = found
-        end_s = first_s + length
+        assert found.slopes is not None
+        root = np.linalg.inv(np.linalg.qr(found.slopes, mode="r"))
+        values, covariance, chi2, end_s = found.values, root @ root.T, left, first_s + length
     half = 1.96 * math.sqrt(max(1.0, chi2)) * np.sqrt(np.diag(covariance))
     draw = values + np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(len(values))
     told = dict(zip(wanted, values.tolist(), strict=True))
@@ -267,51 +261,48 @@ def tune(
     )
 
 
-class _Line:
-    """Residuals over the noise as a function of the nuisances, with what is known of them before."""
+def _fit(
+    predictor: Predictor,
+    start: np.ndarray,
+    means: np.ndarray,
+    *,
+    weights: np.ndarray,
+    rounds: int,
+    centred: bool = False,
+) -> Fit:
+    """Values near a start that explain the channels best.
 
-    def __init__(
-        self, experiment: Experiment, wanted: dict[str, tuple[float, float] | None], parts: dict[str, Measured]
-    ) -> None:
-        self._predictor = Predictor(experiment, tuple(wanted), parts)
-        means = [prior[0] if prior is not None else 0.0 for prior in wanted.values()]
-        self._means = np.array(means)
-        # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
-        self._weights = np.array(
-            [
-                1.0 / (prior[1] if prior is not None else scale)
-                for prior, scale in zip(wanted.values(), self._predictor.scales, strict=True)
-            ]
-        )
-        self._means = np.where([prior is None for prior in wanted.values()], self._predictor.start, self._means)
+    Args:
+        predictor: Of the channels.
+        start: Where the search begins, shape (keys,).
+        means: What is known of the values before, shape (keys,) ...
+        weights: ... and how well: one over the standard deviation, 0 where nothing is, shape (keys,).
+        rounds: Largest number of steps.
+        centred: Without each channel's mean.
+    """
 
-    def fit(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """The values, their covariance by the noise, and the mean square of what is left."""
-        z = self._residuals(values)
-        slopes = self._slopes(values)
-        for number in range(_ROUNDS):
-            slopes = slopes if number == 0 else self._slopes(values)
-            step = np.linalg.lstsq(slopes, -z, rcond=None)[0]
-            for part in (1.0, 0.3, 0.1):
-                ahead = self._residuals(values + part * step)
-                if ahead @ ahead < z @ z:
-                    values, z = values + part * step, ahead
-                    break
-            else:
-                break
-        triangle = np.linalg.qr(slopes, mode="r")
-        root = np.linalg.inv(triangle)
-        return values, root @ root.T, float(z @ z) / len(z)
+    def residuals(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([_residuals(predictor, values, centred=centred), (values - means) * weights])
 
-    def _residuals(self, values: np.ndarray) -> np.ndarray:
-        found = self._predictor.predict(values).values
-        z = [((found[name] - part.values) / part.floor).ravel() for name, part in self._predictor.parts.items()]
-        return np.concatenate([*z, (values - self._means) * self._weights])
+    def slopes(values: np.ndarray, _z: np.ndarray) -> np.ndarray:
+        found = predictor.derivatives(values, check=False).slopes
+        columns = [_over_noise(predictor, slope, centred=centred) for slope in found]
+        return np.vstack([np.column_stack(columns), np.diag(weights)])
 
-    def _slopes(self, values: np.ndarray) -> np.ndarray:
-        found = self._predictor.derivatives(values, check=False)
-        parts = self._predictor.parts
-        columns = [
-            np.concatenate([(s[name] / part.floor).ravel() for name, part in parts.items()]) for s in found.slopes
-        ]
-        return np.vstack([np.column_stack(columns), np.diag(self._weights)])
+    found = fit(residuals, slopes, start, rounds=rounds)
+    assert found is not None
+    return found
+
+
+def _residuals(predictor: Predictor, values: Sequence[float] | np.ndarray, *, centred: bool) -> np.ndarray:
+    """Predicted less measured over the noise, of all channels, shape (n,)."""
+    found = predictor.predict(values).values
+    return _over_noise(
+        predictor, {name: found[name] - part.values for name, part in predictor.parts.items()}, centred=centred
+    )
+
+
+def _over_noise(predictor: Predictor, values: dict[str, np.ndarray], *, centred: bool) -> np.ndarray:
+    """Values of all channels, by group, in units of each one's noise, shape (n,)."""
+    found = [values[name] / part.floor for name, part in predictor.parts.items()]
+    return np.concatenate([(one - one.mean(axis=0) if centred else one).ravel() for one in found])
