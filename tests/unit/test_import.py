@@ -18,8 +18,7 @@ from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
 from replays.recordings.formats import clock, unit
 from replays.recordings.formats import mapping as mappings
-from replays.recordings.formats.conversion import Conversion, convert
-from replays.recordings.formats.imported import write_recording
+from replays.recordings.formats.conversion import Conversion, convert, write_recording
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import open_source
 from replays.recordings.formats.template import example, template

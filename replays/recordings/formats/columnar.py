@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from replays.recordings.formats import export
 from replays.recordings.formats.dialect import parse_heading, time_column
 from replays.recordings.formats.source import Entry, Signal, Source, even_rate_hz
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from replays.recordings.formats.selection import Chunk, Column, Selection, Table
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a Parquet file.
 
     Raises:
@@ -157,7 +158,7 @@ def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
     return pyarrow.Table.from_arrays(arrays, schema=schema)
 
 
-class Writer:
+class Writer(export.Writer):
     """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata."""
 
     merged = True
@@ -175,20 +176,12 @@ class Writer:
             told = {key: str(value) for key, value in column.metadata.items()}
             fields.append(pyarrow.field(column.heading, _type(column, kind), metadata=told))
         whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz})}
-        self._rows = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
+        self._file = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
 
     def write(self, table: Table, chunk: Chunk) -> None:
         """Take rows; those that no stream has are left out."""
         values = [table.exported(c, chunk)[chunk.present] for c in range(len(table.columns))]
-        self._rows.write([chunk.times_s[chunk.present], *values])
-
-    def close(self) -> None:
-        """Write what is left."""
-        self._rows.close()
-
-    def abandon(self) -> None:
-        """Let go of the file."""
-        self._rows.close()
+        self._file.write([chunk.times_s[chunk.present], *values])
 
 
 def _type(column: Column, kind: Any) -> Any:

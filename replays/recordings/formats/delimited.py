@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a text file and read its columns.
 
     Raises:

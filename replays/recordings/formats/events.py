@@ -15,8 +15,8 @@ from rig.errors import InputError
 
 if TYPE_CHECKING:
     from replays.recordings.formats.clock import Axis
+    from replays.recordings.formats.group import PlacedGroup
     from replays.recordings.formats.mapping import ExperimentMapping, HammerMapping
-    from replays.recordings.formats.placement import PlacedGroup
 
 _FOOT = 0.05
 """A pulse is summed out to this part of its peak on either side."""

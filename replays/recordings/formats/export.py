@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,32 +21,39 @@ _WRITERS = {
 }  # fmt: skip
 SUFFIXES = tuple(_WRITERS)
 Method = Literal["polyphase", "linear"]
-
-
 _MOST_MISSING = 1_000_000
 """Missing rows that a format with a start and a step fills in, besides as many as there are."""
 
 
-class Writer(Protocol):
-    """Writes the tables of a selection.
+class Writer:
+    """Writes the tables of a selection; one of each format derives from it.
 
-    `merged` formats take one table, with all channels of one rate; `sparse` ones leave out the rows that no stream has.
+    Attributes:
+        merged: The format takes one table, with all channels of one rate.
+        sparse: Rows that no stream has are left out.
+        sidecar: It has no place for metadata: FILE.json stands beside it.
     """
 
-    merged: bool
-    sparse: bool
+    merged = False
+    sparse = False
+    sidecar = False
+    _file: Any
+    """What the values go to; has `close`."""
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        raise NotImplementedError
 
     def write(self, table: Table, chunk: Chunk) -> None:
-        """Take rows."""
-        ...
+        """Take rows; a missing one is nan where the format has a start and a step and no times."""
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Finish the file."""
-        ...
+        """Write what is left, and close the file."""
+        self._file.close()
 
     def abandon(self) -> None:
         """Let go of the file, which will be removed."""
-        ...
+        self._file.close()
 
 
 @dataclass(frozen=True)
@@ -75,10 +82,10 @@ def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = SUFFIXE
 
 def merged(path: Path) -> bool:
     """Whether a format holds one table of one rate."""
-    return bool(_writer_class(path).merged)
+    return _writer_class(path).merged
 
 
-def _writer_class(path: Path) -> Any:
+def _writer_class(path: Path) -> type[Writer]:
     return importlib.import_module(f"replays.recordings.formats.{_WRITERS[path.suffix]}").Writer
 
 
@@ -116,7 +123,7 @@ def export(
         jobs = [(_rated(path, table, source), replace(source, tables=(table,))) for table in source.tables]
     total = sum(table.rows for table in source.tables)
     for target, part in jobs:
-        for made in [target, *([_beside(target)] if hasattr(kind, "sidecar") else [])]:
+        for made in [target, *([_beside(target)] if kind.sidecar else [])]:
             check_output(made, force=force, suffixes=(*SUFFIXES, ".json"))
             check_not_among([each.path for each in selection.recording.parts], made)
         for table in part.tables:
@@ -130,7 +137,7 @@ def export(
     written = []
     with ExitStack() as stack:
         for target, part in jobs:
-            writer: Writer = kind(stack.enter_context(whole_file(target)), part)
+            writer = kind(stack.enter_context(whole_file(target)), part)
             whole = False
             try:
                 for table in part.tables:
@@ -144,7 +151,7 @@ def export(
                 if not whole:
                     with suppress(Exception):
                         writer.abandon()
-            if hasattr(kind, "sidecar"):
+            if kind.sidecar:
                 text = json.dumps(part.sidecar(), indent=1, ensure_ascii=False)
                 stack.enter_context(whole_file(_beside(target))).write_text(text + "\n", encoding="utf-8")
             tables = tuple((t.name, t.rate_hz, t.rows, part.missing[t.name]) for t in part.tables)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rig.errors import InputError
+from rig.outside import open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -123,7 +124,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
     if name is None:
         raise InputError("file", f"a file that ends in {', '.join(_READERS)}", str(path))
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             empty = not file.read(1)
     except OSError as error:
         raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
@@ -134,7 +135,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
     what = _FORMATS[name]
     module = importlib.import_module(f"replays.recordings.formats.{name}")
     with _parsing(path, what):
-        source: Source = module.open_file(path, options)
+        source: Source = module.look_into(path, options)
     if not source.entries:
         raise InputError("file", "a file with signals in it", str(path))
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.recordings.formats import export
 from replays.recordings.formats.dialect import is_time
 from replays.recordings.formats.source import Entry, Signal, Source, damaged, even_rate_hz, library
 
@@ -36,7 +37,7 @@ def _quiet() -> Iterator[None]:
             one.setLevel(before)
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a TDMS file.
 
     Raises:
@@ -112,18 +113,15 @@ def _signal(group: Any, name: str, start: Any) -> Signal:
     return Signal(values=values, scale=scale, offset=offset, times_s=times_s)
 
 
-class Writer:
+class Writer(export.Writer):
     """A TDMS file: a group a sensor group; counts with a linear scale, which LabVIEW applies on reading."""
-
-    merged = False
-    sparse = False
 
     def __init__(self, path: Path, selection: Selection) -> None:
         nptdms = library("npTDMS", "nptdms")
         self._api = nptdms
         self._selection = selection
-        self._writer = nptdms.TdmsWriter(path)
-        self._writer.open()
+        self._file = nptdms.TdmsWriter(path)
+        self._file.open()
         self._described: set[str] = set()
         self._start = np.datetime64(selection.start.astimezone(UTC).replace(tzinfo=None), "us")
 
@@ -140,7 +138,7 @@ class Writer:
             properties = self._properties(table, c, scaled=counts) if new else {}
             objects.append(api.ChannelObject(table.name, column.name, values, properties))
         self._described.add(table.name)
-        self._writer.write_segment(objects)
+        self._file.write_segment(objects)
 
     def _properties(self, table: Table, c: int, *, scaled: bool) -> dict[str, Any]:
         column = table.columns[c]
@@ -159,11 +157,3 @@ class Writer:
                 "NI_Scale[0]_Linear_Input_Source": np.uint32(_RAW_INPUT),
             }  # fmt: skip
         return properties
-
-    def close(self) -> None:
-        """Write what is left."""
-        self._writer.close()
-
-    def abandon(self) -> None:
-        """Let go of the file."""
-        self._writer.close()

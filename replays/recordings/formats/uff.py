@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from replays.recordings.formats import export
 from replays.recordings.formats import unit as units
 from replays.recordings.formats.source import Entry, Signal, Source, damaged, library
 from rig.errors import InputError
+from rig.outside import open_file
 from rig.text import printable
 
 if TYPE_CHECKING:
@@ -42,7 +44,7 @@ _ORDINATE = {
 """Specific data type, and exponents of length and force, by what a unit measures (9: reaction force)."""
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a universal file.
 
     Raises:
@@ -84,7 +86,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
 
 def _ends(path: Path) -> bool:
     """Whether the file ends with the close of a dataset; pyuff passes over one that does not end."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         file.seek(max(0, path.stat().st_size - _TAIL))
         end = file.read().rstrip(_BLANK)
     # Binary numbers are followed by it without a new line; after one that closes, another opens the next dataset.
@@ -109,11 +111,8 @@ def _start(texts: list[str]) -> datetime | None:
     return None
 
 
-class Writer:
+class Writer(export.Writer):
     """A universal file: a binary dataset 58 a channel, in float64."""
-
-    merged = False
-    sparse = False
 
     def __init__(self, path: Path, selection: Selection) -> None:
         self._file = path.open("wb")
@@ -130,14 +129,6 @@ class Writer:
         for c, at in enumerate(self._at[table.name]):
             self._file.seek(at + 8 * chunk.index)
             self._file.write(table.exported(c, chunk).astype("<f8").tobytes())
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def abandon(self) -> None:
-        """Let go of the file."""
-        self._file.close()
 
 
 def _header(table: Table, column: Column, selection: Selection) -> bytes:

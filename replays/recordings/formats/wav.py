@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat
 
+from replays.recordings.formats import export
 from replays.recordings.formats.source import Entry, Signal, Source, library
 from rig.errors import InputError
 from rig.outside import DOCUMENT_BYTES, check
@@ -26,7 +27,7 @@ RULE = (
 )
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a WAV file; names, units and full scales come from FILE.wav.json if it stands beside it.
 
     Raises:
@@ -100,11 +101,10 @@ def _beside(path: Path, channels: int) -> tuple[tuple[_Column, ...], float, date
     return table.columns, table.first_s, found.start
 
 
-class Writer:
+class Writer(export.Writer):
     """A WAV file. Counts as 32-bit integers, all else as floating point from -1 to 1."""
 
     merged = True
-    sparse = False
     sidecar = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
@@ -140,11 +140,3 @@ class Writer:
             halves = [1.0 if column.source is None else 2.0 ** (column.source.adc_bits - 1) for column in table.columns]
             samples = chunk.values / np.array(halves)
         self._file.write(samples)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def abandon(self) -> None:
-        """Let go of the file."""
-        self._file.close()
