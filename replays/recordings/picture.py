@@ -9,7 +9,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.verdict import hammer_time_s
-from replays.recordings.whirl import parameter_si, whirl_figures
+from replays.recordings.whirl import parameter_si, reactions, whirl_figures
 from replays.report.canvas import new_figure, save
 from rig.orbit import SPECTRUM_HZ, full_spectrum, waterfall
 
@@ -74,8 +74,7 @@ def draw(recording: Recording, path: Path) -> None:
     ax.set(title="Spin speed", xlabel="time [s]", ylabel="[Hz]", xlim=(drive.times_s[0], end_s))
     ax.set_ylim(bottom=0, top=1.1 * float(drive.column("speed").max()))
 
-    pair_x = forces.column("P_E") - forces.column("P_W")
-    pair_y = forces.column("P_N") - forces.column("P_S")
+    pair_x, pair_y = reactions(forces)
     for ax, low, high, title in (
         (axes[1, 1], forces.times_s[0], end_s, "Reactions"),
         (axes[1, 2], blow_s - 0.01, blow_s + 0.12, "Reactions, first impacts"),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.whirl import WhirlFigures, parameter_si, whirl_figures
+from replays.recordings.whirl import WhirlFigures, parameter_si, reactions, whirl_figures
 from rig.errors import InputError
 from rig.simulation import ENERGY_ALARM
 
@@ -152,8 +152,7 @@ def _impact_row(recording: Recording, blow_s: float) -> Row:
     """The hardest impacts, in each direction."""
     forces = recording.samples("forces")
     after = forces.times_s >= blow_s
-    pairs = [forces.column(a)[after] - forces.column(b)[after] for a, b in (("P_E", "P_W"), ("P_N", "P_S"))]
-    largest = " / ".join(f"{np.abs(pair).max():.0f} N" for pair in pairs)
+    largest = " / ".join(f"{np.abs(pair[after]).max():.0f} N" for pair in reactions(forces))
     return _told("largest reactions E/W / N/S", largest, "the paper: +-5000 N, the axes of its simulation (Fig. 15)")
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -103,19 +103,7 @@ def first_instant(column: Any) -> datetime | None:
     return None if told is None else told.replace(microsecond=0)
 
 
-class RowsFile(Protocol):
-    """A file that grows by rows."""
-
-    def write(self, columns: Sequence[np.ndarray]) -> None:
-        """Take rows, column by column, each shape (n,)."""
-        ...
-
-    def close(self) -> None:
-        """Write what is left."""
-        ...
-
-
-class Rows:
+class ParquetRows:
     """A Parquet file that grows by rows."""
 
     def __init__(self, path: Path, schema: Any) -> None:
@@ -163,8 +151,8 @@ class Writer(export.Writer):
 
     merged = True
     sparse = True
-    rows: Callable[[Path, Any], RowsFile] = Rows
-    """What takes the rows."""
+    rows: Callable[[Path, Any], Any] = ParquetRows
+    """What takes the rows: has `write` and `close`."""
 
     def __init__(self, path: Path, selection: Selection) -> None:
         import pyarrow

@@ -171,19 +171,10 @@ def _rated(path: Path, table: Table, selection: Selection) -> Path:
 
 @dataclass(frozen=True)
 class _Resampled(Selection):
-    """A selection that was brought to one rate."""
+    """A selection that was brought to one rate: a table of no streams, which lacks no rows."""
 
     held: np.ndarray = None  # type: ignore[assignment]
     """Counts or values, float64, shape (rows, columns)."""
-
-    def whole(self, table: Table) -> bool:
-        """It has no gaps."""
-        return True
-
-    @property
-    def missing(self) -> dict[str, int]:  # type: ignore[override]
-        """None."""
-        return {table.name: 0 for table in self.tables}
 
     def chunks(self, table: Table, rows: int = ROWS, *, sparse: bool = False) -> Iterator[Chunk]:
         """Rows, in order."""

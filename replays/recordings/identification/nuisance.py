@@ -285,7 +285,7 @@ def _fit(
         return np.concatenate([_residuals(predictor, values, centred=centred), (values - means) * weights])
 
     def slopes(values: np.ndarray, _z: np.ndarray) -> np.ndarray:
-        found = predictor.derivatives(values, check=False).slopes
+        found = predictor.derivatives(values).slopes
         columns = [_over_noise(predictor, slope, centred=centred) for slope in found]
         return np.vstack([np.column_stack(columns), np.diag(weights)])
 

@@ -12,6 +12,7 @@ from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
 from replays.report import Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, draw_grid, new_figure
+from rig.orbit import full_spectrum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -254,12 +255,9 @@ def _orbits(found: Validation, pairs: list[tuple[str, str]]) -> Figure:
             signals, (BLUE, ORANGE), ("recorded", "foretold"), ("-", "--"), strict=True
         ):
             left.plot(signal.real, signal.imag, style, color=colour, lw=0.5, label=label, rasterized=True)
-            window = np.hanning(len(signal))
-            spectrum = np.abs(np.fft.fft((signal - signal.mean()) * window)) / window.sum()
-            frequency = np.fft.fftfreq(len(signal), 1.0 / rate)
-            shown = np.fft.fftshift(np.abs(frequency) < 250.0)
-            right.semilogy(np.fft.fftshift(frequency)[shown], np.fft.fftshift(spectrum)[shown] + 1e-12, style,
-                           color=colour, lw=0.8)  # fmt: skip
+            frequency, amplitude = full_spectrum(signal.real, signal.imag, rate)
+            shown = np.abs(frequency) < 250.0
+            right.semilogy(frequency[shown], amplitude[shown] + 1e-12, style, color=colour, lw=0.8)
         left.set_aspect("equal")
         left.set_xlabel(f"{pair[0]} [mm]")
         left.set_ylabel(f"{pair[1]} [mm]")
