@@ -43,7 +43,6 @@ class Conversion:
         document: All of that, the mapping and the files, as JSON.
         start: Wall time of the recording's time zero.
         experiment: Scene, parameters and scene document, or None.
-        clock_known: The source told when it was.
     """
 
     table: ChannelTable
@@ -93,8 +92,8 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     blows, low_s, high_s = _range(taken, log)
     say("placing samples")
     groups, zero_s = place(taken, mapping, low_s, high_s)
-    rotated = rotate(groups, mapping, remarks)
-    table, counts, present, channels = quantise(groups, rotated)
+    rotate(groups, mapping, remarks)
+    table, counts, present, channels = quantise(groups)
     lead_s = mapping.experiment.lead if mapping.experiment is not None else 0
     zero_s -= lead_s
     if lead_s:

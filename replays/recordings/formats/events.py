@@ -87,8 +87,10 @@ def speed_before(
     """Mean speed before the first blow, or of the whole without one [Hz]: of the channel `speed`, else of the edges."""
     drive = groups.get("drive")
     until_s = blows[0].at_s if blows else math.inf
-    if drive is not None and "speed" in drive.values:
-        values = drive.values["speed"][: max(1, round((min(until_s, 1e6) + zero_s - drive.start_s) * drive.rate_hz))]
+    if drive is not None and "speed" in drive.channels:
+        values = drive.channels["speed"].values[
+            : max(1, round((min(until_s, 1e6) + zero_s - drive.start_s) * drive.rate_hz))
+        ]
         return float(np.nanmean(values))
     times = edges[edges < until_s * 1e6] if len(edges) else edges
     return (len(times) - 1) * 1e6 / float(times[-1] - times[0]) if len(times) > 1 else None

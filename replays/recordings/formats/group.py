@@ -36,17 +36,13 @@ class PlacedGroup:
         rate_hz: Their rate [Hz].
         start_s: Time of the first row, in the time of the source [s].
         rows: Number of rows.
-        values: Engineering values by channel, nan where missing, each shape (rows,).
-        raw: Integers of the source by channel, where they are untouched, each shape (rows,).
-        taken: Where each is from.
+        channels: What they show, by name, on this axis.
     """
 
     rate_hz: int
     start_s: float
     rows: int
-    values: dict[str, np.ndarray]
-    raw: dict[str, np.ndarray]
-    taken: dict[str, MappedSignal]
+    channels: dict[str, MappedSignal]
 
 
 def whole_rate(axis: clock.Axis) -> int | None:
@@ -88,10 +84,9 @@ def place(
         if rows > _MOST_TIMES * held + _MOST_ROWS:
             must = f"such that {held} values in {name} become at most {_MOST_TIMES * held + _MOST_ROWS} rows"
             raise InputError("resample.rate_hz", must, f"{rate} Hz, {rows} rows")
-        group = PlacedGroup(rate, start, rows, {}, {}, {entry.name: entry for entry in entries})
+        placed[name] = PlacedGroup(rate, start, rows, {entry.name: entry for entry in entries})
         for entry in entries:
-            _put(group, entry, mapping)
-        placed[name] = group
+            _put(placed[name], entry, mapping)
     return placed, zero_s
 
 
@@ -142,9 +137,9 @@ def _put(group: PlacedGroup, entry: MappedSignal, mapping: Mapping) -> None:
     shift = (group.start_s - axis.first_s) * axis.rate_hz
     if whole_rate(axis) == rate and abs(shift - round(shift)) < _NEAR:
         part = slice(round(shift), round(shift) + group.rows)
-        group.values[entry.name] = entry.values[part]
+        entry.values = entry.values[part]
         if entry.signal.values.dtype.kind in "iu" and not entry.missing:
-            group.raw[entry.name] = entry.signal.values[part]
+            entry.raw = entry.signal.values[part]
         return
     if method == "none":
         if whole_rate(axis) != rate:
@@ -158,41 +153,35 @@ def _put(group: PlacedGroup, entry: MappedSignal, mapping: Mapping) -> None:
         raise InputError(f"channels.{entry.name}.missing", '"hold" where samples are resampled', entry.mapping.missing)
     wanted = group.start_s + np.arange(group.rows) / rate
     if method == "linear":
-        group.values[entry.name] = clock.linear(entry.values, axis, wanted)
+        entry.values = clock.linear(entry.values, axis, wanted)
         entry.touched.append(f"{axis.rate_hz:.9g} Hz to {rate} Hz: straight lines between samples")
     else:
-        group.values[entry.name] = clock.polyphase(entry.values, axis, group.start_s, rate, group.rows)
+        entry.values = clock.polyphase(entry.values, axis, group.start_s, rate, group.rows)
         entry.touched.append(f"{axis.rate_hz:.9g} Hz to {rate} Hz: {clock.FILTER}")
 
 
-def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str]) -> set[str]:
-    """Make x and y of pairs of probes; gives the channels that were so.
+def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str]) -> None:
+    """Make x and y of pairs of probes.
 
     Raises:
         InputError: Two channels that are no pair, or probes that look nearly the same way.
     """
-    rotated: set[str] = set()
     for number, entry in enumerate(mapping.rotate):
         a, b = entry.channels
-        group = next((group for group in groups.values() if a in group.values and b in group.values), None)
-        if group is None or group.taken[a].target.unit != group.taken[b].target.unit or a == b:
+        group = next((group.channels for group in groups.values() if {a, b} <= set(group.channels)), None)
+        if group is None or group[a].target.unit != group[b].target.unit or a == b:
             raise InputError(f"rotate.{number}.channels", "two channels of one group and unit", f"{a}, {b}")
         angles = np.radians(entry.angles_deg)
         seen = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         if abs(np.linalg.det(seen)) < 0.1:
             raise InputError(f"rotate.{number}.angles_deg", "well apart (the sine of their difference 0.1 or more)",
                              list(entry.angles_deg))  # fmt: skip
-        x, y = np.linalg.inv(seen) @ np.stack([group.values[a], group.values[b]])
-        group.values[a], group.values[b] = x, y
-        for name in (a, b):
-            group.raw.pop(name, None)
-            group.taken[name].touched.append(
-                f"x and y of probes at {entry.angles_deg[0]:g} and {entry.angles_deg[1]:g} deg"
-            )
-        rotated |= {a, b}
-        told = f"{entry.angles_deg[0]:g} and {entry.angles_deg[1]:g} deg"
-        remarks.append(f"{a} and {b} worked out of probes at {told}")
-    return rotated
+        told = f"probes at {entry.angles_deg[0]:g} and {entry.angles_deg[1]:g} deg"
+        mixed = np.linalg.inv(seen) @ np.stack([group[a].values, group[b].values])
+        for name, values in zip((a, b), mixed, strict=True):
+            group[name].mix(values)
+            group[name].touched.append(f"x and y of {told}")
+        remarks.append(f"{a} and {b} worked out of {told}")
 
 
 @dataclass(frozen=True)
@@ -219,42 +208,32 @@ class ImportedChannel:
 
 
 def quantise(
-    groups: dict[str, PlacedGroup], rotated: set[str]
+    groups: dict[str, PlacedGroup],
 ) -> tuple[ChannelTable, dict[str, np.ndarray], dict[str, np.ndarray], list[ImportedChannel]]:
-    """Channel table, int32 counts and present rows by group, and what was done to each channel.
-
-    Args:
-        groups: Values by group.
-        rotated: Channels that two signals were mixed into.
-    """
+    """Channel table, int32 counts and present rows by group, and what was done to each channel."""
     tables, counts, present, told = {}, {}, {}, []
     for name, group in groups.items():
         columns, channels = [], []
-        good = np.all([np.isfinite(values) for values in group.values.values()], axis=0)
-        for wanted, values in group.values.items():
-            entry = group.taken[wanted]
-            raw = group.raw.get(wanted)
-            channel, column, rule = _counts(entry, values, raw, group.rate_hz, mixed=wanted in rotated)
+        for entry in group.channels.values():
+            channel, column, rule = _counts(entry, group.rate_hz)
             channels.append(channel)
             columns.append(column)
-            told.append(_told(entry, channel, rule, values, group.rate_hz))
+            told.append(_told(entry, channel, rule, group.rate_hz))
         known = default_table().groups.get(name)
         title = known.title if known is not None else name
         tables[name] = Group(name=name, title=title, rate_hz=group.rate_hz, channels=tuple(channels))
         counts[name] = np.stack(columns, axis=1)
-        present[name] = good
+        present[name] = np.all([np.isfinite(entry.values) for entry in group.channels.values()], axis=0)
     return ChannelTable(groups=tables), counts, present, told
 
 
-def _counts(
-    entry: MappedSignal, values: np.ndarray, raw: np.ndarray | None, rate_hz: int, *, mixed: bool
-) -> tuple[Channel, np.ndarray, str]:
+def _counts(entry: MappedSignal, rate_hz: int) -> tuple[Channel, np.ndarray, str]:
     """A channel with its scale, and its int32 counts.
 
     Integers that nobody has touched stay as they are. All else is counted in a power of two that leaves the largest
     value between a quarter and a half of int32: half a count is at most 2^-30 of the largest value.
     """
-    signal = entry.signal
+    signal, values, raw, mixed = entry.signal, entry.values, entry.raw, entry.mixed
     limits = np.iinfo(np.int32)
     keeps = raw is not None and len(raw) and int(raw.min()) >= limits.min and int(raw.max()) <= limits.max
     volts_per_unit = None if entry.volts is None or mixed else entry.volts / entry.gain
@@ -323,7 +302,7 @@ def _noise(values: np.ndarray) -> float:
     return float(np.quantile(rms, 0.1)) / (quiet if stretches > _MANY else 1.0)
 
 
-def _told(entry: MappedSignal, channel: Channel, rule: str, values: np.ndarray, rate_hz: int) -> ImportedChannel:
+def _told(entry: MappedSignal, channel: Channel, rule: str, rate_hz: int) -> ImportedChannel:
     unit = units.canonical(entry.mapping.unit or entry.entry.unit or "1")
     source = f"(source {'-' if entry.bias > 0.0 else '+'} {abs(entry.bias):.6g})" if entry.bias else "source"
     ratio = "" if unit == channel.unit else f" {channel.unit} per {unit}".replace(" 1 per", " per")
@@ -336,5 +315,5 @@ def _told(entry: MappedSignal, channel: Channel, rule: str, values: np.ndarray, 
         formula=f"{gain}{source}",
         time=f"{entry.axis.note}{delay}; " + ("; ".join(entry.touched) or "samples as they were"),
         counts=rule, rate_hz=rate_hz, jitter_us=entry.axis.jitter_s[1] * 1e6, drift_ppm=drift, missing=entry.missing,
-        overrange=entry.overrange, low=float(np.nanmin(values)), high=float(np.nanmax(values)),
+        overrange=entry.overrange, low=float(np.nanmin(entry.values)), high=float(np.nanmax(entry.values)),
     )  # fmt: skip

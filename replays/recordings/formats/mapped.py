@@ -41,11 +41,19 @@ class MappedSignal:
     """Volts per source unit, where it is a voltage."""
     bias: float = 0.0
     values: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """Engineering values, shape (rows of the axis,)."""
+    """Engineering values, nan where missing, on its own axis, then on its group's, shape (rows,)."""
+    raw: np.ndarray | None = None
+    """Integers of the source where they are untouched, on the group's axis, shape (rows,)."""
+    mixed: bool = False
+    """It was worked out of two signals."""
     touched: list[str] = field(default_factory=list)
     """What was done that changes samples."""
     missing: int = 0
     overrange: int = 0
+
+    def mix(self, values: np.ndarray) -> None:
+        """Take values that were worked out of two signals."""
+        self.values, self.raw, self.mixed = values, None, True
 
 
 class Log:
