@@ -1,9 +1,9 @@
 """What the sensors would show without noise, and how that changes with any number of the experiment.
 
 A value goes by its dotted key: a parameter (`contact.friction`, in its own unit), a number of the scene
-(`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first blow; `at_s`, `duration_ms` and `direction`
-[degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its clock,
-`shaft.angle_rad` where it begins).
+(`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first hammer pulse; `at_s`, `duration_ms` and
+`direction` [degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its
+clock, `shaft.angle_rad` where it begins).
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class Predictor:
     def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
         """The channels at some values, shape (keys,).
 
-        What a simulation rounds to its rows (times and durations of blows) is interpolated between simulations.
+        What a simulation rounds to its rows (times and durations of hammer pulses) is interpolated between simulations.
 
         Raises:
             InputError: A value that the model does not take.

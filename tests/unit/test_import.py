@@ -679,10 +679,10 @@ source = "speed"
 """
 
 
-def test_a_blow_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
+def test_a_hammer_pulse_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
     path = hammer_log(tmp_path / "x.csv", at_s=0.73211, force_n=87.0, duration_s=6.5e-3)
     conversion, recording = imported(tmp_path, [path], HAMMER_MAPPING)
-    assert len(conversion.blows) == 1
+    assert len(conversion.pulses) == 1
     experiment = Experiment.of(recording)
     assert experiment.first_s == 5.0  # time zero lies before the first sample, so that the scene settles
     (timed,) = experiment.scene.commands
@@ -988,11 +988,11 @@ def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsy
 
 def test_a_comment_that_is_json_is_told_by_its_label(tmp_path: Path) -> None:
     from replays.recordings.formats.source import Entry
-    from replays.recordings.formats.template import _label
+    from replays.recordings.formats.template import label_of
 
-    assert _label(Entry("x", "", "mm", 1, None, label=json.dumps({"name": "x", "label": "Ring"}))) == "Ring"
-    assert _label(Entry("x", "", "mm", 1, None, label="{not json")) == "{not json"
-    assert _label(Entry("x", "", "mm", 1, None, label="long " * 20)).endswith("...")
+    assert label_of(Entry("x", "", "mm", 1, None, label=json.dumps({"name": "x", "label": "Ring"}))) == "Ring"
+    assert label_of(Entry("x", "", "mm", 1, None, label="{not json")) == "{not json"
+    assert label_of(Entry("x", "", "mm", 1, None, label="long " * 20)).endswith("...")
 
 
 @pytest.mark.parametrize(

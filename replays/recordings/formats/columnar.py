@@ -12,11 +12,11 @@ import numpy as np
 
 from replays.recordings.formats import export
 from replays.recordings.formats.dialect import parse_heading, time_column
-from replays.recordings.formats.source import Entry, Signal, Source, even_rate_hz
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
-    from replays.recordings.formats.selection import Chunk, Column, Selection, Table
+    from replays.recordings.formats.selection import Column, ExportChunk, ExportTable, Selection
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
@@ -53,8 +53,8 @@ def look_into(path: Path, options: FileOptions) -> Source:
                 Entry(name, "", unit or told.get("unit", ""), file.metadata.num_rows, rate, c, told.get("label", ""))
             )
 
-    def read(entry: Entry) -> Signal:
-        return Signal(values=column(entry.place), times_s=times_s)
+    def read(entry: Entry) -> FileSignal:
+        return FileSignal(values=column(entry.place), times_s=times_s)
 
     kept = {key.decode(): text.decode(errors="replace") for key, text in about.items() if key != b"ARROW:schema"}
     return Source(path=path, format="Parquet", entries=tuple(entries), read=read, about=kept, start=start)
@@ -146,7 +146,7 @@ def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
     return pyarrow.Table.from_arrays(arrays, schema=schema)
 
 
-class Writer(export.Writer):
+class ParquetWriter(export.FormatWriter):
     """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata."""
 
     merged = True
@@ -166,7 +166,7 @@ class Writer(export.Writer):
         whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz})}
         self._file = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
 
-    def write(self, table: Table, chunk: Chunk) -> None:
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows; those that no stream has are left out."""
         values = [table.exported(c, chunk)[chunk.present] for c in range(len(table.columns))]
         self._file.write([chunk.times_s[chunk.present], *values])

@@ -37,7 +37,7 @@ class Conversion:
         present: Which rows there are, by group, shape (rows,).
         first_tick: Tick of the first row, by group.
         edges: Keyphasor edges [ticks], float64, shape (turns,).
-        blows: Hammer blows that were found.
+        pulses: Hammer pulses that were found.
         channels: What was done, channel by channel.
         remarks: What was done to the whole, and what was assumed.
         document: All of that, the mapping and the files, as JSON.
@@ -50,7 +50,7 @@ class Conversion:
     present: dict[str, np.ndarray]
     first_tick: dict[str, int]
     edges: np.ndarray
-    blows: tuple[events.Blow, ...]
+    pulses: tuple[events.HammerPulse, ...]
     channels: tuple[ImportedChannel, ...]
     remarks: tuple[str, ...]
     document: dict[str, Any]
@@ -89,7 +89,7 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     check_rows(taken)
     for entry in taken:
         engineering(entry, mapping)
-    blows, low_s, high_s = _range(taken, log)
+    pulses, low_s, high_s = _range(taken, log)
     say("placing samples")
     groups, zero_s = place(taken, mapping, low_s, high_s)
     rotate(groups, mapping, remarks)
@@ -100,8 +100,8 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
         remarks.append(f"time zero lies {lead_s} s before the first sample: so long the scene runs, to have settled")
     first_tick = {name: round((group.start_s - zero_s) * TICK_RATE_HZ) for name, group in groups.items()}
     edges = _edges(log, zero_s, groups)
-    since = tuple(replace(blow, at_s=blow.at_s - zero_s) for blow in blows)
-    kept = tuple(blow for blow in since if blow.at_s >= 0.0)
+    since = tuple(replace(pulse, at_s=pulse.at_s - zero_s) for pulse in pulses)
+    kept = tuple(pulse for pulse in since if pulse.at_s >= 0.0)
     begin = _began(log, zero_s)
     end_s = max(first_tick[name] / TICK_RATE_HZ + group.rows / group.rate_hz for name, group in groups.items())
     experiment = None
@@ -122,7 +122,7 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
         "remarks": remarks,
     }
     return Conversion(
-        table=table, counts=counts, present=present, first_tick=first_tick, edges=edges, blows=kept,
+        table=table, counts=counts, present=present, first_tick=first_tick, edges=edges, pulses=kept,
         channels=tuple(channels), remarks=tuple(remarks), document=document, start=begin, experiment=experiment,
     )  # fmt: skip
 
@@ -147,25 +147,25 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[events.Blow, ...], float, float]:
-    """Blows (in the time of the source), and from when to when is imported [s]."""
+def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[events.HammerPulse, ...], float, float]:
+    """Hammer pulses (in the time of the source), and from when to when is imported [s]."""
     mapping = log.mapping
     low = -math.inf if mapping.time.from_s is None else mapping.time.from_s
     high = math.inf if mapping.time.to_s is None else mapping.time.to_s
-    blows: tuple[events.Blow, ...] = ()
+    pulses: tuple[events.HammerPulse, ...] = ()
     if mapping.hammer is not None:
         hammer = next(entry for entry in taken if entry.name == "hammer")
-        found = events.find_blows(hammer.values, hammer.axis, mapping.hammer)
-        blows = tuple(blow for blow in found if low <= blow.at_s <= high)
-        if not blows:
+        found = events.find_pulses(hammer.values, hammer.axis, mapping.hammer)
+        pulses = tuple(pulse for pulse in found if low <= pulse.at_s <= high)
+        if not pulses:
             largest = float(np.nanmax(hammer.values))
             raise InputError("hammer.threshold_n", f"below the largest force, {largest:.3g} N, in what is imported",
                              mapping.hammer.threshold_n)  # fmt: skip
-        told = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in blows[:5])
-        log.remarks.append(f"{len(blows)} hammer blows found: {told}")
+        told = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in pulses[:5])
+        log.remarks.append(f"{len(pulses)} hammer pulses found: {told}")
         if mapping.hammer.pre_s is not None:
-            low = max(low, blows[0].at_s - mapping.hammer.pre_s)
-    return blows, low, high
+            low = max(low, pulses[0].at_s - mapping.hammer.pre_s)
+    return pulses, low, high
 
 
 def _edges(log: Log, zero_s: float, groups: dict[str, PlacedGroup]) -> np.ndarray:
@@ -265,9 +265,9 @@ def _event(tick: int, event: str, **about: Any) -> bytes:
 
 
 def _happenings(conversion: Conversion) -> Iterator[tuple[int, bytes]]:
-    """The commands of the scene, or the blows that were found where there is none."""
+    """The commands of the scene, or the hammer pulses that were found where there is none."""
     experiment = conversion.experiment
-    commands = [blow.command() for blow in conversion.blows] if experiment is None else experiment.commands
+    commands = [pulse.command() for pulse in conversion.pulses] if experiment is None else experiment.commands
     for command in commands:
         tick = round(command["at_s"] * TICK_RATE_HZ)
         if tick < conversion.end_tick:

@@ -13,7 +13,7 @@ import numpy as np
 from replays.recordings.background import Background
 from replays.recordings.formats import columnar
 from replays.recordings.formats.dialect import MISSING, Layout, find_layout, instant, time_column
-from replays.recordings.formats.source import Entry, Signal, Source, damaged, even_rate_hz
+from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz
 from rig.errors import InputError
 from rig.text import printable
 
@@ -46,9 +46,9 @@ def look_into(path: Path, options: FileOptions) -> Source:
         Entry(name, "", layout.units[c], len(columns[c]), rate, c) for c, name in enumerate(names) if c != stamps
     )
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         values = columns[entry.place]
-        return Signal(values=values, times_s=times_s, rate_hz=layout.rate_hz, first_s=layout.first_s)
+        return FileSignal(values=values, times_s=times_s, rate_hz=layout.rate_hz, first_s=layout.first_s)
 
     dialect = layout.dialect
     told: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
@@ -200,7 +200,7 @@ class CsvRows:
             self._file.close()
 
 
-class Writer(columnar.Writer):
+class CsvWriter(columnar.ParquetWriter):
     """A CSV file: `time [s]` and a column a channel."""
 
     sidecar = True

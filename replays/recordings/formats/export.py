@@ -13,19 +13,21 @@ from typing import Any, Literal
 import numpy as np
 
 from replays.recordings.formats import clock
-from replays.recordings.formats.selection import ROWS, Chunk, Selection, Table
+from replays.recordings.formats.selection import ROWS, ExportChunk, ExportTable, Selection
 from rig.errors import InputError, check_new_file, check_not_among, whole_file
 
 _WRITERS = {
-    ".mf4": "mdf", ".tdms": "tdms", ".uff": "uff", ".csv": "delimited", ".parquet": "columnar", ".wav": "wav",
+    ".mf4": ("mdf", "MdfWriter"), ".tdms": ("tdms", "TdmsWriter"), ".uff": ("uff", "UffWriter"),
+    ".csv": ("delimited", "CsvWriter"), ".parquet": ("columnar", "ParquetWriter"), ".wav": ("wav", "WavWriter"),
 }  # fmt: skip
+"""Module and class of each format."""
 SUFFIXES = tuple(_WRITERS)
 Method = Literal["polyphase", "linear"]
 _MOST_MISSING = 1_000_000
 """Missing rows that a format with a start and a step fills in, besides as many as there are."""
 
 
-class Writer:
+class FormatWriter:
     """Writes the tables of a selection; one of each format derives from it.
 
     Attributes:
@@ -43,7 +45,7 @@ class Writer:
     def __init__(self, path: Path, selection: Selection) -> None:
         raise NotImplementedError
 
-    def write(self, table: Table, chunk: Chunk) -> None:
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows; a missing one is nan where the format has a start and a step and no times."""
         raise NotImplementedError
 
@@ -85,8 +87,9 @@ def merged(path: Path) -> bool:
     return _writer_class(path).merged
 
 
-def _writer_class(path: Path) -> type[Writer]:
-    return importlib.import_module(f"replays.recordings.formats.{_WRITERS[path.suffix]}").Writer
+def _writer_class(path: Path) -> type[FormatWriter]:
+    module, name = _WRITERS[path.suffix]
+    return getattr(importlib.import_module(f"replays.recordings.formats.{module}"), name)
 
 
 def export(
@@ -163,7 +166,7 @@ def _beside(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def _rated(path: Path, table: Table, selection: Selection) -> Path:
+def _rated(path: Path, table: ExportTable, selection: Selection) -> Path:
     alike = [other for other in selection.tables if f"{other.rate_hz:g}" == f"{table.rate_hz:g}"]
     more = f"-{alike.index(table) + 1}" if len(alike) > 1 else ""
     return path.with_name(f"{path.stem}-{table.rate_hz:g}Hz{more}{path.suffix}")
@@ -176,12 +179,12 @@ class _Resampled(Selection):
     held: np.ndarray = None  # type: ignore[assignment]
     """Counts or values, float64, shape (rows, columns)."""
 
-    def chunks(self, table: Table, rows: int = ROWS, *, sparse: bool = False) -> Iterator[Chunk]:
+    def chunks(self, table: ExportTable, rows: int = ROWS, *, sparse: bool = False) -> Iterator[ExportChunk]:
         """Rows, in order."""
         for start in range(0, table.rows, rows):
             values = self.held[start : start + rows]
             times_s = table.first_s + np.arange(start, start + len(values)) / table.rate_hz
-            yield Chunk(index=start, times_s=times_s, values=values, present=np.ones(len(values), dtype=bool))
+            yield ExportChunk(index=start, times_s=times_s, values=values, present=np.ones(len(values), dtype=bool))
 
 
 def resampled(selection: Selection, rate_hz: float, method: Method) -> Selection:
@@ -217,7 +220,7 @@ def resampled(selection: Selection, rate_hz: float, method: Method) -> Selection
             parts.append(values_c if linear is None else values_c * linear[0] + linear[1])
             columns.append(replace(column, linear=None, source=None))
     title = "; ".join(table.title for table in selection.tables)
-    table = Table("resampled", title, tuple(columns), (), rate_hz, first_s, rows, 0)
+    table = ExportTable("resampled", title, tuple(columns), (), rate_hz, first_s, rows, 0)
     how = clock.FILTER if method == "polyphase" else "straight lines between samples"
     rates = ", ".join(f"{other:g}" for other in sorted({table.rate_hz for table in selection.tables}))
     return _Resampled(

@@ -76,10 +76,10 @@ def place(
     for name in order:
         entries, rate = members[name], rates[name]
         if mapping.resample.method == "none" or _untouched(entries, rate):
-            start, hair = _next_sample(entries[0].axis, first[name]), clock.EVEN
+            start, slack = _next_sample(entries[0].axis, first[name]), clock.EVEN
         else:
-            start, hair = zero_s + math.ceil((first[name] - zero_s) * rate - 1e-6) / rate, 1e-6
-        rows = math.floor((last[name] - start) * rate + hair) + 1
+            start, slack = zero_s + math.ceil((first[name] - zero_s) * rate - 1e-6) / rate, 1e-6
+        rows = math.floor((last[name] - start) * rate + slack) + 1
         held = max(entry.axis.rows for entry in entries)
         if rows > _MOST_TIMES * held + _MOST_ROWS:
             must = f"such that {held} values in {name} become at most {_MOST_TIMES * held + _MOST_ROWS} rows"
@@ -218,7 +218,7 @@ def quantise(
             channel, column, rule = _counts(entry, group.rate_hz)
             channels.append(channel)
             columns.append(column)
-            told.append(_told(entry, channel, rule, group.rate_hz))
+            told.append(_imported(entry, channel, rule, group.rate_hz))
         known = default_table().groups.get(name)
         title = known.title if known is not None else name
         tables[name] = Group(name=name, title=title, rate_hz=group.rate_hz, channels=tuple(channels))
@@ -302,7 +302,7 @@ def _noise(values: np.ndarray) -> float:
     return float(np.quantile(rms, 0.1)) / (quiet if stretches > _MANY else 1.0)
 
 
-def _told(entry: MappedSignal, channel: Channel, rule: str, rate_hz: int) -> ImportedChannel:
+def _imported(entry: MappedSignal, channel: Channel, rule: str, rate_hz: int) -> ImportedChannel:
     unit = units.canonical(entry.mapping.unit or entry.entry.unit or "1")
     source = f"(source {'-' if entry.bias > 0.0 else '+'} {abs(entry.bias):.6g})" if entry.bias else "source"
     ratio = "" if unit == channel.unit else f" {channel.unit} per {unit}".replace(" 1 per", " per")

@@ -14,7 +14,7 @@ import numpy as np
 from replays.recordings.formats import clock
 from replays.recordings.formats import unit as units
 from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalName
-from replays.recordings.formats.source import Entry, Signal, Source, even_rate_hz, open_source
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
 from rig.channels import Channel, default_table
 from rig.errors import InputError
 
@@ -32,7 +32,7 @@ class MappedSignal:
     mapping: ChannelMapping
     source: Source
     entry: Entry
-    signal: Signal
+    signal: FileSignal
     axis: clock.Axis
     target: Channel
     gain: float
@@ -103,7 +103,7 @@ class Log:
         more = f" ({len(names)} in all)" if len(names) > len(close) else ""
         raise InputError(f"{where}.source", f"a signal of the file, such as {', '.join(close)}{more}", wanted.source)
 
-    def read(self, source: Source, entry: Entry, where: str) -> tuple[Signal, clock.Axis]:
+    def read(self, source: Source, entry: Entry, where: str) -> tuple[FileSignal, clock.Axis]:
         """A signal and its own time axis; nan where samples are missing from an even one.
 
         Raises:
@@ -117,7 +117,7 @@ class Log:
             signal = replace(signal, values=axis.placed(signal.values.astype(float)))
         return signal, axis
 
-    def _axis(self, signal: Signal, what: str) -> clock.Axis:
+    def _axis(self, signal: FileSignal, what: str) -> clock.Axis:
         """The time axis of a signal, as the file or the mapping tells it."""
         rows, time = len(signal.values), self.mapping.time
         if time.rate_hz is not None:

@@ -14,11 +14,11 @@ import numpy as np
 
 from replays.recordings.formats import export
 from replays.recordings.formats import unit as units
-from replays.recordings.formats.source import Entry, Signal, Source, damaged, even_rate_hz, library
+from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz, library
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
-    from replays.recordings.formats.selection import Chunk, Selection, Table
+    from replays.recordings.formats.selection import ExportChunk, ExportTable, Selection
 
 _TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
 """The text in a comment that is XML."""
@@ -47,7 +47,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     with _quiet():
         entries, texts = _entries(mdf)
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         group, index = entry.place
         with _quiet():
             return _signal(mdf, group, index)
@@ -120,7 +120,7 @@ def _numeric(mdf: Any, group: int, index: int) -> bool:
     return few.ndim == 1 and few.dtype.kind in "iufb"
 
 
-def _signal(mdf: Any, group: int, index: int) -> Signal:
+def _signal(mdf: Any, group: int, index: int) -> FileSignal:
     raw = mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
     kind = _IDENTITY if raw.conversion is None else raw.conversion.conversion_type
     scale, offset = 1.0, 0.0
@@ -136,10 +136,10 @@ def _signal(mdf: Any, group: int, index: int) -> Signal:
         values[np.asarray(invalid, dtype=bool)] = np.nan
     second = _second(mdf, group)
     times_s = None if second is None else np.asarray(raw.timestamps, dtype=float) * second
-    return Signal(values=values, scale=scale, offset=offset, times_s=times_s)
+    return FileSignal(values=values, scale=scale, offset=offset, times_s=times_s)
 
 
-class Writer(export.Writer):
+class MdfWriter(export.FormatWriter):
     """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion."""
 
     sparse = True
@@ -155,7 +155,7 @@ class Writer(export.Writer):
             self._file.header.start_time = selection.start
             self._file.header.description = selection.summary()
 
-    def write(self, table: Table, chunk: Chunk) -> None:
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows; those that no stream has are left out."""
         present = chunk.present
         times_s = chunk.times_s[present]

@@ -59,7 +59,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Signal:
+class FileSignal:
     """The values of one signal.
 
     Attributes:
@@ -107,7 +107,7 @@ class Source:
     path: Path
     format: str
     entries: tuple[Entry, ...]
-    read: Callable[[Entry], Signal]
+    read: Callable[[Entry], FileSignal]
     start: datetime | None = None
     about: dict[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
@@ -139,7 +139,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
     if not source.entries:
         raise InputError("file", "a file with signals in it", str(path))
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         where = f"{what} (signal {entry.name})"
         with _parsing(path, where):
             signal = source.read(entry)
@@ -170,7 +170,7 @@ def _parsing(path: Path, what: str) -> Iterator[None]:
         raise damaged(path, what, error) from None
 
 
-def _check(signal: Signal) -> None:
+def _check(signal: FileSignal) -> None:
     """See that the numbers of a signal are such that a measurement can have.
 
     Raises:

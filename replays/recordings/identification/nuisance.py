@@ -1,4 +1,4 @@
-"""What a log of another system does not tell exactly: its clock, the shaft's angle, the speed, the force of the blow.
+"""What a log of another system does not tell exactly: its clock, the shaft's angle, the speed, the force of the pulse.
 
 A recording of this rig has all of that to the tick. Of an imported log it is fitted along with whatever is asked, so
 that it neither spoils other values nor passes for a fault of the model.
@@ -28,8 +28,8 @@ NUISANCES = (
     "hammer.1.force_n",
     "hammer.1.duration_ms",
 )
-"""In place of the time of the first blow stand the clock and the angle: a simulation has blows only at its own rows."""
-_BLOW = "hammer.1.at_s"
+"""In place of the time of the first pulse stand clock and angle: a simulation has pulses only at its own rows."""
+_PULSE = "hammer.1.at_s"
 _DEVIATIONS = {"clock.rate_ppm": 50.0}
 """What is known before: the standard deviation of a crystal, in ppm; ..."""
 _RELATIVE = {"drive.speed_hz": 1e-4}
@@ -37,13 +37,13 @@ _RELATIVE = {"drive.speed_hz": 1e-4}
 _ANGLES = 8
 _ROUNDS = 2
 _LOOK_S = 0.5
-"""So much before the blow tells angle and speed [s] ..."""
+"""So much before the hammer pulse tells angle and speed [s] ..."""
 _MARGIN_S = 2e-3
-"""... up to here, as the time of the blow is not known better ..."""
+"""... up to here, as the time of the hammer pulse is not known better ..."""
 _BEFORE_S = 0.03
 """... and so much of it is in the fit of all [s]."""
 _WINDOWS_S = (6e-3, 9e-3, 13e-3, 20e-3, 30e-3)
-"""How far behind the begin of the blow the fits look [s]."""
+"""How far behind the begin of the hammer pulse the fits look [s]."""
 _WORSE = 1.5
 """A longer window is given up where it leaves more by this factor."""
 
@@ -62,9 +62,9 @@ class Fitted:
         """In words."""
         if self.key == "clock.offset_s":
             return f"time: shifted by {self.value * 1e6:+.1f} +-{1.0e6 * self.half_width:.2g} us, fitted"
-        if self.key == _BLOW:
+        if self.key == _PULSE:
             late = 1e6 * (self.value - self.start)
-            return f"time: blow shifted by {late:+.1f} +-{1e6 * self.half_width:.2g} us, fitted"
+            return f"time: hammer pulse shifted by {late:+.1f} +-{1e6 * self.half_width:.2g} us, fitted"
         if self.key == "clock.rate_ppm":
             return f"clock: {self.value:+.1f} +-{self.half_width:.2g} ppm fast, fitted"
         change = self.value - self.start
@@ -77,10 +77,10 @@ class Tuned:
 
     Attributes:
         begun: The experiment before the fit.
-        experiment: With the fitted numbers, those of a blow as its rows can have them.
+        experiment: With the fitted numbers, those of a hammer pulse as its rows can have them.
         fitted: What was fitted.
         values: The same, by key.
-        aside: Values as far off as the fit leaves open, drawn once from what it says.
+        perturbed: Values as far off as the fit leaves open, drawn once from what it says.
         about_s: Where the clocks differ by the offset alone [s].
         end_s: End of the samples that it rests on [s].
         chi2: Sum of squares of what is left over the noise, a sample.
@@ -90,7 +90,7 @@ class Tuned:
     experiment: Experiment
     fitted: tuple[Fitted, ...]
     values: dict[str, float]
-    aside: dict[str, float]
+    perturbed: dict[str, float]
     about_s: float
     end_s: float
     chi2: float
@@ -99,14 +99,14 @@ class Tuned:
         """Channels of the log on the model's clock."""
         return on_the_models_clock(parts, self.values, about_s=self.about_s)
 
-    def predict(self, parts: dict[str, Measured], *, aside: bool = False) -> Prediction:
-        """What is foretold for channels of the log, on its own clock; a blow may lie between two rows.
+    def predict(self, parts: dict[str, Measured], *, perturbed: bool = False) -> Prediction:
+        """What is predicted for channels of the log, on its own clock; a hammer pulse may lie between two rows.
 
         Args:
             parts: The channels.
-            aside: As far off as the fit leaves open.
+            perturbed: As far off as the fit leaves open.
         """
-        values = self.aside if aside else self.values
+        values = self.perturbed if perturbed else self.values
         predictor = Predictor(self.begun, tuple(values), parts, about_s=self.about_s)
         return predictor.predict(tuple(values.values()))
 
@@ -126,8 +126,8 @@ def nuisances_of(
         keys: The nuisances.
         besides: What is asked anyway.
     """
-    if experiment.first_s == 0.0:  # it has run from the scene's own start: the blow is late, and not the clock
-        keys = [_BLOW if key == "clock.offset_s" else key for key in keys]
+    if experiment.first_s == 0.0:  # it has run from the scene's own start: the pulse is late, and not the clock
+        keys = [_PULSE if key == "clock.offset_s" else key for key in keys]
     found: dict[str, tuple[float, float] | None] = {}
     for key in keys:
         if key in besides:
@@ -135,14 +135,14 @@ def nuisances_of(
         try:
             value = value_of(experiment, key)
         except InputError:
-            continue  # no blow
+            continue  # no hammer pulse
         deviation = _DEVIATIONS.get(key) or _RELATIVE.get(key, 0.0) * abs(value)
         found[key] = (value, deviation) if deviation else None
     return found
 
 
 def turned(recording: Recording, experiment: Experiment) -> Experiment:
-    """With the angle and the speed of the shaft that explain the motion before the first blow best.
+    """With the angle and the speed of the shaft that explain the motion before the first pulse best.
 
     The steady motion is a constant and a vector that turns along with the angle: a sum of squares over the angle is a
     constant, a cosine and a sine. From its least place on, a fit.
@@ -152,7 +152,7 @@ def turned(recording: Recording, experiment: Experiment) -> Experiment:
         window = (first_s - _LOOK_S, first_s - _MARGIN_S) if first_s > 0.0 else (None, None)
         parts = observe(recording, experiment, window=window).parts
     except InputError:
-        return experiment  # no samples before the blow
+        return experiment  # no samples before the hammer pulse
     predictor = Predictor(experiment, (ANGLE, "drive.speed_hz"), parts)
     speed_hz = float(predictor.start[1])
     angles = 2.0 * math.pi * np.arange(_ANGLES) / _ANGLES
@@ -172,7 +172,7 @@ def turned(recording: Recording, experiment: Experiment) -> Experiment:
 def asked_along(experiment: Experiment, keys: Sequence[str]) -> dict[str, tuple[float, float] | None]:
     """Nuisances that are fitted along with what is asked of an imported log: those that a search can take.
 
-    The speed is known before the blow, and the length of a blow only in rows of the simulation.
+    The speed is known before the hammer pulse, and the length of a hammer pulse only in rows of the simulation.
     """
     few = tuple(key for key in NUISANCES if key not in ("drive.speed_hz", "hammer.1.duration_ms"))
     return nuisances_of(experiment, few, besides=keys)
@@ -189,12 +189,12 @@ def check_begin(experiment: Experiment, to_s: float | None) -> None:
         to_s: Where the samples end [s]; None for the log's end.
 
     Raises:
-        InputError: It is such a log, and the samples go beyond the first blow.
+        InputError: It is such a log, and the samples go beyond the first pulse.
     """
-    blow_s = first_command_s(experiment)
-    if experiment.first_s > 0.0 and blow_s > 0.0 and (to_s is None or to_s > blow_s):
+    hammer_s = first_command_s(experiment)
+    if experiment.first_s > 0.0 and hammer_s > 0.0 and (to_s is None or to_s > hammer_s):
         must = "a log that begins with the run, at rest (lead_s = 0 in its mapping), to be fitted through impacts; of "
-        must += f"one from the middle of a run, only what is before the blow: --to {blow_s - _MARGIN_S:.3f}"
+        must += f"one from the middle of a run, only what is before the hammer pulse: --to {hammer_s - _MARGIN_S:.3f}"
         raise InputError("file", must, f"{experiment.first_s:g} s of the run are before its first sample")
 
 
@@ -211,7 +211,7 @@ def tune(
     *,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Tuned:
-    """Fit what a log does not tell exactly, and nothing else, on windows that grow from the blow.
+    """Fit what a log does not tell exactly, and nothing else, on windows that grow from the pulse.
 
     Args:
         recording: The log.
@@ -222,7 +222,7 @@ def tune(
     Raises:
         InputError: There are no samples to do it by.
     """
-    progress("angle and speed of the shaft before the blow")
+    progress("angle and speed of the shaft before the hammer pulse")
     begun = turned(recording, experiment) if ANGLE in keys else experiment
     wanted = nuisances_of(begun, keys)
     first_s = first_command_s(begun)
@@ -254,7 +254,7 @@ def tune(
             for (key, value), width in zip(told.items(), half, strict=True)
         ),
         values=told,
-        aside=dict(zip(wanted, draw.tolist(), strict=True)),
+        perturbed=dict(zip(wanted, draw.tolist(), strict=True)),
         about_s=min(float(part.times_s[0]) for part in whole.parts.values()),
         end_s=end_s,
         chi2=chi2,

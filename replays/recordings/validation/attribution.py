@@ -70,9 +70,9 @@ def attribute(
     """Find what explains a difference.
 
     Args:
-        experiment: What was foretold.
+        experiment: What was predicted.
         parts: What was recorded.
-        nominal: What was foretold, on the same rows.
+        nominal: What was predicted, on the same rows.
         rules: Candidates and limits.
         from_s: First difference [s].
         step: Told what is being done.
@@ -190,11 +190,11 @@ def _candidates(experiment: Experiment, parts: dict[str, Measured], rules: Attri
         try:
             found[candidate.name] = _CandidateFit(experiment, candidate, parts)
         except InputError:
-            continue  # the experiment has no such number: no blow, no speed
+            continue  # the experiment has no such number: no hammer pulse, no speed
     return found
 
 
-class _Stage(NamedTuple):
+class _WindowStage(NamedTuple):
     """What the candidates explain on one window."""
 
     end_s: float
@@ -214,7 +214,7 @@ def _model(
 ) -> tuple[list[Explanation], float]:
     """What each candidate explains, and the end of the window that this is said of [s]."""
     places = dict.fromkeys(candidates, 0.0)  # where the fits begin, of those that are not given up
-    stages: list[_Stage] = []
+    stages: list[_WindowStage] = []
     for end_s in ends:
         fits: dict[str, Fit] = {}
         for name, p in places.items():
@@ -232,7 +232,7 @@ def _model(
         told = {
             name: candidates[name].explanation(found, before, end_s) for name, found in fits.items() if before > 0.0
         }
-        stages.append(_Stage(end_s, [one for one in told.values() if one.explained > 0.0]))
+        stages.append(_WindowStage(end_s, [one for one in told.values() if one.explained > 0.0]))
         best = max((one.explained for one in told.values()), default=0.0)
         fewest = min((one.squares for one in told.values()), default=0.0)
         places = {

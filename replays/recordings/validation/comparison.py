@@ -77,7 +77,7 @@ class _Again:
         quick: The same motion, with sensors that cost little.
         criteria: Loosened for an imported log.
         parts: What was recorded, on the model's clock.
-        nominal: What was foretold.
+        nominal: What was predicted.
         perturbed: The same, as far off as another build or a fit may be.
         bits: By key; empty for an imported log.
         tuned: What was fitted before, of an imported log.
@@ -97,21 +97,21 @@ def _done_again(
 ) -> _Again:
     rules = criteria.window
     parts = measured(recording, experiment.scene.sensors, longest_s=rules.longest_s)
-    further = "perturbed, to see how far it can be foretold"
+    how_far = "perturbed, to see how far it can be predicted"
     if is_imported(recording):
         tuned = tune(recording, experiment, criteria.imported.nuisances, progress=lambda text: step(f"log: {text}"))
         nominal = tuned.predict(parts)
-        step(further)
+        step(how_far)
         return _Again(
             quick=bare(tuned.experiment), criteria=criteria.loosened(criteria.imported.noise),
-            parts=tuned.on_time(parts), nominal=nominal, perturbed=tuned.predict(parts, aside=True), bits={},
+            parts=tuned.on_time(parts), nominal=nominal, perturbed=tuned.predict(parts, perturbed=True), bits={},
             tuned=tuned,
         )  # fmt: skip
     bits = Bits(recording, experiment.simulation().table)
     step("re-simulated, payload by payload")
     nominal = predict(experiment, parts, follow=bits.follow)
     quick = bare(experiment)
-    step(further)
+    step(how_far)
     moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
     return _Again(quick, criteria, parts, nominal, moved, bits.finish(), None)
 
@@ -145,8 +145,8 @@ def calibration(recording: Recording) -> list[str]:
     found = []
     if is_imported(recording):
         mapped = recording.scene["import"]["mapping"]["channels"]
-        untold = [name for name, entry in mapped.items() if "bandwidth_hz" not in entry]
-        return [f"no bandwidth told of {', '.join(untold)}: taken for half of the rate"] if untold else []
+        lacking = [name for name, entry in mapped.items() if "bandwidth_hz" not in entry]
+        return [f"no bandwidth told of {', '.join(lacking)}: taken for half of the rate"] if lacking else []
     for name, channel in recording.table.channels.items():
         if name not in own:
             found.append(f"{name}: not in the rig's own channel table")

@@ -114,7 +114,7 @@ class Clock:
 
         Args:
             parts: What was recorded.
-            nominal: What was foretold.
+            nominal: What was predicted.
             end_s: End of the window [s].
         """
         from scipy.interpolate import CubicSpline
@@ -133,7 +133,7 @@ class Clock:
     def residuals(self, change: np.ndarray) -> np.ndarray:
         """Over the noise, at a shift [s], or a shift and a rate [1], shape (n,)."""
         shift, rate = float(change[0]), float(change[1]) if len(change) > 1 else 0.0
-        # Beyond the window the foretold is known as well: a shift does not run out of it.
+        # Beyond the window the prediction is known as well: a shift does not run out of it.
         values = {
             name: self._splines[name](part.times_s - shift - rate * (part.times_s - self._first_s))
             for name, part in self._kept.items()

@@ -118,7 +118,7 @@ class Validation:
         explained: Where something failed, what it may come from.
         fitted: What was fitted before, as an imported log does not tell it exactly.
         parts: What was recorded.
-        nominal: What was foretold.
+        nominal: What was predicted.
         files: Number of files that the recording was in.
         doubts: What in the recording does not fit the rest of it: then nothing that is left of it is good.
     """

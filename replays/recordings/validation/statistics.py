@@ -53,7 +53,7 @@ def statistics(
     Args:
         experiment: What was done, with cheap sensors.
         parts: What was recorded.
-        nominal: What is foretold.
+        nominal: What is predicted.
         tables: The recorded truth.
         criteria: What is asked.
     """
@@ -77,7 +77,7 @@ def statistics(
             ends = [energy_change(tables["energy"], columns, phase, prediction) for _, prediction in members]
             samples[name] = (
                 energy_change(tables["energy"], columns, phase, nominal)[0],
-                [foretold for _, foretold in ends],
+                [predicted for _, predicted in ends],
             )
         results += [_judge(number, phase, name, *sample, criteria) for name, sample in samples.items()]
     return phases, results
@@ -105,7 +105,7 @@ def _viewer(experiment: Experiment, parts: dict[str, Measured]) -> Callable[[dic
 def _ensemble(
     experiment: Experiment, parts: dict[str, Measured], criteria: Criteria
 ) -> list[tuple[dict[str, np.ndarray], Prediction]]:
-    """Perturbed runs: what the channels show with noise of their own, and what is foretold without."""
+    """Perturbed runs: what the channels show with noise of their own, and what is predicted without."""
     generator = np.random.default_rng(0)  # of the ensemble's noise and perturbations: the same in every validation
     members = []
     for _ in range(criteria.ensemble.members):
@@ -122,12 +122,12 @@ def _ensemble(
 def _judge(
     number: int, phase: Phase, name: str, value: float, sample: list[float], criteria: Criteria
 ) -> StatisticResult:
-    foretold, deviation = float(np.median(sample)), float(np.std(sample, ddof=1))
+    predicted, deviation = float(np.median(sample)), float(np.std(sample, ddof=1))
     criterion = criteria.statistic_of(phase.name, name)
     limit = None
     if criterion is not None:
-        limit = criterion.relative * abs(foretold) + criterion.absolute + criterion.spread * deviation
+        limit = criterion.relative * abs(predicted) + criterion.absolute + criterion.spread * deviation
     return StatisticResult(
-        number=number, phase=phase.name, quantity=name, unit=QUANTITIES[name].unit, recorded=value, foretold=foretold,
+        number=number, phase=phase.name, quantity=name, unit=QUANTITIES[name].unit, recorded=value, foretold=predicted,
         spread=deviation, limit=limit, reason=criterion.reason if criterion else "",
     )  # fmt: skip

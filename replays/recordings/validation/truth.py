@@ -1,4 +1,4 @@
-"""The model's truth in a recording: table by table against what is foretold, and the energies of a phase."""
+"""The model's truth in a recording: table by table against what is predicted, and the energies of a phase."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def judge_truth(
     *,
     end_s: float,
 ) -> list[TruthResult]:
-    """Hold truth tables against what is foretold, to some time [s]; allowed is ten times what a perturbation does."""
+    """Hold truth tables against what is predicted, to some time [s]; allowed is ten times what a perturbation does."""
     found = []
     for name, (index, values) in tables.items():
         here, there = nominal.truth[name], perturbed.truth[name]
@@ -61,7 +61,7 @@ def judge_truth(
 def energy_change(
     table: tuple[np.ndarray, np.ndarray], columns: tuple[str, ...], phase: Phase, prediction: Prediction
 ) -> tuple[float, float]:
-    """Recorded and foretold change of a sum of integrals over a phase [J]."""
+    """Recorded and predicted change of a sum of integrals over a phase [J]."""
     index, values = table
     picked = [TRUTH["energy"].index(column) for column in columns]
     rate = prediction.truth_rate_hz
@@ -71,5 +71,5 @@ def energy_change(
         return 0.0, 0.0
     ends = [rows[0], rows[-1]]
     recorded = values[np.ix_(ends, picked)].sum(axis=1)
-    foretold = prediction.truth["energy"][np.ix_(index[ends], picked)].sum(axis=1)
-    return float(recorded[1] - recorded[0]), float(foretold[1] - foretold[0])
+    predicted = prediction.truth["energy"][np.ix_(index[ends], picked)].sum(axis=1)
+    return float(recorded[1] - recorded[0]), float(predicted[1] - predicted[0])
