@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import tomllib
 import wave
@@ -887,6 +888,14 @@ def test_damaged_files_are_one_line(
     assert printed.err.startswith(f"rig: {message}"), printed.err
     assert printed.err.count("\n") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["m.toml", name])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+@pytest.mark.parametrize("name", ["log.csv", "log.wav"])
+def test_a_pipe_is_no_log_and_is_not_waited_for(name: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match=r"^file must be a file that can be read; instead received .*not a regular"):
+        open_source(tmp_path / name, FileOptions())
 
 
 # pyuff leaves the file that it writes to the garbage collector.

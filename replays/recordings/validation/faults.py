@@ -41,17 +41,7 @@ def sensor_faults(parts: dict[str, Measured], nominal: Prediction, end_s: float)
             crossed = np.concatenate([ra - eb * (fb / fa), rb - ea * (fa / fb)])
             if is_noise(crossed):
                 share = (excess(ra - ea) + excess(rb - eb) - excess(crossed)) / total
-                found.append(
-                    Explanation.of(
-                        crossed,
-                        kind="sensor",
-                        name=f"{a} and {b}",
-                        change="swapped",
-                        value=0.0,
-                        explained=share,
-                        to_s=end_s,
-                    )
-                )
+                found.append(_fault(f"{a} and {b}", "swapped", 0.0, crossed, explained=share, to_s=end_s))
                 swapped |= {a, b}
     for name, (r, e, unit, floor) in off.items():
         if name not in swapped:
@@ -66,10 +56,8 @@ def _one_sensor(
     before = excess(r - e)
 
     def told(what: str, change: str, value: float, left: np.ndarray, of: str = "") -> Explanation:
-        return Explanation.of(
-            left, kind="sensor", name=f"{name} {what}", change=change, value=value, unit=of,
-            explained=(before - excess(left)) / total, to_s=to_s,
-        )  # fmt: skip
+        explained = (before - excess(left)) / total
+        return _fault(f"{name} {what}", change, value, left, unit=of, explained=explained, to_s=to_s)
 
     shift = float((r - e).mean())
     options = [told("offset", f"{shift * floor:+.4g} {unit}", shift * floor, r - e - shift, unit)]
@@ -91,11 +79,17 @@ def _one_sensor(
     tied = e.std() > 1.0 and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
     if white and not tied:
         ratio = float(rest.std())
-        return Explanation.of(
-            rest / ratio, kind="sensor", name=f"{name} noise", change=f"x {ratio:.2f}", value=ratio,
-            explained=before / total, to_s=to_s,
-        )  # fmt: skip
+        share = before / total
+        return _fault(f"{name} noise", f"x {ratio:.2f}", ratio, rest / ratio, explained=share, to_s=to_s)
     return best
+
+
+def _fault(
+    name: str, change: str, value: float, left: np.ndarray, *, unit: str = "", explained: float, to_s: float
+) -> Explanation:
+    return Explanation.of(
+        left, kind="sensor", name=name, change=change, value=value, unit=unit, explained=explained, to_s=to_s
+    )
 
 
 def _gain_words(gain: float) -> tuple[str, str]:
