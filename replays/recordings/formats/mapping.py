@@ -15,6 +15,12 @@ from rig.outside import check, read_toml
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 
 
+_ONLY_TEXT = (
+    "delimiter", "decimal", "thousands", "header_line", "units_line", "first_line", "encoding", "time_format",
+)  # fmt: skip
+"""Options that mean nothing for other files."""
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -62,16 +68,7 @@ class FileOptions(_Section):
         Raises:
             InputError: The first such option.
         """
-        for name in (
-            "delimiter",
-            "decimal",
-            "thousands",
-            "header_line",
-            "units_line",
-            "first_line",
-            "encoding",
-            "time_format",
-        ):
+        for name in _ONLY_TEXT:
             if getattr(self, name) is not None:
                 raise InputError(f"file.{name}", f"left out with {path.suffix} files", getattr(self, name))
 
