@@ -70,7 +70,7 @@ def validate(
 
 
 @dataclass(frozen=True)
-class _Again:
+class _DoneAgain:
     """The recording done again.
 
     Attributes:
@@ -94,7 +94,7 @@ class _Again:
 
 def _done_again(
     recording: Recording, experiment: Experiment, criteria: Criteria, step: Callable[[str], None]
-) -> _Again:
+) -> _DoneAgain:
     rules = criteria.window
     parts = measured(recording, experiment.scene.sensors, longest_s=rules.longest_s)
     how_far = "perturbed, to see how far it can be predicted"
@@ -102,7 +102,7 @@ def _done_again(
         tuned = tune(recording, experiment, criteria.imported.nuisances, progress=lambda text: step(f"log: {text}"))
         nominal = tuned.predict(parts)
         step(how_far)
-        return _Again(
+        return _DoneAgain(
             quick=bare(tuned.experiment), criteria=criteria.loosened(criteria.imported.noise),
             parts=tuned.on_time(parts), nominal=nominal, perturbed=tuned.predict(parts, perturbed=True), bits={},
             tuned=tuned,
@@ -113,10 +113,10 @@ def _done_again(
     quick = bare(experiment)
     step(how_far)
     moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
-    return _Again(quick, criteria, parts, nominal, moved, bits.finish(), None)
+    return _DoneAgain(quick, criteria, parts, nominal, moved, bits.finish(), None)
 
 
-def _window(again: _Again) -> tuple[float, float, str]:
+def _window(again: _DoneAgain) -> tuple[float, float, str]:
     """Begin and end of what is compared sample by sample [s], and how the end was found."""
     rules, parts = again.criteria.window, again.parts
     begin = min(float(part.times_s[0]) for part in parts.values())
@@ -128,7 +128,7 @@ def _window(again: _Again) -> tuple[float, float, str]:
     return begin, parted, f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
 
 
-def _explained(again: _Again, *, from_s: float, step: Callable[[str], None]) -> Explained:
+def _explained(again: _DoneAgain, *, from_s: float, step: Callable[[str], None]) -> Explained:
     rules = again.criteria.attribution
     if again.tuned is not None:  # numbers of the model hang together with what was fitted: `rig identify` fits all
         rules = rules.model_copy(update={"candidates": ()})
