@@ -25,8 +25,9 @@ import pytest
 
 from replays.studies.peers import PEERS, Setting, scaled_error
 from replays.studies.peers.problem import Problem
+from replays.studies.stability.flight import house_oscillator
+from replays.studies.stability.impacts import first_impact
 from replays.studies.stability.motion import move, quiet_inputs, state
-from replays.studies.stability.trials import first_impact, house_oscillator
 from rig import load_scene
 from rig.engines import taylor
 from rig.engines.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, MEMORY, ONSET, PHASE, STEPS

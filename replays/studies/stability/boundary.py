@@ -6,11 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from replays.report.canvas import BLUE, ORANGE
 from replays.studies.stability.motion import hammer_run, move
 
 FREE, BOUNCING, SLIDING, ROLLING = range(4)
 """Class at the end of a run: out of contact; now and then in it; always in it and slipping; always, and rolling."""
 NAMES = ("free", "bouncing", "sliding whirl", "rolling whirl")
+STYLES = (("#F2F2F2", "o"), ("#F0E442", "s"), (ORANGE, "^"), (BLUE, "D"))
+"""Colour and marker of each class, in every picture."""
 _WINDOW_S = 0.05
 _ROLLS = 1e-2
 """Sliding speed up to which a contact counts as rolling [m/s]; sliding at 6.2 Hz is faster by a factor of 50."""
