@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.report.document import Heading, Picture, Report, Table
+from replays.report.document import Heading, Paragraph, Picture, Report, Table
 from replays.studies.paper.blow import BLOW_AT, Blow, Outcome, outcome, outcomes
 from replays.studies.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
-from replays.studies.paper.document import Findings, all_questions, find, planned_groups, steps, write_up
+from replays.studies.paper.document import write_up
 from replays.studies.paper.figure import first_impacts
+from replays.studies.paper.findings import Findings, find, planned_groups, steps
 from replays.studies.paper.spread import (
     assumed_values,
     changes,
@@ -207,8 +208,14 @@ def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: P
     for table in (part for part in report.parts if isinstance(part, Table)):
         assert table.rows, table.caption
         assert any(re.search(r"\d", cell) for row in table.rows for cell in row.cells[1:])
-    for question in all_questions(findings):
-        assert re.search(r"\d", question.answer)
+    opened = report.parts.index(Heading("Open questions"))
+    questions = [n for n, part in enumerate(report.parts) if isinstance(part, Heading) and n > opened]
+    questions = questions[: next(n for n, place in enumerate(questions) if report.parts[place].level == 1)]
+    assert len(questions) == 6
+    for place in questions:
+        answer = report.parts[place + 2]
+        assert isinstance(answer, Paragraph)
+        assert re.search(r"\d", answer.text)
     target = tmp_path / "report.html"
     report.write(target)
     text = target.read_text(encoding="utf-8")
@@ -269,7 +276,7 @@ def test_number():
 
 
 def test_terminal_tells_the_total_and_the_rule(findings: Findings, capsys, monkeypatch):
-    monkeypatch.setattr("replays.studies.paper.document.find", lambda **_: findings)
+    monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
     with pytest.raises(SystemExit) as end:
         main(["paper", "--quick"])
     assert end.value.code == 0
@@ -285,7 +292,7 @@ def test_terminal_tells_the_total_and_the_rule(findings: Findings, capsys, monke
 
 
 def test_a_folder_for_pictures_is_made_beside_others(findings: Findings, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("replays.studies.paper.document.find", lambda **_: findings)
+    monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
     drawn: list[Path] = []
     monkeypatch.setattr("replays.studies.paper.document.draw_pictures", lambda _, folder: drawn.append(folder) or [])
     (tmp_path / "file").write_text("")

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from replays.studies.paper.blow import Blow
 from replays.studies.paper.claim import Groups, Results, median
 from replays.studies.paper.condition import oscillator
@@ -33,19 +31,17 @@ _LENGTHS_MM = (10.0, 16.9, 25.0, 35.0, 50.0)
 
 @dataclass(frozen=True)
 class Question:
-    """One open question.
+    """What there is on one open question; the report's template says what it means.
 
     Attributes:
-        title: In words.
         headings: Of the table.
         rows: What is known, with its number.
-        answer: What the numbers say, made from them.
+        numbers: What the answer is made of.
     """
 
-    title: str
     headings: tuple[str, ...]
     rows: list[tuple[str, ...]]
-    answer: str
+    numbers: dict[str, Any]
 
 
 def question_groups(*, ensemble: int) -> Groups:
@@ -145,14 +141,9 @@ def drop_question(found: dict[str, Reproduction]) -> Question:
         ("100 m/s^2 (Fig. 10(d), unit assumed) of the inner house",
          f"{PAPER_DROP_N * constants.house.inner_mass:.0f} N"),
     ]  # fmt: skip
-    ratio = half_sine_ms / (free.duration * 1e3)
-    answer = (
-        f"To turn the fall round in a push of 100 N takes {half_sine_ms:.1f} ms, {ratio:.0f} times the contact of "
-        f"{free.duration * 1e3:.2f} ms that the printed elastic constants give with the assumed radii. "
-        + ("The printed force and the printed constants do not fit each other; nothing was fitted."
-           if ratio > 2.0 else "The two fit each other.")
-    )  # fmt: skip
-    return Question("The drop's 100 N", ("quantity", "value"), rows, answer)
+    contact_ms = free.duration * 1e3
+    numbers = {"half_sine_ms": half_sine_ms, "contact_ms": contact_ms, "ratio": half_sine_ms / contact_ms}
+    return Question(("quantity", "value"), rows, numbers)
 
 
 def _house_row(name: str, results: Results, group: str, *, mass: float, link: float) -> tuple[str, ...]:
@@ -170,9 +161,11 @@ _HOUSE_HEADINGS = (
 )  # fmt: skip
 
 
-def _spread(rows: list[tuple[str, ...]], place: int) -> float:
-    values = [float(row[place]) for row in rows]
-    return max(values) / min(values) - 1.0
+def _spreads(rows: list[tuple[str, ...]]) -> dict[str, float]:
+    """By how much the readings differ in the force in whirl, E - W, and in its highest value."""
+    columns = {"whirl_spread": 2, "highest_spread": 4}
+    values = {name: [float(row[place]) for row in rows] for name, place in columns.items()}
+    return {name: max(each) / min(each) - 1.0 for name, each in values.items()}
 
 
 def mass_question(results: Results) -> Question:
@@ -184,13 +177,8 @@ def mass_question(results: Results) -> Question:
     ]
     zeta, stiffness, damping = 0.054, p["house.outer_beam_stiffness"], p["house.outer_beam_damping"]
     implied = (damping / (2.0 * zeta)) ** 2 / stiffness
-    answer = (
-        f"The printed D_bh = {damping:g} N s/m with zeta = {zeta} and K_bh implies a mass of {implied:.2f} kg on the "
-        "horizontal beams: 8.88 kg it is, not 10.58 kg. Vertically both houses move on those beams, so this fits the "
-        "total as well as an outer house alone, and does not decide between 7.18 and 8.88 kg. The force in whirl, E - "
-        f"W, differs by {_spread(rows, 2):.1%} between the three readings, the highest by {_spread(rows, 4):.0%}."
-    )
-    return Question("The outer house's mass: 8.88 kg in all, or alone?", _HOUSE_HEADINGS, rows, answer)
+    numbers = {"damping": damping, "zeta": zeta, "implied_kg": implied, **_spreads(rows)}
+    return Question(_HOUSE_HEADINGS, rows, numbers)
 
 
 def pair_question(results: Results) -> Question:
@@ -200,12 +188,7 @@ def pair_question(results: Results) -> Question:
         _house_row(f"{factor:g} K_ft", results, f"pair {factor:g}", mass=mass, link=factor * K_FT)
         for factor in PAIR_STIFFNESS
     ]
-    answer = (
-        "Two preloaded transducers on opposite sides of a mass act in parallel, so the pair has 2 K_ft as long as "
-        f"both stay loaded. In whirl E - W differs by {_spread(rows, 2):.1%} between the readings, the highest by "
-        f"{_spread(rows, 4):.0%}; no printed force decides between them."
-    )
-    return Question("The pair's stiffness: K_ft / 2 or 2 K_ft?", _HOUSE_HEADINGS, rows, answer)
+    return Question(_HOUSE_HEADINGS, rows, _spreads(rows))
 
 
 def magnet_question() -> Question:
@@ -226,17 +209,14 @@ def magnet_question() -> Question:
                  f"{exact / used:.0%}")
             )  # fmt: skip
     enough = [row[0] for row in rows if float(row[2]) * 1e3 >= used]
-    answer = (
-        f"K_mag = {used / 1e3:g} kN/m is assumed from Fig. 7 and from running free of contact. The 8 magnets of 16.9 "
-        f"mm (assumed) that give it by eq. 35 would give {best / 1e3:.2f} kN/m as exact cylinders, {best / used:.0%} "
-        f"of it. " + (f"Of those in the table {enough[0]} would do." if enough else "None in the table would do.")
-    )
-    return Question(
-        "K_mag: do the magnets give the stiffness?",
-        ("magnets (number and length assumed)", "K by eq. 35 [kN/m]", "K of exact cylinders [kN/m]", "of K_mag"),
-        rows,
-        answer,
-    )
+    numbers = {
+        "used_kn_m": used / 1e3,
+        "best_kn_m": best / 1e3,
+        "share": best / used,
+        "enough": enough[0] if enough else "",
+    }
+    headings = ("magnets (number and length assumed)", "K by eq. 35 [kN/m]", "K of exact cylinders [kN/m]", "of K_mag")
+    return Question(headings, rows, numbers)
 
 
 def running_question() -> Question:
@@ -250,18 +230,8 @@ def running_question() -> Question:
             free.append(stiffness)
         natural_hz = oscillator(run.simulation.model.constants).natural / (2.0 * math.pi)
         rows.append((f"{stiffness:g}", f"{natural_hz:.2f}", number(gap_mm), "no" if gap_mm > 0.0 else "yes"))
-    answer = (
-        f"{len(free)} of the {len(STIFFNESSES_KN_M)} tried run at 6.2 Hz without touching the ring, the softest at "
-        f"{min(free):g} kN/m: it does not fix K_mag, where the ring is centred on the sagging shaft (assumed)."
-        if free
-        else f"None of the {len(STIFFNESSES_KN_M)} tried runs free of contact."
-    )
-    return Question(
-        "K_mag: does running free of contact at 6.2 Hz fix it?",
-        ("K_mag [kN/m]", "w_n, linear [Hz]", "least gap in 3 s from rest [mm]", "touches"),
-        rows,
-        answer,
-    )
+    headings = ("K_mag [kN/m]", "w_n, linear [Hz]", "least gap in 3 s from rest [mm]", "touches")
+    return Question(headings, rows, {"free": free, "tried": len(STIFFNESSES_KN_M)})
 
 
 def clearance_question(found: dict[str, Reproduction]) -> Question:
@@ -293,29 +263,23 @@ def clearance_question(found: dict[str, Reproduction]) -> Question:
         ends = [row[3].split(" to ") for row in rows if not any(text in row[0] for text in left_out)]
         return max(float(low) for low, _ in ends), min(float(high) for _, high in ends)
 
-    def told(low: float, high: float) -> str:
-        where = "inside" if low <= r0 <= high else "outside"
-        return f"r0 = {low:.2f} to {high:.2f} mm ({r0:.3f} mm, assumed, is {where})"
-
-    simulated, all_but_one = together("the same", "measured"), together("the same")
-    answer = (
-        f"The paper's simulated axes, but the drop at the probes, together allow {told(*simulated)}, R_S = "
-        f"{13.5 * simulated[0]:.1f} to {13.5 * simulated[1]:.1f} mm; with the measured one, which the paper's own "
-        f"simulation exceeds, {told(*all_but_one)}. An axis is taken to be filled by more than 2/5, and not left; "
-        "lengths and whirl forces go with r0 at equal spin and ratio."
-    )
-    return Question(
-        "Clearance and radius: only R_S / r0 = 13.5 is printed",
-        ("axis", "ours", "the axis", "r0 allowed [mm]", "R_S allowed [mm]", "ours inside"),
-        rows,
-        answer,
-    )
+    numbers = {"r0_mm": r0, "simulated": together("the same", "measured"), "with_measured": together("the same")}
+    headings = ("axis", "ours", "the axis", "r0 allowed [mm]", "R_S allowed [mm]", "ours inside")
+    return Question(headings, rows, numbers)
 
 
-def spectrum_of(values: np.ndarray) -> tuple[float, float, float]:
-    """5, 50 and 95 % of the finite values."""
-    there = values[np.isfinite(values)]
-    if not len(there):
-        return math.nan, math.nan, math.nan
-    low, middle, high = np.percentile(there, [5, 50, 95])
-    return float(low), float(middle), float(high)
+def all_questions(found: dict[str, Reproduction], results: Results) -> dict[str, Question]:
+    """All open questions by the name that the report's template has for them.
+
+    Args:
+        found: The paper's runs by parameter set.
+        results: Outcomes of the scans by group.
+    """
+    return {
+        "drop": drop_question(found),
+        "mass": mass_question(results),
+        "pair": pair_question(results),
+        "magnet": magnet_question(),
+        "running": running_question(),
+        "clearance": clearance_question(found),
+    }
