@@ -135,6 +135,12 @@ def rolling_whirl(constants: Constants, spin: float) -> tuple[float, float]:
     return -spin * constants.shaft.radius / (contact.clearance + depth), depth
 
 
+def rolling_circle(constants: Constants, spin: float) -> tuple[float, float]:
+    """Whirl frequency [rad/s] and radius [m] of rolling at a spin [rad/s]."""
+    whirl, depth = rolling_whirl(constants, spin)
+    return whirl, constants.contact.clearance + depth
+
+
 def bare_rig(friction: float) -> Constants:
     """The system of the closed forms: a mass on linear magnets in a rigid, centred ring, damped alike both ways."""
     constants = base_model(ModelLevels(magnet="linear", shaft="planar", stator="rigid")).constants

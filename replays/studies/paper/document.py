@@ -17,11 +17,13 @@ import numpy as np
 
 from replays.report import Report
 from replays.report.canvas import save
-from replays.studies.paper import condition, figure
+from replays.studies.paper import condition, figure, question
 from replays.studies.paper.chart import draw_conditions, draw_law
 from replays.studies.paper.claim import (
     BANDWIDTHS_HZ,
+    LAWS,
     MEASURED_N,
+    SCALES,
     bars,
     draw_mobility,
     draw_spread,
@@ -30,52 +32,68 @@ from replays.studies.paper.claim import (
     toward_measured,
 )
 from replays.studies.paper.findings import Findings, count
-from replays.studies.paper.question import Question, all_questions
-from replays.studies.paper.spread import column, free_values, rank_correlation
+from replays.studies.paper.spread import assumed_values, column, free_values, percentiles, present, rank_correlation
 from replays.studies.paper.statement import number
-from replays.studies.paper.table import IDLE_N, TABLES, closed_force, idle_changes, summary, whirling_spin
+from replays.studies.paper.table import IDLE_N, TABLES, idle_changes, summary
+from rig.parameters import load_parameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PLACED = re.compile(r"\[(?P<kind>table|picture|verdicts) (?P<name>[^],]+)(, (?P<dpi>\d+) dpi)?\] ?(?P<caption>.*)")
+_CELLS = " | "
+"""Between the cells of a table in the text."""
 
 
 def write_up(findings: Findings, *, quick: bool) -> Report:
     """The report of what was found."""
     import jinja2
 
-    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True, autoescape=False)
+    environment = jinja2.Environment(
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False
+    )
     environment.filters |= {"as": format, "number": number}
     template = environment.from_string(files(__package__).joinpath("report.jinja").read_text(encoding="utf-8"))
-    questions = all_questions(findings.found, findings.results)
-    text = template.render(quick=quick, **_numbers(findings, questions))
-    title, lead, *blocks = [" ".join(block.split()) for block in re.split(r"\n\s*\n", text.strip())]
-    report = Report(title, lead)
+    text = template.render(quick=quick, **_numbers(findings))
+    title, lead, *blocks = re.split(r"\n\s*\n", text.strip())
+    report = Report(_joined(title), _joined(lead))
     for block in blocks:
-        placed = _PLACED.fullmatch(block)
+        words = _joined(block)
+        placed = _PLACED.fullmatch(words)
         if placed:
-            _place(report, findings, questions, placed)
+            _place(report, findings, placed)
         elif block.startswith("#"):
-            marks, _, words = block.partition(" ")
-            report.heading(words, level=len(marks))
+            marks, _, heading = words.partition(" ")
+            report.heading(heading, level=len(marks))
+        elif _CELLS in block:
+            _add_table(report, block)
         else:
-            report.text(block)
+            report.text(words)
     return report
 
 
-def _place(report: Report, findings: Findings, questions: dict[str, Question], placed: re.Match[str]) -> None:
-    """Put a table or picture, or the summary's lines of one figure once more, where the text names it."""
-    kind, name, caption = placed["kind"], placed["name"], placed["caption"]
-    if kind == "picture":
+def _joined(text: str) -> str:
+    """Lines as one."""
+    return " ".join(text.split())
+
+
+def _add_table(report: Report, block: str) -> None:
+    """A table that stands in the text: caption, headings, rows; an indented line goes on with the one before."""
+    lines = re.sub(r"\n\s+", " ", block).split("\n")
+    first = next(n for n, line in enumerate(lines) if _CELLS in line)
+    headings, *rows = ([_joined(cell) for cell in line.split(_CELLS)] for line in lines[first:])
+    report.table(headings, rows, caption=_joined(" ".join(lines[:first])))
+
+
+def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
+    """Put a picture, a table, or the summary's lines on some quantities once more, where the text names it."""
+    name, caption = placed["name"], placed["caption"]
+    if placed["kind"] == "picture":
         dpi = {"dpi": int(placed["dpi"])} if placed["dpi"] else {}
         report.picture(_PICTURES[name](findings), caption, **dpi)
-    elif kind == "verdicts":
+    elif placed["kind"] == "verdicts":
         lines = [*findings.lines, *findings.claims]
         report.table(*summary([line for line in lines if line.statement.quantity.startswith(tuple(name.split()))]))
-    elif name.endswith("-question"):
-        question = questions[name.removesuffix("-question")]
-        report.table(question.headings, question.rows, caption=caption)
     else:
         report.table(*TABLES[name](findings), caption=caption)
 
@@ -110,39 +128,33 @@ def draw_pictures(findings: Findings, folder: Path) -> list[Path]:
     ]
 
 
-def _numbers(findings: Findings, questions: dict[str, Question]) -> dict[str, Any]:
+def _numbers(findings: Findings) -> dict[str, Any]:
     """What the text is filled with."""
     lines = [*findings.lines, *findings.claims]
-    own, constants, fastest = condition.oscillator(findings.constants), findings.constants, findings.least[-1]
-    spin = 2.0 * math.pi * fastest.spin_hz
-    whirl, depth = condition.rolling_whirl(constants, spin)
-    force = condition.normal_force(own, whirl, constants.contact.clearance + depth)
-    turned = condition.blow_whirl(constants, force_n=100.0, duration_s=5e-3)
-    share = 0.5 * (turned / own.natural - own.natural / turned)
-    kinds = [result.outcome for result in findings.spread]
+    results, found = findings.results, findings.found
     return {
         "lines": len(lines),
         "counts": count(lines),
+        "found": found,
+        "median": lambda group, quantity: median(results[group], quantity),
         "measured_n": MEASURED_N,
-        **{name: question.numbers for name, question in questions.items()},
+        "drop": question.drop_numbers(found),
+        **question.house_numbers(results),
+        "magnet": question.magnet_numbers(),
+        "running": question.running_numbers(),
+        "clearance": question.clearance_numbers(found),
         "tornado": {"idle_n": IDLE_N, "idle": idle_changes(findings)},
         "moves": _moves(findings),
-        "ring": {
-            "closed_n": closed_force(constants, whirling_spin(findings.found["corrected"], 6.2)),
-            "rigid_n": median(findings.results["alternative house rigid"], "normal_n"),
-        },
-        "spread": {
-            "runs": len(kinds),
-            "outcomes": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
-            "chance": 2 / math.sqrt(max(1, len(kinds))),
-        },
-        "own": {"mass": own.mass, "natural_hz": own.natural / (2 * math.pi), "ratio": own.ratio},
-        "fastest": {
-            "spin_hz": fastest.spin_hz,
-            "swing_n": condition.friction_swing(constants, spin),
-            "asked_n": fastest.with_houses * force,
-        },
-        "turned": {"whirl_hz": turned / (2 * math.pi), "friction": own.ratio / share},
+        "mobility": {f"x {scale:g}": f"mobility {scale:g}" for scale in SCALES} | {"rigid": "alternative house rigid"},
+        "low_passes": dict(zip(BANDWIDTHS_HZ, results["bandwidth"], strict=True)),
+        "laws": LAWS,
+        "ring": _ring_forces(findings),
+        "spread": _spread(findings),
+        **_whirl(findings),
+        "assumed": [
+            (entry, present(entry), entry.unit or load_parameters("corrected").entries[entry.key].unit)
+            for entry in assumed_values()
+        ],
     }
 
 
@@ -173,4 +185,67 @@ def _moves(findings: Findings) -> dict[str, Any]:
         "share": float(np.mean([result.reaction_x_n <= MEASURED_N for result in whirling])) if whirling else math.nan,
         "first": first,
         "second": second,
+    }
+
+
+def _ring_forces(findings: Findings) -> dict[str, Any]:
+    """Force on a rigid ring in whirl by closed form [N], by the drive's speed [Hz], at the simulated spin."""
+    constants = findings.constants
+    own, closed = condition.oscillator(constants), {}
+    for speed, run in findings.found["corrected"].speeds.items():
+        spin = float(np.mean(run["spin_rate"][run.times_s > run.times_s[-1] - 0.3]))
+        closed[speed] = condition.normal_force(own, *condition.rolling_circle(constants, spin))
+    rigid = median(findings.results["alternative house rigid"], "normal_n")
+    return {"speeds": closed, "closed_n": closed[6.2], "rigid_n": rigid}
+
+
+def _spread(findings: Findings) -> dict[str, Any]:
+    """What comes of all assumed values at once."""
+    shown = {
+        "E - W in whirl [N]": "reaction_x_n",
+        "N - S in whirl [N]": "reaction_y_n",
+        "mean normal force in whirl [N]": "normal_n",
+        "highest normal force [N]": "peak_normal_n",
+        "highest E - W [N]": "peak_x_n",
+        "whirl frequency [Hz]": "whirl_hz",
+        "spin in whirl [Hz]": "spin_hz",
+    }
+    spread = findings.spread
+    kinds = [result.outcome for result in spread]
+    ranked = [np.abs(column(spread, name)) for name in ("reaction_x_n", "peak_x_n", "whirl_hz")]
+    ranks = np.transpose([rank_correlation(findings.parts, values) for values in ranked])
+    return {
+        "runs": len(kinds),
+        "outcomes": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
+        "chance": 2 / math.sqrt(max(1, len(kinds))),
+        "quantities": {label: percentiles(column(spread, name)) for label, name in shown.items()},
+        "ranks": {entry.key: each.tolist() for entry, each in zip(free_values(), ranks, strict=True)},
+    }
+
+
+def _whirl(findings: Findings) -> dict[str, Any]:
+    """When it whirls, and how fast."""
+    constants, fastest = findings.constants, findings.least[-1]
+    own = condition.oscillator(constants)
+    spin = 2.0 * math.pi * fastest.spin_hz
+    force = condition.normal_force(own, *condition.rolling_circle(constants, spin))
+    turned = condition.blow_whirl(constants, force_n=100.0, duration_s=5e-3)
+    share = 0.5 * (turned / own.natural - own.natural / turned)
+    sweep = []
+    for speed, result in findings.sweep.items():
+        law, rigid = condition.law_hz(speed)
+        error = condition.law_error(result, speed)
+        sweep.append({"speed_hz": speed, "law_hz": law, "rigid_hz": rigid, "error": error, **vars(result)})
+    return {
+        "own": {"mass": own.mass, "natural_hz": own.natural / (2 * math.pi), "ratio": own.ratio},
+        "slowest": findings.slowest,
+        "least": findings.least,
+        "fastest": {
+            "spin_hz": fastest.spin_hz,
+            "swing_n": condition.friction_swing(constants, spin),
+            "asked_n": fastest.with_houses * force,
+        },
+        "starts": findings.starts,
+        "turned": {"whirl_hz": turned / (2 * math.pi), "friction": own.ratio / share},
+        "sweep": sweep,
     }

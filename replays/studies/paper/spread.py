@@ -140,3 +140,12 @@ def rank_correlation(parts: np.ndarray, values: np.ndarray) -> np.ndarray:
         return np.full(parts.shape[1], math.nan)
     found: list[Any] = [spearmanr(parts[there, k], values[there]) for k in range(parts.shape[1])]
     return np.array([float(each.statistic) for each in found])
+
+
+def percentiles(values: np.ndarray) -> tuple[float, float, float]:
+    """5, 50 and 95 % of the finite values, nan where there are none."""
+    there = values[np.isfinite(values)]
+    if not len(there):
+        return math.nan, math.nan, math.nan
+    low, middle, high = np.percentile(there, [5, 50, 95])
+    return float(low), float(middle), float(high)
