@@ -12,7 +12,7 @@ from rig.engines import ENGINES, load_engine
 from rig.engines.memory import MEMORY
 from rig.errors import SimulationError
 from rig.kernels.constants import Constants, Inputs
-from rig.kernels.signals import N_STATE, N_VECTOR
+from rig.kernels.signals import N_VECTOR
 from rig.simulation import Simulation
 
 
@@ -74,10 +74,10 @@ class Course:
         )
         self.tick += steps * self.step
 
-    @property
-    def state(self) -> np.ndarray:
-        """The state without the integrals, shape (N_STATE,)."""
-        return self.y[:N_STATE]
+    def look(self, rows: np.ndarray) -> None:
+        """Write the row of now, shape (1, N_ROW), and stay."""
+        y, memory = self.y.copy(), self.memory.copy()
+        self._engine.advance(self._constants, self._inputs, y, memory, self.tick, self.step, 1, 1, rows)
 
 
 class Timed(NamedTuple):

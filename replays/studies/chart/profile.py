@@ -59,19 +59,19 @@ def cheapest(contender: Competitor, problem: Problem, reference: Reference, budg
     """Walk down a method's ladder until the target is reached.
 
     Returns:
-        Columns of that rung's point; where none reaches it, of the last one tried, with failure "target".
+        Columns of that setting's point; where none reaches it, of the last one tried, with failure "target".
     """
     columns: dict[str, Any] = {}
-    for rung in contender.rungs:
+    for setting in contender.settings:
         try:
-            columns = point(contender, rung, problem, reference, budget._replace(runs=1, single_s=0.0))
+            columns = point(contender, setting, problem, reference, budget._replace(runs=1, single_s=0.0))
         except NotImplementedError as error:
             columns = {"failure": "error", "message": str(error)}
             break
-        columns |= {"rung": rung.label, "step_us": rung.step_us, "tolerance": rung.tolerance}
+        columns |= {"rung": setting.label, "step_us": setting.step_us, "tolerance": setting.tolerance}
         error = columns["error"]
         if error is not None and error <= TARGET and not columns["failure"]:
-            again = point(contender, rung, problem, reference, budget)
+            again = point(contender, setting, problem, reference, budget)
             return {**columns, **again}
         if columns["failure"] == "budget":
             return columns

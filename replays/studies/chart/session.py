@@ -10,7 +10,7 @@ from typing import Any
 
 from replays.studies.chart import profile
 from replays.studies.chart.measure import Budget, point, run_engine, statistics_point
-from replays.studies.chart.methods import OURS, Competitor, Rung, competitors, missing_peers
+from replays.studies.chart.methods import OURS, Competitor, competitors, missing_peers
 from replays.studies.chart.phases import (
     FLOORS,
     PHASES,
@@ -123,7 +123,7 @@ def make_chart(
 def _own_reference(problem: Problem) -> Reference | None:
     """Where no second peer is installed: scipy's DOP853 and our rk8, which share the equations but not the code."""
     first = PEERS["scipy-dop853"].solve(problem, Setting("1e-13", 1e-13), budget_s=300.0)
-    second = run_engine("rk8", Rung("1e-12", 25, 1e-12), problem, Budget(300.0, 1))
+    second = run_engine("rk8", Setting("1e-12", 1e-12, step_us=25), problem, Budget(300.0, 1))
     if first.failure is not None or second.failure:
         return None
     error = scaled_error(first.states, second.states)
@@ -180,22 +180,19 @@ class _Work:
         self.store.add(row | columns)
         self.compiling(row["family"], float(columns.get("compile_s") or 0.0), again=row["family"] == OURS)
 
-    def base(self, panel: str, phase: str, case: str, contender: Competitor, rung: Rung | None) -> Row:
-        tolerance = None
-        if rung is not None:
-            tolerance = rung.tolerance if rung.setting is None else rung.setting.tolerance
+    def base(self, panel: str, phase: str, case: str, contender: Competitor, setting: Setting | None) -> Row:
         return {
             "mode": self.mode,
             "panel": panel,
             "phase": phase,
             "case": case,
             "method": contender.name,
-            "rung": "" if rung is None else rung.label,
+            "rung": "" if setting is None else setting.label,
             "title": contender.title,
             "family": contender.family,
             "known_failure": contender.known_failure,
-            "step_us": rung.step_us if rung is not None and rung.step_us else None,
-            "tolerance": tolerance,
+            "step_us": setting.step_us or None if setting is not None else None,
+            "tolerance": None if setting is None else setting.tolerance,
         }
 
 
@@ -249,9 +246,9 @@ def _references(work: _Work, panel: str, phase: str, case: str) -> None:
 
 def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadline: float) -> None:
     contender = work.contenders[task.method]
-    progress.step(f"{task.panel}, {task.phase}: {contender.title}, {task.rung.label}")
-    row = work.base(task.panel, task.phase, task.case, contender, task.rung)
-    if work.store.has((work.mode, task.panel, task.phase, task.case, task.method, task.rung.label)):
+    progress.step(f"{task.panel}, {task.phase}: {contender.title}, {task.setting.label}")
+    row = work.base(task.panel, task.phase, task.case, contender, task.setting)
+    if work.store.has((work.mode, task.panel, task.phase, task.case, task.method, task.setting.label)):
         outcome.resumed += 1
         return
     if time.perf_counter() > deadline + work.compile_s:
@@ -264,13 +261,13 @@ def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadli
     if task.panel == RUB:
         budget = budget._replace(solve_s=_RUB_BUDGET_S[work.mode])
         settle = min(1.0, 0.25 * problem.duration_s)
-        columns = statistics_point(contender, task.rung, problem, budget, settle_s=settle)
+        columns = statistics_point(contender, task.setting, problem, budget, settle_s=settle)
     else:
         reference = work.reference(task.panel, task.phase, task.case)
         if reference is None:
             outcome.left += 1
             return
-        columns = point(contender, task.rung, problem, reference, budget)
+        columns = point(contender, task.setting, problem, reference, budget)
     work.keep(row, columns)
     outcome.measured += 1
 
