@@ -8,6 +8,7 @@ from typing import Any, Literal
 from replays.studies.chart.methods import Competitor
 from replays.studies.peers import Setting
 from replays.studies.peers.problem import Problem
+from replays.studies.peers.window import cut_window
 from rig.errors import InputError
 from rig.scenes import load_scene, parse_scene
 
@@ -159,7 +160,7 @@ def problem_of(
         scene = parse_scene(
             {"name": window.name, "duration_s": end, "drive": {"speed_hz": RUB_SPEED_HZ}, "set": changes}
         )
-    return Problem.from_scene(
+    return cut_window(
         scene,
         end_s=end,
         sample_s=FRAME_S if panel != RUB else RUB_SAMPLE_S,

@@ -15,6 +15,7 @@ from replays.studies.chart.methods import Competitor
 from replays.studies.chart.phases import FRAME_S
 from replays.studies.peers.problem import Problem
 from replays.studies.peers.reference import Reference
+from replays.studies.peers.window import cut_window
 from rig.scenes import Scene, parse_scene
 
 TARGET = 1e-3
@@ -52,7 +53,7 @@ def draw_scene(seed: int) -> Scene:
 
 def draw_problem(seed: int) -> Problem:
     """Its window, with exact Coulomb friction."""
-    return Problem.from_scene(draw_scene(seed), sample_s=FRAME_S, friction="exact")
+    return cut_window(draw_scene(seed), sample_s=FRAME_S, friction="exact")
 
 
 def cheapest(contender: Competitor, problem: Problem, reference: Reference, budget: Budget) -> dict[str, Any]:

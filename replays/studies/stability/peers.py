@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from replays.studies.peers import PEERS, Problem, Setting
+from replays.studies.peers.window import cut_window
 from replays.studies.stability.cell import Case, Cell
 from replays.studies.stability.flight import house_energy, house_oscillator
 from replays.studies.stability.motion import quiet_inputs, state
@@ -40,7 +41,7 @@ def _hammer(name: str, tolerance: float) -> float:
     scene = load_scene("hammer", {"drive.speed_hz": 0.0, "duration_s": 0.6})
     command = scene.commands[0].model_copy(update={"at_s": 0.5})
     scene = scene.model_copy(update={"commands": (command,)})
-    problem = Problem.from_scene(scene, end_s=0.5051, sample_s=1e-3, friction="smoothed")
+    problem = cut_window(scene, end_s=0.5051, sample_s=1e-3, friction="smoothed")
     states = PEERS[name].solve(problem, Setting(f"{tolerance:g}", tolerance), budget_s=20.0).states
     right = PEERS["scipy-dop853"].solve(problem, Setting("1e-8", 1e-8), budget_s=20.0).states
     return abs(float(states[-1, 8] / right[-1, 8]) - 1.0)
