@@ -197,7 +197,10 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
     ):
         axes.semilogx(speeds, values, **{"lw": 1.8, "label": name, **style})
     low = max(0.0, min(min(values) for values in curves.values()) - 0.02)
-    for place, text in ((floor, f"floor of v0, {floor:g} m/s"), (impact.speed, f"reference, {impact.speed:g} m/s")):
+    for place, text in (
+        (floor, f"lower limit of v₀, {floor:g} m/s"),
+        (impact.speed, f"reference, {impact.speed:g} m/s"),
+    ):
         axes.axvline(place, color="0.5", lw=0.9, ls=":")
         axes.annotate(
             text, (place, low), xytext=(4, 5), textcoords="offset points", ha="left", va="bottom", rotation=90,
@@ -227,12 +230,12 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
                 depths[within] * 1e6, (fitted / depths)[within] * 1e-6, color=color, ls="none", marker="o", ms=4,
                 mfc="white", markevery=3,
             )  # fmt: skip
-    axes.plot([], [], color="0.3", ls="none", marker="o", ms=4, mfc="white", label="K delta^n in its place")
+    axes.plot([], [], color="0.3", ls="none", marker="o", ms=4, mfc="white", label="K δⁿ in its place")
     low, high = (force / depths * 1e-6 for force in WORKING_FORCES)
     axes.fill_between(depths * 1e6, low, high, color="0.94", zorder=0, label="5 N to 3 kN")
     axes.set(
-        title=f"Stiffness laws, ring {pair.width * 1e3:g} mm wide (assumed)", xlabel="penetration [um]",
-        ylabel="force / penetration [N/um]", xlim=(0.3, 30), ylim=(2, 700),
+        title=f"Stiffness laws, ring {pair.width * 1e3:g} mm wide (assumed)", xlabel="penetration [µm]",
+        ylabel="force / penetration [N/µm]", xlim=(0.3, 30), ylim=(2, 700),
     )  # fmt: skip
     axes.legend(loc="lower right", fontsize=9, ncols=2)
 

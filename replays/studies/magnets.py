@@ -221,7 +221,7 @@ def _draw_ripple(axes: Any, model: Model) -> None:
     axes.plot([], [], color=SKY, lw=2.0, ls=(0, (5, 3)), label="cylinder map")
     axes.plot([], [], color="0.3", lw=1.6, ls=(0, (1, 1.2)), label="far-field sum, same radii")
     axes.set(
-        title="Ripple of the force over the direction", xlabel="direction from a magnet [deg]",
+        title="Ripple of the force over the direction", xlabel="direction from a magnet [°]",
         ylabel="force / mean over directions - 1 [1]", xlim=(0.0, float(np.degrees(angle[-1]))),
         ylim=(-1.1 * peak, 1.5 * peak),
     )  # fmt: skip

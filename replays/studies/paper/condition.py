@@ -76,8 +76,8 @@ def friction_with_houses(constants: Constants, spin: float) -> float:
     22-25), each at its amplitude of forced vibration; what their dampers take on the mean, friction must bring.
     """
     own = oscillator(constants)
-    whirl, depth = rolling_whirl(constants, spin)
-    whirl, radius = -whirl, constants.contact.clearance + depth
+    whirl, radius = rolling_circle(constants, spin)
+    whirl = -whirl
     force = normal_force(own, whirl, radius)
     power = -0.5 * whirl * force * sum(amplitude.imag for amplitude in _ring_motion(constants, whirl, force))
     return least_friction(own, whirl) + power / (radius * whirl * force)
@@ -110,8 +110,8 @@ def friction_swing(constants: Constants, spin: float) -> float:
     frequency and so hurries and brakes it along the ring, by m w^2 |X - Y| / 2.
     """
     own = oscillator(constants)
-    whirl, depth = rolling_whirl(constants, spin)
-    force = normal_force(own, whirl, constants.contact.clearance + depth)
+    whirl, radius = rolling_circle(constants, spin)
+    force = normal_force(own, whirl, radius)
     across, up = _ring_motion(constants, -whirl, force)
     return 0.5 * own.mass * whirl**2 * abs(across - up)
 
@@ -256,9 +256,7 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ, *, steps: int = 1
         full = base_model(ModelLevels()).constants
         values = []
         for constants in (bare, full):
-            begun = _rolled(constants, spin)
-
-            values.append(bisect(_holder(constants, begun, spin), 0.3 * closed, 6.0 * closed, steps=steps))
+            values.append(bisect(_holder(constants, spin), 0.3 * closed, 6.0 * closed, steps=steps))
         bare_mu, full_mu = values
         with_houses, used = friction_with_houses(full, spin), friction_used(full, spin)
         found.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
@@ -274,8 +272,9 @@ def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
     return abs(float(friction.mean() / normal.mean())), float(np.max(np.abs(friction[there] / normal[there])))
 
 
-def _holder(constants: Constants, begun: np.ndarray, spin: float) -> Callable[[float], bool]:
+def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
     """Whether a rolling whirl goes on at a friction."""
+    begun = _rolled(constants, spin)
 
     def holds(mu: float) -> bool:
         changed = constants._replace(contact=constants.contact._replace(friction=mu))

@@ -46,15 +46,15 @@ def draw_magnets(one: Reproduction) -> Figure:
         shown = np.where(inside, component, np.nan).reshape(81, 81)
         filled = axes.contourf(axis * 1e3, axis * 1e3, shown, levels=np.linspace(-40, 40, 17), cmap="RdBu_r",
                                extend="both")  # fmt: skip
-        axes.set(title=f"F_mag,{name} [N]", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+        axes.set(title=f"$F_{{mag,{name}}}$ [N]", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
         figure.colorbar(filled, ax=axes, shrink=0.85, ticks=[-40, -20, 0, 20, 40])
     line = panels[2]
     along = map_force(axis, np.zeros_like(axis), model.constants.magnet)[:, 0]
-    told = f"map at K_mag = {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
+    told = f"map at $K_{{mag}}$ = {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
     line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label=told)
-    line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="spring K_mag")
+    line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="spring $K_{mag}$")
     _axis_lines(line, -40.0, 40.0)
-    line.set(title="through the centre", xlabel="x [mm]", ylabel="F_mag,x [N]", xlim=(-10, 10), ylim=(-46, 46))
+    line.set(title="through the centre", xlabel="x [mm]", ylabel="$F_{mag,x}$ [N]", xlim=(-10, 10), ylim=(-46, 46))
     line.legend(fontsize=8, loc="lower left")
     draw_grid(line)
     return figure
@@ -84,7 +84,7 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         path.plot(run["ring_x"] * 1e3, run["ring_y"] * 1e3, color=BLUE, lw=1.2)
         angle = np.linspace(0, 2 * math.pi, 181)
         r0 = run.simulation.model.constants.contact.clearance * 1e3
-        path.plot(r0 * np.cos(angle), r0 * np.sin(angle), color="0.6", lw=1.0, label="r0 (assumed)")
+        path.plot(r0 * np.cos(angle), r0 * np.sin(angle), color="0.6", lw=1.0, label="$r_0$ (assumed)")
         path.set(xlabel="x in the ring [mm]", ylabel=f"{one.parameters}\ny in the ring [mm]", aspect="equal",
                  xlim=(-1.3, 1.3), ylim=(-1.3, 1.3))  # fmt: skip
         _axis_lines(path, -1.0, 1.0)
@@ -98,8 +98,8 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         force.set(ylabel="SOUTH reaction P_S - P_N [N]")
         force.margins(y=0.35)
         house.plot(t, run["inner_ay"], color=BLACK, lw=0.5)
-        _axis_lines(house, -100.0, 100.0, text="the paper's axis, +-100")
-        house.set(ylabel="inner house [m/s^2]")
+        _axis_lines(house, -100.0, 100.0, text="the paper's axis, ±100")
+        house.set(ylabel="inner house [m/s²]")
         house.margins(y=0.35)
         height.set(xlabel="time [ms]", xlim=(0, 200))
         first = first_impacts(run["penetration"], t)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -113,17 +114,8 @@ def hypercube(samples: int) -> tuple[np.ndarray, list[Blow]]:
 
 def phases(blow: Blow, count: int) -> list[Blow]:
     """The same blow at `count` places of the shaft's turn: impacts are chaotic, one run of them says little."""
-    return [
-        Blow(
-            label=blow.label,
-            parameters=blow.parameters,
-            changes={**blow.changes, BLOW_AT: round(0.02 + k / count / blow.speed_hz, 4)},
-            speed_hz=blow.speed_hz,
-            force_n=blow.force_n,
-            duration_s=blow.duration_s,
-        )
-        for k in range(count)
-    ]
+    at_s = [round(0.02 + k / count / blow.speed_hz, 4) for k in range(count)]
+    return [replace(blow, changes={**blow.changes, BLOW_AT: each}) for each in at_s]
 
 
 def column(results: list[Outcome], name: str) -> np.ndarray:

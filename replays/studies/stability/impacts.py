@@ -24,13 +24,15 @@ from rig.levels import ModelLevels
 
 ONSET_SPEEDS = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
 """[m/s]"""
+PUSH_N = 1000.0
+"""Peak of the push at the disk in `pushed` [N]."""
 
 
-def bounce(engine: str, step: int = 0, *, speed: float = 0.5) -> tuple[float, Motion]:
+def bounce(engine: str, step: int = 0) -> tuple[float, Motion]:
     """Largest energy drift in flight over 25 elastic, frictionless impacts across the ring, and the motion."""
     constants = bare_shaft(damping_factor=0.0)
     shaft, magnet = constants.shaft, constants.magnet
-    y0 = state(beta_rate=speed / shaft.arm_ring)
+    y0 = state(beta_rate=0.5 / shaft.arm_ring)
     with np.errstate(all="ignore"):
         motion = move(engine, constants, quiet_inputs(magnets=True), y0, ticks=100_000, step=step, every=200)
         stiffness = magnet.stiffness * shaft.arm_magnet**2
@@ -51,7 +53,7 @@ def bounce_cases(engine: str, quick: bool) -> Iterator[Case]:
     yield Case("step of 200 us", bounce(engine, 200)[0], 1e-3, because, expected)
 
 
-def first_impact(engine: str, speed: float, *, step: int = 0, tolerance: float = 0.0) -> dict[str, float]:
+def first_impact(engine: str, speed: float, *, tolerance: float = 0.0) -> dict[str, float]:
     """Relative errors of one impact on the rigid ring against its quadrature: restitution, impulse, peak, duration."""
     constants = bare_shaft()
     shaft, contact = constants.shaft, constants.contact
@@ -63,7 +65,7 @@ def first_impact(engine: str, speed: float, *, step: int = 0, tolerance: float =
     onset = 1.01371e-3
     y0 = state(beta=(contact.clearance - speed * onset) / shaft.arm_ring, beta_rate=speed / shaft.arm_ring)
     ticks = 1000 * math.ceil(2.0 + 2e3 * right.duration)
-    motion = move(engine, constants, quiet_inputs(), y0, ticks=ticks, step=step, tolerance=tolerance)
+    motion = move(engine, constants, quiet_inputs(), y0, ticks=ticks, tolerance=tolerance)
     back = -motion.end_of("beta_rate") * shaft.arm_ring
     place = motion.end_of("beta") * shaft.arm_ring
     lift_off = ticks * 1e-6 - (contact.clearance - place) / back
@@ -114,7 +116,7 @@ def drop_cases(engine: str, quick: bool) -> Iterator[Case]:
     yield Case("steps given up", float(motion.ceiling), 0.0, "no stall")
 
 
-def pushed(engine: str, *, floor: float, force_n: float = 1000.0, step: int = 0) -> float:
+def pushed(engine: str, *, floor: float) -> float:
     """A shaft that touches the ring at rest is pushed into it for 20 ms: error of its depth over the deepest.
 
     v0 is the floor, latched when nothing moved, and stays while the force grows to some 1.6 kN: as stale as can be.
@@ -124,10 +126,10 @@ def pushed(engine: str, *, floor: float, force_n: float = 1000.0, step: int = 0)
     length = 20_000
     y0 = state(beta=contact.clearance / shaft.arm_ring)
     ticks = round(0.9 * length)  # to where the force still pushes
-    inputs = quiet_inputs(blow=(force_n, 0, length))
+    inputs = quiet_inputs(blow=(PUSH_N, 0, length))
     with np.errstate(all="ignore"):
-        motion = move(engine, constants, inputs, y0, ticks=ticks, step=step, every=1000)
-    load = force_n * shaft.arm_disk / shaft.arm_ring
+        motion = move(engine, constants, inputs, y0, ticks=ticks, every=1000)
+    load = PUSH_N * shaft.arm_disk / shaft.arm_ring
 
     def pulse(t: float) -> float:
         return load * math.sin(math.pi * t / (length * 1e-6))
@@ -139,10 +141,10 @@ def pushed(engine: str, *, floor: float, force_n: float = 1000.0, step: int = 0)
     return float(np.max(np.abs(motion.column("penetration") - right)) / np.max(right))
 
 
-def stale_stiffness(engine: str, floor: float, force_n: float = 1000.0) -> float:
+def stale_stiffness(engine: str, floor: float) -> float:
     """Value of h lambda of the stale damping at an engine's own step: c F/(v0 m) h at the peak of `pushed`."""
     constants = bare_shaft(speed_floor=floor)
-    load = force_n * constants.shaft.arm_disk / constants.shaft.arm_ring
+    load = PUSH_N * constants.shaft.arm_disk / constants.shaft.arm_ring
     rate = constants.contact.damping_factor * load / floor / pivoted_mass(constants)
     return ENGINES[engine].step_us * 1e-6 * rate
 
