@@ -136,8 +136,8 @@ def _truth(found: Validation) -> Table:
 
 def _statistics(found: Validation) -> Table:
     table = new_table("Phases")
-    for header in ("phase", "quantity", "recorded", "foretold", "limit", "verdict"):
-        table.add_column(header, justify="right" if header in ("recorded", "foretold", "limit") else "left")
+    for header in ("phase", "quantity", "recorded", "predicted", "limit", "verdict"):
+        table.add_column(header, justify="right" if header in ("recorded", "predicted", "limit") else "left")
     for one in found.statistics:
         limit = "" if one.limit is None else f"+- {one.limit:.2g}"
         table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])
