@@ -214,7 +214,7 @@ def _cheapest(
 
 
 def _with_steps_between(ladder: tuple[Setting, ...]) -> list[Setting]:
-    """A ladder of tolerances with three steps a decade: a coarse one would hold a peer to a rung below the goal."""
+    """A ladder of tolerances with three steps a decade: a coarse one would hold a peer to a setting below the goal."""
     finer = list(ladder)
     for above, below in pairwise(ladder):
         if above.absolute is None and below.absolute is None:

@@ -121,7 +121,7 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
 def over_speed(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[float]]:
     """Restitution returned over the approach speed [m/s], for the three ways of damping.
 
-    Memory of v0 (c from the exact rule) returns the same at any speed above the floor of v0, and more below it. A
+    Memory of v0 (c from the exact rule) returns the same at any speed above the lower limit of v0, and more below it. A
     linear law (Kelvin-Voigt) has no speed of its own. A constant D on Hertz's force, set at the reference impact,
     returns less the slower the impact.
     """
@@ -263,7 +263,7 @@ def _resolved(
 
 
 def _returned(name: str, restitution: float) -> float:
-    """What a damping law returns at any speed above the floor of v0: Kelvin-Voigt's D is set to return it."""
+    """What a damping law returns at any speed above the lower limit of v0: Kelvin-Voigt's D is set to return it."""
     factor = DAMPING[name].factor
     return restitution if factor is None else returned_restitution(factor(restitution))
 

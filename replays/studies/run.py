@@ -107,7 +107,7 @@ def run_scene(
         limit_s: Wall time allowed [s].
 
     Raises:
-        SimulationError: It takes too long: an engine that stalls has to be told from one that is slow.
+        SimulationError: It takes too long: an engine may stall.
     """
     kept: list[np.ndarray] = []
     wall_s = cpu_s = 0.0

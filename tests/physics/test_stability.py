@@ -59,7 +59,7 @@ def test_impact_quadrature_against_an_integration(factor, speed):
     from scipy.integrate import solve_ivp
 
     mass, stiffness, floor = 1.99, 2.86e10, 1e-3
-    right = impact(mass=mass, speed=speed, stiffness=stiffness, exponent=1.5, factor=factor, floor=floor)
+    right = impact(mass=mass, speed=speed, stiffness=stiffness, exponent=1.5, factor=factor, speed_floor=floor)
 
     def rates(t, z):
         force = stiffness * max(0.0, z[0]) ** 1.5 * (1.0 + factor * z[1] / max(speed, floor))

@@ -258,7 +258,7 @@ def test_a_small_chart_end_to_end_resumes_and_says_what_is_missing(
 
 def test_without_peers_there_is_still_a_reference() -> None:
     problem = problem_of("exact", "first-impacts", "", end_s=0.03)
-    own = session._own_reference(problem)
+    own = session.own_reference(problem)
     truth = PEERS["scipy-radau"].solve(problem, Setting("1e-9", 1e-9))
     assert own is not None
     assert not own.independent

@@ -29,7 +29,7 @@ fidelity = "auto"
 [drive]
 speed_hz = 6.2  # as in the paper
 
-# the blow
+# the pulse
 [[commands]]
 at_s = 0.02
 command = "hammer"
@@ -174,7 +174,7 @@ def test_only_the_table_is_replaced(found: Ladder, end: str) -> None:
     changed = with_pick(later, pick.model_copy(update={"seed": 5}))
     assert "# mine" in changed
     assert "noise = false  # quiet" in changed
-    assert "# the blow" in changed
+    assert "# the pulse" in changed
     data = tomllib.loads(changed)
     assert data["pick"]["seed"] == 5
     assert data["sensors"] == {"noise": False}

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from replays.report.document import Heading, Paragraph, Picture, Report, Table
-from replays.studies.paper.blow import BLOW_AT, Blow, Outcome, outcome, outcomes
 from replays.studies.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
 from replays.studies.paper.document import write_up
 from replays.studies.paper.figure import first_impacts
 from replays.studies.paper.findings import Findings, find, planned_groups, steps
+from replays.studies.paper.pulse import PULSE_AT, Outcome, Pulse, outcome, outcomes
 from replays.studies.paper.spread import (
     assumed_values,
     changes,
@@ -78,9 +78,9 @@ def test_tied_value_follows():
 
 
 def test_hypercube_is_one_in_each_layer_and_the_same_again():
-    parts, blows = hypercube(8)
+    parts, pulses = hypercube(8)
     assert np.array_equal(parts, hypercube(8)[0])
-    assert len(blows) == 8
+    assert len(pulses) == 8
     for column in parts.T:
         assert sorted(np.floor(column * 8).astype(int)) == list(range(8))
 
@@ -118,15 +118,15 @@ def test_printed_values_against_the_sets():
     assert differs == {"house.outer_mass", "house.pair_stiffness_vertical"}
 
 
-def test_a_blow_that_dies_out_and_one_that_cannot_be_built():
-    weak = outcome(Blow(force_n=5.0, duration_s=0.3))
+def test_a_pulse_that_dies_out_and_one_that_cannot_be_built():
+    weak = outcome(Pulse(force_n=5.0, duration_s=0.3))
     assert not weak.whirls
     assert math.isnan(weak.whirl_hz)
-    assert outcome(Blow(changes={"magnet.count": 20})).outcome == "cannot be built"
+    assert outcome(Pulse(changes={"magnet.count": 20})).outcome == "cannot be built"
 
 
 def test_bandwidth_lowers_the_peak_and_not_the_contact():
-    plain, slow = (outcome(Blow(changes=change)) for change in ({}, {"transducer.bandwidth": 200.0}))
+    plain, slow = (outcome(Pulse(changes=change)) for change in ({}, {"transducer.bandwidth": 200.0}))
     assert slow.peak_x_n < 0.6 * plain.peak_x_n
     assert slow.normal_n == plain.normal_n
     # Butterworth of order 2 at 82 Hz.
@@ -156,7 +156,7 @@ def test_tornado_is_widest_first_and_tells_what_reaches_the_measured():
 
 
 def test_phases_cover_one_turn_of_the_shaft():
-    at = [blow.changes[BLOW_AT] for blow in phases(Blow(), 4)]
+    at = [pulse.changes[PULSE_AT] for pulse in phases(Pulse(), 4)]
     assert np.diff(at) == pytest.approx([1 / 6.2 / 4] * 3, abs=2e-4)
 
 
@@ -224,17 +224,17 @@ def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: P
 
 @pytest.mark.wallclock
 def test_two_processes_give_what_one_gives():
-    blows = [Blow(label=str(force), force_n=force, duration_s=0.3) for force in (20.0, 80.0, 100.0, 120.0)]
+    pulses = [Pulse(label=str(force), force_n=force, duration_s=0.3) for force in (20.0, 80.0, 100.0, 120.0)]
     told: list[str] = []
-    assert str(list(outcomes(blows, processes=2, progress=told.append))) == str(list(outcomes(blows, processes=1)))
-    assert told == [blow.label for blow in blows]
+    assert str(list(outcomes(pulses, processes=2, progress=told.append))) == str(list(outcomes(pulses, processes=1)))
+    assert told == [pulse.label for pulse in pulses]
 
 
 _POOL = """
 import os, signal
-from replays.studies.paper.blow import Blow, outcomes
-blows = [Blow(force_n=20.0, duration_s=0.05)] * 400
-for n, _ in enumerate(outcomes(blows, processes=2)):
+from replays.studies.paper.pulse import Pulse, outcomes
+pulses = [Pulse(force_n=20.0, duration_s=0.05)] * 400
+for n, _ in enumerate(outcomes(pulses, processes=2)):
     if n == 0:
         import multiprocessing
         print(*(child.pid for child in multiprocessing.active_children()), flush=True)

@@ -186,9 +186,9 @@ def test_samples_do_not_move_the_steps_of_cvode() -> None:
 
 
 @pytest.mark.parametrize("name", ["cvode-bdf", "scipy-bdf"])
-def test_without_stops_a_short_blow_is_stepped_over(name: str) -> None:
-    blow = {"at_s": 0.1, "command": "hammer", "force_n": 400.0, "duration_ms": 1.0}
-    given = problem(0.12, changes={"commands": [blow]})
+def test_without_stops_a_short_pulse_is_stepped_over(name: str) -> None:
+    pulse = {"at_s": 0.1, "command": "hammer", "force_n": 400.0, "duration_ms": 1.0}
+    given = problem(0.12, changes={"commands": [pulse]})
     missed = solve(f"{name}-no-stops", given, 1e-4)
     assert missed.failure == MISSED_HAMMER
     assert missed.contacts == 0
@@ -233,7 +233,7 @@ def test_what_a_peer_cannot_express_is_a_failure() -> None:
         assert "friction" in failure
 
 
-def test_a_state_that_blows_up_is_a_failure() -> None:
+def test_a_state_that_pulses_up_is_a_failure() -> None:
     given = problem(0.01)
     wild = replace(given, y0=np.where(np.arange(14) == 3, 1e200, given.y0))
     assert solve("scipy-dop853", wild, 1e-6, budget_s=5.0).failure is not None

@@ -193,13 +193,13 @@ def _memory(figure: Any, rows: list[Row]) -> str:
 def _profile_figure(figure: Any, rows: list[Row]) -> str:
     figure.set_size_inches(12.6, 7.2)
     grid = figure.add_gridspec(1, 2, left=0.065, right=0.995, top=0.85, bottom=0.2, width_ratios=(1, 0.4), wspace=0.06)
-    _say(figure, 0.93, "Not one hero scene: random blows, speeds, friction and restitution")
+    _say(figure, 0.93, "Not one hero scene: random pulses, speeds, friction and restitution")
     chaotic = draw_profile(figure.add_subplot(grid[0, 0]), rows)
     draw_legend(figure, rows, ("profile",), figure.add_subplot(grid[0, 1]), failures=False)
-    aside = f" {chaotic} draws without a sharp reference (chaotic) are left out for all." if chaotic else ""
+    chaos = f" {chaotic} draws without a sharp reference (chaotic) are left out for all." if chaotic else ""
     return (
         f"Each method walks down its ladder to the first setting that comes within {TARGET:g} of the scene's own "
-        f"reference, exact Coulomb, 0.15 s, and is timed there; curves that end below 100 % did not get there.{aside}"
+        f"reference, exact Coulomb, 0.15 s, and is timed there; curves that end below 100 % did not get there.{chaos}"
     )
 
 

@@ -171,7 +171,7 @@ def _in_one_go(begin: Callable[[], Course], frames: int, stride: int, budget: Bu
 
 
 def _kind_of(failure: str) -> str:
-    """The kind of a failure told in words."""
+    """The kind of a failure that is given in words."""
     kinds = {
         "": not failure,
         "hammer": failure == MISSED_HAMMER,

@@ -17,7 +17,7 @@ FRAME_S = 1e-3
 """Instants at which states are compared, and the frame that is timed [s]."""
 SMOOTHING = 5e-3
 """v_s of the smoothed law [m/s]."""
-FLOORS = (5e-3, 5e-4, 1e-4)
+SMOOTHED_SPEEDS = (5e-3, 5e-4, 1e-4)
 """v_s whose distance from exact Coulomb is drawn [m/s]."""
 RUB = "rub"
 

@@ -1,4 +1,4 @@
-"""Performance profile: over many random scenes, how often a method is how much dearer than the best of them.
+"""Performance profile: over many random scenes, how often a method is how much more expensive than the best of them.
 
 After Dolan and More, Math. Program. 91 (2002) 201: the share of scenes that a method solves, to the error asked for,
 within a factor tau of the cheapest method.
@@ -27,7 +27,7 @@ SHARP = 0.1
 
 
 def draw_scene(seed: int) -> Scene:
-    """A random scene: a blow of the hammer at 5 ms, on a rotor and a contact that differ from draw to draw."""
+    """A random scene: a hammer pulse at 5 ms, on a rotor and a contact that differ from draw to draw."""
     rng = np.random.default_rng([2013, seed])
     return parse_scene(
         {

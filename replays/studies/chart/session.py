@@ -12,9 +12,9 @@ from replays.studies.chart import profile
 from replays.studies.chart.measure import Budget, point, run_engine, statistics_point
 from replays.studies.chart.methods import OURS, Competitor, competitors, missing_peers
 from replays.studies.chart.phases import (
-    FLOORS,
     PHASES,
     RUB,
+    SMOOTHED_SPEEDS,
     SMOOTHING,
     Mode,
     Task,
@@ -120,7 +120,7 @@ def make_chart(
     return outcome
 
 
-def _own_reference(problem: Problem) -> Reference | None:
+def own_reference(problem: Problem) -> Reference | None:
     """Where no second peer is installed: scipy's DOP853 and our rk8, which share the equations but not the code."""
     first = PEERS["scipy-dop853"].solve(problem, Setting("1e-13", 1e-13), budget_s=300.0)
     second = run_engine("rk8", Setting("1e-12", 1e-12, step_us=25), problem, Budget(300.0, 1))
@@ -170,7 +170,7 @@ class _Work:
         return self.references[key]
 
     def solve(self, problem: Problem) -> Reference | None:
-        reference = find_reference(problem, quick=self.mode == "quick") or _own_reference(problem)
+        reference = find_reference(problem, quick=self.mode == "quick") or own_reference(problem)
         if reference is not None:
             for name, solution in zip(reference.names, (reference.solution, reference.second), strict=True):
                 self.compiling(PEERS[name].family if name in PEERS else OURS, solution.compile_s, again=False)
@@ -233,12 +233,12 @@ def _references(work: _Work, panel: str, phase: str, case: str) -> None:
         "contacts": reference.solution.contacts,
         "simulated_s": reference.solution.times[-1],
     }
-    for speed in FLOORS if panel == "exact" and phase != "drop" else ():
+    for speed in SMOOTHED_SPEEDS if panel == "exact" and phase != "drop" else ():
         smooth = work.solve(work.problem(panel, phase, "smoothed", speed))
         if smooth is not None:
-            floor = scaled_error(smooth.solution.states, reference.solution.states)
+            distance = scaled_error(smooth.solution.states, reference.solution.states)
             work.store.add(
-                {**base, "case": "floor", "method": "floor", "rung": f"v_s = {speed * 1e3:g} mm/s", "error": floor,
+                {**base, "case": "floor", "method": "floor", "rung": f"v_s = {speed * 1e3:g} mm/s", "error": distance,
                  "smoothing_speed": speed, "reference_error": smooth.error}
             )  # fmt: skip
     work.store.add({**base, "method": "reference", **columns})
@@ -289,7 +289,7 @@ def _profile(work: _Work, scenes: int, outcome: Outcome, progress: Progress, dea
             continue
         problem = profile.draw_problem(seed)
         reference = work.solve(problem)
-        # A chaotic draw has no pointwise reference: it is told, and counts for nobody.
+        # A chaotic draw has no pointwise reference: its row says so, and it counts for nobody.
         blunt = reference is None or reference.error > profile.SHARP * profile.TARGET
         for one in waiting:
             row = {**work.base("profile", scene, "", one, None), "friction": "exact"}
@@ -298,8 +298,8 @@ def _profile(work: _Work, scenes: int, outcome: Outcome, progress: Progress, dea
                                 "reference_error": None if reference is None else reference.error}  # fmt: skip
             else:
                 columns = profile.cheapest(one, problem, reference, budget)
-            # The rung found is no part of the key: a scene and a method are one point.
+            # The setting found is no part of the key: a scene and a method are one point.
             found = columns.pop("rung", "")
-            message = columns.get("message") or f"cheapest rung {found}"
+            message = columns.get("message") or f"cheapest setting {found}"
             work.keep(row, {**columns, "rung": "cheapest", "message": message})
             outcome.measured += 1

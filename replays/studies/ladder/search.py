@@ -31,7 +31,7 @@ STAND_INS = ("smoothed", "switch")
 """Friction laws that stand in for the exact one: measured, not picked, for they spare no work."""
 TIE = 1.1
 """Costs this close are the same: timings have no finer meaning."""
-DEARER = 1.25
+COSTLIER = 1.25
 """A lowered level that takes this many times the steps of the higher one spares nothing."""
 _REFERENCE = ("rk8", 25, 1e-10)
 _UNLIKE = ("split", 1, 0.0)
@@ -283,12 +283,12 @@ def _one_at_a_time(work: _Work, standard: _Standard, keep: tuple[str, ...]) -> d
             cost = work.cost(lowered)
             stand_in = choice in STAND_INS
             # By count, not by clock: the way down has to be the same each time.
-            dearer = not stand_in and cost.steps > DEARER * top.steps
-            note = "stands in for exact, spares no work" if stand_in else "spares nothing" if dearer else ""
+            costlier = not stand_in and cost.steps > COSTLIER * top.steps
+            note = "stands in for exact, spares no work" if stand_in else "spares nothing" if costlier else ""
             errors = standard.model_errors(converged)
             step = standard.step("single", f"{level} {choice}", converged, errors, cost=cost, note=note)
             steps.append(step)
-            if step.passes and not stand_in and not dearer and level not in keep:
+            if step.passes and not stand_in and not costlier and level not in keep:
                 passing.setdefault(level, {})[choice] = errors.worst(standard.allowed)
     return passing
 

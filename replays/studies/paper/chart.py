@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from replays.report.canvas import BLACK, BLUE, ORANGE, RED, draw_grid, new_figure
-from replays.studies.paper.blow import Outcome
 from replays.studies.paper.condition import (
     Start,
     Threshold,
@@ -18,6 +17,7 @@ from replays.studies.paper.condition import (
     oscillator,
     rolling_whirl,
 )
+from replays.studies.paper.pulse import Outcome
 from replays.studies.stability.boundary import NAMES, STYLES
 from rig.kernels.constants import Constants
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def draw_conditions(
     slowest: list[Threshold], least: list[Threshold], starts: list[Start], constants: Constants
 ) -> Figure:
-    """Thresholds in the plane of friction and whirl frequency, and what becomes of a blow over friction."""
+    """Thresholds in the plane of friction and whirl frequency, and what becomes of a pulse over friction."""
     figure = new_figure((13.0, 4.8), "Bartha's second condition (eq. 43), its sign put right", title_size=12)
     plane, scan = figure.subplots(1, 2)
     own = oscillator(constants)
@@ -55,8 +55,8 @@ def draw_conditions(
             scan.plot(there, [row] * len(there), mark, color=colour, ms=6.5, mec="0.35", mew=0.7, label=label)
     scan.axvline(constants.contact.friction, color="0.5", ls=":", lw=1.2, label="the paper's µ")
     scan.set_yticks(range(len(starts)), [f"{start.force_n:g} N" for start in starts])
-    scan.set(xlabel="friction µ", ylabel="blow of 5 ms at 6.2 Hz", ylim=(-0.6, len(starts) + 0.2),
-             title="what becomes of a blow")  # fmt: skip
+    scan.set(xlabel="friction µ", ylabel="pulse of 5 ms at 6.2 Hz", ylim=(-0.6, len(starts) + 0.2),
+             title="what becomes of a pulse")  # fmt: skip
     scan.legend(fontsize=8, loc="upper right", ncols=3)
     draw_grid(plane, scan)
     return figure

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replays.studies.paper.blow import Blow, Outcome
+from replays.studies.paper.pulse import Outcome, Pulse
 from replays.studies.stability.boundary import NAMES, ROLLING, whirl_class
 from replays.studies.stability.motion import base_model, move, pivoted_mass, quiet_inputs, state
 from rig.kernels.constants import Constants
@@ -294,10 +294,10 @@ def _rolled(constants: Constants, spin: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Start:
-    """What becomes of one blow over friction.
+    """What becomes of one pulse over friction.
 
     Attributes:
-        force_n: Peak of the blow [N].
+        force_n: Peak of the pulse [N].
         frictions: Shape (n,).
         classes: Of `replays.studies.stability.boundary`, shape (n,).
     """
@@ -325,25 +325,25 @@ class Start:
         return ", ".join(f"{n} {NAMES[k]}" for k in range(len(NAMES)) if (n := int(np.sum(self.classes == k))))
 
 
-def start_by_blow(force_n: float, *, points: int) -> Start:
-    """Scan friction for one blow of 5 ms at 6.2 Hz."""
+def start_by_pulse(force_n: float, *, points: int) -> Start:
+    """Scan friction for one pulse of 5 ms at 6.2 Hz."""
     frictions = np.linspace(0.02, 0.40, points)
     classes = np.array([whirl_class(ENGINE, float(mu), force_n) for mu in frictions])
     return Start(force_n, frictions, classes)
 
 
-def blow_whirl(constants: Constants, *, force_n: float, duration_s: float) -> float:
-    """Whirl frequency if all of a half-sine blow at the disk became motion along the ring [rad/s]."""
+def pulse_whirl(constants: Constants, *, force_n: float, duration_s: float) -> float:
+    """Whirl frequency if all of a half-sine pulse at the disk became motion along the ring [rad/s]."""
     shaft = constants.shaft
     impulse = force_n * duration_s * 2.0 / math.pi
     speed = impulse * shaft.arm_disk * shaft.arm_ring / shaft.transverse_inertia
     return speed / constants.contact.clearance
 
 
-def sweep_blows(speeds_hz: tuple[float, ...]) -> list[Blow]:
-    """A blow at each speed, on a drive that holds it: what the whirl frequency law is held against."""
-    blow = Blow(changes={"drive.mode": "ideal"}, force_n=150.0)
-    return [replace(blow, label=f"{speed:g} Hz", speed_hz=speed) for speed in speeds_hz]
+def sweep_pulses(speeds_hz: tuple[float, ...]) -> list[Pulse]:
+    """A pulse at each speed, on a drive that holds it: what the whirl frequency law is held against."""
+    pulse = Pulse(changes={"drive.mode": "ideal"}, force_n=150.0)
+    return [replace(pulse, label=f"{speed:g} Hz", speed_hz=speed) for speed in speeds_hz]
 
 
 def law_hz(speed_hz: float) -> tuple[float, float]:

@@ -229,7 +229,7 @@ def _whirl(findings: Findings) -> dict[str, Any]:
     own = condition.oscillator(constants)
     spin = 2.0 * math.pi * fastest.spin_hz
     force = condition.normal_force(own, *condition.rolling_circle(constants, spin))
-    turned = condition.blow_whirl(constants, force_n=100.0, duration_s=5e-3)
+    turned = condition.pulse_whirl(constants, force_n=100.0, duration_s=5e-3)
     share = 0.5 * (turned / own.natural - own.natural / turned)
     sweep = []
     for speed, result in findings.sweep.items():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, draw_grid, new_figure
-from replays.studies.paper.reproduction import BLOW_S, FIG_7_M, SPEEDS_HZ, Reproduction, spectra
+from replays.studies.paper.reproduction import FIG_7_M, PULSE_S, SPEEDS_HZ, Reproduction, spectra
 from rig.magnets import map_force
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ def draw_magnets(one: Reproduction) -> Figure:
         figure.colorbar(filled, ax=axes, shrink=0.85, ticks=[-40, -20, 0, 20, 40])
     line = panels[2]
     along = map_force(axis, np.zeros_like(axis), model.constants.magnet)[:, 0]
-    told = f"map at $K_{{mag}}$ = {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
-    line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label=told)
+    label = f"map at $K_{{mag}}$ = {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
+    line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label=label)
     line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="spring $K_{mag}$")
     _axis_lines(line, -40.0, 40.0)
     line.set(title="through the centre", xlabel="x [mm]", ylabel="$F_{mag,x}$ [N]", xlim=(-10, 10), ylim=(-46, 46))
@@ -112,18 +112,18 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
 
 
 def _phases(one: Reproduction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Before the blow, impacts, whirl: masks over the rows."""
+    """Before the pulse, impacts, whirl: masks over the rows."""
     run = one.whirl
     t = run.times_s
     touching = run["penetration"] > 0.0
-    loose = np.flatnonzero(~touching & (t >= BLOW_S))
-    lasting = t[loose[-1]] if len(loose) else BLOW_S
-    return t < BLOW_S, (t >= BLOW_S) & (t <= lasting), t > lasting
+    loose = np.flatnonzero(~touching & (t >= PULSE_S))
+    lasting = t[loose[-1]] if len(loose) else PULSE_S
+    return t < PULSE_S, (t >= PULSE_S) & (t <= lasting), t > lasting
 
 
 def draw_hammer(found: dict[str, Reproduction]) -> Figure:
     """Figure 12: orbit, spin, x(t), y(t)."""
-    figure = new_figure((14.0, 7.2), "Fig. 12: blow of 100 N, 5 ms (shape assumed) at 6.2 Hz", title_size=12)
+    figure = new_figure((14.0, 7.2), "Fig. 12: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", title_size=12)
     panels = figure.subplots(len(found), 4, squeeze=False)
     for row, one in _halves(found):
         run, t = one.whirl, one.whirl.times_s

@@ -11,9 +11,9 @@ import numpy as np
 
 from replays.report import Mark, Row
 from replays.studies.paper import condition
-from replays.studies.paper.blow import Blow, Outcome, outcomes
 from replays.studies.paper.claim import LAWS, Groups, Results, claim_groups, median
 from replays.studies.paper.condition import Start, Threshold
+from replays.studies.paper.pulse import Outcome, Pulse, outcomes
 from replays.studies.paper.question import question_groups
 from replays.studies.paper.reproduction import SPEEDS_HZ, Reproduction, reproduce
 from replays.studies.paper.spread import hypercube
@@ -72,7 +72,7 @@ class Findings:
         parts: Of the hypercube, shape (samples, values).
         spread: Its outcomes.
         sweep: Outcomes of the speed sweep by speed [Hz].
-        starts: Friction needed to start, by blow.
+        starts: Friction needed to start, by pulse.
         slowest: Slowest sliding whirl that gains speed.
         least: Least friction that keeps up whirl.
         constants: Of the corrected rig.
@@ -106,13 +106,13 @@ def count(lines: list[Line]) -> dict[str, int]:
 
 
 def planned_groups(*, quick: bool) -> Groups:
-    """Every blow that is run, by group."""
+    """Every pulse that is run, by group."""
     ensemble = 2 if quick else 9
     return {
         **claim_groups(ensemble=ensemble),
         **question_groups(ensemble=ensemble),
         "hypercube": hypercube(32 if quick else 512)[1],
-        "sweep": condition.sweep_blows(SWEEP_HZ[1:6:2] if quick else SWEEP_HZ),
+        "sweep": condition.sweep_pulses(SWEEP_HZ[1:6:2] if quick else SWEEP_HZ),
     }
 
 
@@ -123,7 +123,7 @@ def steps(*, quick: bool) -> int:
 
 
 def _forces(*, quick: bool) -> tuple[float, ...]:
-    """Blows over which friction is scanned [N]; the paper's is one of them."""
+    """Hammer pulses over which friction is scanned [N]; the paper's is one of them."""
     return START_FORCES_N[1:2] if quick else START_FORCES_N
 
 
@@ -138,14 +138,14 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
     tell = progress or (lambda _: None)
     found = {name: reproduce(name, quick=quick, progress=tell) for name in SETS}
     groups = planned_groups(quick=quick)
-    blows: list[Blow] = [blow for group in groups.values() for blow in group]
-    done = list(outcomes(blows, processes=processes, progress=tell))
+    pulses: list[Pulse] = [pulse for group in groups.values() for pulse in group]
+    done = list(outcomes(pulses, processes=processes, progress=tell))
     ends = np.cumsum([0, *(len(group) for group in groups.values())])
     results = {name: done[a:b] for name, (a, b) in zip(groups, pairwise(ends.tolist()), strict=True)}
     starts = []
     for force in _forces(quick=quick):
-        starts.append(condition.start_by_blow(force, points=12 if quick else 39))
-        tell(f"friction over a blow of {force:g} N")
+        starts.append(condition.start_by_pulse(force, points=12 if quick else 39))
+        tell(f"friction over a pulse of {force:g} N")
     slowest = condition.start_thresholds((0.08, 0.25)) if quick else condition.start_thresholds()
     tell("slowest whirl that friction keeps up")
     least = condition.sustain_thresholds((6.2,)) if quick else condition.sustain_thresholds()
@@ -155,7 +155,7 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
         results=results,
         parts=hypercube(len(groups["hypercube"]))[0],
         spread=results["hypercube"],
-        sweep={blow.speed_hz: result for blow, result in zip(groups["sweep"], results["sweep"], strict=True)},
+        sweep={pulse.speed_hz: result for pulse, result in zip(groups["sweep"], results["sweep"], strict=True)},
         starts=starts,
         slowest=slowest,
         least=least,

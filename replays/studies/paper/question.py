@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from replays.studies.paper.blow import Blow
 from replays.studies.paper.claim import Groups, Results, median
 from replays.studies.paper.condition import oscillator
+from replays.studies.paper.pulse import Pulse
 from replays.studies.paper.reproduction import Reproduction, drop_impact, drop_impulse
 from replays.studies.paper.spread import phases
 from replays.studies.stability.closed_forms import Impact, impact, stiffest_mode
@@ -32,15 +32,15 @@ Numbers = dict[str, Any]
 
 
 def question_groups(*, ensemble: int) -> Groups:
-    """Blows for the questions on the houses."""
+    """Hammer pulses for the questions on the houses."""
     groups: Groups = {}
     for mass in OUTER_MASSES_KG:
-        blow = Blow(label=f"M_oh {mass:g} kg", changes={"house.outer_mass": mass})
-        groups[f"mass {mass:g}"] = phases(blow, ensemble)
+        pulse = Pulse(label=f"M_oh {mass:g} kg", changes={"house.outer_mass": mass})
+        groups[f"mass {mass:g}"] = phases(pulse, ensemble)
     for factor in PAIR_STIFFNESS:
         keys = ("house.pair_stiffness_vertical", "house.pair_stiffness_horizontal")
-        blow = Blow(label=f"k_T {factor:g} K_ft", changes=dict.fromkeys(keys, factor * K_FT))
-        groups[f"pair {factor:g}"] = phases(blow, ensemble)
+        pulse = Pulse(label=f"k_T {factor:g} K_ft", changes=dict.fromkeys(keys, factor * K_FT))
+        groups[f"pair {factor:g}"] = phases(pulse, ensemble)
     return groups
 
 
@@ -70,7 +70,7 @@ def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
     def hit(mass: float, at: float = speed, stiffness: float = contact.stiffness) -> Impact:
         return impact(
             mass=mass, speed=at, stiffness=stiffness, exponent=contact.exponent, factor=contact.damping_factor,
-            floor=contact.speed_floor,
+            speed_floor=contact.speed_floor,
         )  # fmt: skip
 
     stiffness = _where_peak_is_printed(lambda k: hit(masses.shaft_mass, stiffness=k).peak, 1e4, 1e12)
@@ -212,11 +212,11 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
         # Lengths and forces of the whirl go with r0 at equal spin and R_S / r0.
         return Axis(name, ours, low, high, (r0 * low / ours, r0 * high / ours))
 
-    orbit = axis("orbit +-1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], 0.4, 1.0)
-    drop = axis("drop +-1 mm, in the ring, Fig. 10", r0, 0.4, 1.0)
+    orbit = axis("orbit ±1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], 0.4, 1.0)
+    drop = axis("drop ±1 mm, in the ring, Fig. 10", r0, 0.4, 1.0)
     probes = axis("the same, at the probes", r0 * lever, 0.4, 1.0)
-    disk = axis("x(t) +-2 mm at the probes, Fig. 12(c)", n["orbit_disk"], 0.8, 2.0)
-    measured = axis("E - W +-500 N, measured, Fig. 15(c)", n["sensed_x"], 200.0, 500.0)
+    disk = axis("x(t) ±2 mm at the probes, Fig. 12(c)", n["orbit_disk"], 0.8, 2.0)
+    measured = axis("E - W ±500 N, measured, Fig. 15(c)", n["sensed_x"], 200.0, 500.0)
     east = axis("EAST 0 to 900 N, Fig. 16", n["east"], 360.0, 900.0)
 
     def together(*axes: Axis) -> tuple[float, float]:

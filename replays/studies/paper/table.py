@@ -54,9 +54,9 @@ def _worked_out(findings: Findings) -> Content:
 
     inner, outer, support = p["house.inner_mass"], p["house.outer_mass"], "house.outer_beam_stiffness"
     worked = (
-        ("D_bv = 2 zeta_x sqrt(K_bv M_ih), zeta_x = 0.026 [N s/m]", 238.0,
+        ("D_bv = 2 ζ_x √(K_bv M_ih), ζ_x = 0.026 [N s/m]", 238.0,
          damping(0.026, "house.inner_beam_stiffness", inner)),
-        ("D_bh = 2 zeta_y sqrt(K_bh M_oh), zeta_y = 0.054, M_oh as printed [N s/m]", 1576.0,
+        ("D_bh = 2 ζ_y √(K_bh M_oh), ζ_y = 0.054, M_oh as printed [N s/m]", 1576.0,
          damping(0.054, support, printed_outer)),
         ("the same with M_ih + M_oh of eqs. 24, 25 [N s/m]", 1576.0, damping(0.054, support, printed_outer + inner)),
         ("the same with the corrected M_oh alone [N s/m]", 1576.0, damping(0.054, support, outer)),

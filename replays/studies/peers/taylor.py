@@ -5,11 +5,12 @@ contact with smoothed friction or none, sliding forward, sliding backward, rolli
 tension (no force). Rolling is Filippov's: the friction force is what keeps v_t at 0, linear in the accelerations, and
 ends where it reaches mu F_n.
 
-The root at the rim. delta^1.5 has a branch point at delta = 0, so a contact starts a hair inside: the flight's own
+The root at the rim. delta^1.5 has a branch point at delta = 0, so a contact starts slightly inside: the flight's own
 series is carried on past the onset to a depth h, and a contact ends at that depth too. What is left out is the impulse
-K h^2.5 / (2.5 rate) twice a contact; h is chosen for it to change a speed by `_HAIR` times the tolerance, in m/s. From
-there the steps grow with the distance from the branch point, about 13 % a step. (Between h for 1 and for 1e-6 times
-the tolerance, the first 0.1 s of the hammer scene move by 1.4e-11 scaled at tolerance 1e-15: the noise of rounding.)
+K h^2.5 / (2.5 rate) twice a contact; h is chosen for it to change a speed by `_MARGIN` times the tolerance, in m/s.
+From there the steps grow with the distance from the branch point, about 13 % a step. (Between h for 1 and for 1e-6
+times the tolerance, the first 0.1 s of the hammer scene move by 1.4e-11 scaled at tolerance 1e-15: the noise of
+rounding.)
 
 Left out: a transducer that loses its preload. Samples that show it make the run a failure.
 """
@@ -38,8 +39,8 @@ from replays.studies.peers.taylor_equations import (
 )
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, SWITCH, TOUCHING
 
-_HAIR = 1e-2
-_LEAST_HAIR = 1e-14
+_MARGIN = 1e-2
+_LEAST_MARGIN = 1e-14
 """[m], well above the rounding of the gap."""
 _CHUNK = 500
 """Samples between two looks at the clock."""
@@ -99,7 +100,7 @@ def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
     """Go from phase to phase until the end, into the journal."""
     numbers = numbers_of(problem)
     values = np.array([numbers[name] for name in PARAMETERS])
-    hair_at, speed_at = PARAMETERS.index("hair"), PARAMETERS.index("v0")
+    margin_at, speed_at = PARAMETERS.index("margin"), PARAMETERS.index("v0")
 
     def look(time_s: float, state: np.ndarray) -> tuple[float, ...]:
         contact_at = _contact_function(kind_of(problem, ROLLING, hit=hit))
@@ -113,7 +114,7 @@ def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
     samples[0] = state
     hit = False
     values[speed_at] = problem.onset_speed
-    values[hair_at] = _hair(problem, problem.onset_speed, tolerance)
+    values[margin_at] = _margin(problem, problem.onset_speed, tolerance)
     while corners and not journal.overrun():
         hit = pulse is not None and pulse[0] <= t < pulse[1]
         system = _system(kind_of(problem, phase, hit=hit), tolerance)
@@ -147,8 +148,8 @@ def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
                 speed = max(rate, problem.constants.contact.speed_floor)
                 journal.onsets.append((t, speed))
                 values[speed_at] = speed
-                values[hair_at] = hair = _hair(problem, max(rate, 1e-9), tolerance)
-                beyond = t + hair / max(rate, 1e-9)
+                values[margin_at] = margin = _margin(problem, max(rate, 1e-9), tolerance)
+                beyond = t + margin / max(rate, 1e-9)
                 for i in range(*np.searchsorted(times, (t, beyond), side="right")):
                     samples[i] = series.update_d_output(times[i])
                 t = beyond
@@ -173,17 +174,17 @@ def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
     journal.phase, journal.onset_speed = phase, float(values[speed_at])
 
 
-def _hair(problem: Problem, rate: float, tolerance: float) -> float:
+def _margin(problem: Problem, rate: float, tolerance: float) -> float:
     """Depth [m] up to which a contact's force is left out."""
     shaft, contact = problem.constants.shaft, problem.constants.contact
     mass = 1.0 / (shaft.arm_ring**2 / shaft.transverse_inertia + 1.0 / problem.constants.house.inner_mass)
-    change = _HAIR * tolerance
+    change = _MARGIN * tolerance
     n = contact.exponent + 1.0
     depth = (n * mass * rate * change / contact.stiffness) ** (1.0 / n)
     if contact.viscous_damping > 0.0:
         # A force that is there at once leaves out the impulse D h as well.
         depth = min(depth, mass * change / contact.viscous_damping)
-    return max(depth, _LEAST_HAIR)
+    return max(depth, _LEAST_MARGIN)
 
 
 @functools.cache
@@ -196,11 +197,11 @@ def _system(kind: Kind, tolerance: float) -> _System:
     watched: list[tuple[Any, Any, int]] = []
     # The gap by its square where it is no part of the motion: heyoka's step suits the motion's series, not that of an
     # event, and the root has branch points where the shaft passes the ring's middle.
-    inside = seen["square"] - (parameter("r0") + (parameter("hair") if kind.phase != FLIGHT else 0.0)) ** 2.0
+    inside = seen["square"] - (parameter("r0") + (parameter("margin") if kind.phase != FLIGHT else 0.0)) ** 2.0
     if kind.phase == FLIGHT:
         watched.append((inside, up, sliding))
     else:
-        watched.append((inside if kind.phase == SLACK else seen["depth"] - parameter("hair"), down, FLIGHT))
+        watched.append((inside if kind.phase == SLACK else seen["depth"] - parameter("margin"), down, FLIGHT))
         if kind.damped or kind.viscous:
             watched.append((seen["pull"], up, sliding) if kind.phase == SLACK else (seen["pull"], down, SLACK))
     if kind.phase == FORWARD:

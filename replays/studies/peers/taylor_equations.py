@@ -31,7 +31,7 @@ SERIES_SCALE = np.where(np.arange(14) == 2, 40.0, STATE_SCALE)
 PARAMETERS = (
     "Ixx", "Izz", "lA", "lB", "lI", "R", "unbalance", "phi", "moment",
     "K_m", "a3", "a5", "a7", "ripple", "growth", "D_x", "D_y",
-    "r0", "x0", "y0", "K", "c", "D", "mu", "v_s", "both", "v0", "hair",
+    "r0", "x0", "y0", "K", "c", "D", "mu", "v_s", "both", "v0", "margin",
     "M_ih", "M_oh", "K_bv", "D_bv", "K_bh", "D_bh", "k_ns", "k_ew",
     "gain", "speed", "slope", "H_x", "H_y", "t_hit", "T_hit",
 )  # fmt: skip
@@ -107,7 +107,7 @@ def numbers_of(problem: Problem) -> dict[str, float]:
         "v_s": contact.smoothing_speed,
         "both": contact.gap_counts_outer,
         "v0": problem.onset_speed,
-        "hair": 0.0,
+        "margin": 0.0,
         "M_ih": house.inner_mass,
         "M_oh": house.outer_mass,
         "K_bv": house.inner_beam_stiffness,

@@ -52,7 +52,7 @@ def cut_window(
         memory: False takes the damping term with its impact speed out of the contact law.
 
     Raises:
-        InputError: The window is empty, or drive, magnets or a second blow change inside it.
+        InputError: The window is empty, or drive, magnets or a second pulse change inside it.
     """
     model = build_model(scene.load_parameters(), scene.model)
     constants = _under_law(model.constants, friction, smoothing_speed, memory)
@@ -117,7 +117,7 @@ def _phase(problem: Problem) -> int:
 def _first_state(scene: Scene, model: Model, spin: float) -> np.ndarray:
     """The scene's state at time zero, shape (14,)."""
     initial, clearance = scene.initial, model.constants.contact.clearance
-    # A hair inside the clearance, so that rounding does not make it a contact.
+    # Slightly inside the clearance, so that rounding does not make it a contact.
     inside = clearance * (1.0 - 1e-12)
     places: dict[str, tuple[float | None, float | None]] = {
         "equilibrium": (None, None),
@@ -140,11 +140,11 @@ def _inputs(scene: Scene, model: Model, tick: int) -> tuple[Inputs, int]:
     points = [(round(time / TICK_S), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))]
     segments = [(t0, w0, (w1 - w0) / ((t1 - t0) * TICK_S)) for (t0, w0), (t1, w1) in pairwise(points)]
     segments.append((*points[-1], 0.0))
-    blows = [(at, command) for at, command in timed if isinstance(command, HammerCommand)]
+    pulses = [(at, command) for at, command in timed if isinstance(command, HammerCommand)]
     if any(isinstance(command, SpeedCommand) and at <= tick for at, command in timed):
         raise InputError("start_s", "before the scene's first command of speed", tick * TICK_S)
 
-    begun = [blow for blow in blows if blow[0] <= tick] or blows[:1]
+    begun = [pulse for pulse in pulses if pulse[0] <= tick] or pulses[:1]
     force, (dx, dy), begin, end = 0.0, (1.0, 0.0), 0, 0
     if begun:
         begin, command = begun[-1]
@@ -152,7 +152,7 @@ def _inputs(scene: Scene, model: Model, tick: int) -> tuple[Inputs, int]:
         end = begin + max(1, round(command.duration_ms * 1e-3 / TICK_S))
     changes = [at for at, _, _ in segments]
     changes += [at for at, command in timed if isinstance(command, ReleaseCommand | SpeedCommand)]
-    changes += [at for at, _ in blows if at != begin]
+    changes += [at for at, _ in pulses if at != begin]
     segment = max(one for one in segments if one[0] <= tick)
     inputs = Inputs(
         tick_s=TICK_S,

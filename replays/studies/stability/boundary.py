@@ -1,4 +1,4 @@
-"""Where a blow leads to lasting backward whirl, over friction and the blow's force: the class by every engine."""
+"""Where a pulse leads to lasting backward whirl, over friction and the pulse's force: the class by every engine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Boundary(NamedTuple):
     Attributes:
         engine: Its name.
         frictions: mu, shape (n,).
-        forces: Peak force of the blow [N], shape (m,).
+        forces: Peak force of the pulse [N], shape (m,).
         classes: Shape (m, n).
     """
 
@@ -36,7 +36,7 @@ class Boundary(NamedTuple):
 
 
 def whirl_class(engine: str, mu: float, force_n: float, *, tolerance: float = 0.0) -> int:
-    """Class of the run over its last 50 ms: the blow lasts 5 ms, the rotor runs at 6.2 Hz, friction is Coulomb's."""
+    """Class of the run over its last 50 ms: the pulse lasts 5 ms, the rotor runs at 6.2 Hz, friction is Coulomb's."""
     constants, inputs, y0 = hammer_run("exact", mu=mu, force_n=force_n)
     motion = move(engine, constants, inputs, y0, ticks=round(_DURATION_S * 1e6), every=1000, tolerance=tolerance)
     last = motion.times > _DURATION_S - _WINDOW_S
@@ -50,7 +50,7 @@ def whirl_class(engine: str, mu: float, force_n: float, *, tolerance: float = 0.
 
 
 def chart(engine: str, *, points: int, tolerance: float = 0.0) -> Boundary:
-    """Classes of an engine over mu and the force of the blow, `points` along each axis."""
+    """Classes of an engine over mu and the force of the pulse, `points` along each axis."""
     frictions, forces = np.linspace(0.02, 0.40, points), np.linspace(20.0, 200.0, points)
     pairs = [(mu, force) for force in forces.tolist() for mu in frictions.tolist()]
     classes = [whirl_class(engine, mu, force, tolerance=tolerance) for mu, force in pairs]

@@ -102,8 +102,8 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
             smooth.loglog(reach, [smoothing_distance(engine, v) for v in reach], **style)
         places = np.geomspace(1e-5, 1.0, 11 if quick else 21)
         graze.loglog(places, [max(1e-12, first_impact(engine, float(v))["restitution"]) for v in places], **style)
-        floors = np.geomspace(1e-5, 1.0, 11 if quick else 21)
-        stale.loglog(floors, [max(1e-12, pushed(engine, floor=float(v))) for v in floors], **style)
+        limits = np.geomspace(1e-5, 1.0, 11 if quick else 21)
+        stale.loglog(limits, [max(1e-12, pushed(engine, speed_floor=float(v))) for v in limits], **style)
     slope = smoothing_distance("tsit5", 1e-3) / 1e-3
     smooth.loglog(speeds, [slope * v for v in speeds], color="0.6", lw=5, alpha=0.5, zorder=0, label="linear in $v_s$")
     lowest = 1e-5 if quick else 1e-6
@@ -140,7 +140,7 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
 
 
 def draw_whirl(engines: list[str], *, quick: bool) -> Any:
-    """Class of the run over friction and the blow's impulse, each engine with its disagreements marked."""
+    """Class of the run over friction and the pulse's impulse, each engine with its disagreements marked."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
     from matplotlib.patches import Patch
 
@@ -149,7 +149,7 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
     right = boundary.chart("taylor", points=points, tolerance=1e-12)
     figure = new_figure(
         (3.3 * max(1, len(able)) + 0.6, 4.9),
-        "A 5 ms blow at 6.2 Hz, after 0.6 s; line: boundary by taylor at 1e-12; x: another class than there",
+        "A 5 ms pulse at 6.2 Hz, after 0.6 s; line: boundary by taylor at 1e-12; x: another class than there",
         title_size=12,
     )
     panels = figure.subplots(1, max(1, len(able)), squeeze=False)[0]
@@ -179,7 +179,7 @@ def draw_whirl(engines: list[str], *, quick: bool) -> Any:
         ax.set_title(f"{engine}\n{int(wrong.sum())} of {wrong.size} differ, {grave} off the boundary", fontsize=10.5)
         ax.set_xlabel("friction coefficient µ [1]")
         if ax is panels[0]:
-            ax.set_ylabel("impulse of the blow [N s]")
+            ax.set_ylabel("impulse of the pulse [N s]")
         else:
             ax.tick_params(labelleft=False)
     handles: list[Any] = [

@@ -89,7 +89,7 @@ def pulse_cases(engine: str, quick: bool) -> Iterator[Case]:
     right = constants.shaft.arm_disk * force * (end - start) * 1e-6 * 2.0 / math.pi
     for case, step in (("own step", 0), ("longest step a scene takes, 1 ms", 1000)):
         # Nothing else moves, so an adaptive engine comes along in its longest steps.
-        motion = move(engine, constants, quiet_inputs(blow=(force, start, end)), state(), ticks=200_000, step=step)
+        motion = move(engine, constants, quiet_inputs(pulse=(force, start, end)), state(), ticks=200_000, step=step)
         got = float(motion.end_of("beta_rate")) * constants.shaft.transverse_inertia
         allowance = traits(engine).allowance
         # An engine of low order sees it, if badly: the trapezoidal rule of five steps.

@@ -19,7 +19,7 @@ from rig.engines import ENGINES
 from rig.kernels.signals import COLUMN
 
 WINDOW_TICKS = 60_000
-"""First impacts after a blow at time zero: the first contacts slide, turn and roll."""
+"""First impacts after a pulse at time zero: the first contacts slide, turn and roll."""
 LEAST_SMOOTHING = 0.9e-6
 """Below this v_s [m/s] error control costs minutes, for what no run needs."""
 

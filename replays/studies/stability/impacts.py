@@ -59,7 +59,7 @@ def first_impact(engine: str, speed: float, *, tolerance: float = 0.0) -> dict[s
     shaft, contact = constants.shaft, constants.contact
     right = impact(
         mass=pivoted_mass(constants), speed=speed, stiffness=contact.stiffness, exponent=contact.exponent,
-        factor=contact.damping_factor, floor=contact.speed_floor,
+        factor=contact.damping_factor, speed_floor=contact.speed_floor,
     )  # fmt: skip
     # The onset falls on no engine's grid.
     onset = 1.01371e-3
@@ -91,12 +91,12 @@ def grazing_cases(engine: str, quick: bool) -> Iterator[Case]:
     errors = [first_impact(engine, speed) for speed in ONSET_SPEEDS]
     worst = max(error["restitution"] for error in errors)
     yield Case("restitution, 1e-5 to 1 m/s", worst, 2e-3 * traits(engine).allowance,
-               "the law with v0 at its floor is a law like any other")  # fmt: skip
-    floor = bare_shaft().contact.speed_floor
+               "the law with v0 at its lower limit is a law like any other")  # fmt: skip
+    limit = bare_shaft().contact.speed_floor
     wrong = sum(
-        (speed < 0.999 * floor) != bool(error["floored"])
+        (speed < 0.999 * limit) != bool(error["floored"])
         for speed, error in zip(ONSET_SPEEDS, errors, strict=True)
-        if abs(speed / floor - 1.0) > 1e-3
+        if abs(speed / limit - 1.0) > 1e-3
     )
     yield Case("floor not told", float(wrong), 0.0, "a floored v0 is counted, no other")
 
@@ -112,21 +112,22 @@ def drop_cases(engine: str, quick: bool) -> Iterator[Case]:
     fallen = 0.5 * constants.shaft.mass * constants.shaft.gravity * constants.contact.clearance
     yield Case("energy left", energy / fallen, 1e-6, "it comes to rest (e = 0.5)")
     yield Case("contacts", float(motion.contacts), 40.0,
-               "a compliant law with a floor of v0 ends in lasting contact: no Zeno")  # fmt: skip
+               "a compliant law with a lower limit of v0 ends in lasting contact: no Zeno")  # fmt: skip
     yield Case("steps given up", float(motion.ceiling), 0.0, "no stall")
 
 
-def pushed(engine: str, *, floor: float) -> float:
+def pushed(engine: str, *, speed_floor: float) -> float:
     """A shaft that touches the ring at rest is pushed into it for 20 ms: error of its depth over the deepest.
 
-    v0 is the floor, latched when nothing moved, and stays while the force grows to some 1.6 kN: as stale as can be.
+    v0 is at its lower limit, latched when nothing moved, and stays while the force grows to some 1.6 kN: as stale as
+    can be.
     """
-    constants = bare_shaft(speed_floor=floor)
+    constants = bare_shaft(speed_floor=speed_floor)
     shaft, contact = constants.shaft, constants.contact
     length = 20_000
     y0 = state(beta=contact.clearance / shaft.arm_ring)
     ticks = round(0.9 * length)  # to where the force still pushes
-    inputs = quiet_inputs(blow=(PUSH_N, 0, length))
+    inputs = quiet_inputs(pulse=(PUSH_N, 0, length))
     with np.errstate(all="ignore"):
         motion = move(engine, constants, inputs, y0, ticks=ticks, every=1000)
     load = PUSH_N * shaft.arm_disk / shaft.arm_ring
@@ -136,26 +137,26 @@ def pushed(engine: str, *, floor: float) -> float:
 
     right = pushed_contact(
         mass=pivoted_mass(constants), load=pulse, stiffness=contact.stiffness, exponent=contact.exponent,
-        factor=contact.damping_factor, onset_speed=floor, times=motion.times,
+        factor=contact.damping_factor, onset_speed=speed_floor, times=motion.times,
     )[:, 0]  # fmt: skip
     return float(np.max(np.abs(motion.column("penetration") - right)) / np.max(right))
 
 
-def stale_stiffness(engine: str, floor: float) -> float:
+def stale_stiffness(engine: str, speed_floor: float) -> float:
     """Value of h lambda of the stale damping at an engine's own step: c F/(v0 m) h at the peak of `pushed`."""
-    constants = bare_shaft(speed_floor=floor)
+    constants = bare_shaft(speed_floor=speed_floor)
     load = PUSH_N * constants.shaft.arm_disk / constants.shaft.arm_ring
-    rate = constants.contact.damping_factor * load / floor / pivoted_mass(constants)
+    rate = constants.contact.damping_factor * load / speed_floor / pivoted_mass(constants)
     return ENGINES[engine].step_us * 1e-6 * rate
 
 
 def stale_cases(engine: str, quick: bool) -> Iterator[Case]:
     """T14: contact that lasts on a v0 long out of date."""
     own = traits(engine)
-    yield Case("v0 = 1e-2 m/s", pushed(engine, floor=1e-2), 2e-2,
+    yield Case("v0 = 1e-2 m/s", pushed(engine, speed_floor=1e-2), 2e-2,
                f"h lambda = {stale_stiffness(engine, 1e-2):.2g} and less: not stiff")  # fmt: skip
-    for floor in (1e-3, 1e-4, 1e-5):
-        z = stale_stiffness(engine, floor)
+    for limit in (1e-3, 1e-4, 1e-5):
+        z = stale_stiffness(engine, limit)
         expected, because = None, ""
         if is_adaptive(engine):
             expected, because = True, "error control shortens the steps"
@@ -164,4 +165,4 @@ def stale_cases(engine: str, quick: bool) -> Iterator[Case]:
             because = f"measured, h lambda = {z:.2g}: {own.damping_because}"
             if own.on_real_axis:
                 because = f"h lambda = {z:.2g} against {RUNGE_KUTTA_4_REAL_LIMIT:.4g}"
-        yield Case(f"v0 = {floor:.0e} m/s", pushed(engine, floor=floor), 2e-2, because, expected)
+        yield Case(f"v0 = {limit:.0e} m/s", pushed(engine, speed_floor=limit), 2e-2, because, expected)

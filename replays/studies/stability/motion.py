@@ -36,19 +36,19 @@ def quiet_inputs(
     spin: float = 0.0,
     magnets: bool = False,
     ideal: bool = False,
-    blow: tuple[float, int, int] = (0.0, 0, 0),
+    pulse: tuple[float, int, int] = (0.0, 0, 0),
 ) -> Inputs:
-    """Nothing happens but, perhaps, one blow along x.
+    """Nothing happens but, perhaps, one pulse along x.
 
     Args:
         tick_s: Length of a tick [s].
         spin: What the drive aims at [rad/s].
         magnets: Whether they hold.
         ideal: The drive prescribes the spin instead of a torque.
-        blow: Peak force [N], first tick and end of the pulse.
+        pulse: Peak force [N], first tick and end of the pulse.
     """
     return Inputs(
-        tick_s=tick_s, hammer_force=blow[0], hammer_x=1.0, hammer_y=0.0, hammer_start=blow[1], hammer_end=blow[2],
+        tick_s=tick_s, hammer_force=pulse[0], hammer_x=1.0, hammer_y=0.0, hammer_start=pulse[1], hammer_end=pulse[2],
         speed=spin, speed_slope=0.0, speed_tick=0, ideal_drive=ideal, magnet_engaged=magnets,
     )  # fmt: skip
 
@@ -94,7 +94,7 @@ class Motion:
 
     @property
     def floored(self) -> int:
-        """Contacts begun slower than the floor of v0."""
+        """Contacts begun slower than the lower limit of v0."""
         return int(self.memory[FLOORED])
 
     @property
@@ -172,7 +172,7 @@ def bare_shaft(
         damping_factor: c of the contact; None for the rig's own.
         exponent: n.
         stiffness: K [N/m^n]; None for the rig's own.
-        speed_floor: Floor of v0 [m/s]; None for the rig's own.
+        speed_floor: Lower limit of v0 [m/s]; None for the rig's own.
         gravity: Whether there is any.
     """
     levels = ModelLevels(magnet="linear", shaft="planar", stator="rigid", friction="none")
@@ -204,5 +204,5 @@ def hammer_run(
         smoothing_speed=contact.smoothing_speed if smoothing_speed is None else smoothing_speed,
     )
     spin = 2.0 * np.pi * 6.2
-    inputs = quiet_inputs(spin=spin, magnets=True, blow=(force_n, 20_000, 25_000))
+    inputs = quiet_inputs(spin=spin, magnets=True, pulse=(force_n, 20_000, 25_000))
     return model.constants._replace(contact=contact), inputs, model.state(spin=spin)

@@ -37,7 +37,7 @@ def _ring_down(name: str, tolerance: float) -> float:
 
 
 def _hammer(name: str, tolerance: float) -> float:
-    """1 - part of the blow's work that is seen: the rig at a standstill is hit at 0.5 s."""
+    """1 - part of the pulse's work that is seen: the rig at a standstill is hit at 0.5 s."""
     scene = load_scene("hammer", {"drive.speed_hz": 0.0, "duration_s": 0.6})
     command = scene.commands[0].model_copy(update={"at_s": 0.5})
     scene = scene.model_copy(update={"commands": (command,)})

@@ -22,7 +22,7 @@ class Trial:
         name: T1 to T14.
         title: What is done.
         value: What is measured, in words.
-        cases: Gives the cases of one engine; told whether to be quick.
+        cases: Gives the cases of one engine; the flag asks for few of them.
     """
 
     name: str
@@ -41,15 +41,15 @@ _ALL = (
     Trial("T2", "Elastic, frictionless bounce: 24 impacts", "energy drift", impacts.bounce_cases),
     Trial("T3", "Rolling at v_t = 0", "residual slip", hammer.rolling_cases),
     Trial("T4", "First impact against 1-D quadrature", "relative error", impacts.first_impact_cases),
-    Trial("T5", "A blow out of rest: seen or missed", "|momentum / impulse - 1|", flight.pulse_cases),
+    Trial("T5", "A hammer pulse out of rest: seen or missed", "|momentum / impulse - 1|", flight.pulse_cases),
     Trial("T6", "Free flight against the matrix exponential", "scaled error", flight.free_flight_cases),
     Trial("T7", "v_s ladder against the set-valued limit", "distance to exact Coulomb", hammer.smoothing_cases),
-    Trial("T8", "Grazing onsets: v0 ladder and its floor", "relative error", impacts.grazing_cases),
+    Trial("T8", "Grazing onsets: v0 ladder and its lower limit", "relative error", impacts.grazing_cases),
     Trial("T9", "Whirl or no whirl at the boundary in (mu, impulse)", "wrong classes", hammer.boundary_cases),
     Trial("T10", "Drop to rest", "what is left, count", impacts.drop_cases),
     Trial("T11", "Step or tolerance ladder", "ratio of errors", hammer.ladder_cases),
     Trial("T12", "Frames of 1 ms and restart, bit for bit", "numbers that differ", whole_runs.bit_cases),
-    Trial("T13", "What goes wrong says so", "0 told, 1 silent", whole_runs.warning_cases),
+    Trial("T13", "What goes wrong says so", "0 warned, 1 silent", whole_runs.warning_cases),
     Trial("T14", "Lasting contact with a stale v0", "error of the depth", impacts.stale_cases),
 )
 TRIALS: dict[str, Trial] = {trial.name: trial for trial in _ALL}

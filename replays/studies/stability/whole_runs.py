@@ -18,7 +18,7 @@ from rig.simulation import Simulation
 
 
 def engine_scene(name: str, **choice: float) -> Scene:
-    """The hammer's scene for an engine at its own step and tolerance unless told otherwise, with bare sensors."""
+    """The hammer's scene for an engine at its own step and tolerance unless given others, with bare sensors."""
     scene = load_scene("hammer")
     method = ENGINES[name]
     engine = EngineChoice(**{"name": name, "step_us": method.step_us, "tolerance": method.tolerance, **choice})  # pyright: ignore[reportArgumentType]
@@ -79,7 +79,7 @@ def _silent(warnings: list[str], *words: str) -> float:
 
 
 def warning_cases(engine: str, quick: bool) -> Iterator[Case]:
-    """T13: whatever goes wrong is told."""
+    """T13: a run says what goes wrong in it."""
     yield Case("nan", float(not _is_poisoned(engine)), 0.0, "the state is checked", unit="silent")
     # A step of 1 ms is far too long for anything but error control; with that, a tolerance that cannot be met.
     if is_adaptive(engine):
