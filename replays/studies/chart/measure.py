@@ -18,7 +18,7 @@ from replays.studies.peers.solution import MISSED_HAMMER, Solution
 from replays.studies.run import Course
 from rig.engines.memory import CONTACTS, EVALUATIONS, STEPS
 from rig.kernels.contact import normal_force
-from rig.kernels.dynamics import gap
+from rig.kernels.geometry import gap
 from rig.kernels.signals import N_ROW, N_STATE
 from rig.simulation import energy_balance
 

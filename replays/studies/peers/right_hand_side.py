@@ -21,7 +21,8 @@ from replays.studies.peers.problem import Problem
 from rig.kernels import signals as S
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
-from rig.kernels.dynamics import evaluate, gap
+from rig.kernels.dynamics import evaluate
+from rig.kernels.geometry import gap
 
 N_STATE, N_VECTOR, N_OBSERVED = S.N_STATE, S.N_VECTOR, S.N_OBSERVED
 N_SWITCH = 2
