@@ -53,7 +53,9 @@ def write_up(findings: Findings, *, quick: bool) -> Report:
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False
     )
     environment.filters |= {"as": format, "number": number}
-    template = environment.from_string(files(__package__).joinpath("report.jinja").read_text(encoding="utf-8"))
+    template = environment.from_string(
+        files("replays.studies.paper").joinpath("report.jinja").read_text(encoding="utf-8")
+    )
     text = template.render(quick=quick, **_numbers(findings))
     title, lead, *blocks = re.split(r"\n\s*\n", text.strip())
     report = Report(_joined(title), _joined(lead))

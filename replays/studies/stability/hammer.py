@@ -124,11 +124,12 @@ def boundary_cases(engine: str, quick: bool) -> Iterator[Case]:
 def ladder(engine: str) -> list[float]:
     """Errors of the first impacts at ever finer steps or tolerances."""
     friction = friction_of(engine)
-    name, settings = "step", (100, 50, 25, 10, 5, 2)
     if is_adaptive(engine):
-        name, settings = "tolerance", (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-    right = sharp_impacts(friction).states
-    return [scaled_error(first_impacts(engine, friction, **{name: value}).states, right) for value in settings]
+        tolerances = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
+        motions = [first_impacts(engine, friction, tolerance=tolerance) for tolerance in tolerances]
+    else:
+        motions = [first_impacts(engine, friction, step=step) for step in (100, 50, 25, 10, 5, 2)]
+    return [scaled_error(motion.states, sharp_impacts(friction).states) for motion in motions]
 
 
 def ladder_cases(engine: str, quick: bool) -> Iterator[Case]:
