@@ -57,6 +57,8 @@ _STYLES: dict[str, tuple[str, Any]] = {
     "pereira-cylinder": (RED, "-"),
     "liu-cylinder": (SKY, "-"),
 }
+_OTHER = ("#882255", (0, (3, 1)))
+"""Of a law that has no style of its own."""
 
 
 def compare(parameters: ParameterSet) -> dict[str, Any]:
@@ -165,7 +167,7 @@ def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) ->
     curves = {name: np.array([_returned(name, float(e)) for e in asked]) for name in DAMPING}
     # From the most elastic down, as the curves stand in the picture at half.
     for name in sorted(curves, key=lambda name: -float(curves[name][90])):
-        color, dash = _STYLES[name]
+        color, dash = _STYLES.get(name, _OTHER)
         style = {"color": color, "ls": dash, "lw": 3.4 if name == "exact" else 1.8, "label": name}
         style["zorder"] = 1 if name == "exact" else 2
         wanted.plot(asked, curves[name], **style)
@@ -198,7 +200,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
         axes.semilogx(speeds, values, **{"lw": 1.8, "label": name, **style})
     low = max(0.0, min(min(values) for values in curves.values()) - 0.02)
     for place, text in (
-        (floor, f"lower limit of v₀, {floor:g} m/s"),
+        (floor, f"limit of v₀, {floor:g} m/s"),
         (impact.speed, f"reference, {impact.speed:g} m/s"),
     ):
         axes.axvline(place, color="0.5", lw=0.9, ls=":")
@@ -220,7 +222,7 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
         entry = _stiffness(parameters, pair, name)
         if entry["refused"]:
             continue
-        color, dash = _STYLES[name]
+        color, dash = _STYLES.get(name, _OTHER)
         forces = np.array([law.force(float(depth), pair) for depth in depths])
         axes.loglog(depths * 1e6, forces / depths * 1e-6, color=color, ls=dash, lw=1.8, label=name)
         if entry["fit_error"]:
