@@ -26,8 +26,10 @@ def _axis_lines(axes: Any, *levels: float, text: str = "the paper's axis", along
     axes.plot([], [], label=text, **_PAPER)
 
 
-def _halves(found: dict[str, Reproduction]) -> list[tuple[int, Reproduction]]:
-    return list(enumerate(found.values()))
+def _since_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Time from where a force first rises through 0 [ms], as the paper's figures begin."""
+    rises = np.flatnonzero((force[:-1] < 0.0) & (force[1:] >= 0.0))
+    return (times_s - times_s[int(rises[0]) if len(rises) else 0]) * 1e3
 
 
 def draw_magnets(one: Reproduction) -> Figure:
@@ -78,7 +80,7 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         (14.0, 7.2), "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", title_size=12
     )
     panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in _halves(found):
+    for row, one in enumerate(found.values()):
         run, t = one.drop, one.drop.times_s * 1e3
         path, height, force, house = panels[row]
         path.plot(run["ring_x"] * 1e3, run["ring_y"] * 1e3, color=BLUE, lw=1.2)
@@ -125,7 +127,7 @@ def draw_hammer(found: dict[str, Reproduction]) -> Figure:
     """Figure 12: orbit, spin, x(t), y(t)."""
     figure = new_figure((14.0, 7.2), "Fig. 12: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", title_size=12)
     panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in _halves(found):
+    for row, one in enumerate(found.values()):
         run, t = one.whirl, one.whirl.times_s
         orbit, spin, across, up = panels[row]
         for part, colour, name in zip(
@@ -155,7 +157,7 @@ def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
     """Figure 14: full spectrum over time."""
     figure = new_figure((13.0, 4.6), "Fig. 14: full spectrum of the disk's probes over time", title_size=12)
     panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for (_, one), axes in zip(_halves(found), panels, strict=True):
+    for one, axes in zip(found.values(), panels, strict=True):
         times, frequencies, amplitude = spectra(one.whirl)
         level = 20.0 * np.log10(np.maximum(amplitude, 1e-5))
         mesh = axes.pcolormesh(times, frequencies, level.T, cmap="magma", vmin=-80, vmax=5, shading="nearest",
@@ -172,7 +174,7 @@ def draw_reactions(found: dict[str, Reproduction]) -> Figure:
     """Figure 15: horizontal and vertical reactions, the impacts and the whirl on scales of their own."""
     figure = new_figure((14.0, 7.2), "Fig. 15: reactions, the difference of opposed transducers", title_size=12)
     panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in _halves(found):
+    for row, one in enumerate(found.values()):
         run, t = one.whirl, one.whirl.times_s
         for place, (a, b, name) in enumerate((("P_E", "P_W", "E - W"), ("P_N", "P_S", "N - S"))):
             truth, sensed = run[a] - run[b], run.samples[a] - run.samples[b]
@@ -197,14 +199,11 @@ def draw_east(found: dict[str, Reproduction]) -> Figure:
     """Figure 16: EAST in full annular whirl, over a turn and a half."""
     figure = new_figure((13.0, 4.2), "Fig. 16: EAST in full annular whirl", title_size=12)
     panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for (_, one), axes in zip(_halves(found), panels, strict=True):
+    for one, axes in zip(found.values(), panels, strict=True):
         run = one.whirl
         last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.030)
         pair = (run["P_E"] - run["P_W"])[last]
-        # From where the force rises through 0, as the paper's begins.
-        rises = np.flatnonzero((pair[:-1] < 0.0) & (pair[1:] >= 0.0))
-        start = int(rises[0]) if len(rises) else 0
-        t = (run.times_s[last] - run.times_s[last][start]) * 1e3
+        t = _since_rise_ms(run.times_s[last], pair)
         preload = run.simulation.model.constants.house.preload
         axes.plot(t, pair, color=BLUE, lw=2.0, label="E - W, truth")
         axes.plot(t, (run.samples["P_E"] - run.samples["P_W"])[last], color=RED, lw=0.8, label="E - W, transducers")
@@ -222,14 +221,12 @@ def draw_speeds(found: dict[str, Reproduction]) -> Figure:
     """Figure 17: EAST at four speeds."""
     figure = new_figure((13.0, 4.2), "Fig. 17: EAST (E - W) in full annular whirl at four speeds", title_size=12)
     panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for (_, one), axes in zip(_halves(found), panels, strict=True):
+    for one, axes in zip(found.values(), panels, strict=True):
         for speed, colour in zip(SPEEDS_HZ, (SKY, GREEN, ORANGE, PINK), strict=True):
             run = one.speeds[speed]
             pair = run["P_E"] - run["P_W"]
             last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.08)
-            rises = np.flatnonzero((pair[last][:-1] < 0.0) & (pair[last][1:] >= 0.0))
-            start = int(rises[0]) if len(rises) else 0
-            t = (run.times_s[last] - run.times_s[last][start]) * 1e3
+            t = _since_rise_ms(run.times_s[last], pair[last])
             axes.plot(t, pair[last], color=colour, lw=1.6, label=f"{speed:g} Hz")
         axes.set(title=one.parameters, xlabel="time [ms]", ylabel="E - W [N]", xlim=(0, 24), ylim=(-650, 850))
         axes.legend(fontsize=8, loc="upper right", ncols=4)
