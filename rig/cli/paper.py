@@ -13,7 +13,7 @@ from rig.cli.progress import reporting
 from rig.cli.tables import echo, new_table, table_console
 
 if TYPE_CHECKING:
-    from replays.studies.paper.document import Findings
+    from replays.studies.paper.findings import Findings
 
 
 def paper(
@@ -35,7 +35,8 @@ def paper(
     import json
 
     from replays.report import check_report
-    from replays.studies.paper.document import draw_pictures, find, steps, write_up
+    from replays.studies.paper.document import draw_pictures, write_up
+    from replays.studies.paper.findings import find, steps
     from rig.kernels import COMPILE_NOTICE, compiled_before
 
     if output is not None:
@@ -85,7 +86,7 @@ def summary(findings: Findings) -> dict[str, object]:
 def _show(findings: Findings) -> None:
     from rich.text import Text
 
-    from replays.studies.paper.document import JUDGED_BY, count
+    from replays.studies.paper.findings import JUDGED_BY, count
 
     table = new_table("the paper's statements, and ours")
     for heading in ("statement", "the paper", "as-printed", "corrected", "verdict"):
