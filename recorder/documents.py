@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -11,6 +12,7 @@ from recorder import schemas
 from rig.channels import ChannelTable
 from rig.errors import InputError
 from rig.outside import Count, input_error, read_json
+from rig.wire import EVENTS, STATUS, schema_of
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Rate = Annotated[float, Field(gt=0.0, le=1e12, allow_inf_nan=False)]
@@ -190,8 +192,43 @@ class SeriesPart(_Text):
     number: Count
 
 
+@dataclass(frozen=True)
+class Kind:
+    """What the documents of a topic are.
+
+    Attributes:
+        model: What is read of them.
+        definition: What the file says of their form.
+    """
+
+    model: type[BaseModel]
+    definition: schemas.Definition
+
+
+KINDS = {
+    EVENTS: Kind(Event, schemas.document_definition("rig.Event", event="string")),
+    STATUS: Kind(Status, schemas.document_definition("rig.Status")),
+    schemas.GAPS: Kind(
+        Gap,
+        schemas.document_definition("recorder.Gap", kind="string", key="string", index="integer", size="integer"),
+    ),
+    schemas.CLOCK: Kind(
+        ClockPair, schemas.document_definition("recorder.Clock", tick="integer", time_s="number", wall_s="number")
+    ),
+}
+"""The documents of a recording, by topic."""
+_ANY = schemas.document_definition("rig.Document")
 METADATA: dict[str, type[BaseModel]] = {"rig": Rig, "end": End, "series": SeriesPart}
 ATTACHED: dict[str, type[BaseModel]] = {"catalogue": Catalogue, "parameters": Parameters, "scene": Scene}
+
+
+def definition_of(key: str) -> schemas.Definition:
+    """The form of the payloads of a key."""
+    schema = schema_of(key)
+    if schema is not None:
+        return schemas.BLOCKS[schema]
+    return KINDS[key].definition if key in KINDS else _ANY
+
 
 Model = TypeVar("Model", bound=BaseModel)
 

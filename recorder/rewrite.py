@@ -10,21 +10,24 @@ import contextlib
 import json
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from recorder import documents, schemas
-from recorder.payload import block_in, tick_in
+from recorder.commands import Commands
+from recorder.counts import Counts
+from recorder.draft import check_destination
+from recorder.head import Beginning
+from recorder.payload import Payload, tick_in
 from recorder.reader import Recording
 from recorder.records import COPY
-from recorder.series import Commands
-from recorder.writer import Counts, RecordingWriter, check_destination
+from recorder.writer import RecordingWriter
 from rig.errors import PART_SUFFIX, InputError, check_not_among
 from rig.outside import open_file
-from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_document, encode_block, schema_of
+from rig.wire import EDGES, SENSORS, TRUTH, Block, encode_block, schema_of
 
 _TELL_EVERY = 5000
 """Messages between two reports of progress."""
@@ -119,7 +122,6 @@ def recover(
             metadata={"recovered": about},
             reason="recovered",
             force=force,
-            change=lambda _, payload: payload,
             on_progress=on_progress,
         )
     return Rewritten(output, counts, recording.damaged, recording.unchecked, recording.short)
@@ -167,20 +169,20 @@ def cut(
     for event in recording.events:
         tick = tick_in(event)
         if tick is not None and tick < from_tick:
-            commands.follow(EVENTS, event)
+            commands.follow(event)
 
-    def change(key: str, payload: bytes) -> bytes | None:
+    def change(payload: Payload) -> Payload | None:
+        key, tick, block = payload.key, payload.tick, payload.block
         if schema_of(key) is None:
-            tick = _tick_of(payload)
             return payload if tick is None or from_tick <= tick < to_tick else None
         if key not in columns:
             return None
-        try:
-            block = block_in(key, payload)
-        except ValueError:
+        if block is None:
             return payload
         kept = _trimmed(key, block, from_tick, to_tick, columns[key])
-        return payload if kept is block else None if kept is None else encode_block(kept)
+        if kept is None or kept is block:
+            return payload if kept else None
+        return replace(payload, data=encode_block(kept), block=kept)
 
     about = {
         "sources": json.dumps([part.path.name for part in recording.parts]),
@@ -215,7 +217,7 @@ def _write(
     metadata: dict[str, dict[str, str]],
     reason: str,
     force: bool,
-    change: Callable[[str, bytes], bytes | None],
+    change: Callable[[Payload], Payload | None] = lambda payload: payload,
     on_progress: Callable[[float], None] | None,
 ) -> Counts:
     """Copy what was recorded, changed or left out (None), and derive the rest anew."""
@@ -224,6 +226,7 @@ def _write(
     left_out = {"rig", "end"} if "recovered" in metadata else {"rig", "end", "series"}  # a cut is no part of a series
     kept = {name: entries for name, entries in recording.metadata.items() if name not in left_out}
     metadata = {**kept, "rig": {"created": about["created"]}, **metadata}
+    attachments = {name: data for name, data in recording.attachments.items() if name not in _HEAD}
     with contextlib.ExitStack() as stack:
         writer = RecordingWriter(
             output,
@@ -232,26 +235,25 @@ def _write(
             scene=scene,
             view_rate_hz=float(about.get("view_rate_hz", 0.0)),
             force=force,
-            metadata=metadata,
-            attachments={name: data for name, data in recording.attachments.items() if name not in _HEAD},
+            beginning=Beginning(metadata=metadata, attachments=attachments),
             sync_every_s=2.0,
         )
         stack.callback(writer.abandon)  # nothing half-written stays; does nothing once it is finished
         total = max(1, sum(recording.messages.values()))
-        for number, (key, _, wall_ns, payload) in enumerate(recording.everything()):
+        for number, (key, _, wall_ns, data) in enumerate(recording.everything()):
             if on_progress is not None and number % _TELL_EVERY == 0:
                 on_progress(number / total)
             if key.startswith(schemas.VIEW + "/") or key == schemas.CLOCK:
                 continue
             if key == schemas.GAPS:
                 with contextlib.suppress(InputError):
-                    gap, _ = documents.read(documents.Gap, payload, field=key)
+                    gap, _ = documents.read(documents.Gap, data, field=key)
                     if gap.get("kind") == "messages":
                         writer.write_missed(gap["key"], gap["size"], wall_ns)
                 continue
-            changed = change(key, payload)
+            changed = change(Payload.read(key, data, wall_ns))
             if changed is not None:
-                writer.write(key, changed, wall_ns)
+                writer.take(changed)
         writer.finish(reason)
     return writer.counts()
 
@@ -280,13 +282,6 @@ def _unlocked(path: Path) -> Iterator[None]:
 
 def _tick(at_s: float, tick_rate_hz: float) -> float:
     return at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz))
-
-
-def _tick_of(payload: bytes) -> int | None:
-    try:
-        return tick_in(decode_document(payload))
-    except ValueError:
-        return None
 
 
 def _overlaps(recording: Recording, key: str, from_s: float, to_s: float) -> bool:

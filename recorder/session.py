@@ -9,13 +9,17 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from recorder.payload import block_in
-from recorder.series import Limits, Series, check_room, check_series
-from recorder.trigger import Capture, Captures, check_captures
-from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_view_rate
-from rig.channels import ChannelTable
+from recorder.captures import Captures, check_captures
+from recorder.counts import NS, Counts
+from recorder.head import Beginning
+from recorder.payload import Payload
+from recorder.room import Limits, check_room
+from recorder.series import Series, check_series
+from recorder.sink import Sink
+from recorder.trigger import Capture
+from recorder.writer import RecordingError, RecordingWriter, check_view_rate
 from rig.errors import InputError
 from rig.intake import Catalogue, Intake
 from rig.text import printable
@@ -37,6 +41,7 @@ from rig.wire import (
     truth_key,
 )
 
+Document = dict[str, Any]
 RIG_LOST = "rig lost"
 """End reason of a session whose rig vanished without an end event."""
 INBOX_BYTES = 256 << 20
@@ -146,64 +151,6 @@ class Summary:
     def good(self) -> bool:
         """Whether the run did not fail, and all of it was recorded that was to be."""
         return not (self.error or self.losses or self.reason.startswith("failed"))
-
-
-class Sink(Protocol):
-    """Where payloads go: a `Series`, or `Captures`."""
-
-    path: Path
-    files: list[Path]
-    removed: int
-    ended: str
-    out_of_room: bool
-    remarks: tuple[str, ...]
-
-    @property
-    def part(self) -> Path:
-        """Name of the file that is being written."""
-        ...
-
-    @property
-    def table(self) -> ChannelTable:
-        """The channel table."""
-        ...
-
-    @property
-    def next_index(self) -> dict[str, int]:
-        """Number of the row that is due next, by key."""
-        ...
-
-    def counts(self) -> Counts:
-        """What was received so far."""
-        ...
-
-    def kept(self) -> list[Counts]:
-        """What stands in the files, for each stretch of time that is recorded without a pause."""
-        ...
-
-    def write(self, key: str, payload: bytes, wall_ns: int) -> dict[str, Any] | None:
-        """Take one payload."""
-        ...
-
-    def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
-        """Record that the transport lost messages for good."""
-        ...
-
-    def short_of(self, rows: dict[str, int]) -> dict[str, int]:
-        """Streams that have not come to the end of what was published."""
-        ...
-
-    def note_short(self, rows: dict[str, int], wall_ns: int) -> None:
-        """Record what is missing at the end of streams."""
-        ...
-
-    def sync_if_due(self) -> None:
-        """Flush to the disk if the last flush was long enough ago."""
-        ...
-
-    def finish(self, reason: str, *, notes: dict[str, str] | None = None) -> None:
-        """Close the last file."""
-        ...
 
 
 class _Inbox:
@@ -378,9 +325,10 @@ class RecordingSession:
         catalogue, parameters, scene = (decode_document(self._ask(key)) for key in (CATALOGUE, PARAMETERS, SCENE))
         promised = Catalogue.read(catalogue)
         self._rig = self._client.rig
-        writer = self._open_sink(catalogue, parameters, scene)
+        writer = self._open_sink(promised, catalogue, parameters, scene)
         self._intake = Intake(promised)
         self._tick_rate_hz = round(promised.tick_rate_hz)
+        self._table = promised.table
         self._streams = {*map(sensor_key, promised.table.groups), *map(truth_key, promised.truth)}
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
         thread.start()
@@ -412,40 +360,31 @@ class RecordingSession:
                     raise
                 time.sleep(0.05)
 
-    def _open_sink(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> Sink:
-        def open_writer(path: Path, *, from_start: bool, **options: Any) -> RecordingWriter:
+    def _open_sink(self, promised: Catalogue, catalogue: Document, parameters: Document, scene: Document) -> Sink:
+        def open_file(path: Path, scene: Document, beginning: Beginning) -> RecordingWriter:
             return RecordingWriter(
                 path,
                 catalogue=catalogue,
                 parameters=parameters,
+                scene=scene,
                 view_rate_hz=self._view_rate_hz,
-                from_start=from_start and self._history,
+                beginning=beginning,
                 force=self._force,
                 wall_ns=self._wall_ns,
                 monotonic_s=self._monotonic_s,
-                **options,
             )
 
+        common: Document = {
+            "tick_rate_hz": round(promised.tick_rate_hz),
+            "scene": scene,
+            "limits": self._limits,
+            "open_file": open_file,
+            "force": self._force,
+            "monotonic_s": self._monotonic_s,
+        }
         if self._capture is None:
-            return Series(
-                self.path,
-                scene=scene,
-                limits=self._limits,
-                open_writer=open_writer,
-                force=self._force,
-                monotonic_s=self._monotonic_s,
-            )
-        return Captures(
-            self.path,
-            self._capture,
-            table=Catalogue.read(catalogue).table,
-            tick_rate_hz=round(catalogue["tick_rate_hz"]),
-            scene=scene,
-            open_writer=open_writer,
-            limits=self._limits,
-            force=self._force,
-            monotonic_s=self._monotonic_s,
-        )
+            return Series(self.path, from_start=self._history, **common)
+        return Captures(self.path, self._capture, table=promised.table, **common)
 
     # On the transport's threads.
 
@@ -488,12 +427,12 @@ class RecordingSession:
     def _write_all(self, writer: Sink) -> None:
         try:
             while (items := self._inbox.take(0.1)) is not None:
-                for key, payload, wall_ns in items:
-                    if not self._is_in_time(key, payload):
+                for item in items:
+                    payload = Payload.read(*item)
+                    if not self._is_in_time(payload):
                         continue
-                    document = writer.write(key, payload, wall_ns)
-                    if document is not None:
-                        self._follow(key, document)
+                    writer.take(payload)
+                    self._follow(payload)
                     if writer.ended:
                         self._inbox.close()
                         self._wake.set()
@@ -506,14 +445,12 @@ class RecordingSession:
             self._inbox.close()
             self._wake.set()
 
-    def _is_in_time(self, key: str, payload: bytes) -> bool:
+    def _is_in_time(self, payload: Payload) -> bool:
         """Whether a payload is of the time to record; only what is a block can be of a later one."""
-        if math.isinf(self._duration_ns) or schema_of(key) is None:
+        key, block = payload.key, payload.block
+        if math.isinf(self._duration_ns) or block is None:
             return True
-        try:
-            start_ns = block_in(key, payload).tick * NS // self._tick_rate_hz
-        except ValueError:
-            return True
+        start_ns = block.tick * NS // self._tick_rate_hz
         begin_ns = self._begin_ns.setdefault(key, start_ns)
         first_ns = min(self._begin_ns.values())
         if key == EDGES or begin_ns - first_ns > _ROUND_NS:
@@ -524,12 +461,13 @@ class RecordingSession:
         self._beyond.add(key)
         return False
 
-    def _follow(self, key: str, document: dict) -> None:
-        if key == EVENTS and document.get("event") == "end":
+    def _follow(self, payload: Payload) -> None:
+        document = payload.document or {}
+        if payload.event("end"):
             self._end_rows = document.get("rows")
             self._end_reason = printable(document.get("reason") or "ended", 500)
             self._wake.set()
-        elif key == STATUS and document.get("state") == "ended" and not self._end_reason:
+        elif payload.key == STATUS and document.get("state") == "ended" and not self._end_reason:
             self._end_reason = "ended before the recording began"
             self._wake.set()
 
@@ -580,15 +518,15 @@ class RecordingSession:
         if now_s - ended_s > PATIENCE_S or self._replaced:
             return True
         # The `end` event can overtake blocks that are being recovered: while a stream is short of it, wait longer.
-        whole = self._end_rows is not None and not len(self._inbox) and not writer.short_of(self._end_rows)
+        whole = self._end_rows is not None and not len(self._inbox) and not writer.tally.short_of(self._end_rows)
         quiet_s = now_s - max(ended_s, self._heard_s)
         return quiet_s > (QUIET_S if whole or self._rig_lost else RECOVERY_S)
 
     def _report(self, writer: Sink, *, done: bool = False) -> None:
-        groups = list(writer.table.groups)
+        groups = list(self._table.groups)
         first = sensor_key("probes" if "probes" in groups or not groups else groups[0])
         lost = sum(writer.counts().lost.values())
-        self._reporter.tell(writer.next_index.get(first, 0), lost=lost, done=done)
+        self._reporter.tell(writer.tally.next.get(first, 0), lost=lost, done=done)
 
     def _progress(self, writer: Sink) -> Progress:
         counts = writer.counts()
@@ -612,8 +550,9 @@ class RecordingSession:
             while self._misses:
                 writer.write_missed(*self._misses.popleft())
             for each in self._intake.rest(self._end_rows) if not self._replaced and self._failure is None else ():
-                if self._is_in_time(each.key, each.payload):
-                    writer.write(each.key, each.payload, each.wall_ns)
+                payload = Payload.read(each.key, each.payload, each.wall_ns)
+                if self._is_in_time(payload):
+                    writer.take(payload)
             if reason == self._end_reason and self._end_rows:
                 writer.note_short(self._end_rows, self._wall_ns())
             notes = {
@@ -631,7 +570,7 @@ class RecordingSession:
 
     def _summary(self, writer: Sink, reason: str, trouble: str) -> Summary:
         files = tuple(writer.files)
-        if trouble and writer.part.exists():
+        if trouble and writer.part is not None and writer.part.exists():
             files = (*files, writer.part)
         counts = writer.counts()
         kept = writer.kept()

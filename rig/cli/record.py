@@ -134,7 +134,7 @@ def record(
     """
     import os
 
-    from recorder.series import MB, Limits
+    from recorder.room import MB, Limits
     from recorder.session import RecordingSession
     from recorder.trigger import Capture, Trigger
     from rig.transport.zenoh import ZenohClient

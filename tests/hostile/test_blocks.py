@@ -21,7 +21,7 @@ import recorder.session
 from drivers.daq import Daq
 from drivers.sources.rig import RigSource
 from recorder.reader import Recording, join
-from recorder.series import Limits
+from recorder.room import Limits
 from recorder.session import RecordingSession, Summary
 from recorder.trigger import Capture, Trigger
 from recorder.viewer import live

@@ -1,0 +1,112 @@
+"""An MCAP file in the making: topics, messages, metadata and attachments; knows nothing of what they say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from recorder.chunk_index import keep_on_disk
+from recorder.draft import Draft
+from recorder.schemas import Definition
+
+_CHUNK_BYTES = 1 << 20
+_MESSAGE_BYTES = 47
+"""What a message takes besides its data: its head, and its place in the index of the chunk."""
+_END_BYTES = 100_000
+"""What comes to a file when it is finished, its index aside: channels and schemas again, and the last plotted rows."""
+
+
+@dataclass(slots=True)
+class Topic:
+    """One topic of the file.
+
+    Attributes:
+        channel: Number of its channel.
+        sequence: Number of its next message.
+    """
+
+    channel: int
+    sequence: int = 0
+
+
+class McapFile:
+    """Writes to a draft, chunk by chunk.
+
+    Attributes:
+        draft: The file.
+        size_bytes: Its size at the last flush.
+        unflushed_bytes: What waits in memory for the next flush, not yet compressed.
+    """
+
+    def __init__(self, draft: Draft) -> None:
+        """Begin the file.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        from mcap.writer import Writer
+
+        self.draft = draft
+        self.size_bytes = self.unflushed_bytes = 0
+        self._chunks = self._chunk_bytes = self._channels = 0
+        self._schemas: dict[str, int] = {}
+        self._mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
+        keep_on_disk(self._mcap, draft.file)
+        self._mcap.start(profile="ros2", library="rotor-stator-rig recorder")
+
+    @property
+    def index_bytes(self) -> int:
+        """About what the index at the end of the file will take: it names each chunk, and each topic in it [bytes]."""
+        return (60 + 10 * self._channels) * self._chunks
+
+    @property
+    def final_bytes(self) -> int:
+        """What the file comes to at most if it is finished now [bytes]."""
+        return self.size_bytes + self.unflushed_bytes + self.index_bytes + _END_BYTES
+
+    def add_metadata(self, name: str, entries: dict[str, str]) -> None:
+        """Write a record of metadata."""
+        self._mcap.add_metadata(name, entries)
+
+    def attach(self, name: str, data: bytes, *, media_type: str, wall_ns: int) -> None:
+        """Write an attachment, made at a wall time [unix ns]."""
+        self._mcap.add_attachment(wall_ns, 0, name, media_type, data)
+
+    def topic(self, name: str, definition: Definition, metadata: dict[str, str]) -> Topic:
+        """Register a topic of messages of some form, with its metadata."""
+        if definition.name not in self._schemas:
+            number = self._mcap.register_schema(definition.name, definition.language, definition.text)
+            self._schemas[definition.name] = number
+        self._channels += 1
+        number = self._schemas[definition.name]
+        return Topic(self._mcap.register_channel(name, definition.encoding, number, metadata))
+
+    def add(self, topic: Topic, data: bytes, *, time_ns: int, wall_ns: int) -> None:
+        """Write a message of a simulated time [ns], which came at a wall time [unix ns]."""
+        self._mcap.add_message(topic.channel, time_ns, data, wall_ns, topic.sequence)
+        topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
+        self._chunk_bytes += len(data)
+        self.unflushed_bytes += len(data) + _MESSAGE_BYTES
+        if self._chunk_bytes >= _CHUNK_BYTES:
+            self._chunks += 1
+            self._chunk_bytes = 0
+
+    def sync(self) -> None:
+        """End the chunk and bring all to the disk.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        self._mcap.flush()
+        self._chunks += 1
+        self.size_bytes = self.draft.sync()
+        self.unflushed_bytes = self._chunk_bytes = 0
+
+    def finish(self) -> None:
+        """Write the index, and give the file its name.
+
+        Raises:
+            OSError: The disk refused.
+        """
+        self._mcap.finish()
+        self.size_bytes = self.draft.sync()
+        self.draft.finish()
