@@ -53,9 +53,7 @@ class ZenohLink:
         try:
             self._client = ZenohClient(endpoint, wait_s=wait_s)
             try:
-                self._client.subscribe(
-                    data_key(address.name), lambda _, payload: self._data.push(payload), on_miss=self._count_missed
-                )
+                self._client.subscribe(data_key(address.name), self._take, on_miss=self._count_missed)
             except BaseException:
                 self._client.close()
                 raise
@@ -68,6 +66,9 @@ class ZenohLink:
     def lost(self) -> int:
         """Messages that did not come, or found no room."""
         return self._missed + self._data.dropped
+
+    def _take(self, _: str, payload: bytes) -> None:
+        self._data.push(payload)
 
     def _count_missed(self, _: str, count: int) -> None:
         self._missed += count
