@@ -7,7 +7,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,10 @@ from recorder.payload import Payload
 from recorder.room import Limits, check_room
 from recorder.series import Series, check_series
 from recorder.sink import Sink
+from recorder.summary import Progress, Summary
 from recorder.trigger import Capture
 from recorder.writer import RecordingError, RecordingWriter, check_view_rate
+from rig.bounded_queue import BoundedQueue
 from rig.errors import InputError
 from rig.intake import Catalogue, Intake
 from rig.text import printable
@@ -63,147 +64,6 @@ RETURN_S = 10.0
 was stopped for a minute loses its links, and is linked again in a second or two."""
 _DOCUMENTS_BYTES = 64 << 20
 """What documents may take of memory when blocks find no more room."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """State of a session, for display.
-
-    Attributes:
-        time_s: Simulated time recorded since its first row [s].
-        rows: Rows of sensor blocks received.
-        lost: Rows of all block streams that never arrived.
-        size_bytes: Size of the file.
-        waiting: Payloads in the inbox.
-        backlog_bytes: Bytes in the inbox.
-        dropped: Payloads that found the inbox full.
-        files: Finished files.
-        remarks: What the user should know at once, a line each; more come behind these.
-    """
-
-    time_s: float
-    rows: int
-    lost: int
-    size_bytes: int
-    waiting: int
-    backlog_bytes: int = 0
-    dropped: int = 0
-    files: int = 0
-    remarks: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Outcome of a session.
-
-    Attributes:
-        path: The last file; the .part file if it could not be finished.
-        reason: Why the session ended.
-        error: What went wrong at the disk or in the recorder, or that there was no more room; empty if nothing did.
-        first_time_s: Simulated time of the first row in the files [s].
-        duration_s: Simulated time from the first to the last row; of all captures in sum [s].
-        rows: Rows in the files by key.
-        lost: Rows that were lost, by key, only keys that lost some; of captures also those lost between them.
-        gaps: Number of gaps that they are in.
-        missed: Messages that the transport gave up, by key.
-        dropped: Payloads that found the inbox full; they are among the lost.
-        malformed: Payloads that were not what their key promises; they are in the file as they came.
-        size_bytes: Size of the files.
-        files: All files that are there, in order; among them a .part file that could not be finished.
-        removed: Files that were removed for want of room.
-        high_water_bytes: Most that ever waited in the inbox.
-        received_s: Simulated time from the first to the last row received, kept or not [s].
-        fired: Triggers that came; None where it was not recorded around triggers.
-        remarks: What the user should know, a line each.
-        refused: Blocks that cannot be of the rig, and were left out.
-        ended_early: Up to which time it is recorded, where that is not all that was asked for; empty else.
-    """
-
-    path: Path
-    reason: str
-    error: str
-    first_time_s: float
-    duration_s: float
-    rows: dict[str, int]
-    lost: dict[str, int]
-    gaps: int
-    missed: dict[str, int]
-    dropped: int
-    malformed: int
-    size_bytes: int
-    files: tuple[Path, ...] = ()
-    removed: int = 0
-    high_water_bytes: int = 0
-    received_s: float = 0.0
-    fired: int | None = None
-    remarks: tuple[str, ...] = ()
-    refused: int = 0
-    ended_early: str = ""
-
-    @property
-    def losses(self) -> tuple[str, ...]:
-        """What is missing, a line each."""
-        lines = [f"{lost} rows of {key}" for key, lost in self.lost.items()]
-        lines += [f"{missed} messages of {key}, says the transport" for key, missed in self.missed.items()]
-        return (*lines, self.ended_early) if self.ended_early else tuple(lines)
-
-    @property
-    def good(self) -> bool:
-        """Whether the run did not fail, and all of it was recorded that was to be."""
-        return not (self.error or self.losses or self.reason.startswith("failed"))
-
-
-class _Inbox:
-    """Bounded by bytes; a full one refuses blocks rather than make the transport wait, for that would stall the rig.
-
-    What it refuses shows as a gap of the row numbers. Documents are small and rare, and have room of their own.
-    """
-
-    def __init__(self, capacity_bytes: int) -> None:
-        self._capacity = capacity_bytes
-        self._items: deque[tuple[str, bytes, int]] = deque()
-        self._bytes = 0
-        self._taken_bytes = 0
-        self._closed = False
-        self._ready = threading.Condition()
-        self.dropped = 0
-        self.high_water_bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._items)
-
-    def put(self, key: str, payload: bytes, wall_ns: int) -> None:
-        with self._ready:
-            if self._closed:
-                return
-            capacity = self._capacity + (_DOCUMENTS_BYTES if schema_of(key) is None else 0)
-            if self._bytes + len(payload) > capacity:
-                self.dropped += 1
-                return
-            self._items.append((key, payload, wall_ns))
-            self._bytes += len(payload)
-            self.high_water_bytes = max(self.high_water_bytes, self._bytes)
-            self._ready.notify()
-
-    @property
-    def waiting_bytes(self) -> int:
-        return self._bytes
-
-    def take(self, timeout_s: float) -> list[tuple[str, bytes, int]] | None:
-        """What waits, oldest first, when all that was taken before is done with; None when closed and empty."""
-        with self._ready:
-            self._bytes -= self._taken_bytes
-            self._taken_bytes = 0
-            if not self._items and not self._closed:
-                self._ready.wait(timeout_s)
-            items = [self._items.popleft() for _ in range(min(_PORTION, len(self._items)))]
-            self._taken_bytes = sum(len(payload) for _, payload, _ in items)
-            return None if self._closed and not items else items
-
-    def close(self) -> None:
-        with self._ready:
-            self._closed = True
-            self._ready.notify()
 
 
 class RecordingSession:
@@ -283,7 +143,11 @@ class RecordingSession:
         self._force = force
         self._wall_ns = wall_ns
         self._monotonic_s = monotonic_s
-        self._inbox = _Inbox(inbox_bytes)
+        self._inbox: BoundedQueue[tuple[str, bytes, int]] = BoundedQueue(
+            inbox_bytes, size=lambda item: len(item[1]), holds=True
+        )
+        """Payloads that wait to be written; a full one refuses blocks, for a transport that waits would stall the rig.
+        What it refuses shows as a gap of the row numbers. Documents are small and rare, and have room of their own."""
         self._misses: deque[tuple[str, int, int]] = deque()
         self._wake = threading.Event()
         self._stop_reason = ""
@@ -392,21 +256,21 @@ class RecordingSession:
         wall_ns = self._wall_ns()
         if schema_of(key) is None:
             if not self._replaced:
-                self._inbox.put(key, payload, wall_ns)
+                self._inbox.offer((key, payload, wall_ns), room=self._inbox.room + _DOCUMENTS_BYTES)
             return
         due = self._intake.next.get(key, 0)
         try:
             taken = self._intake.take(key, payload, wall_ns)
         except ValueError:
             if self._intake.knows(key):
-                self._inbox.put(key, payload, wall_ns)  # kept as it came, for the reader to judge
+                self._inbox.offer((key, payload, wall_ns))  # kept as it came, for the reader to judge
             return
         if taken:
             # Whoever goes on after the rig was lost and counts from the start again is another one in its place.
             self._replaced = self._replaced or (self._rig_lost and taken[0].block.index < due)
             self._heard_s = self._monotonic_s()
         for each in taken if not self._replaced else ():
-            self._inbox.put(each.key, each.payload, each.wall_ns)
+            self._inbox.offer((each.key, each.payload, each.wall_ns))
 
     def _on_miss(self, key: str, messages: int) -> None:
         self._misses.append((key, messages, self._wall_ns()))
@@ -426,8 +290,8 @@ class RecordingSession:
 
     def _write_all(self, writer: Sink) -> None:
         try:
-            while (items := self._inbox.take(0.1)) is not None:
-                for item in items:
+            while not self._inbox.ended:
+                for item in self._inbox.take_many(_PORTION, 0.1):
                     payload = Payload.read(*item)
                     if not self._is_in_time(payload):
                         continue
@@ -536,7 +400,7 @@ class RecordingSession:
             lost=sum(counts.lost.values()),
             size_bytes=counts.size_bytes,
             waiting=len(self._inbox),
-            backlog_bytes=self._inbox.waiting_bytes,
+            backlog_bytes=self._inbox.used,
             dropped=self._inbox.dropped,
             files=len(writer.files),
             remarks=(*writer.remarks, *self._remarks),
@@ -557,7 +421,7 @@ class RecordingSession:
                 writer.note_short(self._end_rows, self._wall_ns())
             notes = {
                 "dropped_payloads": str(self._inbox.dropped),
-                "backlog_high_water_bytes": str(self._inbox.high_water_bytes),
+                "backlog_high_water_bytes": str(self._inbox.high_water),
                 "refused_blocks": str(self._intake.refused),
                 "foreign_messages": str(self._client.foreign),
             }
@@ -590,7 +454,7 @@ class RecordingSession:
             size_bytes=sum(file.stat().st_size for file in files if file.exists()),
             files=files,
             removed=writer.removed,
-            high_water_bytes=self._inbox.high_water_bytes,
+            high_water_bytes=self._inbox.high_water,
             received_s=counts.extent_ns / NS,
             fired=writer.fired if isinstance(writer, Captures) else None,
             remarks=(*writer.remarks, *self._remarks),

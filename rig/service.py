@@ -11,12 +11,12 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from rig import wire
+from rig.bounded_queue import BoundedQueue
 from rig.desk import Desk, Note, Pending, Step, finite, one_line
 from rig.errors import InputError
 from rig.pacing import Clock, Lockstep, RealTime, StepTimeoutError, short_collections
@@ -133,69 +133,10 @@ class _Entry:
     replies: list[tuple[Pending, dict[str, Any]]] = field(default_factory=list)
 
 
-class _Queue:
-    """Queue of entries between two threads, bounded in its blocks; events and replies are few and never dropped."""
-
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self.high_water = 0
-        self.dropped = 0
-        self._entries: deque[_Entry] = deque()
-        self._blocks = 0
-        self._changed = threading.Condition()
-        self._closed = False
-
-    def __len__(self) -> int:
-        return self._blocks
-
-    def put(self, entry: _Entry) -> int:
-        """Append without waiting; returns how many blocks had to be dropped for it."""
-        dropped = 0
-        with self._changed:
-            while entry.frame is not None and self._blocks >= self.capacity:
-                oldest = self._entries.popleft()
-                heir = self._entries[0] if self._entries else entry
-                heir.before = [*oldest.before, *oldest.after, *heir.before]
-                heir.replies = [*oldest.replies, *heir.replies]
-                if oldest.frame is not None:
-                    self._blocks -= 1
-                    dropped += 1
-            self._entries.append(entry)
-            self._blocks += entry.frame is not None
-            self.dropped += dropped
-            self.high_water = max(self.high_water, self._blocks)
-            self._changed.notify_all()
-        return dropped
-
-    def take(self, timeout_s: float) -> _Entry | None:
-        """The oldest entry, or None after the time or at the end."""
-        with self._changed:
-            if not self._entries and not self._closed:
-                self._changed.wait(timeout_s)
-            if not self._entries:
-                return None
-            entry = self._entries.popleft()
-            self._blocks -= entry.frame is not None
-            self._changed.notify_all()
-            return entry
-
-    def wait_for_room(self, timeout_s: float) -> bool:
-        """Whether another block fits, at the latest after the time."""
-        with self._changed:
-            if self._blocks >= self.capacity:
-                self._changed.wait(timeout_s)
-            return self._blocks < self.capacity
-
-    def close(self) -> None:
-        """Nothing will be put any more."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-    @property
-    def finished(self) -> bool:
-        """Closed and empty."""
-        return self._closed and not self._entries
+def _inherit(dropped: _Entry, following: _Entry) -> None:
+    """Events and replies are few, and are not dropped with their block."""
+    following.before = [*dropped.before, *dropped.after, *following.before]
+    following.replies = [*dropped.replies, *following.replies]
 
 
 class Service:
@@ -237,7 +178,11 @@ class Service:
         self._status_period_s = status_period_s
         self._linger_s = linger_s
         self._rate = simulation.tick_rate_hz
-        self._queue = _Queue(max(2, math.ceil(queue_seconds * self._rate / block_ticks)))
+        self._queue: BoundedQueue[_Entry] = BoundedQueue(
+            max(2, math.ceil(queue_seconds * self._rate / block_ticks)),
+            size=lambda entry: int(entry.frame is not None),
+            inherit=_inherit,
+        )
         self._may_drop = isinstance(clock, RealTime)
 
         self._scene = simulation.scene_document()
@@ -288,7 +233,7 @@ class Service:
         warnings = list(health.get("warnings", []))
         if self._queue.dropped:
             warnings.append(f"{self._queue.dropped} blocks dropped: the publisher did not keep up")
-        waiting_s = len(self._queue) * self._block_ticks / self._rate
+        waiting_s = self._queue.used * self._block_ticks / self._rate
         if self._may_drop and waiting_s > _HELD_UP_S:
             warnings.append(f"{waiting_s:.1f} s of blocks wait: a client holds up the publisher")
         warnings += self._desk.warnings()
@@ -304,8 +249,8 @@ class Service:
                 "block_ms": 1e3 * self._block_ticks / self._rate,
                 **self._clock.statistics(),
                 "queue": {
-                    "depth": len(self._queue),
-                    "capacity": self._queue.capacity,
+                    "depth": self._queue.used,
+                    "capacity": self._queue.room,
                     "high_water": self._queue.high_water,
                     "dropped": self._queue.dropped,
                 },
@@ -352,7 +297,7 @@ class Service:
         simulation = self._simulation
         self.prepare()
         start = {"scene": self._scene.get("name"), "seed": self._scene.get("seed"), "pace": self._clock.pace}
-        self._queue.put(_Entry([self._event("start", **start)]))
+        self._queue.push(_Entry([self._event("start", **start)]))
         publisher = threading.Thread(target=self._publish_all, name="publisher", daemon=True)
         publisher.start()
         started = time.monotonic()
@@ -398,7 +343,7 @@ class Service:
         while True:
             events = self._take_commands()
             if self._stop_requested or (end is not None and simulation.tick >= end):
-                queue.put(_Entry(events))
+                queue.push(_Entry(events))
                 return "stopped" if self._stop_requested else "completed"
             want = self._block_ticks
             if end is not None:
@@ -418,19 +363,19 @@ class Service:
                 answered += self._take_commands()
             self._tick = simulation.tick
             after = [{**event, "wall_s": time.time()} for event in frame.events]
-            self._overflow(queue.put(_Entry(events, frame, [*after, *answered], self._finished_steps())))
+            self._overflow(queue.push(_Entry(events, frame, [*after, *answered], self._finished_steps())))
             self._refresh_health()
 
     def _defer(self, events: list[dict[str, Any]]) -> None:
         """Publish events without a block, where the next block is not yet to be run."""
         if events:
-            self._queue.put(_Entry(events))
+            self._queue.push(_Entry(events))
 
     def _overflow(self, dropped: int) -> None:
         """Say once for each time that the queue overflows; the count is in the status."""
         if dropped and not self._overflowing:
             text = "the publisher does not keep up: the oldest blocks in the queue are dropped"
-            self._queue.put(_Entry([self._event("warning", text=text)]))
+            self._queue.push(_Entry([self._event("warning", text=text)]))
         self._overflowing = bool(dropped)
 
     def _take_commands(self) -> list[dict[str, Any]]:
@@ -520,7 +465,7 @@ class Service:
 
     def _warn(self, text: str) -> None:
         """Put a warning into the stream; on any thread."""
-        self._queue.put(_Entry([self._event("warning", text=text)]))
+        self._queue.push(_Entry([self._event("warning", text=text)]))
 
     def _event(self, name: str, *, tick: int | None = None, **fields: Any) -> dict[str, Any]:
         tick = self._simulation.tick if tick is None else tick
@@ -530,7 +475,7 @@ class Service:
         """Refuse what is still waiting, and put the end of the stream into the queue."""
         self._state = "ended"
         self._desk.close(f"a run that ended: {reason}", [pending for _, pending, _ in self._steps])
-        self._queue.put(_Entry([self._event("end", reason=reason)]))
+        self._queue.push(_Entry([self._event("end", reason=reason)]))
         self._queue.close()
 
     def _linger(self) -> None:
@@ -545,7 +490,7 @@ class Service:
 
     def _publish_all(self) -> None:
         next_status_s = time.monotonic()
-        while not self._queue.finished:
+        while not self._queue.ended:
             entry = self._queue.take(max(0.0, next_status_s - time.monotonic()))
             if entry is not None:
                 self._publish_entry(entry)

@@ -346,9 +346,8 @@ class Player:
                 self._rest(_LOOK_S)
                 continue
             if self._head is None:
-                if self._ahead.ready(_LOOK_S):
-                    self._head = self._ahead.take()
-                elif self._ahead.ended:
+                self._head = self._ahead.take(_LOOK_S)
+                if self._head is None and self._ahead.ended:
                     return "completed"
             if isinstance(self._head, _Mark):
                 if self._burst and self._begun and self._desk.clients.behind(self._outlet.published):

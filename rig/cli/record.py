@@ -15,7 +15,8 @@ from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 
 if TYPE_CHECKING:
-    from recorder.session import Progress, RecordingSession, Summary
+    from recorder.session import RecordingSession
+    from recorder.summary import Progress, Summary
 
 _FILES, _TRIGGERS, _DISK = "Several files", "Around triggers", "The disk"
 

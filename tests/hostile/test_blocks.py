@@ -22,7 +22,8 @@ from drivers.daq import Daq
 from drivers.sources.rig import RigSource
 from recorder.reader import Recording, join
 from recorder.room import Limits
-from recorder.session import RecordingSession, Summary
+from recorder.session import RecordingSession
+from recorder.summary import Summary
 from recorder.trigger import Capture, Trigger
 from recorder.viewer import live
 from rig import wire

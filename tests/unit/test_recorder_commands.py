@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from recorder.reader import Recording
-from recorder.session import Progress, Summary
+from recorder.summary import Progress, Summary
 from recorder.writer import RecordingWriter
 from rig.cli.main import main
 from rig.cli.record import run_session, tell

@@ -13,7 +13,8 @@ import recorder.session
 from recorder.payload import Payload
 from recorder.reader import Recording
 from recorder.room import Limits
-from recorder.session import RIG_LOST, Progress, RecordingSession, Summary
+from recorder.session import RIG_LOST, RecordingSession
+from recorder.summary import Progress, Summary
 from recorder.trigger import Capture, Trigger
 from recorder.writer import RecordingWriter
 from rig.channels import default_table
@@ -300,19 +301,6 @@ def test_blocks_with_impossible_times_are_left_out_and_odd_documents_are_kept_an
     for key, more in ((PROBES, 0), (EVENTS, 1), (STATUS, 0)):
         found = [payload for _, payload in recording.payloads(key)]
         assert found[: len(found) - more] == [payload for each, payload in kept if each == key]
-
-
-def test_what_is_being_written_still_counts_against_the_backlog():
-    inbox = recorder.session._Inbox(100)
-    for _ in range(3):
-        inbox.put(PROBES, bytes(40), 0)
-    assert inbox.dropped == 1
-    assert len(inbox.take(0.0) or []) == 2
-    inbox.put(PROBES, bytes(40), 0)
-    assert inbox.dropped == 2
-    assert inbox.take(0.0) == []
-    inbox.put(PROBES, bytes(40), 0)
-    assert (inbox.dropped, inbox.waiting_bytes, inbox.high_water_bytes) == (2, 40, 80)
 
 
 def test_stop_keeps_everything_received(path):

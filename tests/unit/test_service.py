@@ -15,7 +15,7 @@ from drivers.console import Accepted, Console
 from rig import wire
 from rig.errors import InputError, RefusedError
 from rig.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
-from rig.service import Service, _Entry, _Queue
+from rig.service import Service
 from rig.transport import NoReplyError
 from rig.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, TRUTH, FakeFrame, FakeSimulation
@@ -418,21 +418,6 @@ def test_an_unpaced_run_waits_for_the_publisher() -> None:
     thread.join(20.0)
     assert len(listener.blocks[wire.sensor_key("probes")]) == 100
     assert listener.statuses[-1]["queue"]["dropped"] == 0
-
-
-def test_the_queue_gives_the_events_of_a_dropped_block_to_the_next() -> None:
-    queue = _Queue(1)
-    frame = FakeSimulation()
-    frame.warm_up()
-    assert queue.put(_Entry([{"event": "start"}])) == 0
-    assert queue.put(_Entry([{"event": "a"}], frame.advance(BLOCK), [{"event": "b"}])) == 0
-    assert queue.put(_Entry([{"event": "c"}], frame.advance(BLOCK))) == 1
-    queue.close()
-    entry = queue.take(0.0)
-    assert entry is not None
-    assert [event["event"] for event in entry.before] == ["start", "a", "b", "c"]
-    assert queue.take(0.0) is None
-    assert queue.finished
 
 
 def test_reports_of_clients_are_in_the_status_with_their_lag() -> None:
