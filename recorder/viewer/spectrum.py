@@ -10,13 +10,14 @@ import numpy as np
 from recorder.viewer.canvas import Canvas, pixels
 from recorder.viewer.history import History
 from recorder.viewer.whirl import BACKWARD_RGB, FORWARD_RGB
+from rig.orbit import SPECTRUM_HZ, full_spectrum
 
 ROOT = "/spectrum"
 BACKWARD = f"{ROOT}/now/backward"
 FORWARD = f"{ROOT}/now/forward"
 WATERFALL = f"{ROOT}/waterfall"
 
-LIMIT_HZ = 200
+LIMIT_HZ = round(SPECTRUM_HZ)
 WINDOW_S = 0.5
 COLUMN_HZ = 2
 """Width of a waterfall column [Hz]: the window of half a second resolves no more."""
@@ -26,25 +27,19 @@ FLOOR_DB, CEILING_DB = 0.0, 62.0
 """Colour range [dB re 1 um]: 1 um to 1.26 mm."""
 
 
-def full_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitude of each circular component of z about its centre.
-
-    Hann window over all of z, padded to one second, so that bins stand at whole hertz; scaled so that a steady whirl of
-    radius r has its peak at r.
+def shown_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitude of each circular component of z about its centre, at whole hertz (`rig.orbit.full_spectrum`).
 
     Args:
         z: x + j y, shape (n,), n at most `rate_hz`.
         rate_hz: Samples per second [Hz].
 
     Returns:
-        Frequencies -200 .. 200 [Hz] and amplitudes in the unit of z, both of shape (401,).
+        Frequencies -200 .. 200 [Hz] and amplitudes in the unit of z, both of shape (401,); 0 beyond half the rate.
     """
     frequencies = np.arange(-LIMIT_HZ, LIMIT_HZ + 1)
-    window = np.hanning(len(z) + 2)[1:-1]
-    # The plain mean of an unfinished revolution is not zero: taking it off would put a line at 0 Hz.
-    centre = np.dot(window, z) / window.sum()
-    lines = np.fft.fft((z - centre) * window, n=rate_hz) / window.sum()
-    amplitude = np.abs(lines[frequencies % rate_hz])
+    _, lines = full_spectrum(z.real, z.imag, rate_hz, lines=rate_hz)
+    amplitude = lines[(frequencies + rate_hz // 2) % rate_hz]
     amplitude[np.abs(frequencies) >= rate_hz / 2] = 0.0
     return frequencies, amplitude
 
@@ -85,7 +80,7 @@ class SpectrumPlot:
         z = self._history.last(math.ceil(WINDOW_S * self._rate_hz))
         if len(z) < math.ceil(WINDOW_S * self._rate_hz):
             return
-        _, amplitude = full_spectrum(z, self._rate_hz)
+        _, amplitude = shown_spectrum(z, self._rate_hz)
         bars = amplitude.astype(np.float32)
         self._canvas.draw(BACKWARD, time_s, rr.BarChart(bars[:LIMIT_HZ]))
         self._canvas.draw(FORWARD, time_s, rr.BarChart(bars[LIMIT_HZ + 1 :]))

@@ -7,49 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from recorder.reader import Recording, Samples
+from recorder.reader import Recording
 from replays.recordings.verdict import hammer_time_s
 from replays.recordings.whirl import parameter_si, whirl_figures
 from replays.report.canvas import new_figure, save
+from rig.orbit import SPECTRUM_HZ, full_spectrum, waterfall
 
-WATERFALL_HZ = 200.0
 _BEFORE, _IMPACTS, _WHIRL = "#4c9f70", "#d1495b", "#30638e"
-
-
-def full_spectrum(x: np.ndarray, y: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Two-sided spectrum of x + j y about its mean.
-
-    Args:
-        x: Horizontal, shape (n,).
-        y: Vertical, shape (n,).
-        rate_hz: Sample rate [Hz].
-
-    Returns:
-        Frequencies [Hz], forward positive, and amplitudes (of the rotating vector, in the unit of x), each shape (n,).
-    """
-    n = len(x)
-    window = np.hanning(n)
-    orbit = (x - x.mean()) + 1j * (y - y.mean())
-    amplitude = np.abs(np.fft.fftshift(np.fft.fft(orbit * window))) / window.sum()
-    return np.fft.fftshift(np.fft.fftfreq(n, 1.0 / rate_hz)), amplitude
-
-
-def waterfall(
-    probes: Samples, *, window_s: float = 0.5, hop_s: float = 0.1
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Full spectra of the disk's orbit over time.
-
-    Returns:
-        Times of the windows' centres [s], shape (t,); frequencies [Hz], shape (f,); amplitudes [mm], shape (t, f).
-    """
-    size, hop = round(window_s * probes.rate_hz), round(hop_s * probes.rate_hz)
-    x, y = probes.column("disk_x"), probes.column("disk_y")
-    starts = range(0, max(1, len(x) - size), hop)
-    spectra = [full_spectrum(x[s : s + size], y[s : s + size], probes.rate_hz) for s in starts]
-    frequency = spectra[0][0]
-    near = np.abs(frequency) <= WATERFALL_HZ
-    times = np.array([probes.times_s[min(s + size // 2, len(x) - 1)] for s in starts])
-    return times, frequency[near], np.array([amplitude[near] for _, amplitude in spectra])
 
 
 def draw(recording: Recording, path: Path) -> None:
@@ -126,15 +90,16 @@ def draw(recording: Recording, path: Path) -> None:
 
     ax = axes[2, 1]
     kept = probes.times_s >= end_s - 2.0
-    frequency, amplitude = full_spectrum(probes.column("disk_x")[kept], probes.column("disk_y")[kept], probes.rate_hz)
-    near = np.abs(frequency) <= WATERFALL_HZ
+    disk_x, disk_y = probes.column("disk_x"), probes.column("disk_y")
+    frequency, amplitude = full_spectrum(disk_x[kept], disk_y[kept], probes.rate_hz)
+    near = np.abs(frequency) <= SPECTRUM_HZ
     ax.semilogy(frequency[near], np.maximum(amplitude[near], 1e-5), color=_WHIRL, lw=0.8)
     ax.axvline(figures.law_hz, color="0.4", ls=":", lw=1, label=f"-spin R_S/(r0+delta) = {figures.law_hz:.1f} Hz")
     ax.set(title="Full spectrum, settled whirl", xlabel="backward  -  frequency [Hz]  -  forward", ylabel="[mm]")
     ax.legend(loc="upper right", fontsize=8)
 
     ax = axes[2, 2]
-    times, frequency, amplitude = waterfall(probes)
+    times, frequency, amplitude = waterfall(probes.times_s, disk_x, disk_y, probes.rate_hz)
     level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
     mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
     figure.colorbar(mesh, ax=ax, label="[dB re 1 um]")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from recorder.reader import Recording
 from rig.errors import InputError
+from rig.orbit import whirl_frequency
 
 
 @dataclass(frozen=True)
@@ -38,20 +38,6 @@ class WhirlFigures:
     slip: float
     reaction_x_n: float
     reaction_y_n: float
-
-
-def whirl_frequency(times_s: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
-    """Slope of the phase of x + j y about the orbit's centre [Hz]; forward (with the spin, from x to y) is positive.
-
-    Unlike the bin of a spectrum this has no resolution limit; the orbit must go round its centre.
-
-    Args:
-        times_s: Times [s], shape (n,).
-        x: Horizontal, shape (n,).
-        y: Vertical, shape (n,).
-    """
-    orbit = (x - x.mean()) + 1j * (y - y.mean())
-    return float(np.polyfit(times_s - times_s[0], np.unwrap(np.angle(orbit)), 1)[0] / (2 * math.pi))
 
 
 def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigures:

@@ -56,7 +56,7 @@ def test_contracts_hold() -> None:
         ("recorder/views.py", "from rig.kernels.signals import ROW"),
         ("drivers/console.py", "from rig.model import build_model"),
         ("drivers/hammer/driver.py", "from drivers.hammer.twin import HammerTwin"),
-        ("rig/service.py", "from replays.recordings.whirl import whirl_frequency"),
+        ("rig/service.py", "from replays.recordings.whirl import whirl_figures"),
     ],
 )
 def test_contracts_see_what_is_forbidden(copied: Path, module: str, line: str) -> None:

@@ -10,7 +10,8 @@ from itertools import pairwise
 import numpy as np
 
 from replays.recordings.prediction import Measured
-from replays.recordings.whirl import whirl_frequency
+from rig.orbit import phase as phase_of
+from rig.orbit import whirl_frequency
 
 PHASES = ("free run", "impacts", "whirl", "rest", "decay")
 """Before the first contact; contact that comes and goes; lasting contact that goes round, or does not; after it."""
@@ -239,7 +240,7 @@ def find_phases(view: View, *, floor_n: float) -> list[Phase]:
     """
     if view.has(*_RING) and math.isfinite(view.touches):
         times, contact = view.times_s["ring_x"], view.contact()
-        angle = np.unwrap(np.angle(view.values["ring_x"] + 1j * view.values["ring_y"])) / (2.0 * math.pi)
+        angle = phase_of(view.values["ring_x"], view.values["ring_y"]) / (2.0 * math.pi)
     elif view.has(*_FORCES):
         times, contact = view.times_s["P_E"], np.abs(view.force()) > _CLEAR * floor_n
         angle = np.zeros(len(times))
