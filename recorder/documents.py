@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
@@ -14,6 +15,8 @@ from rig.errors import InputError
 from rig.outside import Count, input_error, read_json
 from rig.wire import EVENTS, STATUS, schema_of
 
+_MOST_KEPT = 64 << 20
+"""Documents of one kind that are kept in memory [bytes]."""
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Rate = Annotated[float, Field(gt=0.0, le=1e12, allow_inf_nan=False)]
 
@@ -244,6 +247,28 @@ def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, A
         return document, model.model_validate_json(payload, strict=True)
     except ValidationError as error:
         raise input_error(error, field) from None
+
+
+def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
+    """The document in a message of one of the topics `KINDS`; None where it is not what the topic promises."""
+    try:
+        document, told = read(KINDS[topic].model, payload, field=topic)
+        if isinstance(told, Event) and told.event == "command":
+            read(Command, payload, field=topic)
+    except InputError:
+        return None
+    return document
+
+
+def check_kept(kept_bytes: int, topic: str, path: Path) -> int:
+    """Refuse a recording with more documents of one kind than memory is to hold; gives their size [bytes].
+
+    Raises:
+        InputError: It has.
+    """
+    if kept_bytes > _MOST_KEPT:
+        raise InputError("file", f"a recording with at most {_MOST_KEPT} bytes of {topic}", str(path))
+    return kept_bytes
 
 
 def told(model: type[Model], entries: dict[str, str], *, field: str) -> Model:

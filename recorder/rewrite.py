@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
@@ -74,11 +75,11 @@ def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None
     with _unlocked(source):
         try:
             recording = Recording.open(source)
-            total = max(1, sum(recording.messages.values()))
-            for number, _ in enumerate(recording.everything() if recording.complete else ()):
-                if on_progress is not None and number % _TELL_EVERY == 0:
-                    on_progress(number / total)
-            return recording.complete and not recording.short
+            if not recording.complete:
+                return False
+            step = _progress(recording, on_progress)
+            recording.look_through(lambda key, block: step())
+            return not recording.short
         except InputError:
             return False
 
@@ -106,7 +107,7 @@ def recover(
     output = output or recovered_path(source)
     check_not_among([source], output)
     with _unlocked(source):
-        recording = Recording(source, salvage=True)
+        recording = Recording.open(source, salvage=True)
         about = {
             "source": source.name,
             "source_bytes": str(source.stat().st_size),
@@ -239,10 +240,9 @@ def _write(
             sync_every_s=2.0,
         )
         stack.callback(writer.abandon)  # nothing half-written stays; does nothing once it is finished
-        total = max(1, sum(recording.messages.values()))
-        for number, (key, _, wall_ns, data) in enumerate(recording.everything()):
-            if on_progress is not None and number % _TELL_EVERY == 0:
-                on_progress(number / total)
+        step = _progress(recording, on_progress)
+        for key, _, wall_ns, data in recording.everything():
+            step()
             if key.startswith(schemas.VIEW + "/") or key == schemas.CLOCK:
                 continue
             if key == schemas.GAPS:
@@ -256,6 +256,18 @@ def _write(
                 writer.take(changed)
         writer.finish(reason)
     return writer.counts()
+
+
+def _progress(recording: Recording, on_progress: Callable[[float], None] | None) -> Callable[[], None]:
+    """Something to call for each message, which reports the part of them that is done now and then."""
+    total, numbers = max(1, sum(recording.messages.values())), count()
+
+    def step() -> None:
+        number = next(numbers)
+        if on_progress is not None and number % _TELL_EVERY == 0:
+            on_progress(number / total)
+
+    return step
 
 
 @contextlib.contextmanager

@@ -14,7 +14,8 @@ from recorder.viewer.geometry import Geometry
 from recorder.viewer.painter import FRAME_S, Painter
 
 if TYPE_CHECKING:
-    from recorder.reader import Recording, Samples
+    from recorder.reader import Recording
+    from recorder.samples import Samples
 
 MOST_ROWS_PER_S = 2000.0
 MOST_ROWS = 60_000

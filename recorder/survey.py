@@ -1,0 +1,173 @@
+"""What a file of a recording holds, counted from what is there, and what in it does not fit the rest of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from recorder import documents, schemas
+from recorder.recording_file import RecordingFile
+from recorder.samples import row_times_s
+from rig.wire import EDGES, EVENTS, Block, Continuity, schema_of
+
+_LEAST_SPAN_S = 0.5
+"""A stream without rows in a recording of this length is told; in a shorter one it may not have begun."""
+_OFF_RATE = 1e-3
+"""Part by which the rate of a block may be off that of its stream: an import's is a whole number."""
+Watch = Callable[[str, Block], None]
+"""Is shown each block, with its key."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What a recording holds of one block stream.
+
+    Attributes:
+        messages: Number of blocks.
+        rows: Number of rows in them.
+        lost: Number of rows missing between them, counted anew from the row numbers.
+        first_time_s: Simulated time of the first row [s].
+        last_time_s: Simulated time of the last row [s].
+        first: Number of the first row.
+        due: Number of the row after the last one.
+        odd: Number of payloads that are no blocks, or do not fit the catalogue.
+        back: Number of blocks that begin before the row that was due.
+        off: Number of blocks at another rate than the catalogue says.
+        missing: Rows that the file says it has, or the rig that it made, and that are not there.
+    """
+
+    messages: int = 0
+    rows: int = 0
+    lost: int = 0
+    first_time_s: float = 0.0
+    last_time_s: float = 0.0
+    first: int = 0
+    due: int = 0
+    odd: int = 0
+    back: int = 0
+    off: int = 0
+    missing: int = 0
+
+    def then(self, later: Stream) -> Stream:
+        """The same stream with what it goes on with in another file."""
+        sums = {
+            name: getattr(self, name) + getattr(later, name)
+            for name in ("messages", "rows", "lost", "odd", "back", "off", "missing")
+        }
+        if not (self.rows and later.rows):
+            return replace(self if self.rows else later, **sums)
+        sums["lost"] += max(0, later.first - self.due)
+        return replace(self, **sums, last_time_s=later.last_time_s, due=later.due)
+
+
+class Survey:
+    """Counts what one file holds.
+
+    Attributes:
+        file: The file.
+        streams: Extent of every block stream by key.
+    """
+
+    def __init__(self, file: RecordingFile, watch: Watch | None = None) -> None:
+        """Read the whole file.
+
+        Args:
+            file: The file.
+            watch: Is shown each block that fits the catalogue.
+
+        Raises:
+            InputError: The file is damaged.
+        """
+        self.file = file
+        self._continuity = Continuity()
+        self._found: dict[str, Stream] = {}
+        self._counted: dict[str, int] = {}
+        self._published: dict[str, int] = {}
+        self._noted: set[tuple[str, int]] = set()
+        self._noted_bytes = 0
+        for key, _, _, payload in file.stamped(None):
+            self._counted[key] = self._counted.get(key, 0) + 1
+            if schema_of(key) is None:
+                self._take_document(key, payload)
+            elif (block := self._take_block(key, payload)) is not None and watch is not None:
+                watch(key, block)
+        self.streams = self._streams()
+
+    @cached_property
+    def short(self) -> tuple[str, ...]:
+        """Rows that the file says it has, and that are not there though all of it is as it was written."""
+        return tuple(f"{one.missing} rows of {key} are missing" for key, one in self.streams.items() if one.missing)
+
+    @cached_property
+    def doubts(self) -> tuple[str, ...]:
+        """What in the file does not fit the rest of it though every checksum holds, in a line each."""
+        promises, messages = self.file.promises, self.file.messages
+        found = list(self.short)
+        for key, stream in self.streams.items():
+            if stream.odd:
+                found.append(f"payloads of {key} that are no blocks, or do not fit the catalogue: {stream.odd}")
+            if stream.back:
+                found.append(f"blocks of {key} that repeat row numbers, or go back: {stream.back}")
+            if stream.off:
+                found.append(f"blocks of {key} at another rate than the catalogue says: {stream.off}")
+            if stream.rows > (told := self.file.told_rows.get(key, stream.rows)):
+                found.append(f"{key} has {stream.rows} rows where the file says {told}")
+            if stream.rows and key not in promises:
+                found.append(f"{key} is not in the catalogue")
+        for topic in sorted(set(messages) | set(self._counted)):
+            if (is_there := self._counted.get(topic, 0)) != (told := messages.get(topic, 0)):
+                found.append(f"{is_there} messages of {topic} where the file says {told}")
+        filled = {key: one for key, one in self.streams.items() if one.rows}
+        span_s = max((one.last_time_s for one in filled.values()), default=0.0)
+        span_s -= min((one.first_time_s for one in filled.values()), default=0.0)
+        for key in sorted(set(promises) - {EDGES} - set(filled)):
+            if span_s > max(_LEAST_SPAN_S, 2.0 / promises[key].rate_hz):
+                found.append(f"no rows of {key}, which the catalogue promises")
+        return tuple(found)
+
+    def _take_block(self, key: str, payload: bytes) -> Block | None:
+        stream = self._found.get(key, Stream())
+        block = self.file.block(key, payload)
+        if block is None:
+            self._found[key] = replace(stream, odd=stream.odd + 1)
+            return None
+        gap = self._continuity.follow(key, block.index, len(block.values))
+        promise = self.file.promises.get(key)
+        off = promise is not None and promise.rate_hz and abs(block.rate_hz / promise.rate_hz - 1.0) > _OFF_RATE
+        first = stream if stream.messages else replace(stream, first=block.index)
+        if len(block.values):
+            times_s = row_times_s(key, block)
+            rows = stream.rows + len(block.values)
+            first_s = stream.first_time_s if stream.rows else float(times_s[0])
+            first = replace(first, rows=rows, first_time_s=first_s, last_time_s=float(times_s[-1]))
+        back = gap is not None and gap.size < 0
+        self._found[key] = replace(
+            first, messages=stream.messages + 1, back=stream.back + back, off=stream.off + bool(off)
+        )
+        return block
+
+    def _take_document(self, key: str, payload: bytes) -> None:
+        """Follow what the rig says of the rows that it published, and the recorder of those that never arrived."""
+        if key not in (EVENTS, schemas.GAPS) or (document := documents.document_in(key, payload)) is None:
+            return
+        if key == schemas.GAPS:
+            self._noted_bytes = documents.check_kept(self._noted_bytes + len(payload), key, self.file.path)
+            if document["index"] >= 0:
+                self._noted.add((document["key"], document["index"] + document["size"]))
+        elif document["event"] in ("start", "end"):
+            self._published = (document.get("rows") or {}) if document["event"] == "end" else {}
+
+    def _streams(self) -> dict[str, Stream]:
+        told = self.file.told_rows
+        # A file that does not go to the end of a run ends where it was to end.
+        whole = not {"trigger", "cut"} & set(self.file.metadata)
+        found = {}
+        for key in sorted(set(self._found) | {key for key, rows in told.items() if rows}):
+            stream, due = self._found.get(key, Stream()), self._continuity.next.get(key, 0)
+            rows, lost = (counts.get(key, 0) for counts in (self._continuity.received, self._continuity.lost))
+            end = self._published.get(key, due)
+            short = end - due if whole and key in self._continuity.next and (key, end) not in self._noted else 0
+            missing = max(0, told.get(key, rows) - rows, short)
+            found[key] = replace(stream, rows=rows, lost=lost, due=due, missing=missing)
+        return found
