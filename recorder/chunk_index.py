@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
-if TYPE_CHECKING:
-    from mcap.records import ChunkIndex
-    from mcap.writer import Writer
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
+from mcap.stream_reader import MAGIC_SIZE
+from mcap.writer import Writer
 
 _RECORD, _CHUNK, _CHANNEL = struct.Struct("<BQ"), struct.Struct("<QQQII"), struct.Struct("<H")
 
@@ -33,10 +34,6 @@ class _ChunkIndexes:
         """Keep nothing."""
 
     def __iter__(self) -> Iterator[ChunkIndex]:
-        from mcap.opcode import Opcode
-        from mcap.records import ChunkIndex
-        from mcap.stream_reader import MAGIC_SIZE
-
         self._file.flush()
         number, position = self._file.fileno(), MAGIC_SIZE
         index = None

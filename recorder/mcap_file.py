@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mcap.writer import Writer
+
 from recorder.chunk_index import keep_on_disk
 from recorder.draft import Draft
 from recorder.schemas import Definition
@@ -43,8 +45,6 @@ class McapFile:
         Raises:
             OSError: The disk refused.
         """
-        from mcap.writer import Writer
-
         self.draft = draft
         self.size_bytes = self.unflushed_bytes = 0
         self._chunks = self._chunk_bytes = self._channels = 0

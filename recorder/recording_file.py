@@ -9,6 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO
 
+from mcap.exceptions import McapError
+
 from recorder import documents, schemas
 from recorder.payload import block_in
 from recorder.records import COPY, MAGIC, Chunk, DamagedError, messages, read_contents, unpack
@@ -165,8 +167,6 @@ class RecordingFile:
     @contextlib.contextmanager
     def _open(self) -> Iterator[BinaryIO]:
         """The open file; whatever a damaged one makes the parsers raise becomes one clear error."""
-        from mcap.exceptions import McapError
-
         try:
             with open_file(self.path) as file:
                 yield file

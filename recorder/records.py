@@ -9,10 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from itertools import pairwise
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
-if TYPE_CHECKING:
-    from mcap.records import Channel
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, Channel, Metadata, MetadataIndex, Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 COPY = "metadata.json"
@@ -120,7 +123,7 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
     _take_data(file, found, indexed, data_end)
     file.seek(data_end)
     opcode, length, expected = _DATA_END.unpack(file.read(_DATA_END.size))
-    if (opcode, length) != (_op().DATA_END, 4):
+    if (opcode, length) != (Opcode.DATA_END, 4):
         raise DamagedError("no end of the data")
     if expected or COPY in found.attachments:
         if _sum(file, data_end) != expected:
@@ -133,7 +136,6 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
 
 def _take_data(file: BinaryIO, found: Contents, indexed: set[tuple[int, int]], data_end: int) -> None:
     """Hold the records of the data against their index, and take metadata and attachments."""
-    opcodes = _op()
     position, room, chunks = len(MAGIC), _Room(data_end), set()
     for chunk in found.chunks:
         indexed.add((chunk.offset, chunk.length + _RECORD.size))
@@ -142,12 +144,12 @@ def _take_data(file: BinaryIO, found: Contents, indexed: set[tuple[int, int]], d
         file.seek(position)
         opcode, length = _head(file)
         end = position + _RECORD.size + length
-        if end > data_end or opcode == opcodes.MESSAGE:
+        if end > data_end or opcode == Opcode.MESSAGE:
             raise DamagedError("records that do not end with the data, or messages outside of chunks")
         room.take(opcode, file, length)
-        if opcode in (opcodes.CHUNK, opcodes.METADATA, opcodes.ATTACHMENT):
+        if opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.ATTACHMENT):
             chunks.add((position, end - position))
-            if opcode != opcodes.CHUNK:
+            if opcode != Opcode.CHUNK:
                 _take(found, opcode, file.read(length))
         position = end
     if chunks != indexed:
@@ -166,7 +168,7 @@ class _Room:
         self.unpacked = 0
         self._most = _MOST_PACKED * size + MOST_CHUNK_BYTES
         self._records = size // _LEAST_RECORD + 10_000
-        self._kept = {_op().ATTACHMENT: _MOST_ATTACHED, _op().METADATA: _MOST_METADATA}
+        self._kept = {Opcode.ATTACHMENT: _MOST_ATTACHED, Opcode.METADATA: _MOST_METADATA}
 
     def take(self, opcode: int, file: BinaryIO, length: int) -> None:
         """Count a record; the file is where its body begins, and stays there.
@@ -175,7 +177,7 @@ class _Room:
             DamagedError: It is too large, or there are too many of them.
         """
         self._records -= 1
-        if opcode == _op().CHUNK:
+        if opcode == Opcode.CHUNK:
             start = file.tell()
             head = file.read(_CHUNK.size)
             file.seek(start)
@@ -194,12 +196,6 @@ def _head(file: BinaryIO) -> tuple[int, int]:
     return _RECORD.unpack(file.read(_RECORD.size))
 
 
-def _op() -> type:
-    from mcap.opcode import Opcode
-
-    return Opcode
-
-
 def _sum(file: BinaryIO, end: int) -> int:
     """CRC-32 of a file up to a place."""
     file.seek(0)
@@ -216,16 +212,12 @@ def _footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
         return None
     file.seek(at)
     opcode, length, start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
-    whole = (opcode, length) == (_op().FOOTER, _FOOTER.size - _RECORD.size) and file.read(len(MAGIC)) == MAGIC
+    whole = (opcode, length) == (Opcode.FOOTER, _FOOTER.size - _RECORD.size) and file.read(len(MAGIC)) == MAGIC
     return (start, checksum) if whole else None
 
 
 def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Contents, set[tuple[int, int]], int]:
     """Channels, counts and chunks by the summary; where metadata and attachments are; where the data end."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import AttachmentIndex, Channel, MetadataIndex, Statistics
-
-    opcodes = _op()
     start, expected = footer
     data_end, end = start - _DATA_END.size, size - len(MAGIC) - _FOOTER.size
     if data_end < len(MAGIC) or start > end:
@@ -240,17 +232,17 @@ def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Conten
     room = _Room(len(data))
     for opcode, at, stop in records(data[: end - start]):
         room.take(opcode, file, 0)
-        if opcode == opcodes.CHUNK_INDEX:
+        if opcode == Opcode.CHUNK_INDEX:
             found.chunks.append(_chunk_indexed(data[at:stop]))
             continue
         body = ReadDataStream(BytesIO(data[at:stop]))
-        if opcode == opcodes.CHANNEL:
+        if opcode == Opcode.CHANNEL:
             channel = Channel.read(body)
             _add_topic(found, channel)
-        elif opcode == opcodes.STATISTICS:
+        elif opcode == Opcode.STATISTICS:
             found.counts = dict(Statistics.read(body).channel_message_counts)
-        elif opcode in (opcodes.ATTACHMENT_INDEX, opcodes.METADATA_INDEX):
-            index = (AttachmentIndex if opcode == opcodes.ATTACHMENT_INDEX else MetadataIndex).read(body)
+        elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+            index = (AttachmentIndex if opcode == Opcode.ATTACHMENT_INDEX else MetadataIndex).read(body)
             places.add((index.offset, index.length))
     for earlier, later in pairwise(found.chunks):
         if later.offset < earlier.offset + earlier.length:
@@ -281,14 +273,9 @@ def _take(found: Contents, opcode: int, body: bytes) -> None:
     Raises:
         DamagedError: It is not what was written, or its name comes twice.
     """
-    from mcap.data_stream import ReadDataStream
-    from mcap.exceptions import McapError
-    from mcap.records import Attachment, Metadata
-
-    opcodes = _op()
     stream = ReadDataStream(BytesIO(body))
     try:
-        if opcode == opcodes.ATTACHMENT:
+        if opcode == Opcode.ATTACHMENT:
             if len(body) < 4 or zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
                 raise DamagedError("an attachment whose checksum does not fit")
             attachment = Attachment.read(stream)
@@ -308,7 +295,6 @@ def _walked(file: BinaryIO, size: int) -> Contents:
 
     A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through.
     """
-    opcodes = _op()
     found = Contents()
     position, room = len(MAGIC), _Room(size)
     while position + _RECORD.size <= size:
@@ -317,22 +303,22 @@ def _walked(file: BinaryIO, size: int) -> Contents:
         end = position + _RECORD.size + length
         if opcode == 0 or end > size:
             # Cut off, or zeros where a power cut left unwritten pages; else its length is not what was written.
-            if opcode == opcodes.CHUNK and _says(file, length):
+            if opcode == Opcode.CHUNK and _says(file, length):
                 found.chunks.append(Chunk(position, size - position - _RECORD.size, cut=True))
             elif not (length == 0 and _zeros(file) if opcode == 0 else _says_index(file, opcode, length)):
                 found.damaged += 1
             break
-        if opcode == opcodes.DATA_END and length == 4:
+        if opcode == Opcode.DATA_END and length == 4:
             break
         room.take(opcode, file, length)
-        if opcode == opcodes.CHUNK:
+        if opcode == Opcode.CHUNK:
             found.chunks.append(Chunk(position, length))
-        elif opcode in (opcodes.METADATA, opcodes.ATTACHMENT):
+        elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             try:
                 _take(found, opcode, file.read(length))
             except DamagedError:
                 found.damaged += 1
-        elif opcode not in (opcodes.HEADER, opcodes.MESSAGE_INDEX):
+        elif opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX):
             found.damaged += 1
         position = end
     return found
@@ -350,11 +336,10 @@ def _says(file: BinaryIO, length: int) -> bool:
 
 def _says_index(file: BinaryIO, opcode: int, length: int) -> bool:
     """The same of another record that was cut: an index behind a chunk, or the metadata at the end."""
-    opcodes = _op()
-    if opcode == opcodes.MESSAGE_INDEX:
+    if opcode == Opcode.MESSAGE_INDEX:
         head = file.read(6)
         return len(head) < 6 or 6 + int.from_bytes(head[2:], "little") == length
-    return opcode in (opcodes.METADATA, opcodes.ATTACHMENT, opcodes.DATA_END)
+    return opcode in (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END)
 
 
 def _zeros(file: BinaryIO) -> bool:
@@ -366,11 +351,6 @@ def _zeros(file: BinaryIO) -> bool:
 
 def _counted(file: BinaryIO, found: Contents) -> Contents:
     """Find channels, counts and times of a cut file in its chunks; one that does not unpack is passed over."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.exceptions import McapError
-    from mcap.records import Channel
-
-    opcodes = _op()
     good, counts, unchecked = [], [], 0
     for chunk in found.chunks:
         times_ns: list[int] = []
@@ -378,11 +358,11 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
         try:
             data = unpack(file, chunk)
             for opcode, start, end in records(data, cut=chunk.cut):
-                if opcode == opcodes.MESSAGE:
+                if opcode == Opcode.MESSAGE:
                     number, time_ns = _stamp(data, start, end)
                     inside[number] = inside.get(number, 0) + 1
                     times_ns.append(time_ns)
-                elif opcode == opcodes.CHANNEL:
+                elif opcode == Opcode.CHANNEL:
                     _add_topic(found, Channel.read(ReadDataStream(BytesIO(data[start:end]))))
         except (McapError, struct.error, ValueError):
             found.damaged += 1
@@ -437,9 +417,8 @@ def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]
 
 def messages(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int, bytes]]:
     """Channel, simulated time [ns], wall time of arrival [unix ns] and payload of each message of a chunk."""
-    opcode_of_message = _op().MESSAGE
     for opcode, start, end in records(data, cut=cut):
-        if opcode == opcode_of_message:
+        if opcode == Opcode.MESSAGE:
             _stamp(data, start, end)
             number, _, log_time, publish_time = MESSAGE.unpack_from(data, start)
             yield number, log_time, publish_time, data[start + MESSAGE.size : end]
@@ -451,8 +430,6 @@ def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
     Raises:
         DamagedError: It is not what was written, or larger than a recorder makes one.
     """
-    import zstandard
-
     if chunk.length > MOST_CHUNK_BYTES + _PIECE:
         raise DamagedError(f"a chunk of {chunk.length} bytes")
     file.seek(chunk.offset + _RECORD.size)
@@ -486,8 +463,6 @@ def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
 
 def _unpack_cut(packed: bytes, size: int) -> bytes:
     """What can be unpacked of a chunk that the file ends in; the last record in it may be cut."""
-    import zstandard
-
     found, length = [], 0
     # In small pieces: where it ends in zeros or in nothing, the blocks before that are good.
     with (

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.clock import WallClock
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 APPLICATION = "rig"
 SIMULATED = "simulated_time"
@@ -19,8 +17,6 @@ WALL = "wall_time"
 
 def new_stream(name: str) -> rr.RecordingStream:
     """A recording stream named `name` that is connected to nothing yet."""
-    import rerun as rr
-
     stream = rr.RecordingStream(APPLICATION)
     # rerun's own time of logging would stand as a third time line that means nothing to the reader.
     stream.set_log_time_enabled(False)
@@ -62,8 +58,6 @@ class Canvas:
 
     def plot(self, path: str, times_s: np.ndarray, columns: Iterable[Any]) -> None:
         """Draw many instants at once; `columns` comes from an archetype's `columns`."""
-        import rerun as rr
-
         indexes = [rr.TimeColumn(SIMULATED, duration=np.round(times_s * 1e9).astype("timedelta64[ns]"))]
         wall = self.clock.at(times_s)
         if wall is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.canvas import Canvas
 from rig.channels import Channel
@@ -46,8 +47,6 @@ class ContactPlot:
     """One lane of the contact view."""
 
     def __init__(self, canvas: Canvas, *, path: str, touch: Touch) -> None:
-        import rerun as rr
-
         self._canvas = canvas
         self._path = path
         self._touch = touch
@@ -66,8 +65,6 @@ class ContactPlot:
 
     def add(self, times_s: np.ndarray, quantity: np.ndarray) -> None:
         """Take the rows of the deciding quantity, shape (n,), and draw the changes."""
-        import rerun as rr
-
         times, states = self._touch.changes(times_s, quantity)
         if len(times_s) and self.touching:
             self.last_contact_s = float(times_s[-1])

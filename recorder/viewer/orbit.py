@@ -10,6 +10,7 @@ import itertools
 import math
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.canvas import Canvas, pixels
 from recorder.viewer.history import History
@@ -56,8 +57,6 @@ class OrbitPlot:
         self._draw_frame(plane)
 
     def _draw_frame(self, plane: str) -> None:
-        import rerun as rr
-
         radius = self._clearance_mm
         circle = radius * np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 181))
         reach = 1.15 * radius
@@ -79,8 +78,6 @@ class OrbitPlot:
     def _write(
         self, name: str, words: dict[complex, str], colors: list[tuple[int, int, int]], time_s: float | None = None
     ) -> None:
-        import rerun as rr
-
         text = rr.Points2D(
             screen(np.array(list(words))),
             radii=pixels(0.0),
@@ -103,8 +100,6 @@ class OrbitPlot:
 
     def draw(self, time_s: float) -> None:
         """Draw the orbit that ends at `time_s`, with an arrow in its direction and a line that names its sense."""
-        import rerun as rr
-
         whirl = whirl_of(self._history.last(math.ceil(_JUDGED_S * self._rate_hz)), self._rate_hz)
         z = self._history.last(math.ceil(shown_s(whirl) * self._rate_hz))
         if len(z) < 2:
@@ -130,8 +125,6 @@ class OrbitPlot:
 
     def _draw_turn(self, time_s: float, position: complex, whirl: Whirl) -> None:
         """Draw a round arrow in the middle that turns as the shaft whirls; it leads up to the shaft's direction."""
-        import rerun as rr
-
         path = f"{self._path}/turn"
         if whirl.sense == "none" or position == 0.0:
             self._canvas.draw(path, time_s, rr.LineStrips2D([]))

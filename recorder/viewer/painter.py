@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import rerun as rr
 
 from recorder import schemas
 from recorder.viewer import contact, orbit
@@ -180,8 +181,6 @@ class Painter:
 
     def note(self, time_s: float, text: str, *, level: str = "INFO") -> None:
         """Write a line into the log of events."""
-        import rerun as rr
-
         self._canvas.draw(EVENTS, time_s, rr.TextLog(text, level=level))
 
     def frame(self, name: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.canvas import Canvas
 from rig.channels import ChannelTable, Group
@@ -155,8 +156,6 @@ class SeriesPlot:
     """The curves of one sensor group on a canvas."""
 
     def __init__(self, canvas: Canvas, group: Group, *, rows_per_s: float) -> None:
-        import rerun as rr
-
         self._canvas = canvas
         self._rate_hz = group.rate_hz
         self._series = series_of(group)
@@ -181,8 +180,6 @@ class SeriesPlot:
 
     def flush(self, *, until_s: float, windows: list[Window], rest: bool = False) -> None:
         """Draw what is complete before `until_s`."""
-        import rerun as rr
-
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             times, values = envelope.take(until_s=until_s, windows=windows, rest=rest)
             if len(times):
@@ -191,8 +188,6 @@ class SeriesPlot:
 
     def lift(self, *, at_s: float, windows: list[Window]) -> None:
         """Draw what is held, then interrupt the curves at `at_s`: rows are missing from here on."""
-        import rerun as rr
-
         self.flush(until_s=np.inf, windows=windows, rest=True)
         for series in self._series:
             hole = np.full((1, len(series.labels)), np.nan)

@@ -6,6 +6,7 @@ import math
 from collections import deque
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.canvas import Canvas, pixels
 from recorder.viewer.history import History
@@ -48,8 +49,6 @@ class SpectrumPlot:
     """The spectrum of the last half second as bars, backward and forward in their own colours, and the waterfall."""
 
     def __init__(self, canvas: Canvas, *, rate_hz: int, interval_s: float, whole: bool) -> None:
-        import rerun as rr
-
         self._canvas = canvas
         self._rate_hz = rate_hz
         self._history = History(capacity=math.ceil(WINDOW_S * rate_hz), dtype=complex)
@@ -75,8 +74,6 @@ class SpectrumPlot:
 
     def draw(self, time_s: float) -> None:
         """Draw the spectrum of the half second that ends at `time_s`; nothing before there is that much."""
-        import rerun as rr
-
         z = self._history.last(math.ceil(WINDOW_S * self._rate_hz))
         if len(z) < math.ceil(WINDOW_S * self._rate_hz):
             return
@@ -107,8 +104,6 @@ class Waterfall:
         self._draw_axes()
 
     def _draw_axes(self) -> None:
-        import rerun as rr
-
         marks = range(-LIMIT_HZ, LIMIT_HZ + 1, 50)
         ticks = [[(self.x_of(hz), HEIGHT), (self.x_of(hz), HEIGHT + (5 if hz == 0 else 3))] for hz in marks]
         faint = pixels(0.6)
@@ -166,8 +161,6 @@ class Waterfall:
 
     def finish(self) -> None:
         """For a whole file: draw the image, its times, and the line that marks the present."""
-        import rerun as rr
-
         if not self._whole or not self._times:
             return
         self._draw_image(None, self.image())
@@ -183,8 +176,6 @@ class Waterfall:
             )
 
     def _draw_image(self, time_s: float | None, image: np.ndarray) -> None:
-        import rerun as rr
-
         picture = rr.DepthImage(
             image, meter=1.0, colormap="inferno", depth_range=[FLOOR_DB, CEILING_DB], draw_order=0.0
         )
@@ -196,8 +187,6 @@ class Waterfall:
             self._draw_times([(0.5, "now"), (HEIGHT - 0.5, f"-{HEIGHT * self._interval_s:.0f} s")])
 
     def _draw_times(self, marks: list[tuple[float, str]]) -> None:
-        import rerun as rr
-
         self._canvas.fix(
             f"{WATERFALL}/times",
             rr.Points2D(

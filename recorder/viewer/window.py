@@ -16,13 +16,12 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
+
+from rerun.experimental import ViewerClient, ViewerState
 
 from recorder.viewer.canvas import SIMULATED
 from rig.errors import InputError
-
-if TYPE_CHECKING:
-    from rerun.experimental import ViewerClient, ViewerState
 
 Kind = Literal["native", "web", "headless"]
 
@@ -151,8 +150,6 @@ class Window:
 
     def _ask(self, satisfied: Callable[[ViewerClient], bool]) -> ViewerClient:
         """Wait until the viewer answers as wanted."""
-        from rerun.experimental import ViewerClient
-
         deadline = time.monotonic() + _LOADED_S
         while time.monotonic() < deadline:
             if not self.open:
