@@ -9,23 +9,19 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from recorder.commands import Commands
-from recorder.counts import NS, Tally
+from recorder.counts import NS
 from recorder.draft import check_destination, remove
 from recorder.head import Beginning
 from recorder.payload import Payload
-from recorder.room import Limits
-from recorder.sink import OpenFile, Sink
+from recorder.sink import Needs, Sink
 from recorder.trigger import Capture, Crossings, Trigger
 from recorder.writer import RecordingError, RecordingWriter
-from rig.channels import ChannelTable
 from rig.errors import PART_SUFFIX, InputError
 from rig.wire import EDGES, EVENTS
 
@@ -90,46 +86,26 @@ class Captures(Sink):
         fired: Triggers so far, those during a capture included.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        capture: Capture,
-        *,
-        table: ChannelTable,
-        tick_rate_hz: int,
-        scene: dict[str, Any],
-        open_file: OpenFile,
-        limits: Limits | None = None,
-        force: bool = False,
-        monotonic_s: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, path: Path, capture: Capture, needs: Needs) -> None:
         """Check names and triggers; a file is opened by the first trigger.
 
         Args:
             path: NAME.mcap, which becomes NAME.TRIGGER-001.mcap and so on.
             capture: What is kept.
-            table: The channel table.
-            tick_rate_hz: Ticks per simulated second.
-            scene: The rig's scene document.
-            open_file: Opens one file.
-            limits: Budget, and room that is left to others on the disk; by default neither.
-            force: Replace what is there of that name.
-            monotonic_s: Clock that times the looks at the disk [s].
+            needs: What a sink needs.
 
         Raises:
             InputError: The name or a channel cannot be used.
         """
-        check_captures(path, capture, force=force)
-        capture.check(table)
-        if force:
+        check_captures(path, capture, force=needs.force)
+        capture.check(needs.table)
+        if needs.force:
             remove(_captures_of(path))
-        limits = limits or Limits(keep_free_mb=0.0)
-        tally = Tally(tick_rate_hz)
-        super().__init__(path, tally=tally, scene=scene, limits=limits, open_file=open_file, monotonic_s=monotonic_s)
+        super().__init__(path, needs)
         self.fired = 0
         self._capture = capture
         self._pre_ns, self._post_ns = round(capture.pre_s * NS), round(capture.post_s * NS)
-        self._crossings = {each: Crossings(each, table) for each in capture.triggers if each.level is not None}
+        self._crossings = {each: Crossings(each, needs.table) for each in capture.triggers if each.level is not None}
         self._ring: deque[_Held] = deque()
         self._reached_ns: dict[str, int] = {}
         self._number = 0
@@ -230,7 +206,7 @@ class Captures(Sink):
         }
         path = capture_path(self.path, trigger, self._number)
         try:
-            writer = self._open_file(path, self._scene_before(start_ns), Beginning(metadata={"trigger": entries}))
+            writer = self._needs.open_file(path, self._scene_before(start_ns), Beginning(metadata={"trigger": entries}))
         except InputError as error:
             raise RecordingError(f"recording stopped: {error}; the captures before it are kept") from None
         latest_end_ns = time_ns - self._pre_ns + round(self._capture.most_s * NS)

@@ -64,12 +64,7 @@ class Tally:
     """Counts payloads as they come, and follows the row numbers and the time.
 
     Attributes:
-        continuity: The row numbers.
-        gaps: Steps of the row numbers.
-        missed: Messages that the transport reported as lost for good, by key.
-        malformed: Payloads that were not what their key promises.
-        first_time_ns: Simulated time of the first row [ns]; None before it.
-        last_time_ns: Simulated time of the latest row [ns].
+        gaps, missed, malformed, first_time_ns, last_time_ns: As in `Counts`.
     """
 
     def __init__(self, tick_rate_hz: int, *, due: dict[str, int] | None = None, from_start: bool = False) -> None:
@@ -80,21 +75,19 @@ class Tally:
             due: Number of the row that is to come first, by key.
             from_start: It is row 0 for every other stream; else whatever comes first.
         """
-        self.continuity = Continuity()
-        self.gaps = 0
+        self.gaps = self.malformed = self.last_time_ns = 0
         self.missed: dict[str, int] = {}
-        self.malformed = 0
         self.first_time_ns: int | None = None
-        self.last_time_ns = 0
+        self._continuity = Continuity()
         self._tick_rate_hz = tick_rate_hz
         self._from_start = from_start
         for key, index in (due or {}).items():
-            self.continuity.follow(key, index, 0)
+            self._continuity.follow(key, index, 0)
 
     @property
     def next(self) -> dict[str, int]:
         """Number of the row that is due next, by key."""
-        return self.continuity.next
+        return self._continuity.next
 
     def time_ns(self, tick: int) -> int:
         """Simulated time of a tick as a message can have it: of one that no clock has, the last one there is [ns]."""
@@ -119,8 +112,8 @@ class Tally:
             return None
         start_ns, end_ns = self.extent_ns(payload)
         if self._from_start and key not in self.next:
-            self.continuity.follow(key, 0, 0)
-        gap = self.continuity.follow(key, block.index, len(block.values))
+            self._continuity.follow(key, 0, 0)
+        gap = self._continuity.follow(key, block.index, len(block.values))
         self.gaps += gap is not None
         self.first_time_ns = start_ns if self.first_time_ns is None else min(start_ns, self.first_time_ns)
         if key != EDGES:
@@ -145,7 +138,7 @@ class Tally:
 
     def end(self, rows: dict[str, int]) -> list[Gap]:
         """Count what is missing at the end of streams as gaps, and give them; see `short_of`."""
-        found = [self.continuity.follow(key, end, 0) for key, end in self.short_of(rows).items()]
+        found = [self._continuity.follow(key, end, 0) for key, end in self.short_of(rows).items()]
         gaps = [gap for gap in found if gap is not None]
         self.gaps += len(gaps)
         return gaps
@@ -155,8 +148,8 @@ class Tally:
         return Counts(
             first_time_ns=self.first_time_ns,
             last_time_ns=self.last_time_ns,
-            rows=dict(self.continuity.received),
-            lost=dict(self.continuity.lost),
+            rows=dict(self._continuity.received),
+            lost=dict(self._continuity.lost),
             gaps=self.gaps,
             missed=dict(self.missed),
             malformed=self.malformed,

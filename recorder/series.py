@@ -11,16 +11,14 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from recorder.counts import NS, Counts, Tally
+from recorder.counts import NS, Counts
 from recorder.draft import check_destination, remove
 from recorder.head import Beginning
 from recorder.payload import Payload
 from recorder.room import MB, Limits, check_room
-from recorder.sink import OpenFile, Sink
+from recorder.sink import Needs, Sink
 from recorder.writer import RecordingError, RecordingWriter
 from rig.errors import PART_SUFFIX, InputError
 from rig.wire import EDGES, EVENTS
@@ -58,46 +56,28 @@ def _parts_of(path: Path) -> list[Path]:
 class Series(Sink):
     """Writes a recording to one file or to several in turn."""
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        tick_rate_hz: int,
-        scene: dict[str, Any],
-        limits: Limits,
-        open_file: OpenFile,
-        from_start: bool = False,
-        force: bool = False,
-        monotonic_s: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, path: Path, needs: Needs, *, from_start: bool = False) -> None:
         """Open the first file.
 
         Args:
             path: Name of the recording, ends in .mcap.
-            tick_rate_hz: Ticks per simulated second.
-            scene: The rig's scene document.
-            limits: Limits of the files.
-            open_file: Opens one file.
+            needs: What a sink needs.
             from_start: Every stream is meant to be recorded from its row 0.
-            force: Replace what is there of that name.
-            monotonic_s: Clock that times the looks at the disk [s].
 
         Raises:
             InputError: The file cannot be created.
         """
-        check_series(path, limits, force=force)
-        tally = Tally(tick_rate_hz, from_start=from_start)
-        super().__init__(path, tally=tally, scene=scene, limits=limits, open_file=open_file, monotonic_s=monotonic_s)
-        self._monotonic_s = monotonic_s
+        self._limits, rotates = needs.limits, needs.limits.rotates
+        check_series(path, needs.limits, force=needs.force)
+        super().__init__(path, needs, from_start=from_start)
         self._sizes: list[int] = []
         self._number = 0
         self._reached_ns: dict[str, int] = {}
         self._full_s: float | None = None
         self._series = f"{path.stem} {time.time_ns():x}"
-        if force and limits.rotates:
+        if needs.force and rotates:
             remove(_parts_of(path))
-        first = path if not limits.rotates else part_path(path, 0)
-        self._file = self._writer = self._open(first, from_start=from_start)
+        self._file = self._writer = self._open(part_path(path, 0) if rotates else path, from_start=from_start)
         self._expected = set(self._file.streams)
 
     def take(self, payload: Payload) -> None:
@@ -126,7 +106,7 @@ class Series(Sink):
                 "due": json.dumps(due),
             }
         beginning = Beginning(from_start=from_start, due=due, metadata=metadata)
-        return self._open_file(path, self._commands.scene, beginning)
+        return self._needs.open_file(path, self._commands.scene, beginning)
 
     def _is_seam(self, payload: Payload) -> bool:
         """Whether the file is full and this is the first block of a later time than all that it holds."""
@@ -145,7 +125,7 @@ class Series(Sink):
     def _await_others(self, block_ns: int) -> bool:
         """Whether streams are still catching up with a block that would begin the next file."""
         behind = {key for key in self._expected if self._reached_ns.get(key, -_BEHIND_NS) < block_ns - _BEHIND_NS}
-        now_s = self._monotonic_s()
+        now_s = self._needs.monotonic_s()
         if not behind:
             self._full_s = None
         elif self._full_s is None:

@@ -16,7 +16,7 @@ from recorder.head import Beginning
 from recorder.payload import Payload
 from recorder.room import Limits, check_room
 from recorder.series import Series, check_series
-from recorder.sink import Sink
+from recorder.sink import Needs, Sink
 from recorder.summary import Progress, Summary
 from recorder.trigger import Capture
 from recorder.writer import RecordingError, RecordingWriter, check_view_rate
@@ -238,17 +238,11 @@ class RecordingSession:
                 monotonic_s=self._monotonic_s,
             )
 
-        common: Document = {
-            "tick_rate_hz": round(promised.tick_rate_hz),
-            "scene": scene,
-            "limits": self._limits,
-            "open_file": open_file,
-            "force": self._force,
-            "monotonic_s": self._monotonic_s,
-        }
+        tick_rate_hz = round(promised.tick_rate_hz)
+        needs = Needs(promised.table, tick_rate_hz, scene, open_file, self._limits, self._force, self._monotonic_s)
         if self._capture is None:
-            return Series(self.path, from_start=self._history, **common)
-        return Captures(self.path, self._capture, table=promised.table, **common)
+            return Series(self.path, needs, from_start=self._history)
+        return Captures(self.path, self._capture, needs)
 
     # On the transport's threads.
 

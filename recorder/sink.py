@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,33 @@ from recorder.head import Beginning
 from recorder.payload import Payload
 from recorder.room import Limits, Room
 from recorder.writer import RecordingWriter
+from rig.channels import ChannelTable
 
 OpenFile = Callable[[Path, dict[str, Any], Beginning], RecordingWriter]
 """Opens one file, given its path, the rig's scene document and how the file begins."""
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What both kinds of sink need.
+
+    Attributes:
+        table: The rig's channel table.
+        tick_rate_hz: Ticks per simulated second.
+        scene: The rig's scene document.
+        open_file: Opens one file.
+        limits: Limits of the files.
+        force: Replace what is there of that name.
+        monotonic_s: Clock that times the looks at the disk [s].
+    """
+
+    table: ChannelTable
+    tick_rate_hz: int
+    scene: dict[str, Any]
+    open_file: OpenFile
+    limits: Limits
+    force: bool = False
+    monotonic_s: Callable[[], float] = time.monotonic
 
 
 class Sink(ABC):
@@ -32,37 +57,18 @@ class Sink(ABC):
         remarks: What the user should know at once, a line each.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        tally: Tally,
-        scene: dict[str, Any],
-        limits: Limits,
-        open_file: OpenFile,
-        monotonic_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """Take what both kinds need; opens nothing.
-
-        Args:
-            path: Name of the recording, ends in .mcap.
-            tally: Counts what is received.
-            scene: The rig's scene document.
-            limits: Limits of the files.
-            open_file: Opens one file.
-            monotonic_s: Clock that times the looks at the disk [s].
-        """
+    def __init__(self, path: Path, needs: Needs, *, from_start: bool = False) -> None:
+        """Take what both kinds need, and whether row 0 is due of each stream; opens nothing."""
         self.path = path
-        self.tally = tally
+        self.tally = Tally(needs.tick_rate_hz, from_start=from_start)
         self.files: list[Path] = []
         self.removed = 0
         self.ended = ""
         self.out_of_room = False
         self.remarks: tuple[str, ...] = ()
-        self._limits = limits
-        self._open_file = open_file
-        self._room = Room(path.parent, limits, monotonic_s=monotonic_s)
-        self._commands = Commands(scene)
+        self._needs = needs
+        self._room = Room(path.parent, needs.limits, monotonic_s=needs.monotonic_s)
+        self._commands = Commands(needs.scene)
         self._writer: RecordingWriter | None = None
         """The file that is being written, or that the disk ended."""
         self._kept: list[Counts] = []

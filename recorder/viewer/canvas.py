@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from recorder.viewer.clock import WallClock
 APPLICATION = "rig"
 SIMULATED = "simulated_time"
 WALL = "wall_time"
+Place = tuple[float, float]
+RGB = tuple[int, int, int]
 
 
 def new_stream(name: str) -> rr.RecordingStream:
@@ -47,6 +49,14 @@ class Canvas:
         if wall is not None:
             self.stream.set_time(WALL, timestamp=float(wall[0]))
         self.stream.log(path, what[0], *what[1:])
+
+    def write(self, path: str, words: dict[Place, str], colors: Sequence[RGB], *, time_s: float | None = None) -> None:
+        """Write words at places of a 2-D view; without a time [s] they hold for all times."""
+        text = rr.Points2D(list(words), radii=pixels(0.0), colors=colors, labels=list(words.values()), show_labels=True)
+        if time_s is None:
+            self.fix(path, text)
+        else:
+            self.draw(path, time_s, text)
 
     def keeps_up(self, *, timeout_s: float) -> bool:
         """Whether all that was drawn so far leaves for the viewer within that time; what does not, piles up here."""

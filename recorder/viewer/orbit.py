@@ -12,7 +12,7 @@ import math
 import numpy as np
 import rerun as rr
 
-from recorder.viewer.canvas import Canvas, pixels
+from recorder.viewer.canvas import Canvas, Place, pixels
 from recorder.viewer.history import History
 from recorder.viewer.whirl import Whirl, whirl_of
 
@@ -36,6 +36,10 @@ _TURN = 0.48
 def screen(z: np.ndarray) -> np.ndarray:
     """Points of the 2-D view for x + j y: shape (n, 2), y turned over."""
     return np.stack((np.real(z), -np.imag(z)), axis=-1)
+
+
+def _placed(words: dict[complex, str]) -> dict[Place, str]:
+    return {(float(np.real(z)), float(-np.imag(z))): text for z, text in words.items()}
 
 
 def shown_s(whirl: Whirl) -> float:
@@ -69,26 +73,12 @@ class OrbitPlot:
             rr.LineStrips2D([screen(circle)], colors=[_CLEARANCE_RGB], radii=pixels(3.5), draw_order=2.0),
         )
         at_ring = " (ring at rest)" if plane == "disk" else ""
-        self._write(
-            "words",
-            {1.30 * radius: "EAST +x", 1.22j * radius: "UP +y", 1.58j * radius: f"clearance {radius:.3f} mm{at_ring}"},
-            [_WORDS_RGB, _WORDS_RGB, _CLEARANCE_RGB],
-        )
-
-    def _write(
-        self, name: str, words: dict[complex, str], colors: list[tuple[int, int, int]], time_s: float | None = None
-    ) -> None:
-        text = rr.Points2D(
-            screen(np.array(list(words))),
-            radii=pixels(0.0),
-            colors=colors,
-            labels=list(words.values()),
-            show_labels=True,
-        )
-        if time_s is None:
-            self._canvas.fix(f"{self._path}/{name}", text)
-        else:
-            self._canvas.draw(f"{self._path}/{name}", time_s, text)
+        words = {
+            1.30 * radius: "EAST +x",
+            1.22j * radius: "UP +y",
+            1.58j * radius: f"clearance {radius:.3f} mm{at_ring}",
+        }
+        self._canvas.write(f"{self._path}/words", _placed(words), [_WORDS_RGB, _WORDS_RGB, _CLEARANCE_RGB])
 
     def add(self, z: np.ndarray) -> None:
         """Take rows of x + j y [mm], shape (n,)."""
@@ -121,7 +111,8 @@ class OrbitPlot:
         self._draw_turn(time_s, complex(points[-1] - z.mean()), whirl)
         first, second = reading_of(whirl)
         at = -1.32j * self._clearance_mm
-        self._write("reading", {at: first, 1.27 * at: second}, [whirl.color], time_s)
+        words = _placed({at: first, 1.27 * at: second})
+        self._canvas.write(f"{self._path}/reading", words, [whirl.color], time_s=time_s)
 
     def _draw_turn(self, time_s: float, position: complex, whirl: Whirl) -> None:
         """Draw a round arrow in the middle that turns as the shaft whirls; it leads up to the shaft's direction."""

@@ -26,6 +26,7 @@ HEIGHT = 120
 """Rows of the waterfall's image."""
 FLOOR_DB, CEILING_DB = 0.0, 62.0
 """Colour range [dB re 1 um]: 1 um to 1.26 mm."""
+_MARKS_RGB = (150, 155, 165)
 
 
 def shown_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
@@ -107,30 +108,11 @@ class Waterfall:
         marks = range(-LIMIT_HZ, LIMIT_HZ + 1, 50)
         ticks = [[(self.x_of(hz), HEIGHT), (self.x_of(hz), HEIGHT + (5 if hz == 0 else 3))] for hz in marks]
         faint = pixels(0.6)
-        self._canvas.fix(
-            f"{WATERFALL}/ticks", rr.LineStrips2D(ticks, colors=[(150, 155, 165)], radii=faint, draw_order=2.0)
-        )
-        named = [hz for hz in marks if hz % 100 == 0]
-        self._canvas.fix(
-            f"{WATERFALL}/frequencies",
-            rr.Points2D(
-                [(self.x_of(hz), HEIGHT + 10) for hz in named],
-                radii=pixels(0.0),
-                colors=[(150, 155, 165)],
-                labels=[f"{hz:+d} Hz" if hz else "0" for hz in named],
-                show_labels=True,
-            ),
-        )
-        self._canvas.fix(
-            f"{WATERFALL}/senses",
-            rr.Points2D(
-                [(self.x_of(-150), -8), (self.x_of(150), -8)],
-                radii=pixels(0.0),
-                colors=[BACKWARD_RGB, FORWARD_RGB],
-                labels=["BACKWARD", "FORWARD"],
-                show_labels=True,
-            ),
-        )
+        self._canvas.fix(f"{WATERFALL}/ticks", rr.LineStrips2D(ticks, colors=[_MARKS_RGB], radii=faint, draw_order=2.0))
+        named = {(self.x_of(hz), HEIGHT + 10): f"{hz:+d} Hz" if hz else "0" for hz in marks if hz % 100 == 0}
+        self._canvas.write(f"{WATERFALL}/frequencies", named, [_MARKS_RGB])
+        senses = {(self.x_of(-150), -8): "BACKWARD", (self.x_of(150), -8): "FORWARD"}
+        self._canvas.write(f"{WATERFALL}/senses", senses, [BACKWARD_RGB, FORWARD_RGB])
 
     def x_of(self, frequency_hz: float) -> float:
         """Place of a frequency in the image [pixels]."""
@@ -165,7 +147,7 @@ class Waterfall:
             return
         self._draw_image(None, self.image())
         start, end = self._times[0], self._times[-1]
-        self._draw_times([(0.5, f"{end:.1f} s"), (HEIGHT - 0.5, f"{start:.1f} s")])
+        self._draw_times(f"{end:.1f} s", f"{start:.1f} s")
         for time in self._times:
             y = HEIGHT * (end - time) / (end - start) if end > start else 0.5
             line = [[(0.0, y), (float(self.columns), y)]]
@@ -184,16 +166,7 @@ class Waterfall:
             return
         self._canvas.draw(f"{WATERFALL}/level", time_s, picture)
         if len(self._times) == 1:
-            self._draw_times([(0.5, "now"), (HEIGHT - 0.5, f"-{HEIGHT * self._interval_s:.0f} s")])
+            self._draw_times("now", f"-{HEIGHT * self._interval_s:.0f} s")
 
-    def _draw_times(self, marks: list[tuple[float, str]]) -> None:
-        self._canvas.fix(
-            f"{WATERFALL}/times",
-            rr.Points2D(
-                [(-9.0, y) for y, _ in marks],
-                radii=pixels(0.0),
-                colors=[(150, 155, 165)],
-                labels=[text for _, text in marks],
-                show_labels=True,
-            ),
-        )
+    def _draw_times(self, newest: str, oldest: str) -> None:
+        self._canvas.write(f"{WATERFALL}/times", {(-9.0, 0.5): newest, (-9.0, HEIGHT - 0.5): oldest}, [_MARKS_RGB])

@@ -20,7 +20,9 @@ from recorder.reader import Recording, join
 from recorder.rewrite import cut, recover
 from recorder.room import Limits
 from recorder.series import Series, part_path
+from recorder.sink import Needs
 from recorder.writer import RecordingError, RecordingWriter
+from rig.channels import default_table
 from rig.errors import InputError
 from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Gap, encode_block, encode_document, schema_of, sensor_key
 
@@ -44,14 +46,7 @@ def series(path: Path, *, force: bool = False, **limits: Any) -> Series:
             monotonic_s=lambda: 0.01 * next(calls),  # a flush each 25 payloads
         )
 
-    return Series(
-        path,
-        tick_rate_hz=TICK_RATE_HZ,
-        scene=about[SCENE],
-        limits=Limits(**limits),
-        open_file=open_file,
-        force=force,
-    )
+    return Series(path, Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, Limits(**limits), force))
 
 
 def write(file: Series, items: list[tuple[str, bytes]]) -> None:

@@ -15,6 +15,7 @@ from recorder.head import Beginning
 from recorder.payload import Payload
 from recorder.reader import Recording
 from recorder.room import Limits
+from recorder.sink import Needs
 from recorder.trigger import Capture, Trigger
 from recorder.writer import RecordingWriter
 from rig.channels import default_table
@@ -40,16 +41,9 @@ def captures(path: Path, *triggers: str, force: bool = False, limits: Limits | N
             force=force,
         )
 
-    return Captures(
-        path,
-        Capture(tuple(Trigger.parse(text) for text in triggers), **options),
-        table=default_table(),
-        tick_rate_hz=TICK_RATE_HZ,
-        scene=about[SCENE],
-        open_file=open_file,
-        limits=limits,
-        force=force,
-    )
+    capture = Capture(tuple(Trigger.parse(text) for text in triggers), **options)
+    limits = limits or Limits(keep_free_mb=0.0)
+    return Captures(path, capture, Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, limits, force))
 
 
 def event(name: str, time_s: float, **fields: Any) -> tuple[str, bytes]:
