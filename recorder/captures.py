@@ -8,7 +8,6 @@ capture has its full time before the trigger, even if the same rows then stand i
 from __future__ import annotations
 
 import json
-import re
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,13 +15,13 @@ from typing import Any, NamedTuple
 
 from recorder.commands import Commands
 from recorder.counts import NS
-from recorder.draft import check_destination, remove
+from recorder.draft import check_destination, files_like, remove
 from recorder.head import Beginning
 from recorder.payload import Payload
 from recorder.sink import Needs, Sink
 from recorder.trigger import Capture, Crossings, Trigger
 from recorder.writer import RecordingError, RecordingWriter
-from rig.errors import PART_SUFFIX, InputError
+from rig.errors import InputError
 from rig.wire import EDGES, EVENTS
 
 _LATE_NS = NS // 2
@@ -52,8 +51,7 @@ def check_captures(path: Path, capture: Capture, *, force: bool = False) -> None
 
 
 def _captures_of(path: Path) -> list[Path]:
-    name = re.compile(rf"{re.escape(path.stem)}\.\w+-\d{{3,}}{re.escape(path.suffix)}({re.escape(PART_SUFFIX)})?")
-    return sorted(each for each in path.parent.iterdir() if name.fullmatch(each.name))
+    return files_like(path, r"\w+-\d{3,}")
 
 
 class _Held(NamedTuple):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -32,6 +33,12 @@ def check_destination(path: Path, *, force: bool = False) -> None:
     check_new_file(path, field="output", suffixes=(".mcap",), force=force)
     if (part := part_of(path)).exists() and not force:
         raise InputError("output", "a new file (--force replaces one)", f"{part}, which exists")
+
+
+def files_like(path: Path, what: str) -> list[Path]:
+    """Files beside a recording NAME.mcap that look like NAME.WHAT.mcap, finished or not; WHAT is an expression."""
+    name = re.compile(rf"{re.escape(path.stem)}\.{what}{re.escape(path.suffix)}({re.escape(PART_SUFFIX)})?")
+    return sorted(each for each in path.parent.iterdir() if name.fullmatch(each.name))
 
 
 def remove(files: Iterable[Path]) -> None:

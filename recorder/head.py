@@ -34,49 +34,31 @@ class Beginning:
     attachments: dict[str, bytes] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
 class Head:
     """The rig's own documents, and what of them stands where in a file.
 
     Attributes:
-        catalogue: The rig's catalogue document: channel table, truth tables, tick rate.
-        parameters: The rig's parameter document.
-        scene: The rig's scene document.
         table: The channel table of the catalogue.
         tick_rate_hz: Ticks per simulated second.
+        streams: Keys of the streams that the catalogue promises.
     """
 
-    catalogue: dict[str, Any]
-    parameters: dict[str, Any]
-    scene: dict[str, Any]
-    table: ChannelTable
-    tick_rate_hz: int
-
-    @classmethod
-    def of(cls, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> Head:
-        """Read what of the documents a file is laid out by.
+    def __init__(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> None:
+        """Take the catalogue, parameter and scene documents.
 
         Raises:
             InputError: The catalogue has no channel table, or no tick rate.
         """
+        self._catalogue, self._parameters, self._scene = catalogue, parameters, scene
         try:
-            table = ChannelTable.model_validate(catalogue["table"])
-            tick_rate_hz = round(catalogue["tick_rate_hz"])
-            if tick_rate_hz < 1:
-                raise ValueError(f"tick rate {tick_rate_hz}")
+            self.table = ChannelTable.model_validate(catalogue["table"])
+            self.tick_rate_hz = round(catalogue["tick_rate_hz"])
+            if self.tick_rate_hz < 1:
+                raise ValueError(f"tick rate {self.tick_rate_hz}")
         except (KeyError, TypeError, ValueError) as error:
             raise InputError("catalogue", "a document with a channel table and a tick rate", str(error)) from None
-        return cls(catalogue, parameters, scene, table, tick_rate_hz)
-
-    @property
-    def truth(self) -> dict[str, Any]:
-        """The truth tables."""
-        return self.catalogue.get("truth", {})
-
-    @property
-    def streams(self) -> list[str]:
-        """Keys of the streams that the catalogue promises."""
-        return [*map(sensor_key, self.table.groups), *map(truth_key, self.truth)]
+        self._truth: dict[str, Any] = catalogue.get("truth", {})
+        self.streams = [*map(sensor_key, self.table.groups), *map(truth_key, self._truth)]
 
     def group(self, key: str) -> Group | None:
         """The sensor group of a key."""
@@ -93,9 +75,9 @@ class Head:
             "log_time": "simulated time [ns]",
             "publish_time": "wall time of arrival [unix ns]",
             "tick_rate_hz": str(self.tick_rate_hz),
-            "scene": str(self.scene.get("name", "")),
-            "seed": str(self.scene.get("seed", "")),
-            "parameter_set": str(self.parameters.get("set", "")),
+            "scene": str(self._scene.get("name", "")),
+            "seed": str(self._scene.get("seed", "")),
+            "parameter_set": str(self._parameters.get("set", "")),
             "view_rate_hz": f"{view_rate_hz:g}",
             **more.get("rig", {}),
         }
@@ -106,9 +88,9 @@ class Head:
         yield "README.txt", "text/plain", self._readme().encode()
         documents = {
             COPY: metadata,
-            "catalogue.json": self.catalogue,
-            "parameters.json": self.parameters,
-            "scene.json": self.scene,
+            "catalogue.json": self._catalogue,
+            "parameters.json": self._parameters,
+            "scene.json": self._scene,
         }
         for name, document in documents.items():
             yield name, "application/json", json.dumps(document, indent=1, allow_nan=False).encode()
@@ -121,7 +103,7 @@ class Head:
         if group is not None:
             return _calibration(group)
         if key.startswith((SENSORS + "/", TRUTH + "/")):
-            columns = self.truth.get(key.removeprefix(TRUTH + "/"), {}).get("columns", [])
+            columns = self._truth.get(key.removeprefix(TRUTH + "/"), {}).get("columns", [])
             return {
                 name + "s": json.dumps([column.get(name, "") for column in columns])
                 for name in ("name", "unit", "label")
@@ -138,13 +120,13 @@ class Head:
                 f"{channel.bias_v:g} V at 0)   {channel.label}"
                 for channel in group.channels
             ]
-        for table, about in self.truth.items():
+        for table, about in self._truth.items():
             lines.append(f"\n{truth_key(table)}: {about.get('rate_hz', '?')} Hz")
             lines += [
                 f"  {column.get('name', '?')} [{column.get('unit', '?')}]   {column.get('label', '')}"
                 for column in about.get("columns", [])
             ]
-        lines += [f"\n{name}: {text}" for name, text in self.catalogue.get("reference", {}).items()]
+        lines += [f"\n{name}: {text}" for name, text in self._catalogue.get("reference", {}).items()]
         return "\n".join(lines) + "\n"
 
 

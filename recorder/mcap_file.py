@@ -35,6 +35,7 @@ class McapFile:
 
     Attributes:
         draft: The file.
+        mcap: Writes metadata and attachments to it.
         size_bytes: Its size at the last flush.
         unflushed_bytes: What waits in memory for the next flush, not yet compressed.
     """
@@ -49,9 +50,9 @@ class McapFile:
         self.size_bytes = self.unflushed_bytes = 0
         self._chunks = self._chunk_bytes = self._channels = 0
         self._schemas: dict[str, int] = {}
-        self._mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
-        keep_on_disk(self._mcap, draft.file)
-        self._mcap.start(profile="ros2", library="rotor-stator-rig recorder")
+        self.mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
+        keep_on_disk(self.mcap, draft.file)
+        self.mcap.start(profile="ros2", library="rotor-stator-rig recorder")
 
     @property
     def index_bytes(self) -> int:
@@ -63,26 +64,18 @@ class McapFile:
         """What the file comes to at most if it is finished now [bytes]."""
         return self.size_bytes + self.unflushed_bytes + self.index_bytes + _END_BYTES
 
-    def add_metadata(self, name: str, entries: dict[str, str]) -> None:
-        """Write a record of metadata."""
-        self._mcap.add_metadata(name, entries)
-
-    def attach(self, name: str, data: bytes, *, media_type: str, wall_ns: int) -> None:
-        """Write an attachment, made at a wall time [unix ns]."""
-        self._mcap.add_attachment(wall_ns, 0, name, media_type, data)
-
     def topic(self, name: str, definition: Definition, metadata: dict[str, str]) -> Topic:
         """Register a topic of messages of some form, with its metadata."""
         if definition.name not in self._schemas:
-            number = self._mcap.register_schema(definition.name, definition.language, definition.text)
+            number = self.mcap.register_schema(definition.name, definition.language, definition.text)
             self._schemas[definition.name] = number
         self._channels += 1
         number = self._schemas[definition.name]
-        return Topic(self._mcap.register_channel(name, definition.encoding, number, metadata))
+        return Topic(self.mcap.register_channel(name, definition.encoding, number, metadata))
 
     def add(self, topic: Topic, data: bytes, *, time_ns: int, wall_ns: int) -> None:
         """Write a message of a simulated time [ns], which came at a wall time [unix ns]."""
-        self._mcap.add_message(topic.channel, time_ns, data, wall_ns, topic.sequence)
+        self.mcap.add_message(topic.channel, time_ns, data, wall_ns, topic.sequence)
         topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
         self._chunk_bytes += len(data)
         self.unflushed_bytes += len(data) + _MESSAGE_BYTES
@@ -96,7 +89,7 @@ class McapFile:
         Raises:
             OSError: The disk refused.
         """
-        self._mcap.flush()
+        self.mcap.flush()
         self._chunks += 1
         self.size_bytes = self.draft.sync()
         self.unflushed_bytes = self._chunk_bytes = 0
@@ -107,6 +100,6 @@ class McapFile:
         Raises:
             OSError: The disk refused.
         """
-        self._mcap.finish()
+        self.mcap.finish()
         self.size_bytes = self.draft.sync()
         self.draft.finish()

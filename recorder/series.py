@@ -9,18 +9,17 @@ recorded like any other. History, which comes stream by stream, stands in the fi
 from __future__ import annotations
 
 import json
-import re
 import time
 from pathlib import Path
 
 from recorder.counts import NS, Counts
-from recorder.draft import check_destination, remove
+from recorder.draft import check_destination, files_like, remove
 from recorder.head import Beginning
 from recorder.payload import Payload
 from recorder.room import MB, Limits, check_room
 from recorder.sink import Needs, Sink
 from recorder.writer import RecordingError, RecordingWriter
-from rig.errors import PART_SUFFIX, InputError
+from rig.errors import InputError
 from rig.wire import EDGES, EVENTS
 
 MOST_PARTS = 1_000_000
@@ -48,9 +47,7 @@ def check_series(path: Path, limits: Limits, *, force: bool = False) -> None:
 
 
 def _parts_of(path: Path) -> list[Path]:
-    """Files that look like parts of a recording of that name."""
-    name = re.compile(rf"{re.escape(path.stem)}\.\d{{4,}}{re.escape(path.suffix)}({re.escape(PART_SUFFIX)})?")
-    return sorted(each for each in path.parent.iterdir() if name.fullmatch(each.name))
+    return files_like(path, r"\d{4,}")
 
 
 class Series(Sink):
@@ -78,7 +75,7 @@ class Series(Sink):
         if needs.force and rotates:
             remove(_parts_of(path))
         self._file = self._writer = self._open(part_path(path, 0) if rotates else path, from_start=from_start)
-        self._expected = set(self._file.streams)
+        self._expected = set(self._file.head.streams)
 
     def take(self, payload: Payload) -> None:
         """Write one payload, to the next file where that is due."""

@@ -17,7 +17,6 @@ from recorder.head import Beginning, Head, about_view, instant
 from recorder.mcap_file import McapFile, Topic
 from recorder.payload import Payload
 from recorder.views import Messages, View, Views
-from rig.channels import ChannelTable
 from rig.errors import DiskError, InputError
 from rig.wire import EDGES, EVENTS, Gap, encode_document
 
@@ -52,6 +51,8 @@ class RecordingWriter:
         path: The file's name in the end.
         closed: Nothing more can be written: finished, or ended by the disk.
         tally: What came.
+        head: What the rig says of itself.
+        file: What it takes of the disk.
     """
 
     def __init__(
@@ -87,17 +88,17 @@ class RecordingWriter:
             RecordingError: The disk refused; there is no file.
         """
         check_view_rate(view_rate_hz)
-        head, beginning = Head.of(catalogue, parameters, scene), beginning or Beginning()
+        self.head, beginning = Head(catalogue, parameters, scene), beginning or Beginning()
         self.path, self.closed = path, False
-        self.tally = Tally(head.tick_rate_hz, due=beginning.due, from_start=beginning.from_start)
+        self.tally = Tally(self.head.tick_rate_hz, due=beginning.due, from_start=beginning.from_start)
         self._sync_every_s = sync_every_s
         self._monotonic_s = monotonic_s
         self._synced_s = monotonic_s()
         self._draft = Draft(path, force=force)
         self._begun = False
         with self._guard():
-            self._file = McapFile(self._draft)
-            self._topics = _Topics(self._file, head, self.tally, view_rate_hz=view_rate_hz, wall_ns=wall_ns)
+            self.file = McapFile(self._draft)
+            self._topics = _Topics(self.file, self.head, self.tally, view_rate_hz=view_rate_hz, wall_ns=wall_ns)
             self._topics.begin(beginning)
             self._sync()
             self._draft.sync_folder()
@@ -114,24 +115,9 @@ class RecordingWriter:
         """Name of the file while it is written."""
         return self._draft.part
 
-    @property
-    def file(self) -> McapFile:
-        """The file, for what it takes of the disk."""
-        return self._file
-
-    @property
-    def table(self) -> ChannelTable:
-        """The channel table of the catalogue."""
-        return self._topics.head.table
-
-    @property
-    def streams(self) -> list[str]:
-        """Keys of the streams that the catalogue promises."""
-        return self._topics.head.streams
-
     def counts(self) -> Counts:
         """What was written so far; from any thread."""
-        return self.tally.counts(size_bytes=self._file.size_bytes, safe_time_ns=self._safe_time_ns)
+        return self.tally.counts(size_bytes=self.file.size_bytes, safe_time_ns=self._safe_time_ns)
 
     def write(self, key: str, data: bytes, wall_ns: int) -> None:
         """Write what came on a key, byte for byte, and what derives from it; see `take`.
@@ -212,7 +198,7 @@ class RecordingWriter:
             return
         with self._guard():
             self._topics.end(reason, notes or {})
-            self._file.finish()
+            self.file.finish()
             self._safe_time_ns = self.tally.last_time_ns
             self.closed = True
         self._draft.sync_folder()
@@ -242,7 +228,7 @@ class RecordingWriter:
 
     def _sync(self) -> None:
         self._topics.settle()
-        self._file.sync()
+        self.file.sync()
         self._safe_time_ns = self.tally.last_time_ns
         self._synced_s = self._monotonic_s()
 
@@ -253,7 +239,7 @@ class _Topics:
     def __init__(
         self, file: McapFile, head: Head, tally: Tally, *, view_rate_hz: float, wall_ns: Callable[[], int]
     ) -> None:
-        self.head = head
+        self._head = head
         self._file = file
         self._tally = tally
         self._view_rate_hz = view_rate_hz
@@ -265,14 +251,14 @@ class _Topics:
     def begin(self, beginning: Beginning) -> None:
         """Write what stands before the first message."""
         now = self._wall_ns()
-        metadata = self.head.metadata(beginning.metadata, view_rate_hz=self._view_rate_hz, wall_ns=now)
+        metadata = self._head.metadata(beginning.metadata, view_rate_hz=self._view_rate_hz, wall_ns=now)
         for name in dict.fromkeys(["rig", *metadata]):
-            self._file.add_metadata(name, metadata[name])
-        for name, media_type, data in self.head.attachments(metadata):
-            self._file.attach(name, data, media_type=media_type, wall_ns=now)
+            self._file.mcap.add_metadata(name, metadata[name])
+        for name, media_type, data in self._head.attachments(metadata):
+            self._file.mcap.add_attachment(now, 0, name, media_type, data)
         for name, data in beginning.attachments.items():
-            self._file.attach(name, data, media_type="application/octet-stream", wall_ns=now)
-        for key in (*self.head.streams, EDGES, EVENTS, schemas.GAPS, schemas.CLOCK):
+            self._file.mcap.add_attachment(now, 0, name, "application/octet-stream", data)
+        for key in (*self._head.streams, EDGES, EVENTS, schemas.GAPS, schemas.CLOCK):
             self._topic(key)
         for view in self._views.all:
             about = about_view(view, self._view_rate_hz)
@@ -288,7 +274,7 @@ class _Topics:
         if (gap := self._tally.take(payload)) is not None:
             self.add_gap(gap, start_ns, payload.wall_ns)
         self._file.add(topic, payload.data, time_ns=start_ns, wall_ns=payload.wall_ns)
-        group = self.head.group(payload.key)
+        group = self._head.group(payload.key)
         if payload.block is not None and group is not None:
             self._add_clock(payload, start_ns)
             if (shown := self._views.add(group, payload.block, start_ns)) is not None:
@@ -329,12 +315,12 @@ class _Topics:
             "missed_messages": json.dumps(counts.missed),
             "malformed": str(counts.malformed),
         }
-        self._file.add_metadata("end", {**about, **notes})
+        self._file.mcap.add_metadata("end", {**about, **notes})
 
     def _topic(self, key: str) -> Topic:
         """The topic of a key, registered with its calibration when it is first met."""
         if key not in self._topics:
-            self._topics[key] = self._file.topic(key, definition_of(key), self.head.about(key))
+            self._topics[key] = self._file.topic(key, definition_of(key), self._head.about(key))
         return self._topics[key]
 
     def _add_clock(self, payload: Payload, time_ns: int) -> None:
