@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from itertools import count
 
 from mcap.writer import Writer
 
@@ -15,19 +16,6 @@ _MESSAGE_BYTES = 47
 """What a message takes besides its data: its head, and its place in the index of the chunk."""
 _END_BYTES = 100_000
 """What comes to a file when it is finished, its index aside: channels and schemas again, and the last plotted rows."""
-
-
-@dataclass(slots=True)
-class Topic:
-    """One topic of the file.
-
-    Attributes:
-        channel: Number of its channel.
-        sequence: Number of its next message.
-    """
-
-    channel: int
-    sequence: int = 0
 
 
 class McapFile:
@@ -48,8 +36,10 @@ class McapFile:
         """
         self.draft = draft
         self.size_bytes = self.unflushed_bytes = 0
-        self._chunks = self._chunk_bytes = self._channels = 0
+        self._chunks = self._chunk_bytes = 0
         self._schemas: dict[str, int] = {}
+        self._topics: dict[str, tuple[int, Iterator[int]]] = {}
+        """Number of the channel of each topic, and the numbers of its messages."""
         self.mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         keep_on_disk(self.mcap, draft.file)
         self.mcap.start(profile="ros2", library="rotor-stator-rig recorder")
@@ -57,26 +47,28 @@ class McapFile:
     @property
     def index_bytes(self) -> int:
         """About what the index at the end of the file will take: it names each chunk, and each topic in it [bytes]."""
-        return (60 + 10 * self._channels) * self._chunks
+        return (60 + 10 * len(self._topics)) * self._chunks
 
     @property
     def final_bytes(self) -> int:
         """What the file comes to at most if it is finished now [bytes]."""
         return self.size_bytes + self.unflushed_bytes + self.index_bytes + _END_BYTES
 
-    def topic(self, name: str, definition: Definition, metadata: dict[str, str]) -> Topic:
+    def __contains__(self, topic: str) -> bool:
+        return topic in self._topics
+
+    def register(self, topic: str, definition: Definition, metadata: dict[str, str]) -> None:
         """Register a topic of messages of some form, with its metadata."""
         if definition.name not in self._schemas:
             number = self.mcap.register_schema(definition.name, definition.language, definition.text)
             self._schemas[definition.name] = number
-        self._channels += 1
         number = self._schemas[definition.name]
-        return Topic(self.mcap.register_channel(name, definition.encoding, number, metadata))
+        self._topics[topic] = self.mcap.register_channel(topic, definition.encoding, number, metadata), count()
 
-    def add(self, topic: Topic, data: bytes, *, time_ns: int, wall_ns: int) -> None:
+    def add(self, topic: str, data: bytes, *, time_ns: int, wall_ns: int) -> None:
         """Write a message of a simulated time [ns], which came at a wall time [unix ns]."""
-        self.mcap.add_message(topic.channel, time_ns, data, wall_ns, topic.sequence)
-        topic.sequence = (topic.sequence + 1) & 0xFFFFFFFF
+        channel, numbers = self._topics[topic]
+        self.mcap.add_message(channel, time_ns, data, wall_ns, next(numbers) & 0xFFFFFFFF)
         self._chunk_bytes += len(data)
         self.unflushed_bytes += len(data) + _MESSAGE_BYTES
         if self._chunk_bytes >= _CHUNK_BYTES:

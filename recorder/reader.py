@@ -25,17 +25,10 @@ class Recording:
 
     Attributes:
         parts: The files that it is read from, in order.
-        path: The first of them.
         complete: All of them were finished.
-        damaged: Records that are not what was written, and are passed over by whoever salvages; else 0.
-        unchecked: What of it no checksum covers.
-        catalogue: The rig's catalogue document.
-        table: The channel table in it.
-        parameters: The rig's parameter document.
-        scene: The rig's scene document, as the first file has it.
+        damaged, unchecked, messages: As in `RecordingFile`, of all files.
+        path, catalogue, table, parameters, scene, attachments: The same of the first file.
         metadata: Metadata records by name: `rig` (start), `end` (closing counts of the last file, only if complete).
-        attachments: The first file's attachments by name; catalogue, parameters and scene are among them.
-        messages: Number of messages by topic.
     """
 
     def __init__(self, parts: tuple[RecordingFile, ...], surveys: tuple[Survey, ...] = ()) -> None:

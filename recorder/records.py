@@ -359,7 +359,7 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
             data = unpack(file, chunk)
             for opcode, start, end in records(data, cut=chunk.cut):
                 if opcode == Opcode.MESSAGE:
-                    number, time_ns = _stamp(data, start, end)
+                    number, _, time_ns, _ = _stamp(data, start, end)
                     inside[number] = inside.get(number, 0) + 1
                     times_ns.append(time_ns)
                 elif opcode == Opcode.CHANNEL:
@@ -384,12 +384,11 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
     return found
 
 
-def _stamp(data: bytes, start: int, end: int) -> tuple[int, int]:
-    """Channel and time of a message [ns]."""
+def _stamp(data: bytes, start: int, end: int) -> tuple[int, int, int, int]:
+    """Channel, number, simulated time [ns] and wall time of arrival [unix ns] of a message."""
     if end - start < MESSAGE.size:
         raise DamagedError("a message without a head")
-    number, _, time_ns, _ = MESSAGE.unpack_from(data, start)
-    return number, time_ns
+    return MESSAGE.unpack_from(data, start)
 
 
 def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]:
@@ -419,8 +418,7 @@ def messages(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int,
     """Channel, simulated time [ns], wall time of arrival [unix ns] and payload of each message of a chunk."""
     for opcode, start, end in records(data, cut=cut):
         if opcode == Opcode.MESSAGE:
-            _stamp(data, start, end)
-            number, _, log_time, publish_time = MESSAGE.unpack_from(data, start)
+            number, _, log_time, publish_time = _stamp(data, start, end)
             yield number, log_time, publish_time, data[start + MESSAGE.size : end]
 
 

@@ -14,7 +14,7 @@ from recorder.counts import NS, Counts, Tally
 from recorder.documents import definition_of
 from recorder.draft import Draft
 from recorder.head import Beginning, Head, about_view, instant
-from recorder.mcap_file import McapFile, Topic
+from recorder.mcap_file import McapFile
 from recorder.payload import Payload
 from recorder.views import Messages, View, Views
 from rig.errors import DiskError, InputError
@@ -100,7 +100,7 @@ class RecordingWriter:
             self.file = McapFile(self._draft)
             self._topics = _Topics(self.file, self.head, self.tally, view_rate_hz=view_rate_hz, wall_ns=wall_ns)
             self._topics.begin(beginning)
-            self._sync()
+            self.sync()
             self._draft.sync_folder()
             self._begun = True
 
@@ -120,16 +120,7 @@ class RecordingWriter:
         return self.tally.counts(size_bytes=self.file.size_bytes, safe_time_ns=self._safe_time_ns)
 
     def write(self, key: str, data: bytes, wall_ns: int) -> None:
-        """Write what came on a key, byte for byte, and what derives from it; see `take`.
-
-        Args:
-            key: Key that it came on.
-            data: Its bytes.
-            wall_ns: Wall time of its arrival [unix ns].
-
-        Raises:
-            RecordingError: The disk refused; the file is closed and what stood in it is kept.
-        """
+        """Read what came on a key at a wall time [unix ns], and take it."""
         self.take(Payload.read(key, data, wall_ns))
 
     def take(self, payload: Payload) -> None:
@@ -140,7 +131,7 @@ class RecordingWriter:
         """
         with self._guard():
             self._topics.add(payload)
-            self._sync_if_due()
+        self.sync_if_due()
 
     def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
         """Record that the transport lost messages for good.
@@ -170,13 +161,16 @@ class RecordingWriter:
 
     def sync_if_due(self) -> None:
         """Flush to the disk if the last flush was long enough ago."""
-        with self._guard():
-            self._sync_if_due()
+        if self._monotonic_s() - self._synced_s >= self._sync_every_s:
+            self.sync()
 
     def sync(self) -> None:
         """Flush to the disk now."""
         with self._guard():
-            self._sync()
+            self._topics.settle()
+            self.file.sync()
+            self._safe_time_ns = self.tally.last_time_ns
+            self._synced_s = self._monotonic_s()
 
     def abandon(self) -> None:
         """Close without finishing and remove what was written; a file that was to be replaced stays."""
@@ -222,16 +216,6 @@ class RecordingWriter:
                 kept = f"nothing is left at {self.part}"
             raise RecordingError(f"recording stopped by the disk: {error.strerror or error}; {kept}") from error
 
-    def _sync_if_due(self) -> None:
-        if self._monotonic_s() - self._synced_s >= self._sync_every_s:
-            self._sync()
-
-    def _sync(self) -> None:
-        self._topics.settle()
-        self.file.sync()
-        self._safe_time_ns = self.tally.last_time_ns
-        self._synced_s = self._monotonic_s()
-
 
 class _Topics:
     """The topics of an open file, and which messages go to which."""
@@ -246,7 +230,6 @@ class _Topics:
         self._views = Views(head.table, rate_hz=view_rate_hz)
         self._wall_ns = wall_ns
         self._clock_ns = 0
-        self._topics: dict[str, Topic] = {}
 
     def begin(self, beginning: Beginning) -> None:
         """Write what stands before the first message."""
@@ -259,21 +242,20 @@ class _Topics:
         for name, data in beginning.attachments.items():
             self._file.mcap.add_attachment(now, 0, name, "application/octet-stream", data)
         for key in (*self._head.streams, EDGES, EVENTS, schemas.GAPS, schemas.CLOCK):
-            self._topic(key)
+            self._register(key)
         for view in self._views.all:
             about = about_view(view, self._view_rate_hz)
-            self._topics[view.topic] = self._file.topic(view.topic, schemas.JOINT_STATE, about)
+            self._file.register(view.topic, schemas.JOINT_STATE, about)
         if self._view_rate_hz:
-            about = {"source": EVENTS}
-            self._topics[schemas.VIEW_EVENTS] = self._file.topic(schemas.VIEW_EVENTS, schemas.LOG, about)
+            self._file.register(schemas.VIEW_EVENTS, schemas.LOG, {"source": EVENTS})
 
     def add(self, payload: Payload) -> None:
         """Write a payload as it came, and what derives from it; a malformed one is left to the reader to judge."""
         start_ns, _ = self._tally.extent_ns(payload)
-        topic = self._topic(payload.key)
+        self._register(payload.key)
         if (gap := self._tally.take(payload)) is not None:
             self.add_gap(gap, start_ns, payload.wall_ns)
-        self._file.add(topic, payload.data, time_ns=start_ns, wall_ns=payload.wall_ns)
+        self._file.add(payload.key, payload.data, time_ns=start_ns, wall_ns=payload.wall_ns)
         group = self._head.group(payload.key)
         if payload.block is not None and group is not None:
             self._add_clock(payload, start_ns)
@@ -282,7 +264,7 @@ class _Topics:
         elif payload.document is not None and payload.key == EVENTS and self._view_rate_hz:
             level, text = schemas.event_text(payload.document)
             line = schemas.encode_log(start_ns, level, payload.key, text)
-            self._file.add(self._topics[schemas.VIEW_EVENTS], line, time_ns=start_ns, wall_ns=payload.wall_ns)
+            self._file.add(schemas.VIEW_EVENTS, line, time_ns=start_ns, wall_ns=payload.wall_ns)
 
     def add_gap(self, gap: Gap, time_ns: int, wall_ns: int) -> None:
         """Write that rows never arrived, before a simulated time [ns]."""
@@ -317,11 +299,10 @@ class _Topics:
         }
         self._file.mcap.add_metadata("end", {**about, **notes})
 
-    def _topic(self, key: str) -> Topic:
-        """The topic of a key, registered with its calibration when it is first met."""
-        if key not in self._topics:
-            self._topics[key] = self._file.topic(key, definition_of(key), self._head.about(key))
-        return self._topics[key]
+    def _register(self, key: str) -> None:
+        """Register the topic of a key, with its calibration, when it is first met."""
+        if key not in self._file:
+            self._file.register(key, definition_of(key), self._head.about(key))
 
     def _add_clock(self, payload: Payload, time_ns: int) -> None:
         """Write a pair of simulated and wall time, twice a second."""
@@ -332,9 +313,8 @@ class _Topics:
 
     def _add_document(self, topic: str, about: dict[str, Any], time_ns: int, wall_ns: int) -> None:
         data = encode_document({**about, "time_s": time_ns / NS, "wall_s": wall_ns / NS})
-        self._file.add(self._topics[topic], data, time_ns=time_ns, wall_ns=wall_ns)
+        self._file.add(topic, data, time_ns=time_ns, wall_ns=wall_ns)
 
     def _add_view(self, view: View, messages: Messages, wall_ns: int) -> None:
-        topic = self._topics[view.topic]
         for row, time_ns in zip(messages.data, messages.times_ns.tolist(), strict=True):
-            self._file.add(topic, row.tobytes(), time_ns=time_ns, wall_ns=wall_ns)
+            self._file.add(view.topic, row.tobytes(), time_ns=time_ns, wall_ns=wall_ns)
