@@ -18,6 +18,7 @@ from recorder.counts import NS
 from recorder.draft import check_destination, files_like, remove
 from recorder.head import Beginning
 from recorder.payload import Payload
+from recorder.room import Limits, check_room
 from recorder.sink import Needs, Sink
 from recorder.trigger import Capture, Crossings, Trigger
 from recorder.writer import RecordingError, RecordingWriter
@@ -38,16 +39,17 @@ def capture_path(path: Path, trigger: Trigger, number: int) -> Path:
     return path.with_name(f"{path.stem}.{trigger.name}-{number:03d}{path.suffix}")
 
 
-def check_captures(path: Path, capture: Capture, *, force: bool = False) -> None:
+def check_captures(path: Path, capture: Capture, limits: Limits, *, force: bool = False) -> None:
     """Refuse names that cannot become the files of captures.
 
     Raises:
-        InputError: As `check_destination`, or a file of an earlier capture is there.
+        InputError: As `check_destination`, a file of an earlier capture is there, or the disk has too little room.
     """
     for name in {trigger.name: trigger for trigger in capture.triggers}.values():
         check_destination(capture_path(path, name, 1), force=force)
     if not force and (taken := _captures_of(path)):
         raise InputError("output", "new files (--force replaces them)", f"{taken[0]}, which exists")
+    check_room(path, limits)
 
 
 def _captures_of(path: Path) -> list[Path]:
@@ -95,15 +97,14 @@ class Captures(Sink):
         Raises:
             InputError: The name or a channel cannot be used.
         """
-        check_captures(path, capture, force=needs.force)
-        capture.check(needs.table)
+        check_captures(path, capture, needs.limits, force=needs.force)
+        self._crossings = {each: Crossings(each, needs.table) for each in capture.triggers if each.level is not None}
         if needs.force:
             remove(_captures_of(path))
         super().__init__(path, needs)
         self.fired = 0
         self._capture = capture
         self._pre_ns, self._post_ns = round(capture.pre_s * NS), round(capture.post_s * NS)
-        self._crossings = {each: Crossings(each, needs.table) for each in capture.triggers if each.level is not None}
         self._ring: deque[_Held] = deque()
         self._reached_ns: dict[str, int] = {}
         self._number = 0
@@ -185,7 +186,7 @@ class Captures(Sink):
     def _begin(self, trigger: Trigger, time_ns: int, about: dict[str, Any]) -> None:
         """Begin a capture, and write to it what the ring holds of it."""
         if self._open is not None:
-            self._close_captured(self._open)
+            self._close_capture(self._open)
         if self.ended:
             return
         if why := self._room.lack():
@@ -228,15 +229,13 @@ class Captures(Sink):
             return
         late = self.tally.last_time_ns >= self._open.end_ns + _LATE_NS
         if late or min(self._reached_ns.values(), default=0) >= self._open.end_ns:
-            self._close_captured(self._open)
+            self._close_capture(self._open)
 
-    def _close_captured(self, writing: _Open) -> None:
+    def _close_capture(self, writing: _Open, reason: str = "", notes: dict[str, str] | None = None) -> None:
+        """Close a capture; without a reason because it has come to its end."""
         full = f", up to its longest length of {self._capture.most_s:g} s" if writing.full else ""
-        self._close_capture(writing, "captured" + full)
-
-    def _close_capture(self, writing: _Open, reason: str, notes: dict[str, str] | None = None) -> None:
         self._open = None
         fired = {"triggers": json.dumps(writing.fired), "trigger_count": str(writing.count)}
-        self._close(writing.writer, reason, {**(notes or {}), **fired})
+        self._close(writing.writer, reason or f"captured{full}", {**(notes or {}), **fired})
         if not self.ended and self._capture.count is not None and self._number >= self._capture.count:
             self.ended = f"{self._number} captures made"

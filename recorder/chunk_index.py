@@ -12,7 +12,9 @@ from mcap.records import ChunkIndex
 from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import Writer
 
-_RECORD, _CHUNK, _CHANNEL = struct.Struct("<BQ"), struct.Struct("<QQQII"), struct.Struct("<H")
+from recorder.records import CHUNK, RECORD
+
+_CHANNEL = struct.Struct("<H")
 
 
 def keep_on_disk(writer: Writer, file: BinaryIO) -> None:
@@ -38,8 +40,8 @@ class _ChunkIndexes:
         number, position = self._file.fileno(), MAGIC_SIZE
         index = None
         while head := os.pread(number, 100, position):
-            kind, length = _RECORD.unpack_from(head)
-            body, whole = _RECORD.size, _RECORD.size + length
+            kind, length = RECORD.unpack_from(head)
+            body, whole = RECORD.size, RECORD.size + length
             if kind == Opcode.MESSAGE_INDEX and index is not None:
                 index.message_index_offsets[_CHANNEL.unpack_from(head, body)[0]] = position
                 index.message_index_length += whole
@@ -47,8 +49,8 @@ class _ChunkIndexes:
                 yield index
                 index = None
             if kind == Opcode.CHUNK:
-                first, last, raw_size, _, letters = _CHUNK.unpack_from(head, body)
-                data = body + _CHUNK.size + letters
+                first, last, raw_size, _, letters = CHUNK.unpack_from(head, body)
+                data = body + CHUNK.size + letters
                 index = ChunkIndex(
                     message_start_time=first,
                     message_end_time=last,

@@ -129,7 +129,7 @@ class Recording:
         """What in the file does not fit the rest of it though every checksum holds, in a line each."""
         return self._said(lambda survey: survey.doubts)
 
-    def look_through(self, watch: Watch) -> None:
+    def look_through(self, watch: Watch | None = None) -> None:
         """Show all blocks that fit the catalogue, in file order; `streams`, `short` and `doubts` need no further pass.
 
         Raises:
@@ -139,7 +139,7 @@ class Recording:
 
     def _surveyed(self) -> tuple[Survey, ...]:
         if not self._surveys:
-            self._surveys = tuple(Survey(part) for part in self.parts)
+            self.look_through()
         return self._surveys
 
     def _said(self, what: Callable[[Survey], tuple[str, ...]]) -> tuple[str, ...]:

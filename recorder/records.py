@@ -34,9 +34,9 @@ _MOST_PACKED = 1000
 """Chunks unpack to at most so many times the file, and to `MOST_CHUNK_BYTES` of a small one."""
 _LEAST_RECORD = 24
 """A file of records shorter than this, on the whole, is none of a recorder's [bytes]."""
-_RECORD = struct.Struct("<BQ")
+RECORD = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQII")
+CHUNK = struct.Struct("<QQQII")
 _CHUNK_INDEX = struct.Struct("<QQQQI")
 _INDEXED = struct.Struct("<HQ")
 _FOOTER = struct.Struct("<BQQQI")
@@ -138,12 +138,12 @@ def _take_data(file: BinaryIO, found: Contents, indexed: set[tuple[int, int]], d
     """Hold the records of the data against their index, and take metadata and attachments."""
     position, room, chunks = len(MAGIC), _Room(data_end), set()
     for chunk in found.chunks:
-        indexed.add((chunk.offset, chunk.length + _RECORD.size))
+        indexed.add((chunk.offset, chunk.length + RECORD.size))
     found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # one without an index has no messages
     while position < data_end:
         file.seek(position)
         opcode, length = _head(file)
-        end = position + _RECORD.size + length
+        end = position + RECORD.size + length
         if end > data_end or opcode == Opcode.MESSAGE:
             raise DamagedError("records that do not end with the data, or messages outside of chunks")
         room.take(opcode, file, length)
@@ -154,7 +154,7 @@ def _take_data(file: BinaryIO, found: Contents, indexed: set[tuple[int, int]], d
         position = end
     if chunks != indexed:
         raise DamagedError("an index that does not fit what is there")
-    if sum(found.counts.values()) > room.unpacked // (_RECORD.size + MESSAGE.size):
+    if sum(found.counts.values()) > room.unpacked // (RECORD.size + MESSAGE.size):
         raise DamagedError("more messages counted than there is room for")
     counted = {number for number, count in found.counts.items() if count}
     if counted != set().union(*(chunk.channels or () for chunk in found.chunks)):
@@ -179,9 +179,9 @@ class _Room:
         self._records -= 1
         if opcode == Opcode.CHUNK:
             start = file.tell()
-            head = file.read(_CHUNK.size)
+            head = file.read(CHUNK.size)
             file.seek(start)
-            unpacked = _CHUNK.unpack(head)[2] if len(head) == _CHUNK.size else 0
+            unpacked = CHUNK.unpack(head)[2] if len(head) == CHUNK.size else 0
             self.unpacked += unpacked if unpacked <= MOST_CHUNK_BYTES else 0  # a larger one is not unpacked
         elif opcode in self._kept:
             self._kept[opcode] -= length + _HEAD_BYTES
@@ -193,7 +193,7 @@ class _Room:
 
 def _head(file: BinaryIO) -> tuple[int, int]:
     """Opcode and length of the record that begins here."""
-    return _RECORD.unpack(file.read(_RECORD.size))
+    return RECORD.unpack(file.read(RECORD.size))
 
 
 def _sum(file: BinaryIO, end: int) -> int:
@@ -212,7 +212,7 @@ def _footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
         return None
     file.seek(at)
     opcode, length, start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
-    whole = (opcode, length) == (Opcode.FOOTER, _FOOTER.size - _RECORD.size) and file.read(len(MAGIC)) == MAGIC
+    whole = (opcode, length) == (Opcode.FOOTER, _FOOTER.size - RECORD.size) and file.read(len(MAGIC)) == MAGIC
     return (start, checksum) if whole else None
 
 
@@ -256,10 +256,10 @@ def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Conten
 def _chunk_indexed(body: bytes) -> Chunk:
     begin_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
     stop = _CHUNK_INDEX.size + indexed
-    if stop > len(body) or indexed % _INDEXED.size or length < _RECORD.size:
+    if stop > len(body) or indexed % _INDEXED.size or length < RECORD.size:
         raise DamagedError("an index of a chunk that is none")
     channels = frozenset(number for number, _ in _INDEXED.iter_unpack(body[_CHUNK_INDEX.size : stop]))
-    return Chunk(offset, length - _RECORD.size, begin_ns, end_ns, channels)
+    return Chunk(offset, length - RECORD.size, begin_ns, end_ns, channels)
 
 
 def _add_topic(found: Contents, channel: Channel) -> None:
@@ -297,14 +297,14 @@ def _walked(file: BinaryIO, size: int) -> Contents:
     """
     found = Contents()
     position, room = len(MAGIC), _Room(size)
-    while position + _RECORD.size <= size:
+    while position + RECORD.size <= size:
         file.seek(position)
         opcode, length = _head(file)
-        end = position + _RECORD.size + length
+        end = position + RECORD.size + length
         if opcode == 0 or end > size:
             # Cut off, or zeros where a power cut left unwritten pages; else its length is not what was written.
             if opcode == Opcode.CHUNK and _says(file, length):
-                found.chunks.append(Chunk(position, size - position - _RECORD.size, cut=True))
+                found.chunks.append(Chunk(position, size - position - RECORD.size, cut=True))
             elif not (length == 0 and _zeros(file) if opcode == 0 else _says_index(file, opcode, length)):
                 found.damaged += 1
             break
@@ -326,12 +326,12 @@ def _walked(file: BinaryIO, size: int) -> Contents:
 
 def _says(file: BinaryIO, length: int) -> bool:
     """Whether a chunk that was cut is as long as it says in two places, as far as the file goes."""
-    head = file.read(_CHUNK.size + _LONGEST_NAME + 8)
-    if len(head) < _CHUNK.size:
+    head = file.read(CHUNK.size + _LONGEST_NAME + 8)
+    if len(head) < CHUNK.size:
         return True
-    name = _CHUNK.unpack_from(head)[-1]
-    packed = head[_CHUNK.size + name : _CHUNK.size + name + 8]
-    return len(packed) < 8 or _CHUNK.size + name + 8 + int.from_bytes(packed, "little") == length
+    name = CHUNK.unpack_from(head)[-1]
+    packed = head[CHUNK.size + name : CHUNK.size + name + 8]
+    return len(packed) < 8 or CHUNK.size + name + 8 + int.from_bytes(packed, "little") == length
 
 
 def _says_index(file: BinaryIO, opcode: int, length: int) -> bool:
@@ -402,11 +402,11 @@ def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]
         DamagedError: They do not end with the data.
     """
     position = 0
-    while position + _RECORD.size <= len(data):
-        opcode, length = _RECORD.unpack_from(data, position)
+    while position + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, position)
         if opcode == 0:  # no record: zeros
             break
-        start = position + _RECORD.size
+        start = position + RECORD.size
         position = start + length
         if position <= len(data):
             yield opcode, start, position
@@ -430,19 +430,19 @@ def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
     """
     if chunk.length > MOST_CHUNK_BYTES + _PIECE:
         raise DamagedError(f"a chunk of {chunk.length} bytes")
-    file.seek(chunk.offset + _RECORD.size)
+    file.seek(chunk.offset + RECORD.size)
     body = file.read(chunk.length)
-    if len(body) < _CHUNK.size + 8:
+    if len(body) < CHUNK.size + 8:
         if chunk.cut:
             return b""
         raise DamagedError("a chunk without a head")
-    *_, size, checksum, name_length = _CHUNK.unpack_from(body)
-    name, packed = body[_CHUNK.size : _CHUNK.size + name_length], body[_CHUNK.size + name_length + 8 :]
+    *_, size, checksum, name_length = CHUNK.unpack_from(body)
+    name, packed = body[CHUNK.size : CHUNK.size + name_length], body[CHUNK.size + name_length + 8 :]
     if size > MOST_CHUNK_BYTES or name not in (b"", b"zstd"):
         raise DamagedError(f"a chunk of {size} bytes, packed by {name[:_LONGEST_NAME]!r}")
     if chunk.cut:
         return _unpack_cut(packed, size) if name else packed
-    told = int.from_bytes(body[_CHUNK.size + name_length : _CHUNK.size + name_length + 8], "little")
+    told = int.from_bytes(body[CHUNK.size + name_length : CHUNK.size + name_length + 8], "little")
     if told != len(packed):
         raise DamagedError("a chunk that does not end where it should")
     data = packed

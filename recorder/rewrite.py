@@ -118,8 +118,6 @@ def recover(
         counts = _write(
             recording,
             output,
-            scene=recording.scene,
-            catalogue=recording.catalogue,
             metadata={"recovered": about},
             reason="recovered",
             force=force,
@@ -213,11 +211,11 @@ def _write(
     recording: Recording,
     output: Path,
     *,
-    scene: dict[str, Any],
-    catalogue: dict[str, Any],
     metadata: dict[str, dict[str, str]],
     reason: str,
     force: bool,
+    scene: dict[str, Any] | None = None,
+    catalogue: dict[str, Any] | None = None,
     change: Callable[[Payload], Payload | None] = lambda payload: payload,
     on_progress: Callable[[float], None] | None,
 ) -> Counts:
@@ -231,9 +229,9 @@ def _write(
     with contextlib.ExitStack() as stack:
         writer = RecordingWriter(
             output,
-            catalogue=catalogue,
+            catalogue=catalogue or recording.catalogue,
             parameters=recording.parameters,
-            scene=scene,
+            scene=scene or recording.scene,
             view_rate_hz=float(about.get("view_rate_hz", 0.0)),
             force=force,
             beginning=Beginning(metadata=metadata, attachments=attachments),

@@ -14,33 +14,19 @@ from recorder.captures import Captures, check_captures
 from recorder.counts import NS, Counts
 from recorder.head import Beginning
 from recorder.payload import Payload
-from recorder.room import Limits, check_room
+from recorder.room import Limits
 from recorder.series import Series, check_series
 from recorder.sink import Needs, Sink
 from recorder.summary import Progress, Summary
 from recorder.trigger import Capture
 from recorder.writer import RecordingError, RecordingWriter, check_view_rate
+from rig import wire
 from rig.bounded_queue import BoundedQueue
 from rig.errors import InputError
 from rig.intake import Catalogue, Intake
 from rig.text import printable
 from rig.transport import Client, NoReplyError
 from rig.transport.clients import Reporter
-from rig.wire import (
-    ALIVE,
-    CATALOGUE,
-    EDGES,
-    EVENTS,
-    PARAMETERS,
-    SCENE,
-    SENSORS,
-    STATUS,
-    TRUTH,
-    decode_document,
-    schema_of,
-    sensor_key,
-    truth_key,
-)
 
 Document = dict[str, Any]
 RIG_LOST = "rig lost"
@@ -130,8 +116,7 @@ class RecordingSession:
             for field in ("rotate_mb", "rotate_s"):
                 if (given := getattr(self._limits, field)) is not None:
                     raise InputError(field, "left out where it is recorded around triggers", given)
-            check_captures(path, capture, force=force)
-            check_room(path, self._limits)
+            check_captures(path, capture, self._limits, force=force)
         self.path = path
         self._client = client
         self._reporter = Reporter(client, name)
@@ -186,20 +171,21 @@ class RecordingSession:
             NoReplyError: No rig answers.
             InputError: The file cannot be created.
         """
-        catalogue, parameters, scene = (decode_document(self._ask(key)) for key in (CATALOGUE, PARAMETERS, SCENE))
+        asked = (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE)
+        catalogue, parameters, scene = (wire.decode_document(self._ask(key)) for key in asked)
         promised = Catalogue.read(catalogue)
         self._rig = self._client.rig
         writer = self._open_sink(promised, catalogue, parameters, scene)
         self._intake = Intake(promised)
         self._tick_rate_hz = round(promised.tick_rate_hz)
         self._table = promised.table
-        self._streams = {*map(sensor_key, promised.table.groups), *map(truth_key, promised.truth)}
+        self._streams = {*map(wire.sensor_key, promised.table.groups), *map(wire.truth_key, promised.truth)}
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
         thread.start()
         reason = "failed"
         try:
-            self._client.watch(ALIVE, self._on_alive)
-            for key in (f"{SENSORS}/**", f"{TRUTH}/**", EVENTS, STATUS):
+            self._client.watch(wire.ALIVE, self._on_alive)
+            for key in (f"{wire.SENSORS}/**", f"{wire.TRUTH}/**", wire.EVENTS, wire.STATUS):
                 self._client.subscribe(key, self._on_message, on_miss=self._on_miss, history=self._history)
             reason = self._wait_for_end(writer, on_progress)
         except BaseException as error:
@@ -248,7 +234,7 @@ class RecordingSession:
 
     def _on_message(self, key: str, payload: bytes) -> None:
         wall_ns = self._wall_ns()
-        if schema_of(key) is None:
+        if wire.schema_of(key) is None:
             if not self._replaced:
                 self._inbox.offer((key, payload, wall_ns), room=self._inbox.room + _DOCUMENTS_BYTES)
             return
@@ -311,7 +297,7 @@ class RecordingSession:
         start_ns = block.tick * NS // self._tick_rate_hz
         begin_ns = self._begin_ns.setdefault(key, start_ns)
         first_ns = min(self._begin_ns.values())
-        if key == EDGES or begin_ns - first_ns > _ROUND_NS:
+        if key == wire.EDGES or begin_ns - first_ns > _ROUND_NS:
             begin_ns = first_ns
         if start_ns < begin_ns + self._duration_ns:
             self._within_s = self._monotonic_s()
@@ -325,7 +311,7 @@ class RecordingSession:
             self._end_rows = document.get("rows")
             self._end_reason = printable(document.get("reason") or "ended", 500)
             self._wake.set()
-        elif payload.key == STATUS and document.get("state") == "ended" and not self._end_reason:
+        elif payload.key == wire.STATUS and document.get("state") == "ended" and not self._end_reason:
             self._end_reason = "ended before the recording began"
             self._wake.set()
 
@@ -382,7 +368,7 @@ class RecordingSession:
 
     def _report(self, writer: Sink, *, done: bool = False) -> None:
         groups = list(self._table.groups)
-        first = sensor_key("probes" if "probes" in groups or not groups else groups[0])
+        first = wire.sensor_key("probes" if "probes" in groups or not groups else groups[0])
         lost = sum(writer.counts().lost.values())
         self._reporter.tell(writer.tally.next.get(first, 0), lost=lost, done=done)
 
@@ -390,7 +376,7 @@ class RecordingSession:
         counts = writer.counts()
         return Progress(
             time_s=0.0 if counts.first_time_ns is None else (counts.last_time_ns - counts.first_time_ns) / NS,
-            rows=sum(rows for key, rows in counts.rows.items() if key.startswith(SENSORS + "/")),
+            rows=sum(rows for key, rows in counts.rows.items() if key.startswith(wire.SENSORS + "/")),
             lost=sum(counts.lost.values()),
             size_bytes=counts.size_bytes,
             waiting=len(self._inbox),

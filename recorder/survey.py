@@ -19,7 +19,7 @@ Watch = Callable[[str, Block], None]
 """Is shown each block, with its key."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Stream:
     """What a recording holds of one block stream.
 
@@ -81,7 +81,7 @@ class Survey:
         """
         self.file = file
         self._continuity = Continuity()
-        self._found: dict[str, Stream] = {}
+        self.streams: dict[str, Stream] = {}
         self._counted: dict[str, int] = {}
         self._published: dict[str, int] = {}
         self._noted: set[tuple[str, int]] = set()
@@ -92,7 +92,7 @@ class Survey:
                 self._take_document(key, payload)
             elif (block := self._take_block(key, payload)) is not None and watch is not None:
                 watch(key, block)
-        self.streams = self._streams()
+        self._end()
 
     @cached_property
     def short(self) -> tuple[str, ...]:
@@ -127,24 +127,21 @@ class Survey:
         return tuple(found)
 
     def _take_block(self, key: str, payload: bytes) -> Block | None:
-        stream = self._found.get(key, Stream())
-        block = self.file.block(key, payload)
+        stream = self.streams.setdefault(key, Stream())
+        block, promise = self.file.block(key, payload), self.file.promises.get(key)
         if block is None:
-            self._found[key] = replace(stream, odd=stream.odd + 1)
+            stream.odd += 1
             return None
         gap = self._continuity.follow(key, block.index, len(block.values))
-        promise = self.file.promises.get(key)
-        off = promise is not None and promise.rate_hz and abs(block.rate_hz / promise.rate_hz - 1.0) > _OFF_RATE
-        first = stream if stream.messages else replace(stream, first=block.index)
+        stream.first = stream.first if stream.messages else block.index
+        stream.messages += 1
+        stream.back += gap is not None and gap.size < 0
+        if promise is not None and promise.rate_hz:
+            stream.off += abs(block.rate_hz / promise.rate_hz - 1.0) > _OFF_RATE
         if len(block.values):
-            times_s = row_times_s(key, block)
-            rows = stream.rows + len(block.values)
-            first_s = stream.first_time_s if stream.rows else float(times_s[0])
-            first = replace(first, rows=rows, first_time_s=first_s, last_time_s=float(times_s[-1]))
-        back = gap is not None and gap.size < 0
-        self._found[key] = replace(
-            first, messages=stream.messages + 1, back=stream.back + back, off=stream.off + bool(off)
-        )
+            first_s, stream.last_time_s = row_times_s(key, block)[[0, -1]].tolist()
+            stream.first_time_s = stream.first_time_s if stream.rows else first_s
+            stream.rows += len(block.values)
         return block
 
     def _take_document(self, key: str, payload: bytes) -> None:
@@ -158,16 +155,16 @@ class Survey:
         elif document["event"] in ("start", "end"):
             self._published = (document.get("rows") or {}) if document["event"] == "end" else {}
 
-    def _streams(self) -> dict[str, Stream]:
-        told = self.file.told_rows
+    def _end(self) -> None:
+        """Hold what was counted against what the file says of itself, and the rig of what it published."""
+        told, continuity = self.file.told_rows, self._continuity
         # A file that does not go to the end of a run ends where it was to end.
         whole = not {"trigger", "cut"} & set(self.file.metadata)
-        found = {}
-        for key in sorted(set(self._found) | {key for key, rows in told.items() if rows}):
-            stream, due = self._found.get(key, Stream()), self._continuity.next.get(key, 0)
-            rows, lost = (counts.get(key, 0) for counts in (self._continuity.received, self._continuity.lost))
-            end = self._published.get(key, due)
-            short = end - due if whole and key in self._continuity.next and (key, end) not in self._noted else 0
-            missing = max(0, told.get(key, rows) - rows, short)
-            found[key] = replace(stream, rows=rows, lost=lost, due=due, missing=missing)
-        return found
+        for key in set(self.streams) | {key for key, rows in told.items() if rows}:
+            stream = self.streams.setdefault(key, Stream())
+            stream.rows, stream.lost = continuity.received.get(key, 0), continuity.lost.get(key, 0)
+            stream.due = continuity.next.get(key, 0)
+            end = self._published.get(key, stream.due)
+            short = end - stream.due if whole and key in continuity.next and (key, end) not in self._noted else 0
+            stream.missing = max(0, told.get(key, stream.rows) - stream.rows, short)
+        self.streams = dict(sorted(self.streams.items()))

@@ -122,16 +122,6 @@ class Capture:
         """Whether this trigger makes a capture longer that is being made."""
         return trigger.level is None if self.again is None else self.again == "extend"
 
-    def check(self, table: ChannelTable) -> None:
-        """Refuse channels that the rig does not have.
-
-        Raises:
-            InputError: A trigger names one.
-        """
-        for trigger in self.triggers:
-            if trigger.level is not None and trigger.name not in table.channels:
-                raise InputError("trigger", f"on one of {', '.join(table.channels)}", trigger.text)
-
 
 class Crossings:
     """Where a channel crosses the level of a trigger, block after block.
@@ -142,7 +132,13 @@ class Crossings:
     """
 
     def __init__(self, trigger: Trigger, table: ChannelTable) -> None:
-        """Find the channel, which must be in the table."""
+        """Find the channel.
+
+        Raises:
+            InputError: The table does not have it.
+        """
+        if trigger.name not in table.channels:
+            raise InputError("trigger", f"on one of {', '.join(table.channels)}", trigger.text)
         self._trigger = trigger
         self._channel = table.channels[trigger.name]
         names = table.groups[self._channel.group].names

@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from recorder.reader import Recording
+from recorder.samples import Samples
 from recorder.viewer.canvas import Canvas
 from recorder.viewer.geometry import Geometry
 from recorder.viewer.painter import FRAME_S, Painter
-
-if TYPE_CHECKING:
-    from recorder.reader import Recording
-    from recorder.samples import Samples
 
 MOST_ROWS_PER_S = 2000.0
 MOST_ROWS = 60_000
