@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from collections.abc import Iterator
 from itertools import count
+from typing import BinaryIO
 
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
+from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import Writer
 
-from recorder.chunk_index import keep_on_disk
 from recorder.draft import Draft
+from recorder.records import CHUNK, RECORD
 from recorder.schemas import Definition
 
 _CHUNK_BYTES = 1 << 20
+_CHUNK_LIST = "_Writer__chunk_indices"
+"""The writer's list of its chunks, which would grow with the file. It is private, and there is no public way to leave it
+out and still write the index; the version is bounded for that (mcap<2)."""
+_CHANNEL = struct.Struct("<H")
 _MESSAGE_BYTES = 47
 """What a message takes besides its data: its head, and its place in the index of the chunk."""
 _END_BYTES = 100_000
@@ -41,7 +51,7 @@ class McapFile:
         self._topics: dict[str, tuple[int, Iterator[int]]] = {}
         """Number of the channel of each topic, and the numbers of its messages."""
         self.mcap = Writer(draft.file, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
-        keep_on_disk(self.mcap, draft.file)
+        setattr(self.mcap, _CHUNK_LIST, _ChunkIndexes(draft.file))
         self.mcap.start(profile="ros2", library="rotor-stator-rig recorder")
 
     @property
@@ -95,3 +105,42 @@ class McapFile:
         self.mcap.finish()
         self.size_bytes = self.draft.sync()
         self.draft.finish()
+
+
+class _ChunkIndexes:
+    """The index of a file's chunks, which it ends with, taken from the disk and not from memory."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+
+    def append(self, index: ChunkIndex) -> None:
+        """Keep nothing."""
+
+    def __iter__(self) -> Iterator[ChunkIndex]:
+        self._file.flush()
+        number, position = self._file.fileno(), MAGIC_SIZE
+        index = None
+        while head := os.pread(number, 100, position):
+            kind, length = RECORD.unpack_from(head)
+            body, whole = RECORD.size, RECORD.size + length
+            if kind == Opcode.MESSAGE_INDEX and index is not None:
+                index.message_index_offsets[_CHANNEL.unpack_from(head, body)[0]] = position
+                index.message_index_length += whole
+            elif index is not None:
+                yield index
+                index = None
+            if kind == Opcode.CHUNK:
+                first, last, raw_size, _, letters = CHUNK.unpack_from(head, body)
+                data = body + CHUNK.size + letters
+                index = ChunkIndex(
+                    message_start_time=first,
+                    message_end_time=last,
+                    chunk_start_offset=position,
+                    chunk_length=whole,
+                    message_index_offsets={},
+                    message_index_length=0,
+                    compression=head[data - letters : data].decode(),
+                    compressed_size=length - (data - body) - 8,
+                    uncompressed_size=raw_size,
+                )
+            position += whole

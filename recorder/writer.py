@@ -316,5 +316,6 @@ class _Topics:
         self._file.add(topic, data, time_ns=time_ns, wall_ns=wall_ns)
 
     def _add_view(self, view: View, messages: Messages, wall_ns: int) -> None:
-        for row, time_ns in zip(messages.data, messages.times_ns.tolist(), strict=True):
+        times_ns, data = messages
+        for row, time_ns in zip(data, times_ns.tolist(), strict=True):
             self._file.add(view.topic, row.tobytes(), time_ns=time_ns, wall_ns=wall_ns)

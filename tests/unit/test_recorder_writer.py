@@ -188,7 +188,7 @@ def test_groups_that_never_come_do_not_hold_up_the_others_for_ever(monkeypatch):
     for number in range(6):
         shown = views.add(table.groups["probes"], block_of(PROBES, number), number * 10_000_000)
         assert shown is not None
-        counts.append(len(shown[1]))
+        counts.append(len(shown[1][0]))
     assert counts == [0, 0, 0, 5, 5, 5]
 
 
