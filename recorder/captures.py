@@ -110,6 +110,11 @@ class Captures(Sink):
         self._number = 0
         self._open: _Open | None = None
 
+    @property
+    def held(self) -> int:
+        """Payloads in the ring."""
+        return len(self._ring)
+
     def take(self, payload: Payload) -> None:
         """Take one payload: into the ring, and into the capture that is open."""
         self.tally.take(payload)

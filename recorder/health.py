@@ -285,7 +285,7 @@ def examine(recording: Recording) -> Health:
 def _with_findings(recording: Recording, channels: list[ChannelHealth], misplaced: dict[str, int]) -> Health:
     clock = recording.clock if _has_clock(recording) else np.empty((0, 2))
     span_s = float(np.ptp(clock[:, 1])) if len(clock) else 0.0
-    pace, jitter_ms, jitter_max_ms, strays = _pace(clock)
+    pace, jitter_ms, jitter_max_ms, strays = pace_of(clock)
     last = recording.last_status or {}
     kept = ("pace", "real_time_factor", "lateness_ms", "overruns", "queue", "energy", "engine")
     warnings = dict.fromkeys(
@@ -328,7 +328,7 @@ def _has_clock(recording: Recording) -> bool:
     return not any((event.get("event"), event.get("pace")) in without for event in recording.events)
 
 
-def _pace(clock: np.ndarray) -> tuple[float, float, float, float]:
+def pace_of(clock: np.ndarray) -> tuple[float, float, float, float]:
     """Slope of simulated over wall time, deviations from the line (rms and largest [ms]), part of strays.
 
     The line is through medians: what a recorder fetched from the rig's cache arrived in one burst. A first one, through

@@ -19,8 +19,8 @@ from recorder.schemas import Definition
 
 _CHUNK_BYTES = 1 << 20
 _CHUNK_LIST = "_Writer__chunk_indices"
-"""The writer's list of its chunks, which would grow with the file. It is private, and there is no public way to leave it
-out and still write the index; the version is bounded for that (mcap<2)."""
+"""The writer's list of its chunks, which would grow with the file. It is private, and no public way leaves it
+out and still writes the index; the version is bounded for that (mcap<2)."""
 _CHANNEL = struct.Struct("<H")
 _MESSAGE_BYTES = 47
 """What a message takes besides its data: its head, and its place in the index of the chunk."""

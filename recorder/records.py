@@ -168,7 +168,7 @@ class _Room:
         self.unpacked = 0
         self._most = _MOST_PACKED * size + MOST_CHUNK_BYTES
         self._records = size // _LEAST_RECORD + 10_000
-        self._kept = {Opcode.ATTACHMENT: _MOST_ATTACHED, Opcode.METADATA: _MOST_METADATA}
+        self._kept: dict[int, int] = {Opcode.ATTACHMENT: _MOST_ATTACHED, Opcode.METADATA: _MOST_METADATA}
 
     def take(self, opcode: int, file: BinaryIO, length: int) -> None:
         """Count a record; the file is where its body begins, and stays there.

@@ -158,6 +158,11 @@ class RecordingSession:
         # Only a flag: a signal handler that took the lock of an event could wait for its own thread.
         self._stop_reason = self._stop_reason or reason
 
+    @property
+    def waiting(self) -> int:
+        """Payloads that wait to be written."""
+        return len(self._inbox)
+
     def run(self, on_progress: Callable[[Progress], None] | None = None) -> Summary:
         """Record until the end.
 
@@ -362,7 +367,7 @@ class RecordingSession:
         if now_s - ended_s > PATIENCE_S or self._replaced:
             return True
         # The `end` event can overtake blocks that are being recovered: while a stream is short of it, wait longer.
-        whole = self._end_rows is not None and not len(self._inbox) and not writer.tally.short_of(self._end_rows)
+        whole = self._end_rows is not None and not self.waiting and not writer.tally.short_of(self._end_rows)
         quiet_s = now_s - max(ended_s, self._heard_s)
         return quiet_s > (QUIET_S if whole or self._rig_lost else RECOVERY_S)
 
@@ -379,7 +384,7 @@ class RecordingSession:
             rows=sum(rows for key, rows in counts.rows.items() if key.startswith(wire.SENSORS + "/")),
             lost=sum(counts.lost.values()),
             size_bytes=counts.size_bytes,
-            waiting=len(self._inbox),
+            waiting=self.waiting,
             backlog_bytes=self._inbox.used,
             dropped=self._inbox.dropped,
             files=len(writer.files),

@@ -36,7 +36,7 @@ class Canvas:
 
     def __init__(self, stream: rr.RecordingStream, clock: WallClock | None = None) -> None:
         self.stream = stream
-        self.clock = clock or WallClock()
+        self.clock = WallClock() if clock is None else clock
 
     def fix(self, path: str, *what: Any) -> None:
         """Draw something that holds for all times."""

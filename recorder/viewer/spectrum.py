@@ -40,7 +40,7 @@ def shown_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]
         Frequencies -200 .. 200 [Hz] and amplitudes in the unit of z, both of shape (401,); 0 beyond half the rate.
     """
     frequencies = np.arange(-LIMIT_HZ, LIMIT_HZ + 1)
-    _, lines = full_spectrum(z.real, z.imag, rate_hz, lines=rate_hz)
+    _, lines = full_spectrum(np.real(z), np.imag(z), rate_hz, lines=rate_hz)
     amplitude = lines[(frequencies + rate_hz // 2) % rate_hz]
     amplitude[np.abs(frequencies) >= rate_hz / 2] = 0.0
     return frequencies, amplitude
@@ -109,9 +109,9 @@ class Waterfall:
         ticks = [[(self.x_of(hz), HEIGHT), (self.x_of(hz), HEIGHT + (5 if hz == 0 else 3))] for hz in marks]
         faint = pixels(0.6)
         self._canvas.fix(f"{WATERFALL}/ticks", rr.LineStrips2D(ticks, colors=[_MARKS_RGB], radii=faint, draw_order=2.0))
-        named = {(self.x_of(hz), HEIGHT + 10): f"{hz:+d} Hz" if hz else "0" for hz in marks if hz % 100 == 0}
+        named = {(self.x_of(hz), HEIGHT + 10.0): f"{hz:+d} Hz" if hz else "0" for hz in marks if hz % 100 == 0}
         self._canvas.write(f"{WATERFALL}/frequencies", named, [_MARKS_RGB])
-        senses = {(self.x_of(-150), -8): "BACKWARD", (self.x_of(150), -8): "FORWARD"}
+        senses = {(self.x_of(-150), -8.0): "BACKWARD", (self.x_of(150), -8.0): "FORWARD"}
         self._canvas.write(f"{WATERFALL}/senses", senses, [BACKWARD_RGB, FORWARD_RGB])
 
     def x_of(self, frequency_hz: float) -> float:

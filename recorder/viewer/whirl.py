@@ -50,5 +50,5 @@ def whirl_of(z: np.ndarray, rate_hz: float) -> Whirl:
     """
     if not len(z):
         return Whirl(frequency_hz=0.0, radius_mm=0.0)
-    x, y = z.real, z.imag
+    x, y = np.real(z), np.imag(z)
     return Whirl(frequency_hz=mean_rotation(x, y, rate_hz), radius_mm=rms_radius(x, y))

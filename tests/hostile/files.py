@@ -44,7 +44,7 @@ def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -
         file.write("rig/events", encode_document(event), 0)
     file.write_missed(PROBES, 2, 0)
     if leave:
-        file._sync()
+        file.sync()
         kept = path.with_name(path.name + ".part")
         kept.write_bytes(file.part.read_bytes())
         data = kept.read_bytes()
@@ -192,10 +192,10 @@ class Layout:
         made.metadata, made.attachments = copy.deepcopy(self.metadata), dict(self.attachments)
         made.messages = list(self.messages)
         for _ in range(int(rng.integers(1, 4))):
-            made._spoil(rng)
+            made.spoil(rng)
         return made
 
-    def _spoil(self, rng: Rng) -> None:
+    def spoil(self, rng: Rng) -> None:
         kind = int(rng.integers(0, 10))
         at = int(rng.integers(0, len(self.messages)))
         topic, payload, time_ns = self.messages[at]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections import defaultdict
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,7 +33,9 @@ from .recorder_stream import TICK_RATE_HZ, block_of, documents, stream
 PROBES = sensor_key("probes")
 
 
-def series(path: Path, *, force: bool = False, **limits: Any) -> Series:
+def series(
+    path: Path, *, force: bool = False, monotonic_s: Callable[[], float] = time.monotonic, **limits: Any
+) -> Series:
     about = documents()
     calls = count()
 
@@ -46,7 +50,8 @@ def series(path: Path, *, force: bool = False, **limits: Any) -> Series:
             monotonic_s=lambda: 0.01 * next(calls),  # a flush each 25 payloads
         )
 
-    return Series(path, Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, Limits(**limits), force))
+    needs = Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, Limits(**limits), force, monotonic_s)
+    return Series(path, needs)
 
 
 def write(file: Series, items: list[tuple[str, bytes]]) -> None:
@@ -216,13 +221,14 @@ def test_the_oldest_files_make_room_on_a_disk_of_which_nothing_is_to_be_left(tmp
 def test_room_is_left_on_the_disk(tmp_path, monkeypatch):
     free = [100]
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=free[0], f_frsize=1_000_000))
-    file = series(tmp_path / "run.mcap", keep_free_mb=50.0)
+    now_s = [0.0]
+    file = series(tmp_path / "run.mcap", monotonic_s=lambda: now_s[0], keep_free_mb=50.0)
     items = list(stream(40))
     for key, payload in items[:160]:
         file.take(Payload.read(key, payload, 0))
     assert file.ended == ""
     free[0] = 51
-    file._room._checked_s = -1e9
+    now_s[0] = 1.0
     file.take(Payload.read(*items[160], 0))
     assert file.ended == "less than 50 MB are free on the disk"
     file.finish(file.ended)

@@ -170,7 +170,7 @@ def test_wall_clock_joins_marks_and_goes_on_at_the_wall_s_pace() -> None:
     for n in range(10_000):
         clock.mark(20.0 + n, 200.0 + n)
     np.testing.assert_allclose(clock.at(np.array([9000.0])), [9180.0])
-    assert len(clock._wall) < 5000
+    assert len(clock) < 5000
 
 
 def test_geometry_takes_lengths_in_their_unit_and_names_what_it_assumes() -> None:
