@@ -252,8 +252,8 @@ def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, A
 def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
     """The document in a message of one of the topics `KINDS`; None where it is not what the topic promises."""
     try:
-        document, told = read(KINDS[topic].model, payload, field=topic)
-        if isinstance(told, Event) and told.event == "command":
+        document, found = read(KINDS[topic].model, payload, field=topic)
+        if isinstance(found, Event) and found.event == "command":
             read(Command, payload, field=topic)
     except InputError:
         return None
@@ -271,7 +271,7 @@ def check_kept(kept_bytes: int, topic: str, path: Path) -> int:
     return kept_bytes
 
 
-def told(model: type[Model], entries: dict[str, str], *, field: str) -> Model:
+def read_metadata(model: type[Model], entries: dict[str, str], *, field: str) -> Model:
     """Metadata as its model.
 
     Raises:

@@ -254,7 +254,7 @@ def _limits(channel: Channel) -> tuple[float, float]:
 
 
 def examine(recording: Recording) -> Health:
-    """Look at everything that a recording tells about its own soundness, in one pass over its samples."""
+    """Look at everything that a recording says of its own soundness, in one pass over its samples."""
     noisy = _has_noise(recording.scene)
     watches = {
         sensor_key(name): _Watch(group, noisy=noisy)

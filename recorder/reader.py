@@ -15,7 +15,7 @@ from recorder import documents, schemas
 from recorder.recording_file import Message, RecordingFile
 from recorder.records import Chunk
 from recorder.samples import Samples, row_times_s
-from recorder.survey import Stream, Survey, Watch
+from recorder.survey import OnBlock, Stream, Survey
 from rig.errors import InputError
 from rig.wire import EDGES, EVENTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
 
@@ -129,13 +129,13 @@ class Recording:
         """What in the file does not fit the rest of it though every checksum holds, in a line each."""
         return self._said(lambda survey: survey.doubts)
 
-    def look_through(self, watch: Watch | None = None) -> None:
+    def look_through(self, on_block: OnBlock | None = None) -> None:
         """Show all blocks that fit the catalogue, in file order; `streams`, `short` and `doubts` need no further pass.
 
         Raises:
             InputError: The file is damaged.
         """
-        self._surveys = tuple(Survey(part, watch) for part in self.parts)
+        self._surveys = tuple(Survey(part, on_block) for part in self.parts)
 
     def _surveyed(self) -> tuple[Survey, ...]:
         if not self._surveys:

@@ -41,7 +41,7 @@ class RecordingFile:
         attachments: All attachments by name; catalogue, parameters and scene are among them.
         messages: Number of messages by topic.
         chunks: Where its messages are, in file order.
-        told_rows: Rows by key, as the file itself says at its end.
+        stated_rows: Rows by key, as the file itself says at its end.
     """
 
     def __init__(self, path: Path, *, salvage: bool = False) -> None:
@@ -63,10 +63,10 @@ class RecordingFile:
         self.complete, self.unchecked = found.complete, found.unchecked
         self.damaged += found.damaged
         self.attachments, self.chunks, self._topics = found.attachments, tuple(found.chunks), found.topics
-        self.told_rows: dict[str, int] = {}
+        self.stated_rows: dict[str, int] = {}
         with contextlib.suppress(InputError):
-            told = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
-            self.told_rows = read_json(documents.told(documents.End, told, field="end").rows.encode())
+            stated = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
+            self.stated_rows = read_json(documents.read_metadata(documents.End, stated, field="end").rows.encode())
         self.messages = {self._topics[number]: count for number, count in sorted(found.counts.items())}
         if len(set(self._topics.values())) < len(self._topics):
             raise InputError("file", "a recording with each channel once", str(path))
@@ -77,10 +77,10 @@ class RecordingFile:
         self.damaged, self.metadata = 0, found
         if copy is None:
             return
-        told = read_json(copy, field=COPY)
-        if {name: found.get(name) for name in told} != told:
+        stated = read_json(copy, field=COPY)
+        if {name: found.get(name) for name in stated} != stated:
             self.damaged = 1
-        self.metadata = {**({"end": found["end"]} if "end" in found and not salvage else {}), **told}
+        self.metadata = {**({"end": found["end"]} if "end" in found and not salvage else {}), **stated}
 
     def _check_documents(self, *, salvage: bool) -> None:
         """Hold metadata and attached documents against what they must be."""
@@ -90,7 +90,7 @@ class RecordingFile:
         documents.check_version(about)
         for kind, model in documents.METADATA.items():
             if kind in self.metadata:
-                documents.told(model, self.metadata[kind], field=f"{name}: {kind}")
+                documents.read_metadata(model, self.metadata[kind], field=f"{name}: {kind}")
         payloads = [self.attachments.get(f"{kind}.json") for kind in documents.ATTACHED]
         if None in payloads:
             # Where it is damaged it is not there either.

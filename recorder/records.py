@@ -442,8 +442,8 @@ def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
         raise DamagedError(f"a chunk of {size} bytes, packed by {name[:_LONGEST_NAME]!r}")
     if chunk.cut:
         return _unpack_cut(packed, size) if name else packed
-    told = int.from_bytes(body[CHUNK.size + name_length : CHUNK.size + name_length + 8], "little")
-    if told != len(packed):
+    stated = int.from_bytes(body[CHUNK.size + name_length : CHUNK.size + name_length + 8], "little")
+    if stated != len(packed):
         raise DamagedError("a chunk that does not end where it should")
     data = packed
     if name:

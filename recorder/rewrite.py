@@ -55,7 +55,7 @@ class Rewritten:
 
 
 def recovered_path(source: Path) -> Path:
-    """Where `recover` writes to unless told otherwise: beside NAME.mcap.part or NAME.mcap, to NAME.recovered.mcap."""
+    """Where `recover` writes to by default: beside NAME.mcap.part or NAME.mcap, to NAME.recovered.mcap."""
     name = source.name.removesuffix(PART_SUFFIX).removesuffix(".mcap")
     return source.with_name(f"{name}.recovered.mcap")
 

@@ -46,7 +46,7 @@ up [s]."""
 PATIENCE_S = 30.0
 """After the end of the stream: longest wait [s]."""
 RETURN_S = 10.0
-"""Unless told otherwise, how long a rig that is lost may take to be there again with the same run [s]: a recorder that
+"""How long, by default, a rig that is lost may take to be there again with the same run [s]: a recorder that
 was stopped for a minute loses its links, and is linked again in a second or two."""
 _DOCUMENTS_BYTES = 64 << 20
 """What documents may take of memory when blocks find no more room."""
@@ -138,9 +138,9 @@ class RecordingSession:
         self._stop_reason = ""
         self._end_reason = ""
         self._end_rows: dict[str, int] | None = None
-        """Number of the row after the last one published, by key, as the end event tells it."""
+        """Number of the row after the last one published, by key, as the end event states it."""
         self._rig: str | None = None
-        """Who the rig is, as the transport tells."""
+        """Who the rig is, by its transport."""
         self._rig_lost = False
         self._lost_s = 0.0
         self._replaced = False

@@ -12,10 +12,10 @@ from recorder.samples import row_times_s
 from rig.wire import EDGES, EVENTS, Block, Continuity, schema_of
 
 _LEAST_SPAN_S = 0.5
-"""A stream without rows in a recording of this length is told; in a shorter one it may not have begun."""
+"""A stream without rows raises doubt in a recording of this length; in a shorter one it may not have begun."""
 _OFF_RATE = 1e-3
 """Part by which the rate of a block may be off that of its stream: an import's is a whole number."""
-Watch = Callable[[str, Block], None]
+OnBlock = Callable[[str, Block], None]
 """Is shown each block, with its key."""
 
 
@@ -69,12 +69,12 @@ class Survey:
         streams: Extent of every block stream by key.
     """
 
-    def __init__(self, file: RecordingFile, watch: Watch | None = None) -> None:
+    def __init__(self, file: RecordingFile, on_block: OnBlock | None = None) -> None:
         """Read the whole file.
 
         Args:
             file: The file.
-            watch: Is shown each block that fits the catalogue.
+            on_block: Is shown each block that fits the catalogue.
 
         Raises:
             InputError: The file is damaged.
@@ -90,8 +90,8 @@ class Survey:
             self._counted[key] = self._counted.get(key, 0) + 1
             if schema_of(key) is None:
                 self._take_document(key, payload)
-            elif (block := self._take_block(key, payload)) is not None and watch is not None:
-                watch(key, block)
+            elif (block := self._take_block(key, payload)) is not None and on_block is not None:
+                on_block(key, block)
         self._end()
 
     @cached_property
@@ -111,13 +111,13 @@ class Survey:
                 found.append(f"blocks of {key} that repeat row numbers, or go back: {stream.back}")
             if stream.off:
                 found.append(f"blocks of {key} at another rate than the catalogue says: {stream.off}")
-            if stream.rows > (told := self.file.told_rows.get(key, stream.rows)):
-                found.append(f"{key} has {stream.rows} rows where the file says {told}")
+            if stream.rows > (stated := self.file.stated_rows.get(key, stream.rows)):
+                found.append(f"{key} has {stream.rows} rows where the file says {stated}")
             if stream.rows and key not in promises:
                 found.append(f"{key} is not in the catalogue")
         for topic in sorted(set(messages) | set(self._counted)):
-            if (is_there := self._counted.get(topic, 0)) != (told := messages.get(topic, 0)):
-                found.append(f"{is_there} messages of {topic} where the file says {told}")
+            if (is_there := self._counted.get(topic, 0)) != (stated := messages.get(topic, 0)):
+                found.append(f"{is_there} messages of {topic} where the file says {stated}")
         filled = {key: one for key, one in self.streams.items() if one.rows}
         span_s = max((one.last_time_s for one in filled.values()), default=0.0)
         span_s -= min((one.first_time_s for one in filled.values()), default=0.0)
@@ -157,14 +157,14 @@ class Survey:
 
     def _end(self) -> None:
         """Hold what was counted against what the file says of itself, and the rig of what it published."""
-        told, continuity = self.file.told_rows, self._continuity
+        stated, continuity = self.file.stated_rows, self._continuity
         # A file that does not go to the end of a run ends where it was to end.
         whole = not {"trigger", "cut"} & set(self.file.metadata)
-        for key in set(self.streams) | {key for key, rows in told.items() if rows}:
+        for key in set(self.streams) | {key for key, rows in stated.items() if rows}:
             stream = self.streams.setdefault(key, Stream())
             stream.rows, stream.lost = continuity.received.get(key, 0), continuity.lost.get(key, 0)
             stream.due = continuity.next.get(key, 0)
             end = self._published.get(key, stream.due)
             short = end - stream.due if whole and key in continuity.next and (key, end) not in self._noted else 0
-            stream.missing = max(0, told.get(key, stream.rows) - stream.rows, short)
+            stream.missing = max(0, stated.get(key, stream.rows) - stream.rows, short)
         self.streams = dict(sorted(self.streams.items()))

@@ -20,7 +20,7 @@ _LEVEL = re.compile(r"\s*(\|?)([A-Za-z_]\w*)(\|?)\s*([<>])\s*([-+.\deE]+)\s*")
 MOST_CAPTURES = 1000
 _MOST_PRE_S = 120.0
 LONGEST_S = 60.0
-"""Longest length of a capture unless told otherwise [s of simulated time]."""
+"""Longest length of a capture by default [s of simulated time]."""
 REARM_S = 0.25
 """A level starts a new capture only if nothing was beyond it for so long: whirl crosses one twice a turn, and would
 otherwise start captures for as long as it lasts [s of simulated time]."""

@@ -16,7 +16,7 @@ TOUCH, FREE = "contact", "free"
 
 
 def resolution_mm(channel: Channel) -> float:
-    """What a probe can tell apart [mm]: three standard deviations of its noise and converter step."""
+    """Resolution of a probe [mm]: three standard deviations of its noise and converter step."""
     step = channel.lsb_v / math.sqrt(12.0)
     return 3.0 * math.hypot(channel.noise_v, step) / abs(channel.sensitivity_v) * channel.si * 1e3
 

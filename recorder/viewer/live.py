@@ -22,7 +22,7 @@ from rig.transport.clients import Reporter
 
 NAME = "viewer"
 ROWS_PER_S = 500.0
-"""Points of each curve per simulated second [Hz]; full rate around hammer blows."""
+"""Points of each curve per simulated second [Hz]; full rate around hammer pulses."""
 _TICK_S = 0.04
 _FLUSH_EVERY = 4
 _HEARTBEAT_S = 0.5
@@ -108,7 +108,7 @@ class LiveView:
         self._there: bool | None = None
         self._gone_at_s = 0.0
         self.ended: str | None = None
-        """Why the run ended, as the rig tells it; None before."""
+        """Why the run ended, as the rig states it; None before."""
         self._stalled = False
         self.failed = False
         """Whether the run failed, or the rig went without an end."""
@@ -202,7 +202,7 @@ class LiveView:
         arrived = []
         while self._inbox:
             arrived.append(self._inbox.popleft())
-        # Stable: each key stays in order, and its blocks come together. Events first: they tell of the hammer.
+        # Stable: each key stays in order, and its blocks come together. Events first: they announce hammer pulses.
         arrived.sort(key=lambda item: (item[0] != wire.EVENTS, item[0]))
         for key, items in groupby(arrived, key=lambda item: item[0]):
             payloads = [payload for _, payload in items]

@@ -30,11 +30,11 @@ _PLAIN = (200, 205, 215)
 _SHADES = {"outer": 0.6}
 """Curves of the outer house stand in the plot of the inner one."""
 
-Window = tuple[float, float]
+Span = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class Curves:
     """Curves that share a plot: one entity with a value per curve.
 
     Attributes:
@@ -50,14 +50,14 @@ class Series:
     select: Callable[[np.ndarray], np.ndarray]
 
 
-def series_of(group: Group) -> list[Series]:
+def series_of(group: Group) -> list[Curves]:
     """The curves of one sensor group: channels with a common first part of the name stand together."""
     planes: dict[str, list[int]] = {}
     for column, channel in enumerate(group.channels):
         if channel.name not in _NOT_DRAWN:
             planes.setdefault(channel.name.split("_")[0], []).append(column)
     found = [
-        Series(
+        Curves(
             path=f"{ROOT}/{group.name}/{plane}",
             labels=tuple(f"{group.channels[column].name} [{group.channels[column].unit}]" for column in columns),
             colors=tuple(_color_of(group.channels[column].name) for column in columns),
@@ -67,7 +67,7 @@ def series_of(group: Group) -> list[Series]:
     ]
     if set(group.names) >= REACTIONS:
         found.append(
-            Series(
+            Curves(
                 path=REACTION,
                 labels=("x: P_E - P_W [N]", "y: P_N - P_S [N]"),
                 colors=(_color_of("x"), _color_of("y")),
@@ -116,7 +116,7 @@ class Envelope:
         self._times.append(times_s)
         self._values.append(values)
 
-    def take(self, *, until_s: float, windows: list[Window], rest: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    def take(self, *, until_s: float, windows: list[Span], rest: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Give the points of the buckets that end before `until_s`; with `rest`, also of the unfinished one."""
         if not self._times:
             return np.empty(0), np.empty((0, 0))
@@ -178,7 +178,7 @@ class SeriesPlot:
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             envelope.add(times_s, series.select(values))
 
-    def flush(self, *, until_s: float, windows: list[Window], rest: bool = False) -> None:
+    def flush(self, *, until_s: float, windows: list[Span], rest: bool = False) -> None:
         """Draw what is complete before `until_s`."""
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             times, values = envelope.take(until_s=until_s, windows=windows, rest=rest)
@@ -186,7 +186,7 @@ class SeriesPlot:
                 self._canvas.plot(series.path, times, rr.Scalars.columns(scalars=values))
                 self.points += values.size
 
-    def lift(self, *, at_s: float, windows: list[Window]) -> None:
+    def lift(self, *, at_s: float, windows: list[Span]) -> None:
         """Draw what is held, then interrupt the curves at `at_s`: rows are missing from here on."""
         self.flush(until_s=np.inf, windows=windows, rest=True)
         for series in self._series:

@@ -85,7 +85,7 @@ class SpectrumPlot:
         self._waterfall.add(time_s, amplitude)
 
     def close(self) -> None:
-        """Draw what only the end tells."""
+        """Draw what is known at the end only."""
         self._waterfall.finish()
 
 
