@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from bisect import insort
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
@@ -28,7 +29,7 @@ from rig.model import build_model, describe
 from rig.scenes import HammerCommand, ReleaseCommand, Scene, SpeedCommand, parse_command, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
-from rig.wire import ROOT, Block
+from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key
 
 TICK_RATE_HZ = 1_000_000
 ROW_TICKS = 25
@@ -67,6 +68,15 @@ class Frame:
     truth: dict[str, Block]
     events: list[dict[str, Any]]
     rows: np.ndarray = field(repr=False)
+
+    def blocks(self) -> Iterator[tuple[str, Block]]:
+        """Keys and blocks, in the order in which they are published."""
+        for group, block in self.samples.items():
+            yield sensor_key(group), block
+        if self.edges is not None:
+            yield EDGES, self.edges
+        for table, block in self.truth.items():
+            yield truth_key(table), block
 
 
 @dataclass(frozen=True, slots=True)

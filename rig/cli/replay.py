@@ -128,7 +128,8 @@ def replay(
 
     with rare_collections():
         from replays.player.edit import Edit
-        from replays.player.player import Part, Player
+        from replays.player.passes import Part
+        from replays.player.player import Player
         from replays.player.playhead import check_rate
         from replays.player.tape import Tape
         from replays.player.timeline import By

@@ -22,7 +22,8 @@ from drivers.console import Console
 from drivers.daq import Daq
 from recorder.reader import Recording
 from recorder.session import RecordingSession
-from replays.player.player import Part, Player
+from replays.player.passes import Part
+from replays.player.player import Player
 from replays.player.tape import Tape
 from rig import wire
 from rig.cli.can_output import CanOutput

@@ -16,9 +16,10 @@ from rig import wire
 from rig.errors import InputError, RefusedError
 from rig.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
 from rig.service import Service
+from rig.simulation import Frame
 from rig.transport import NoReplyError
 from rig.transport.memory import MemoryClient, MemoryServer
-from tests.unit.service_fake import GROUPS, TRUTH, FakeFrame, FakeSimulation
+from tests.unit.service_fake import GROUPS, TRUTH, FakeSimulation
 
 BLOCK = 10_000
 
@@ -377,9 +378,9 @@ def test_a_paced_run_drops_whole_blocks_and_counts_them_while_it_keeps_every_eve
         now[0] += round(seconds * 1e9)
 
     class Noted(FakeSimulation):
-        def advance(self, ticks: int) -> FakeFrame:
+        def advance(self, ticks: int) -> Frame:
             frame = super().advance(ticks)
-            frame.events = [{"event": "hammer", "tick": frame.tick, "time_s": 0.0}]
+            frame.events.append({"event": "hammer", "tick": frame.tick, "time_s": 0.0})
             if self.tick >= 1_000_000:
                 server.open.set()
             return frame
