@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from rig.channels import ChannelTable, default_table
+from rig.channels import ChannelTable
+from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.engines import ENGINES, load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, STEPS
 from rig.errors import InputError, SimulationError
@@ -26,7 +27,7 @@ from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
-from rig.scenes import HammerCommand, ReleaseCommand, Scene, SpeedCommand, parse_command, scene_document
+from rig.scenes import Scene, rig_table, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
 from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key
@@ -135,7 +136,7 @@ class Simulation:
         self.row_ticks = self._stride * self._step_ticks
         self.block_ticks = math.lcm(*periods)
         self.end_tick = math.ceil(round(scene.duration_s * TICK_RATE_HZ) / self.block_ticks) * self.block_ticks
-        self.table: ChannelTable = default_table().only(sensors.groups, sensors.rate_hz)
+        self.table: ChannelTable = rig_table().only(sensors.groups, sensors.rate_hz)
         self._conditioner = Conditioner(
             tuple(self.table.groups.values()),
             row_rate_hz=TICK_RATE_HZ // self.row_ticks,
@@ -220,7 +221,7 @@ class Simulation:
         Raises:
             InputError: Unknown, malformed, out of range, or not possible now.
         """
-        command = parse_command(name, request)
+        command = check_command(name, request)
         waiting = [other for tick, other in self._pending if tick <= self.tick]
         if isinstance(command, HammerCommand):
             busy_until = self._blow[2] if self._blow is not None else 0

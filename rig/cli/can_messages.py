@@ -18,7 +18,9 @@ def dbc(
 ) -> None:
     """Show the DBC of the rig's messages, made from the channel table, or write it to a file."""
     from drivers.can.dbc import text
+    from rig.scenes import rig_table
 
+    rig_table()
     if out is None:
         echo(text(), nl=False)
         return
@@ -36,7 +38,9 @@ def load(
 ) -> None:
     """Show every message of the rig with its period, share of the bus and longest response time."""
     from rig.cli.tables import new_table, table_console
+    from rig.scenes import rig_table
 
+    rig_table()
     schedule, speed = plan(classic=classic, fd=fd, rate_hz=rate, bitrate=bitrate)
     table = new_table(f"CAN at {speed}, every frame at its longest")
     for name in (

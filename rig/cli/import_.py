@@ -42,6 +42,9 @@ def import_(
     """
     if (template is None) == (mapping is None):
         raise InputError("import", "given either --mapping or --template", "both" if mapping else "neither")
+    from rig.scenes import rig_table
+
+    rig_table()
     if template is not None:
         if output is not None:
             raise InputError("--output", "left out with --template", str(output))
