@@ -338,8 +338,9 @@ def test_a_refusal_names_the_field_and_what_it_must_be_for_programs_too() -> Non
 def test_what_latecomers_are_told_of_the_commands_is_bounded_in_bytes() -> None:
     simulation = FakeSimulation(duration_s=None)
     with Running(simulation, Lockstep()) as rig:
+        request = wire.encode_document({"force_n": 1.0, "padding": "x" * 9_900})
         for _ in range(60):
-            rig.console._command("hammer", force_n=1.0, padding="x" * 9_900)
+            assert b'"accepted":true' in rig.listener.client.request(wire.command_key("hammer"), request)
         payload = rig.listener.client.request(wire.SCENE)
         scene = wire.decode_document(payload)
         assert len(payload) < 600_000
