@@ -16,9 +16,10 @@ from rig import wire
 from rig.errors import InputError, RefusedError
 from rig.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
 from rig.service import Service
+from rig.simulation import Frame
 from rig.transport import NoReplyError
 from rig.transport.memory import MemoryClient, MemoryServer
-from tests.unit.service_fake import GROUPS, TRUTH, FakeFrame, FakeSimulation
+from tests.unit.service_fake import GROUPS, TRUTH, FakeSimulation
 
 BLOCK = 10_000
 
@@ -337,8 +338,9 @@ def test_a_refusal_names_the_field_and_what_it_must_be_for_programs_too() -> Non
 def test_what_latecomers_are_told_of_the_commands_is_bounded_in_bytes() -> None:
     simulation = FakeSimulation(duration_s=None)
     with Running(simulation, Lockstep()) as rig:
+        request = wire.encode_document({"force_n": 1.0, "padding": "x" * 9_900})
         for _ in range(60):
-            rig.console._command("hammer", force_n=1.0, padding="x" * 9_900)
+            assert b'"accepted":true' in rig.listener.client.request(wire.command_key("hammer"), request)
         payload = rig.listener.client.request(wire.SCENE)
         scene = wire.decode_document(payload)
         assert len(payload) < 600_000
@@ -377,9 +379,9 @@ def test_a_paced_run_drops_whole_blocks_and_counts_them_while_it_keeps_every_eve
         now[0] += round(seconds * 1e9)
 
     class Noted(FakeSimulation):
-        def advance(self, ticks: int) -> FakeFrame:
+        def advance(self, ticks: int) -> Frame:
             frame = super().advance(ticks)
-            frame.events = [{"event": "hammer", "tick": frame.tick, "time_s": 0.0}]
+            frame.events.append({"event": "hammer", "tick": frame.tick, "time_s": 0.0})
             if self.tick >= 1_000_000:
                 server.open.set()
             return frame
