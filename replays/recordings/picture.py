@@ -9,7 +9,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.verdict import hammer_time_s
-from replays.recordings.whirl import parameter_si, whirl_figures
+from replays.recordings.whirl import parameter_si, reactions, whirl_figures
 from replays.report.canvas import new_figure, save
 from rig.orbit import SPECTRUM_HZ, full_spectrum, waterfall
 
@@ -20,16 +20,16 @@ def draw(recording: Recording, path: Path) -> None:
     """Draw the picture and write it as PNG or SVG.
 
     Raises:
-        InputError: There is no hammer blow in the recording, or the file is neither .png nor .svg.
+        InputError: There is no hammer pulse in the recording, or the file is neither .png nor .svg.
     """
     probes, forces, drive = recording.samples("probes"), recording.samples("forces"), recording.samples("drive")
-    blow_s = hammer_time_s(recording)
+    hammer_s = hammer_time_s(recording)
     end_s = float(probes.times_s[-1])
-    figures = whirl_figures(recording, max(blow_s + 0.5, end_s - 2.0), end_s)
+    figures = whirl_figures(recording, max(hammer_s + 0.5, end_s - 2.0), end_s)
     scene, parameters = recording.scene["name"], recording.parameters["set"]
     figure = new_figure(
         (15.0, 10.0),
-        f"Virtual rotor-stator rig: scene {scene}, parameters {parameters}, hammer at {blow_s:.2f} s; "
+        f"Virtual rotor-stator rig: scene {scene}, parameters {parameters}, hammer at {hammer_s:.2f} s; "
         f"whirl {figures.frequency_hz:.2f} Hz at {figures.spin_hz:.3f} Hz spin (from the recorded samples)",
         title_size=13,
     )
@@ -46,9 +46,9 @@ def draw(recording: Recording, path: Path) -> None:
     )
     ax.plot(reach * np.cos(circle), reach * np.sin(circle), "k--", lw=1, label="clearance at rest")
     for label, color, low, high in (
-        ("impacts", _IMPACTS, blow_s, blow_s + 0.06),
+        ("impacts", _IMPACTS, hammer_s, hammer_s + 0.06),
         ("whirl", _WHIRL, end_s - 0.2, end_s),
-        ("before", _BEFORE, blow_s - 0.5, blow_s),
+        ("before", _BEFORE, hammer_s - 0.5, hammer_s),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
         ax.plot(probes.column("disk_x")[kept], probes.column("disk_y")[kept], color=color, lw=0.8, label=label)
@@ -58,7 +58,7 @@ def draw(recording: Recording, path: Path) -> None:
     # Displacement, whole run and first impacts.
     for ax, low, high, title in (
         (axes[0, 1], probes.times_s[0], end_s, "Displacement at the disk"),
-        (axes[0, 2], blow_s - 0.01, blow_s + 0.12, "First impacts"),
+        (axes[0, 2], hammer_s - 0.01, hammer_s + 0.12, "First impacts"),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
         # Over the whole run a whirl is a band: both must show through.
@@ -70,15 +70,14 @@ def draw(recording: Recording, path: Path) -> None:
 
     ax = axes[1, 0]
     ax.plot(drive.times_s[::20], drive.column("speed")[::20], color=_WHIRL, lw=0.8)
-    ax.axvline(blow_s, color="0.5", lw=0.8, ls=":")
+    ax.axvline(hammer_s, color="0.5", lw=0.8, ls=":")
     ax.set(title="Spin speed", xlabel="time [s]", ylabel="[Hz]", xlim=(drive.times_s[0], end_s))
     ax.set_ylim(bottom=0, top=1.1 * float(drive.column("speed").max()))
 
-    pair_x = forces.column("P_E") - forces.column("P_W")
-    pair_y = forces.column("P_N") - forces.column("P_S")
+    pair_x, pair_y = reactions(forces)
     for ax, low, high, title in (
         (axes[1, 1], forces.times_s[0], end_s, "Reactions"),
-        (axes[1, 2], blow_s - 0.01, blow_s + 0.12, "Reactions, first impacts"),
+        (axes[1, 2], hammer_s - 0.01, hammer_s + 0.12, "Reactions, first impacts"),
         (axes[2, 0], end_s - 0.05, end_s, "Reactions, settled whirl"),
     ):
         kept = (forces.times_s >= low) & (forces.times_s < high)
@@ -103,6 +102,6 @@ def draw(recording: Recording, path: Path) -> None:
     level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
     mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
     figure.colorbar(mesh, ax=ax, label="[dB re 1 um]")
-    ax.axhline(blow_s, color="w", lw=0.8, ls=":")
+    ax.axhline(hammer_s, color="w", lw=0.8, ls=":")
     ax.set(title="Full-spectrum waterfall", xlabel="backward  -  frequency [Hz]  -  forward", ylabel="time [s]")
     save(figure, path)

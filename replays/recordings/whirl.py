@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recorder.reader import Recording
+from recorder.samples import Samples
 from rig.errors import InputError
 from rig.orbit import whirl_frequency
 
@@ -61,7 +62,7 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
     radius = float(np.hypot(ring_x, ring_y).mean())
     law = -spin * shaft_radius_m(recording) / radius
     held = (forces.times_s >= from_s) & (forces.times_s < to_s)
-    pairs = [forces.column(a)[held] - forces.column(b)[held] for a, b in (("P_E", "P_W"), ("P_N", "P_S"))]
+    pairs = [reaction[held] for reaction in reactions(forces)]
     return WhirlFigures(
         from_s=from_s,
         to_s=to_s,
@@ -74,6 +75,11 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
         reaction_x_n=float(np.ptp(pairs[0]) / 2),
         reaction_y_n=float(np.ptp(pairs[1]) / 2),
     )
+
+
+def reactions(forces: Samples) -> tuple[np.ndarray, np.ndarray]:
+    """What opposed transducers differ by: P_E - P_W and P_N - P_S [N], each shape (n,)."""
+    return forces.column("P_E") - forces.column("P_W"), forces.column("P_N") - forces.column("P_S")
 
 
 def parameter_si(recording: Recording, key: str) -> float:

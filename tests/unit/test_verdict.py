@@ -200,10 +200,10 @@ def test_what_the_rig_said_of_itself_counts(
     assert len(verdict.rows) == len(judge(good).rows) + 3
 
 
-def test_a_recording_without_a_blow_is_refused(tmp_path: Path) -> None:
+def test_a_recording_without_a_hammer_pulse_is_refused(tmp_path: Path) -> None:
     quiet = simulated(tmp_path / "quiet.mcap", "stable-run", duration_s=0.2)
     for use in (hammer_time_s, judge, lambda recording: draw(recording, tmp_path / "quiet.png")):
-        with pytest.raises(InputError, match=r"^recording must be one with a hammer blow in it"):
+        with pytest.raises(InputError, match=r"^recording must be one with a hammer pulse in it"):
             use(quiet)
     assert not (tmp_path / "quiet.png").exists()
 
@@ -221,7 +221,7 @@ def test_a_recording_without_the_instruments_is_refused(tmp_path: Path, groups: 
         judge(simulated(tmp_path / "few.mcap", sensors__groups=groups, duration_s=0.1))
 
 
-def test_a_blow_that_dies_out_is_not_good(tmp_path: Path) -> None:
+def test_a_hammer_pulse_that_dies_out_is_not_good(tmp_path: Path) -> None:
     command = '[{ at_s = 0.02, command = "hammer", duration_ms = 2.0 }]'
     verdict = judge(simulated(tmp_path / "weak.mcap", commands=command))
     assert bad(verdict) >= {"whirl frequency, ring probes", "orbit in the ring"}
