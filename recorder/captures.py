@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from recorder.commands import Commands
 from recorder.counts import NS
-from recorder.draft import check_destination, files_like, remove
-from recorder.head import Beginning
+from recorder.draft import files_like, remove
+from recorder.head import Beginning, Commands
 from recorder.payload import Payload
-from recorder.room import Limits, check_room
+from recorder.room import Limits, check_files
 from recorder.sink import Needs, Sink
 from recorder.trigger import Capture, Crossings, Trigger
 from recorder.writer import RecordingError, RecordingWriter
@@ -30,6 +29,7 @@ _LATE_NS = NS // 2
 need for an event that comes after its blocks [ns of simulated time]."""
 _FAR_NS = 60 * NS
 """An event that names a later time, or one that the ring no longer holds, counts as one of now [ns]."""
+_NUMBERED = r"\w+-\d{3,}"
 _MOST_FIRED = 1000
 """Triggers that a file lists; more are only counted."""
 
@@ -40,20 +40,9 @@ def capture_path(path: Path, trigger: Trigger, number: int) -> Path:
 
 
 def check_captures(path: Path, capture: Capture, limits: Limits, *, force: bool = False) -> None:
-    """Refuse names that cannot become the files of captures.
-
-    Raises:
-        InputError: As `check_destination`, a file of an earlier capture is there, or the disk has too little room.
-    """
-    for name in {trigger.name: trigger for trigger in capture.triggers}.values():
-        check_destination(capture_path(path, name, 1), force=force)
-    if not force and (taken := _captures_of(path)):
-        raise InputError("output", "new files (--force replaces them)", f"{taken[0]}, which exists")
-    check_room(path, limits)
-
-
-def _captures_of(path: Path) -> list[Path]:
-    return files_like(path, r"\w+-\d{3,}")
+    """Refuse names that cannot become the files of captures, as `check_files` does."""
+    names = {trigger.name: capture_path(path, trigger, 1) for trigger in capture.triggers}
+    check_files(path, names.values(), _NUMBERED, limits, force=force)
 
 
 class _Held(NamedTuple):
@@ -100,7 +89,7 @@ class Captures(Sink):
         check_captures(path, capture, needs.limits, force=needs.force)
         self._crossings = {each: Crossings(each, needs.table) for each in capture.triggers if each.level is not None}
         if needs.force:
-            remove(_captures_of(path))
+            remove(files_like(path, _NUMBERED))
         super().__init__(path, needs)
         self.fired = 0
         self._capture = capture

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -195,14 +194,8 @@ class SeriesPart(_Text):
     number: Count
 
 
-@dataclass(frozen=True)
-class Kind:
-    """What the documents of a topic are.
-
-    Attributes:
-        model: What is read of them.
-        definition: What the file says of their form.
-    """
+class Kind(NamedTuple):
+    """The documents of a topic: what is read of them, and what the file says of their form."""
 
     model: type[BaseModel]
     definition: schemas.Definition

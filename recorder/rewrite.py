@@ -18,10 +18,9 @@ from typing import Any, Literal
 import numpy as np
 
 from recorder import documents, schemas
-from recorder.commands import Commands
 from recorder.counts import Counts
 from recorder.draft import check_destination
-from recorder.head import Beginning
+from recorder.head import Beginning, Commands
 from recorder.payload import Payload, tick_in
 from recorder.reader import Recording
 from recorder.records import COPY
@@ -163,7 +162,7 @@ def cut(
     check_not_among([part.path for part in recording.parts], output)
     catalogue, columns = _narrowed(recording, channels, only)
     tick_rate_hz = recording.catalogue["tick_rate_hz"]
-    from_tick, to_tick = (_tick(at_s, tick_rate_hz) for at_s in (from_s, to_s))
+    from_tick, to_tick = (at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz)) for at_s in (from_s, to_s))
     commands = Commands(recording.scene)
     for event in recording.events:
         tick = tick_in(event)
@@ -288,10 +287,6 @@ def _unlocked(path: Path) -> Iterator[None]:
         if error.filename != str(path):
             raise
         raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
-
-
-def _tick(at_s: float, tick_rate_hz: float) -> float:
-    return at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz))
 
 
 def _overlaps(recording: Recording, key: str, from_s: float, to_s: float) -> bool:

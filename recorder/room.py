@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from recorder.draft import check_destination, files_like
 from recorder.writer import RecordingWriter
 from rig.errors import InputError
 
@@ -62,12 +63,23 @@ class Limits:
         return self.rotate_mb is not None or self.rotate_s is not None
 
 
-def check_room(path: Path, limits: Limits) -> None:
-    """Refuse to begin on a disk that has too little room.
+def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, *, force: bool) -> None:
+    """Refuse names that cannot become the files of a recording; remove nothing.
+
+    Args:
+        path: Name of the recording.
+        first: Names of the first file, or of what may become it.
+        others: Expression that its numbered files look like (`files_like`); empty if there are none.
+        limits: What they may take of the disk.
+        force: Existing files may be replaced.
 
     Raises:
-        InputError: It has.
+        InputError: As `check_destination`; there are such files; or the disk has too little room to begin with.
     """
+    for name in first:
+        check_destination(name, force=force)
+    if others and not force and (taken := files_like(path, others)):
+        raise InputError("output", "new files (--force replaces them)", f"{taken[0]}, which exists")
     if why := _lack_of_room(path.parent, limits.keep_free_mb):
         raise InputError("output", f"on a disk with room: {why} (--keep-free-mb)", str(path))
 

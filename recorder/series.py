@@ -13,16 +13,17 @@ import time
 from pathlib import Path
 
 from recorder.counts import NS, Counts
-from recorder.draft import check_destination, files_like, remove
+from recorder.draft import files_like, remove
 from recorder.head import Beginning
 from recorder.payload import Payload
-from recorder.room import MB, Limits, check_room
+from recorder.room import MB, Limits, check_files
 from recorder.sink import Needs, Sink
 from recorder.writer import RecordingError, RecordingWriter
 from rig.errors import InputError
 from rig.wire import EDGES, EVENTS
 
 MOST_PARTS = 1_000_000
+_NUMBER = r"\d{4,}"
 _BEHIND_NS = NS
 """Simulated time by which streams may be apart at a seam: more, and one of them is still catching up [ns]."""
 _CATCH_UP_S = 5.0
@@ -35,19 +36,9 @@ def part_path(path: Path, number: int) -> Path:
 
 
 def check_series(path: Path, limits: Limits, *, force: bool = False) -> None:
-    """Refuse names that cannot become the files of a recording; remove nothing.
-
-    Raises:
-        InputError: As `check_destination`, for any part; or the disk has too little room to begin with.
-    """
-    check_destination(part_path(path, 0) if limits.rotates else path, force=force)
-    if limits.rotates and not force and (taken := _parts_of(path)):
-        raise InputError("output", "new files (--force replaces them)", f"{taken[0]}, which exists")
-    check_room(path, limits)
-
-
-def _parts_of(path: Path) -> list[Path]:
-    return files_like(path, r"\d{4,}")
+    """Refuse names that cannot become the files of a recording, as `check_files` does."""
+    rotates = limits.rotates
+    check_files(path, [part_path(path, 0) if rotates else path], _NUMBER if rotates else "", limits, force=force)
 
 
 class Series(Sink):
@@ -73,7 +64,7 @@ class Series(Sink):
         self._full_s: float | None = None
         self._series = f"{path.stem} {time.time_ns():x}"
         if needs.force and rotates:
-            remove(_parts_of(path))
+            remove(files_like(path, _NUMBER))
         self._file = self._writer = self._open(part_path(path, 0) if rotates else path, from_start=from_start)
         self._expected = set(self._file.head.streams)
 

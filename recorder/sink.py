@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recorder.commands import Commands
 from recorder.counts import Counts, Tally
-from recorder.head import Beginning
+from recorder.head import Beginning, Commands
 from recorder.payload import Payload
 from recorder.room import Limits, Room
 from recorder.writer import RecordingWriter

@@ -61,7 +61,7 @@ def series_of(group: Group) -> list[Curves]:
             path=f"{ROOT}/{group.name}/{plane}",
             labels=tuple(f"{group.channels[column].name} [{group.channels[column].unit}]" for column in columns),
             colors=tuple(_color_of(group.channels[column].name) for column in columns),
-            select=_take(columns),
+            select=lambda values, columns=columns: values[:, columns],
         )
         for plane, columns in planes.items()
     ]
@@ -93,10 +93,6 @@ def reaction_of(group: Group) -> Callable[[np.ndarray], np.ndarray]:
     """From rows of the force group to the reaction of each direction [N], shape (n, 2): the pairs' differences."""
     east, west, north, south = (group.names.index(name) for name in ("P_E", "P_W", "P_N", "P_S"))
     return lambda values: np.stack((values[:, east] - values[:, west], values[:, north] - values[:, south]), axis=1)
-
-
-def _take(columns: list[int]) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda values: values[:, columns]
 
 
 class Envelope:
