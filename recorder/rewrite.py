@@ -190,7 +190,8 @@ def cut(
         "only": only or "",
         "channels": json.dumps(channels),
     }
-    if not any(_overlaps(recording, key, from_s, to_s) for key in columns):
+    streams = [stream for key, stream in recording.streams.items() if key in columns and stream.rows]
+    if not any(stream.first_time_s < to_s and stream.last_time_s >= from_s for stream in streams):
         raise InputError("from and to", "times that the recording holds", f"{from_s:g} to {to_s:g} s")
     counts = _write(
         recording,
@@ -287,11 +288,6 @@ def _unlocked(path: Path) -> Iterator[None]:
         if error.filename != str(path):
             raise
         raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
-
-
-def _overlaps(recording: Recording, key: str, from_s: float, to_s: float) -> bool:
-    stream = recording.streams.get(key)
-    return stream is not None and stream.rows > 0 and stream.first_time_s < to_s and stream.last_time_s >= from_s
 
 
 def _narrowed(

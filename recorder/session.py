@@ -52,6 +52,40 @@ _DOCUMENTS_BYTES = 64 << 20
 """What documents may take of memory when blocks find no more room."""
 
 
+class _Extent:
+    """The simulated time to record, from the first block of each stream on."""
+
+    def __init__(self, duration_s: float | None, promised: Catalogue, monotonic_s: Callable[[], float]) -> None:
+        self._duration_ns = math.inf if duration_s is None else duration_s * NS
+        self._tick_rate_hz = round(promised.tick_rate_hz)
+        self._streams = {*map(wire.sensor_key, promised.table.groups), *map(wire.truth_key, promised.truth)}
+        self._monotonic_s = monotonic_s
+        self._begin_ns: dict[str, int] = {}
+        self._within_s = 0.0
+        self._beyond: set[str] = set()
+        """Streams that have come to the end of the time to record."""
+
+    def takes(self, payload: Payload) -> bool:
+        """Whether a payload is of the time to record; only what is a block can be of a later one."""
+        key, block = payload.key, payload.block
+        if math.isinf(self._duration_ns) or block is None:
+            return True
+        start_ns = block.tick * NS // self._tick_rate_hz
+        begin_ns = self._begin_ns.setdefault(key, start_ns)
+        first_ns = min(self._begin_ns.values())
+        if key == wire.EDGES or begin_ns - first_ns > _ROUND_NS:
+            begin_ns = first_ns
+        if start_ns < begin_ns + self._duration_ns:
+            self._within_s = self._monotonic_s()
+            return True
+        self._beyond.add(key)
+        return False
+
+    def over(self, now_s: float) -> bool:
+        """Whether all streams have come to its end, or those that have not are not heard of any more."""
+        return bool(self._beyond) and (self._beyond >= self._streams or now_s - self._within_s > RECOVERY_S)
+
+
 class RecordingSession:
     """Records what a rig publishes until the stream ends, somebody stops it, or the rig or the disk is gone.
 
@@ -120,7 +154,7 @@ class RecordingSession:
         self.path = path
         self._client = client
         self._reporter = Reporter(client, name)
-        self._duration_ns = math.inf if duration_s is None else duration_s * NS
+        self._duration_s = duration_s
         self._view_rate_hz = view_rate_hz
         self._history = history
         self._wait_s = wait_s
@@ -146,11 +180,6 @@ class RecordingSession:
         self._replaced = False
         self._remarks: list[str] = []
         self._heard_s = 0.0
-        self._streams: set[str] = set()
-        self._beyond: set[str] = set()
-        """Streams that have come to the end of the time to record."""
-        self._begin_ns: dict[str, int] = {}
-        self._within_s = 0.0
         self._failure: BaseException | None = None
 
     def stop(self, reason: str = "stopped") -> None:
@@ -182,9 +211,8 @@ class RecordingSession:
         self._rig = self._client.rig
         writer = self._open_sink(promised, catalogue, parameters, scene)
         self._intake = Intake(promised)
-        self._tick_rate_hz = round(promised.tick_rate_hz)
+        self._extent = _Extent(self._duration_s, promised, self._monotonic_s)
         self._table = promised.table
-        self._streams = {*map(wire.sensor_key, promised.table.groups), *map(wire.truth_key, promised.truth)}
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
         thread.start()
         reason = "failed"
@@ -278,7 +306,7 @@ class RecordingSession:
             while not self._inbox.ended:
                 for item in self._inbox.take_many(_PORTION, 0.1):
                     payload = Payload.read(*item)
-                    if not self._is_in_time(payload):
+                    if not self._extent.takes(payload):
                         continue
                     writer.take(payload)
                     self._follow(payload)
@@ -293,22 +321,6 @@ class RecordingSession:
             self._failure = error
             self._inbox.close()
             self._wake.set()
-
-    def _is_in_time(self, payload: Payload) -> bool:
-        """Whether a payload is of the time to record; only what is a block can be of a later one."""
-        key, block = payload.key, payload.block
-        if math.isinf(self._duration_ns) or block is None:
-            return True
-        start_ns = block.tick * NS // self._tick_rate_hz
-        begin_ns = self._begin_ns.setdefault(key, start_ns)
-        first_ns = min(self._begin_ns.values())
-        if key == wire.EDGES or begin_ns - first_ns > _ROUND_NS:
-            begin_ns = first_ns
-        if start_ns < begin_ns + self._duration_ns:
-            self._within_s = self._monotonic_s()
-            return True
-        self._beyond.add(key)
-        return False
 
     def _follow(self, payload: Payload) -> None:
         document = payload.document or {}
@@ -334,7 +346,7 @@ class RecordingSession:
                 return self._stop_reason
             if writer.ended:
                 return writer.ended
-            if self._beyond and (self._beyond >= self._streams or now_s - self._within_s > RECOVERY_S):
+            if self._extent.over(now_s):
                 return "duration reached"
             gone = self._replaced or (self._rig_lost and now_s - self._lost_s > self._patience_s)
             if ended_s is None and (self._end_reason or gone):
@@ -400,7 +412,7 @@ class RecordingSession:
                 writer.write_missed(*self._misses.popleft())
             for each in self._intake.rest(self._end_rows) if not self._replaced and self._failure is None else ():
                 payload = Payload.read(each.key, each.payload, each.wall_ns)
-                if self._is_in_time(payload):
+                if self._extent.takes(payload):
                     writer.take(payload)
             if reason == self._end_reason and self._end_rows:
                 writer.note_short(self._end_rows, self._wall_ns())

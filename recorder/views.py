@@ -94,7 +94,6 @@ class View:
             tick: Tick of the block that the rows are from.
             times_ns: Simulated time of each row [ns], shape (n,).
             values: Engineering values, shape (n, channels of the group).
-
         """
         self._waiting.setdefault(tick, {})[group.name] = (times_ns, values)
         if len(self._waiting[tick]) == len(self.groups):
