@@ -21,7 +21,6 @@ from replays.recordings.formats.export import check_output
 from rig import wire
 from rig.errors import whole_file
 from rig.kernels.signals import ROW
-from rig.service import blocks_of
 from rig.simulation import Frame, Simulation
 
 SUFFIXES = (".mcap", ".parquet", ".csv")
@@ -137,6 +136,7 @@ class McapRun:
         self._background = Background()
 
     def __enter__(self) -> Self:
+        from recorder.head import Beginning
         from recorder.writer import RecordingWriter
 
         epoch_ns = self._epoch_ns
@@ -148,7 +148,7 @@ class McapRun:
             parameters=simulation.parameters_document(),
             scene=simulation.scene_document(),
             view_rate_hz=self._view_rate_hz,
-            from_start=True,
+            beginning=Beginning(from_start=True),
             force=self._force,
             wall_ns=time.time_ns if epoch_ns is None else lambda: epoch_ns,
             monotonic_s=time.monotonic if epoch_ns is None else lambda: 0.0,
@@ -178,7 +178,7 @@ class McapRun:
     def _write(self, frame: Frame) -> None:
         for event in frame.events:
             self._event(event)
-        for key, block in blocks_of(frame):
+        for key, block in frame.blocks():
             self._writer.write(key, wire.encode_block(block), self._wall(frame.tick))
             self._rows.follow(key, block.index, len(block.values))
 

@@ -20,8 +20,8 @@ from rig.cli.options import (
     names_of,
     pairs,
 )
-from rig.cli.progress import reporting
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.progress import reporting, tell_of_compiling
+from rig.cli.tables import echo, echo_json, new_table, table_console
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
@@ -77,8 +77,6 @@ def identify(
     force: Force = False,
 ) -> None:
     """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell."""
-    import json
-
     from recorder.reader import join
     from replays.recordings.identification import ask
     from replays.recordings.identification import identify as run
@@ -86,7 +84,6 @@ def identify(
     from replays.recordings.identification.nuisance import asked_along, check_begin, is_imported, shortly_before, turned
     from replays.recordings.identification.summary import report_of
     from replays.report import check_report
-    from rig.kernels import COMPILE_NOTICE, compiled_before
 
     if output is not None:
         check_set(output, force=force)
@@ -116,8 +113,7 @@ def identify(
         channels=names_of(channels) or None,
         window=(from_s, to_s),
     )
-    if not compiled_before():
-        echo(COMPILE_NOTICE, err=True)
+    tell_of_compiling()
     with reporting() as reporter:
         found = run(question, precision=precision, spread=spread, robust=robust, whole=whole, progress=reporter.step)
     if output is not None:
@@ -125,7 +121,7 @@ def identify(
     if report is not None:
         report_of(found, recording=name).write(report)
     if json_output:
-        echo(json.dumps(identification_document(found, recording=name), indent=2, allow_nan=False))
+        echo_json(identification_document(found, recording=name))
         return
     _show(found, name)
     if along:
@@ -170,18 +166,16 @@ def _show(found: Identification, name: str) -> None:
     from replays.recordings.identification.summary import HEADINGS, cells, fit_line, spread_line, window_line
 
     console = table_console(width=200, highlight=False)
-    table = new_table(f"{name}: what it tells")
-    for heading in HEADINGS:
-        table.add_column(Text(heading), justify="right" if heading in ("start", "result", "95 % interval") else "left")
+    numbers = ("start", "result", "95 % interval")
+    headings = (f">{heading}" if heading in numbers else heading for heading in HEADINGS)
+    table = new_table(f"{name}: what it tells", *headings)
     for finding in found.judgement.findings:
         good = finding.standing == "identified"
         table.add_row(*(Text(cell) for cell in cells(finding)), style=None if good else "yellow")
     console.print(table)
     keys = found.question.keys
     if len(keys) > 1:
-        table = new_table("correlation")
-        for key in ("", *keys):
-            table.add_column(key, justify="right" if key else "left")
+        table = new_table("correlation", "", *(f">{key}" for key in keys))
         for key, row in zip(keys, found.judgement.correlation, strict=True):
             table.add_row(key, *("-" if value != value else f"{value:+.4f}" for value in row))
         console.print()

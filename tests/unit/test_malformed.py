@@ -415,7 +415,7 @@ def test_command_is_refused_and_changes_nothing(
     assert line.startswith(field)
     assert f" must be {must}" in line
     assert "\n" not in line
-    assert not simulation._pending, "a refused command is not kept"
+    assert simulation.advance(simulation.block_ticks).events == [], "a refused command is not kept"
 
 
 def test_commands_that_are_not_possible_now_are_refused() -> None:

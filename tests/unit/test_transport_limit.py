@@ -53,4 +53,4 @@ def test_one_sender_does_not_shut_out_another_and_made_up_names_meet_the_common_
     assert sum(let_through(limit, f"name {n}", 10) for n in range(1000)) == 200
     clock.now_s = 101.0
     assert sum(let_through(limit, f"name {n}", 10) for n in range(1000, 2000)) == 80
-    assert len(limit._senders) <= 64
+    assert len(limit.senders) <= 64
