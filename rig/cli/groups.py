@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import wraps
 from typing import Any, get_type_hints
 
@@ -41,8 +41,9 @@ def _fields(group: Any) -> list[inspect.Parameter]:
         if is_dataclass(hint):
             found += _fields(hint)
         else:
+            default = inspect.Parameter.empty if field.default is MISSING else field.default
             keyword = inspect.Parameter.KEYWORD_ONLY
-            found.append(inspect.Parameter(field.name, keyword, default=field.default, annotation=hint))
+            found.append(inspect.Parameter(field.name, keyword, default=default, annotation=hint))
     return found
 
 
