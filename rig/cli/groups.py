@@ -8,6 +8,13 @@ from dataclasses import MISSING, fields, is_dataclass
 from functools import wraps
 from typing import Any, get_type_hints
 
+import typer
+
+
+def panel(title: str) -> Callable[..., Any]:
+    """What makes options under a heading of the help, of what they say, their names, and further settings."""
+    return lambda says, *names, **settings: typer.Option(*names, help=says, rich_help_panel=title, **settings)
+
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
     """A command with the fields of its groups, and of groups in these, in the place of the groups.

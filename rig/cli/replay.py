@@ -11,6 +11,7 @@ import typer
 from rig.cli.can_output import CanOptions
 from rig.cli.connection import Serving, serve
 from rig.cli.display import all_lateness, lateness
+from rig.cli.groups import panel
 from rig.cli.options import Channels, FromS, RecordingFiles, ToS, names_of, pairs
 from rig.cli.tables import echo
 from rig.errors import InputError
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from replays.player.tape import Tape
     from rig.transport import Server
 
-_PART, _CHANGE = "What is played", "What is changed"
+_part, _change = panel("What is played"), panel("What is changed")
 
 
 class Spacing(StrEnum):
@@ -51,29 +52,16 @@ class Played:
 
     from_s: FromS = None
     to_s: ToS = None
-    start_s: Annotated[
-        float | None,
-        typer.Option("--start", metavar="S", help="Where the first pass begins, in s.", rich_help_panel=_PART),
-    ] = None
-    loop: Annotated[
-        int, typer.Option(metavar="N", help="Passes through it; 0: endless.", rich_help_panel=_PART, min=0)
-    ] = 1
-    pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for `rig resume`, or `rig step`.", rich_help_panel=_PART)
-    ] = False
+    start_s: Annotated[float | None, _part("Where the first pass begins, in s.", "--start", metavar="S")] = None
+    loop: Annotated[int, _part("Passes through it; 0: endless.", metavar="N", min=0)] = 1
+    pause: Annotated[bool, _part("Wait for `rig resume`, or `rig step`.", "--pause")] = False
     wait_for: Annotated[
         int,
-        typer.Option(
-            "--wait-for",
-            metavar="N",
-            help="Begin once N clients listen (recorders, DAQs, viewers), so that they get all of it.",
-            rich_help_panel=_PART,
-            min=0,
+        _part(
+            "Begin once N clients listen (recorders, DAQs, viewers), so that they get all of it.", metavar="N", min=0
         ),
     ] = 0
-    wait_s: Annotated[
-        float, typer.Option(metavar="S", help="Fail where they are not there after S s.", rich_help_panel=_PART)
-    ] = 60.0
+    wait_s: Annotated[float, _part("Fail where they are not there after S s.", metavar="S")] = 60.0
 
     def part(self) -> Part:
         """Which part of the recording, and how often."""
@@ -87,26 +75,16 @@ class Changed:
     """What is changed between the recording and the wire."""
 
     time: Annotated[
-        Numbers,
-        typer.Option(
-            help="Ticks and row numbers as recorded, or new ones that run on through loops and seeks.",
-            rich_help_panel=_CHANGE,
-        ),
+        Numbers, _change("Ticks and row numbers as recorded, or new ones that run on through loops and seeks.")
     ] = Numbers.ORIGINAL
-    only: Annotated[
-        Only | None, typer.Option(help="Leave out what no instrument could know.", rich_help_panel=_CHANGE)
-    ] = None
+    only: Annotated[Only | None, _change("Leave out what no instrument could know.")] = None
     remap: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KEY=KEY", help="The same payloads on another key; may be repeated.", rich_help_panel=_CHANGE
-        ),
+        list[str] | None, _change("The same payloads on another key; may be repeated.", metavar="KEY=KEY")
     ] = None
     channels: Channels = None
-    rename: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=NAME", help="Another name for a channel, as if wired so.", rich_help_panel=_CHANGE),
-    ] = None
+    rename: Annotated[list[str] | None, _change("Another name for a channel, as if wired so.", metavar="NAME=NAME")] = (
+        None
+    )
 
     def edit(self, tape: Tape) -> Edit:
         """Which payloads go out, on which key, and which columns they have.
