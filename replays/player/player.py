@@ -324,8 +324,9 @@ class Player(ServedRun):
             self._outlet.tell(self._event("start", self._tick, **about))
         self._begun = True
 
-    def _end(self, reason: str) -> None:
+    def _end(self, reason: str) -> dict[str, Any]:
         """End the stream: as it was recorded, where that belongs to what was played."""
+        self._desk.close(f"a run that ended: {reason}", [] if self._step is None else [self._step.reply])
         self._playhead.hold(self._playhead.play_ns)
         if self._ahead is not None:
             self._ahead.close()
@@ -337,18 +338,9 @@ class Player(ServedRun):
             self._outlet.tell(self._event("end", self._tick, reason=reason))
         if completed:
             self._outlet.end_status()
-
-    def _unanswered(self) -> list[Pending]:
-        return [] if self._step is None else [self._step.reply]
-
-    def _counts(self) -> dict[str, Any]:
-        return {
-            "replay": self.status()["replay"],
-            "played_s": self._playhead.play_ns / NS,
-            "blocks": self._outlet.blocks,
-            "rows": self._outlet.rows,
-            "left_out": self._outlet.left_out,
-        }
+        out = self._outlet
+        counts = {"blocks": out.blocks, "rows": out.rows, "left_out": out.left_out}
+        return {"played_s": self._playhead.play_ns / NS, **counts}
 
     # Commands.
 
