@@ -423,7 +423,7 @@ def test_commands_that_are_not_possible_now_are_refused() -> None:
     simulation.submit("hammer", {"duration_ms": 5.0})
     simulation.submit("release", {})
     simulation.advance(500)
-    with pytest.raises(InputError, match=r"^hammer must be idle \(it is in a blow until 0\.005000 s\)"):
+    with pytest.raises(InputError, match=r"^hammer must be idle \(it is in a pulse until 0\.005000 s\)"):
         simulation.submit("hammer", {})
     with pytest.raises(InputError, match=r"^release must be given once"):
         simulation.submit("release", {})
