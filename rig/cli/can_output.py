@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+from rig.cli.groups import panel
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,33 +22,19 @@ if TYPE_CHECKING:
     from rig.cli.can_outlets import CanOutlets
     from rig.transport import Server
 
-_PANEL = "CAN"
+_can = panel("CAN")
 
 
 @dataclass(frozen=True)
 class CanMessages:
     """Which frames carry the samples, how often, at which bit rates."""
 
-    can_rate: Annotated[
-        int | None,
-        typer.Option(
-            "--can-rate", metavar="HZ", help="Rate of samples: usually 1000 classic, 10000 FD.", rich_help_panel=_PANEL
-        ),
-    ] = None
-    can_classic: Annotated[
-        bool, typer.Option("--can-classic", help="Samples in classic frames; so by default.", rich_help_panel=_PANEL)
-    ] = False
-    can_fd: Annotated[
-        bool, typer.Option("--can-fd", help="Samples in CAN FD frames, counts as recorded.", rich_help_panel=_PANEL)
-    ] = False
+    can_rate: Annotated[int | None, _can("Rate of samples: usually 1000 classic, 10000 FD.", metavar="HZ")] = None
+    can_classic: Annotated[bool, _can("Samples in classic frames; so by default.", "--can-classic")] = False
+    can_fd: Annotated[bool, _can("Samples in CAN FD frames, counts as recorded.", "--can-fd")] = False
     can_bitrate: Annotated[
         str | None,
-        typer.Option(
-            "--can-bitrate",
-            metavar="RATE[/RATE]",
-            help="Bit rate, and that of the data phase of CAN FD; 1M and 1M/8M by default.",
-            rich_help_panel=_PANEL,
-        ),
+        _can("Bit rate, and that of the data phase of CAN FD; 1M and 1M/8M by default.", metavar="RATE[/RATE]"),
     ] = None
 
     def plan(self) -> tuple[Schedule, Speed]:
@@ -71,38 +56,25 @@ class CanOptions:
 
     can: Annotated[
         str | None,
-        typer.Option(
-            "--can",
-            metavar="INTERFACE:CHANNEL",
-            help="Also be a node of a CAN bus: zenoh:can0 (with its hub), virtual:rig, socketcan:vcan0, "
+        _can(
+            "Also be a node of a CAN bus: zenoh:can0 (with its hub), virtual:rig, socketcan:vcan0, "
             "slcan:/dev/pts/3; python-can's further settings as ?NAME=VALUE&...",
-            rich_help_panel=_PANEL,
+            metavar="INTERFACE:CHANNEL",
         ),
     ] = None
     messages: CanMessages = CanMessages()
     can_overload: Annotated[
         bool,
-        typer.Option(
+        _can(
+            "Run even where the bus cannot carry all: frames that find no room are dropped and counted.",
             "--can-overload",
-            help="Run even where the bus cannot carry all: frames that find no room are dropped and counted.",
-            rich_help_panel=_PANEL,
         ),
     ] = False
     can_socketcand: Annotated[
         str | None,
-        typer.Option(
-            "--can-socketcand",
-            metavar="HOST:PORT",
-            help="Serve the bus to socketcand clients (classic frames), usually at 127.0.0.1:29536.",
-            rich_help_panel=_PANEL,
-        ),
+        _can("Serve the bus to socketcand clients (classic frames), usually at 127.0.0.1:29536.", metavar="HOST:PORT"),
     ] = None
-    can_slcan: Annotated[
-        bool,
-        typer.Option(
-            "--can-slcan", help="Play an SLCAN adapter of the bus on a port of its own.", rich_help_panel=_PANEL
-        ),
-    ] = False
+    can_slcan: Annotated[bool, _can("Play an SLCAN adapter of the bus on a port of its own.", "--can-slcan")] = False
 
     def output(self) -> CanOutput | None:
         """The bus that is asked for, if any; as for `CanOutput`.

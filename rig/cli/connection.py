@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.display import end_with, showing
+from rig.cli.groups import panel
 from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
 from rig.errors import InputError, RefusedError
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from rig.transport import Server
     from rig.transport.zenoh import Exposure, ZenohClient, ZenohServer
 
-_EXPOSURE = "For other computers"
+_exposure = panel("For other computers")
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Connection:
     tls: Annotated[
         Path | None,
         typer.Option(
-            "--tls", metavar="DIR", envvar="RIG_TLS", help="Folder with the keys of a role, for a rig that is exposed."
+            metavar="DIR", envvar="RIG_TLS", help="Folder with the keys of a role, for a rig that is exposed."
         ),
     ] = None
 
@@ -82,29 +83,16 @@ class Serving:
     )
     expose: Annotated[
         str | None,
-        typer.Option(
-            "--expose",
+        _exposure(
+            "Listen at this address of this computer as well, with --tls; port 7463 unless given.",
             metavar="HOST[:PORT]",
-            help="Listen at this address of this computer as well, with --tls; port 7463 unless given.",
-            rich_help_panel=_EXPOSURE,
         ),
     ] = None
-    tls: Annotated[
-        Path | None,
-        typer.Option(
-            "--tls",
-            metavar="DIR",
-            help="Made by `rig keys init`: who may connect, and do what.",
-            rich_help_panel=_EXPOSURE,
-        ),
-    ] = None
+    tls: Annotated[Path | None, _exposure("Made by `rig keys init`: who may connect, and do what.", metavar="DIR")] = (
+        None
+    )
     plaintext: Annotated[
-        bool,
-        typer.Option(
-            "--plaintext",
-            help="Instead of --tls: let everybody in, and do everything, unencrypted.",
-            rich_help_panel=_EXPOSURE,
-        ),
+        bool, _exposure("Instead of --tls: let everybody in, and do everything, unencrypted.", "--plaintext")
     ] = False
 
     def exposure(self) -> Exposure | None:

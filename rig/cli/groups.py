@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import wraps
 from typing import Any, get_type_hints
+
+import typer
+
+
+def panel(title: str) -> Callable[..., Any]:
+    """What makes options under a heading of the help, of what they say, their names, and further settings."""
+    return lambda says, *names, **settings: typer.Option(*names, help=says, rich_help_panel=title, **settings)
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
@@ -41,8 +48,9 @@ def _fields(group: Any) -> list[inspect.Parameter]:
         if is_dataclass(hint):
             found += _fields(hint)
         else:
+            default = inspect.Parameter.empty if field.default is MISSING else field.default
             keyword = inspect.Parameter.KEYWORD_ONLY
-            found.append(inspect.Parameter(field.name, keyword, default=field.default, annotation=hint))
+            found.append(inspect.Parameter(field.name, keyword, default=default, annotation=hint))
     return found
 
 

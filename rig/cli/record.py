@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.connection import Connection
+from rig.cli.groups import panel
 from rig.cli.options import Force
 from rig.cli.tables import echo, plain, table_console
 from rig.errors import InputError
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from recorder.trigger import Capture
     from rig.transport.zenoh import ZenohClient
 
-_FILES, _TRIGGERS, _DISK = "Several files", "Around triggers", "The disk"
+_files, _triggers, _disk = panel("Several files"), panel("Around triggers"), panel("The disk")
 
 
 class WhenFull(StrEnum):
@@ -48,13 +49,8 @@ _LINK_S = 1.0
 class Rotation:
     """When a new file begins."""
 
-    rotate_mb: Annotated[
-        float | None,
-        typer.Option(help="A new file at about this size, in MB: NAME.0000.mcap, ...", rich_help_panel=_FILES),
-    ] = None
-    rotate_s: Annotated[
-        float | None, typer.Option(help="A new file after this simulated time, in s.", rich_help_panel=_FILES)
-    ] = None
+    rotate_mb: Annotated[float | None, _files("A new file at about this size, in MB: NAME.0000.mcap, ...")] = None
+    rotate_s: Annotated[float | None, _files("A new file after this simulated time, in s.")] = None
 
 
 @dataclass(frozen=True)
@@ -63,39 +59,26 @@ class Triggers:
 
     trigger: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
+        _triggers(
+            "Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
             "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
-            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
-            rich_help_panel=_TRIGGERS,
+            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ..."
         ),
     ] = None
     pre_s: Annotated[
-        float | None,
-        typer.Option(
-            help="Simulated time kept before a trigger, in s.", rich_help_panel=_TRIGGERS, show_default=f"{_PRE_S:g}"
-        ),
+        float | None, _triggers("Simulated time kept before a trigger, in s.", show_default=f"{_PRE_S:g}")
     ] = None
     post_s: Annotated[
-        float | None,
-        typer.Option(
-            help="Simulated time kept after a trigger, in s.", rich_help_panel=_TRIGGERS, show_default=f"{_POST_S:g}"
-        ),
+        float | None, _triggers("Simulated time kept after a trigger, in s.", show_default=f"{_POST_S:g}")
     ] = None
     longest_s: Annotated[
-        float | None,
-        typer.Option(
-            help="Longest length of a capture, in s of simulated time.", rich_help_panel=_TRIGGERS, show_default="60"
-        ),
+        float | None, _triggers("Longest length of a capture, in s of simulated time.", show_default="60")
     ] = None
-    trigger_count: Annotated[
-        int | None, typer.Option(help="End after so many captures.", rich_help_panel=_TRIGGERS)
-    ] = None
+    trigger_count: Annotated[int | None, _triggers("End after so many captures.")] = None
     again: Annotated[
         Again | None,
-        typer.Option(
-            help="What a trigger does during a capture: make it longer, or nothing.",
-            rich_help_panel=_TRIGGERS,
+        _triggers(
+            "What a trigger does during a capture: make it longer, or nothing.",
             show_default="extend for events, ignore for levels",
         ),
     ] = None
@@ -127,22 +110,12 @@ class Triggers:
 class Disk:
     """What a recording may take of the disk and of memory."""
 
-    budget_mb: Annotated[
-        float | None, typer.Option(help="What all files of this recording may take, in MB.", rich_help_panel=_DISK)
-    ] = None
-    keep_free_mb: Annotated[float, typer.Option(help="Room to leave on the disk, in MB.", rich_help_panel=_DISK)] = (
-        100.0
+    budget_mb: Annotated[float | None, _disk("What all files of this recording may take, in MB.")] = None
+    keep_free_mb: Annotated[float, _disk("Room to leave on the disk, in MB.")] = 100.0
+    when_full: Annotated[WhenFull, _disk("At the budget, or with no more room: end, or remove the oldest file.")] = (
+        WhenFull.STOP
     )
-    when_full: Annotated[
-        WhenFull,
-        typer.Option(
-            help="At the budget, or with no more room: end, or remove the oldest file.", rich_help_panel=_DISK
-        ),
-    ] = WhenFull.STOP
-    backlog_mb: Annotated[
-        float,
-        typer.Option(help="What may wait in memory for a slow disk, in MB; more is a gap.", rich_help_panel=_DISK),
-    ] = 256.0
+    backlog_mb: Annotated[float, _disk("What may wait in memory for a slow disk, in MB; more is a gap.")] = 256.0
 
     def limits(self, rotation: Rotation) -> Limits:
         """Size of the files, and what they may take.

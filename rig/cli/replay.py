@@ -11,6 +11,7 @@ import typer
 from rig.cli.can_output import CanOptions
 from rig.cli.connection import Serving, serve
 from rig.cli.display import all_lateness, lateness
+from rig.cli.groups import panel
 from rig.cli.options import Channels, FromS, RecordingFiles, ToS, names_of, pairs
 from rig.cli.tables import echo
 from rig.errors import InputError
@@ -19,10 +20,10 @@ if TYPE_CHECKING:
     from replays.player.edit import Edit
     from replays.player.passes import Part
     from replays.player.player import Player
-    from replays.player.tape import Tape
+    from replays.player.track import Track
     from rig.transport import Server
 
-_PART, _CHANGE = "What is played", "What is changed"
+_part, _change = panel("What is played"), panel("What is changed")
 
 
 class Spacing(StrEnum):
@@ -51,29 +52,16 @@ class Played:
 
     from_s: FromS = None
     to_s: ToS = None
-    start_s: Annotated[
-        float | None,
-        typer.Option("--start", metavar="S", help="Where the first pass begins, in s.", rich_help_panel=_PART),
-    ] = None
-    loop: Annotated[
-        int, typer.Option(metavar="N", help="Passes through it; 0: endless.", rich_help_panel=_PART, min=0)
-    ] = 1
-    pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for `rig resume`, or `rig step`.", rich_help_panel=_PART)
-    ] = False
+    start_s: Annotated[float | None, _part("Where the first pass begins, in s.", "--start", metavar="S")] = None
+    loop: Annotated[int, _part("Passes through it; 0: endless.", metavar="N", min=0)] = 1
+    pause: Annotated[bool, _part("Wait for `rig resume`, or `rig step`.", "--pause")] = False
     wait_for: Annotated[
         int,
-        typer.Option(
-            "--wait-for",
-            metavar="N",
-            help="Begin once N clients listen (recorders, DAQs, viewers), so that they get all of it.",
-            rich_help_panel=_PART,
-            min=0,
+        _part(
+            "Begin once N clients listen (recorders, DAQs, viewers), so that they get all of it.", metavar="N", min=0
         ),
     ] = 0
-    wait_s: Annotated[
-        float, typer.Option(metavar="S", help="Fail where they are not there after S s.", rich_help_panel=_PART)
-    ] = 60.0
+    wait_s: Annotated[float, _part("Fail where they are not there after S s.", metavar="S")] = 60.0
 
     def part(self) -> Part:
         """Which part of the recording, and how often."""
@@ -87,28 +75,18 @@ class Changed:
     """What is changed between the recording and the wire."""
 
     time: Annotated[
-        Numbers,
-        typer.Option(
-            help="Ticks and row numbers as recorded, or new ones that run on through loops and seeks.",
-            rich_help_panel=_CHANGE,
-        ),
+        Numbers, _change("Ticks and row numbers as recorded, or new ones that run on through loops and seeks.")
     ] = Numbers.ORIGINAL
-    only: Annotated[
-        Only | None, typer.Option(help="Leave out what no instrument could know.", rich_help_panel=_CHANGE)
-    ] = None
+    only: Annotated[Only | None, _change("Leave out what no instrument could know.")] = None
     remap: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KEY=KEY", help="The same payloads on another key; may be repeated.", rich_help_panel=_CHANGE
-        ),
+        list[str] | None, _change("The same payloads on another key; may be repeated.", metavar="KEY=KEY")
     ] = None
     channels: Channels = None
-    rename: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=NAME", help="Another name for a channel, as if wired so.", rich_help_panel=_CHANGE),
-    ] = None
+    rename: Annotated[list[str] | None, _change("Another name for a channel, as if wired so.", metavar="NAME=NAME")] = (
+        None
+    )
 
-    def edit(self, tape: Tape) -> Edit:
+    def edit(self, track: Track) -> Edit:
         """Which payloads go out, on which key, and which columns they have.
 
         Raises:
@@ -118,7 +96,7 @@ class Changed:
         from rig.wire import CATALOGUE
 
         return Edit(
-            tape.documents[CATALOGUE],
+            track.documents[CATALOGUE],
             keys=pairs("--remap", self.remap, "KEY=KEY"),
             channels=None if self.channels is None else names_of(self.channels),
             names=pairs("--rename", self.rename, "NAME=NAME"),
@@ -151,21 +129,21 @@ def replay(
     with rare_collections():
         from replays.player.player import Player
         from replays.player.playhead import check_rate
-        from replays.player.tape import Tape
         from replays.player.timeline import By
+        from replays.player.track import Track
 
         check_rate(rate)
         if burst and rate != 1.0:
             raise InputError("rate", "left out with --burst", rate)
         if played.wait_for and played.pause:
             raise InputError("--wait-for", "left out with --pause", played.wait_for)
-        tape = Tape(files)
-        edit = changed.edit(tape)
+        track = Track(files)
+        edit = changed.edit(track)
         bus = can.output()
 
     def make(server: Server) -> Player:
         player = Player(
-            tape,
+            track,
             server,
             FreeRun() if burst else RealTime(),
             part=played.part(),
@@ -178,7 +156,7 @@ def replay(
             wait_s=played.wait_s,
         )
         begin_s, end_s = player.reach_s
-        if not tape.complete:
+        if not track.complete:
             echo("rig: the recording was cut off; it is played as far as it goes", err=True)
         what = "paused" if played.pause else "burst" if burst else f"x{rate:g}"
         if played.wait_for:
