@@ -19,7 +19,7 @@ import can  # noqa: TID253 - loaded by python-can itself
 import numpy as np
 from can.bus import BusState  # noqa: TID253
 
-from drivers.can import medium
+from drivers.can.bus import codec
 from rig.errors import InputError, RefusedError
 from rig.outside import check, read_json
 from rig.transport.endpoint import parse_loopback
@@ -27,7 +27,7 @@ from rig.transport.endpoint import parse_loopback
 if TYPE_CHECKING:
     from can.typechecking import AutoDetectedConfig, CanFilters
 
-    from drivers.can.hub import Hub
+    from drivers.can.bus.hub import Hub
 
 _RECEIVE_QUEUE = 100_000
 """Frames that wait to be read, by default: about 7 s of a full bus; the oldest are dropped."""
@@ -91,14 +91,14 @@ class _MediumBus(can.BusABC):
         """Frames in the batches."""
         self._overflowed = False
         """Whether frames were lost of which the reader has not been told."""
-        self._node = medium.NO_NODE
+        self._node = codec.NO_NODE
         self._secret: str | None = None
         """What shows the hub that this node's name is its own."""
         self._fd = False
         self._window = 0
         self._offered = 0
         self._done = 0
-        self._report = medium.Report(medium.NO_NODE, 0, 0, 0, 0, 0)
+        self._report = codec.Report(codec.NO_NODE, 0, 0, 0, 0, 0)
         self._there = False
         self._filters = None
         self.dropped = 0
@@ -144,7 +144,7 @@ class _MediumBus(can.BusABC):
         """
         again = {} if self._secret is None else {"secret": self._secret}
         try:
-            answer = check(medium.Joined, self._ask("join", {"listen_only": self._listen_only, **again}), field="hub")
+            answer = check(codec.Joined, self._ask("join", {"listen_only": self._listen_only, **again}), field="hub")
         except InputError as error:
             raise can.CanInitializationError(f"{self._where()} refuses another node: {error}") from None
         rates = {"bitrate": answer.nominal_bit_s, "data_bitrate": answer.data_bit_s}
@@ -160,7 +160,7 @@ class _MediumBus(can.BusABC):
             self._fd = answer.fd and self._fd_asked is not False
             self._window = answer.window
             self._offered = self._done = 0
-            self._report = medium.Report(self._node, 0, 0, 0, 0, 0)
+            self._report = codec.Report(self._node, 0, 0, 0, 0, 0)
             self._there = True
 
     def _lost(self) -> None:
@@ -178,45 +178,45 @@ class _MediumBus(can.BusABC):
     def _take(self, payload: bytes) -> None:
         """A message of the hub, on the thread of the connection."""
         try:
-            if medium.kind_of(payload) == medium.REPORTS:
-                self._take_reports(medium.decode_reports(payload))
+            if codec.kind_of(payload) == codec.REPORTS:
+                self._take_reports(codec.decode_reports(payload))
             elif len(payload) <= _SHORT:
-                self._take_few(medium.decode(payload))
+                self._take_few(codec.decode(payload))
             else:
-                self._take_many(medium.decode_array(payload))
-        except medium.MediumError:
+                self._take_many(codec.decode_array(payload))
+        except codec.CodecError:
             self.malformed += 1
 
-    def _take_few(self, records: Iterable[medium.Record]) -> None:
+    def _take_few(self, records: Iterable[codec.Record]) -> None:
         """Some frames; arrays would cost more than they save."""
         confirmed = 0
         wanted = []
         for record in records:
-            if not record.identifier & medium.ERROR:
+            if not record.identifier & codec.ERROR:
                 if record.node == self._node:
                     confirmed += 1
                     if not self.receive_own_messages:
                         continue
-                if record.flags & medium.FD and not self._fd:
+                if record.flags & codec.FD and not self._fd:
                     continue
-            elif record.node != self._node and not record.identifier & medium.BUS_ERROR:
+            elif record.node != self._node and not record.identifier & codec.BUS_ERROR:
                 # How another controller is, nobody sees.
                 continue
-            wanted.append(medium.message_of(record, channel=self.channel, node=self._node))
+            wanted.append(codec.message_of(record, channel=self.channel, node=self._node))
         self._keep(confirmed, wanted, None)
 
     def _take_many(self, records: np.ndarray) -> None:
         own = records["node"] == self._node
-        errors = (records["identifier"] & medium.ERROR) != 0
+        errors = (records["identifier"] & codec.ERROR) != 0
         confirmed = int(np.count_nonzero(own & ~errors))
         filters = self._filters
         wanted = np.ones(len(records), bool)
         if confirmed and not self.receive_own_messages:
             wanted &= ~own | errors
         if errors.any():
-            wanted &= ~errors | own | (records["identifier"] & medium.BUS_ERROR != 0)
+            wanted &= ~errors | own | (records["identifier"] & codec.BUS_ERROR != 0)
         if not self._fd:
-            wanted &= (records["flags"] & medium.FD) == 0
+            wanted &= (records["flags"] & codec.FD) == 0
         if filters:
             wanted &= errors | _matching(records["identifier"], filters)
         self._keep(confirmed, records if wanted.all() else records[wanted], filters)
@@ -229,7 +229,7 @@ class _MediumBus(can.BusABC):
             if len(frames):
                 self._store(frames, filters)
 
-    def _take_reports(self, reports: Sequence[medium.Report]) -> None:
+    def _take_reports(self, reports: Sequence[codec.Report]) -> None:
         with self._lock:
             for report in reports:
                 if report.node == self._node:
@@ -274,13 +274,13 @@ class _MediumBus(can.BusABC):
             while not self._ready:
                 if self._overflowed:
                     self._overflowed = False
-                    lost = medium.overflow(time.time_ns())
-                    return medium.message_of(lost, channel=self.channel, node=self._node)
+                    lost = codec.overflow(time.time_ns())
+                    return codec.message_of(lost, channel=self.channel, node=self._node)
                 if self._batches:
                     frames, self._ready_filters = self._batches.popleft()
                     self._waiting -= len(frames)
                     if isinstance(frames, np.ndarray):
-                        frames = medium.messages_of(frames, channel=self.channel, node=self._node)
+                        frames = codec.messages_of(frames, channel=self.channel, node=self._node)
                     self._ready.extend(frames)
                     continue
                 left = None if deadline is None else deadline - time.monotonic()
@@ -303,28 +303,28 @@ class _MediumBus(can.BusABC):
         """
         self._check_open()
         try:
-            record = medium.offered(msg, fd=self._fd)
-        except medium.MediumError as error:
+            record = codec.offered(msg, fd=self._fd)
+        except codec.CodecError as error:
             raise can.CanOperationError(f"{self.channel} cannot send {error}") from None
         self._reserve(1, timeout)
-        self._offer(medium.encode([record]))
+        self._offer(codec.encode([record]))
 
     def send_records(self, records: np.ndarray, timeout: float | None = None) -> None:
         """Hand many frames to the hub at once.
 
         Args:
-            records: Array of one of the layouts `drivers.can.medium.RECORDS`; only what makes a frame counts.
+            records: Array of one of the layouts `drivers.can.bus.codec.RECORDS`; only what makes a frame counts.
             timeout: How long to wait for room in the transmit queue, for each portion of the frames [s].
 
         Raises:
             CanOperationError: As `send`; a frame that the bus cannot have is dropped and counted by the hub.
         """
         self._check_open()
-        portion = min(self._window or 1, medium.MAX_RECORDS)
+        portion = min(self._window or 1, codec.MAX_RECORDS)
         for first in range(0, len(records), portion):
             part = records[first : first + portion]
             self._reserve(len(part), timeout)
-            self._offer(medium.encode_array(part))
+            self._offer(codec.encode_array(part))
 
     def _offer(self, message: bytes) -> None:
         self._put(bytes.fromhex(self._secret or "") + message)
@@ -422,14 +422,14 @@ class ZenohBus(_MediumBus):
         self,
         channel: Any = "can0",
         *,
-        endpoint: str = medium.DEFAULT_ENDPOINT,
+        endpoint: str = codec.DEFAULT_ENDPOINT,
         connect_s: float = 1.0,
         **settings: Any,
     ) -> None:
         self._address, self._connect_s = str(endpoint), connect_s
         super().__init__(channel, **settings)
         # Only now: a hub that comes back is joined anew, which must not meet the first time.
-        self._client.watch(medium.alive_key(self.channel), self._watch)
+        self._client.watch(codec.alive_key(self.channel), self._watch)
         self.channel_info = f"zenoh {self.channel} at {self._address}"
 
     def _connect(self) -> None:
@@ -438,7 +438,7 @@ class ZenohBus(_MediumBus):
 
         try:
             parse_loopback(self._address, field="endpoint")
-            if not medium.is_name(self.channel):
+            if not codec.is_name(self.channel):
                 raise InputError("channel", "letters, digits, - and _, such as can0", self.channel)
         except InputError as error:
             raise can.CanInitializationError(str(error)) from None
@@ -446,9 +446,9 @@ class ZenohBus(_MediumBus):
             self._client = ZenohClient(self._address, wait_s=self._connect_s)
         except NoReplyError:
             raise can.CanInitializationError(self._nobody()) from None
-        self._client.announce(medium.node_key(self.channel, self._name))
+        self._client.announce(codec.node_key(self.channel, self._name))
         self._client.subscribe(
-            medium.bus_key(self.channel),
+            codec.bus_key(self.channel),
             lambda _, payload: self._take(payload),
             on_miss=lambda _, count: self._missed(count),
         )
@@ -467,11 +467,11 @@ class ZenohBus(_MediumBus):
 
         payload = json.dumps({"endpoint": self._name, **document}).encode()
         try:
-            answer = self._client.request(medium.request_key(self.channel, name), payload, timeout_s=_JOIN_S)
+            answer = self._client.request(codec.request_key(self.channel, name), payload, timeout_s=_JOIN_S)
         except NoReplyError as error:
             if name != "join":
                 raise can.CanOperationError(f"{self._where()} does not answer: {error}") from None
-            others = [key.split("/")[2] for key in self._client.tokens(medium.ALIVE)]
+            others = [key.split("/")[2] for key in self._client.tokens(codec.ALIVE)]
             also = f" (channels there: {', '.join(others)})" if others else ""
             raise can.CanInitializationError(self._nobody() + also) from None
         document = read_json(answer, field="hub")
@@ -480,7 +480,7 @@ class ZenohBus(_MediumBus):
         return document
 
     def _put(self, payload: bytes) -> None:
-        self._client.report(medium.offer_key(self.channel, self._name), payload)
+        self._client.report(codec.offer_key(self.channel, self._name), payload)
 
     def _watch(self, there: bool) -> None:
         """The hub has gone, or is there again."""
@@ -503,8 +503,8 @@ class ZenohBus(_MediumBus):
         from rig.transport.zenoh import ZenohClient
 
         try:
-            with ZenohClient(medium.DEFAULT_ENDPOINT, wait_s=0.2) as client:
-                channels = [key.split("/")[2] for key in client.tokens(medium.ALIVE)]
+            with ZenohClient(codec.DEFAULT_ENDPOINT, wait_s=0.2) as client:
+                channels = [key.split("/")[2] for key in client.tokens(codec.ALIVE)]
         except NoReplyError:
             return []
         return [{"interface": "zenoh", "channel": channel} for channel in channels]
@@ -549,15 +549,15 @@ def _bit_rates(bitrate: int | None, data_bitrate: int | None, timing: Any) -> di
 
 def _matching(words: np.ndarray, filters: CanFilters) -> np.ndarray:
     """Which identifier words match at least one filter, shape of `words`."""
-    extended = (words & medium.EXTENDED) != 0
-    identifiers = words & np.uint32(medium.EXTENDED_MASK)
+    extended = (words & codec.EXTENDED) != 0
+    identifiers = words & np.uint32(codec.EXTENDED_MASK)
     found = np.zeros(len(words), bool)
     for entry in filters:
         wanted, mask = int(entry["can_id"]), int(entry["can_mask"])
         # As python-can compares: bits of the mask beyond an identifier's 29 see zeros.
-        if wanted & mask & ~medium.EXTENDED_MASK:
+        if wanted & mask & ~codec.EXTENDED_MASK:
             continue
-        mask &= medium.EXTENDED_MASK
+        mask &= codec.EXTENDED_MASK
         match = identifiers & np.uint32(mask) == wanted & mask
         if "extended" in entry:
             match &= extended == bool(entry["extended"])

@@ -25,7 +25,7 @@ from functools import cache
 
 import numpy as np
 
-from drivers.can.frame import FD_LENGTHS
+from drivers.can.bus.frame import FD_LENGTHS
 from rig.channels import Channel, ChannelTable, default_table
 
 CLASSIC_HZ = 1_000

@@ -21,17 +21,17 @@ import can  # noqa: TID253 - the subject
 import numpy as np
 import pytest
 
-from drivers.can import hub as hubs
-from drivers.can import medium, slcan_port, socketcand
-from drivers.can.bus import BusModel
-from drivers.can.frame import fault_of
+from drivers.can.bus import codec, slcan, socketcand
+from drivers.can.bus import hub as hubs
+from drivers.can.bus.frame import fault_of
+from drivers.can.bus.hub import Hub
+from drivers.can.bus.model import BusModel
+from drivers.can.bus.slcan import SlcanPort
+from drivers.can.bus.socketcand import SocketcandServer
 from drivers.can.gateway import Gateway
-from drivers.can.hub import Hub
 from drivers.can.interface import HubBus
 from drivers.can.schedule import Schedule
 from drivers.can.signals import AHEAD, KEY, Kind, checksum, command_frame, default_messages
-from drivers.can.slcan_port import SlcanPort
-from drivers.can.socketcand import SocketcandServer
 from drivers.instrument.protocol import Codec, ProtocolError
 from drivers.link import memory
 from drivers.link.can import TO_INSTRUMENT, CanLink, CanMedium
@@ -225,17 +225,17 @@ def test_blocks_events_and_states_that_lie_do_not_stop_a_gateway() -> None:
 # Messages and requests to the hub.
 
 
-def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[medium.Record]]:
+def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[codec.Record]]:
     """What comes as an offer, and the frames in it, if it is one."""
     rows = []
     for _ in range(random.integers(1, 20)):
         word = int(random.choice((0x10, 0x7FF, 0x800, 0x1FFFFFFF))) | int(
-            random.choice((0, 0, 0, medium.EXTENDED, medium.REMOTE, medium.ERROR, medium.EXTENDED | medium.REMOTE))
+            random.choice((0, 0, 0, codec.EXTENDED, codec.REMOTE, codec.ERROR, codec.EXTENDED | codec.REMOTE))
         )
         length = int(random.choice((0, 1, 7, 8, 9, 12, 48, 63, 64, 200)))
         flags = int(random.choice((0, 0, 0, 1, 3, 7, 2, 16, 255)))
-        rows.append(medium.Record(0, word, length, flags, int(random.integers(1 << 16)), random.bytes(min(length, 64))))
-    message = medium.encode(rows)
+        rows.append(codec.Record(0, word, length, flags, int(random.integers(1 << 16)), random.bytes(min(length, 64))))
+    message = codec.encode(rows)
     kind = random.integers(8)
     if kind == 0:
         return mutated(random, secret + message), []
@@ -277,7 +277,7 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
                     got.append(int.from_bytes(item.data, "big"))
                 else:
                     strangers += 1
-                    assert fault_of(medium.record_of(item)) is None
+                    assert fault_of(codec.record_of(item)) is None
 
         for number, request in enumerate(requests):
             payload, _ = an_offer(random, secret)
@@ -430,7 +430,7 @@ def test_text_to_a_socketcand_server_stops_nobody() -> None:
                         texts = [b"<" + a_command(random) + b">" for _ in range(10)]
                         flood.write(mutated(random, b"".join(texts)) if random.random() < 0.3 else b"".join(texts))
                         while (item := other.recv(0)) is not None:
-                            assert item.is_error_frame or fault_of(medium.record_of(item)) is None
+                            assert item.is_error_frame or fault_of(codec.record_of(item)) is None
                     flood.quiet()
                     flood.write(b">< statistics 0 ><>< echo >")
                     assert flood.quiet().endswith(b"< echo >")
@@ -468,15 +468,15 @@ def a_line(random: np.random.Generator) -> bytes:
 
 def test_lines_to_an_slcan_port_make_a_frame_only_where_they_stand_for_one() -> None:
     random = np.random.default_rng(6)
-    lines = slcan_port.Lines()
+    lines = slcan.Lines()
     made = 0
     for _ in range(inputs(3000)):
         line = a_line(random).replace(b"\r", b"").replace(b"\n", b"")
         (text,) = lines.feed(line + b"\r")
         found = None
         if text:
-            with contextlib.suppress(slcan_port.FrameError):
-                message = slcan_port.parse(text)
+            with contextlib.suppress(slcan.FrameError):
+                message = slcan.parse(text)
                 found = (
                     *fields_of(message)[:3], message.is_fd, message.bitrate_switch, fields_of(message)[3]
                 )  # fmt: skip
@@ -490,7 +490,7 @@ def test_lines_to_an_slcan_port_make_a_frame_only_where_they_stand_for_one() -> 
             for _ in range(inputs(1500) // 10):
                 flood.write(b"\r".join(a_line(random) for _ in range(10)) + b"\r")
                 while (item := other.recv(0)) is not None:
-                    assert item.is_error_frame or fault_of(medium.record_of(item)) is None
+                    assert item.is_error_frame or fault_of(codec.record_of(item)) is None
             flood.write(b"\r\rC\r")
             flood.quiet()
             flood.write(b"V\r")

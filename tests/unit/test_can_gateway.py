@@ -18,9 +18,9 @@ import pytest
 
 from drivers.can import dbc
 from drivers.can.gateway import Gateway
-from drivers.can.health import Rising
 from drivers.can.schedule import Schedule
 from drivers.can.signals import ABSENT, Kind, Result, State, command_frame, default_messages
+from drivers.health import Rising
 from rig import wire
 from rig.channels import default_table
 from rig.errors import InputError

@@ -22,13 +22,13 @@ from can.bus import BusState  # noqa: TID253
 from can.interfaces.slcan import slcanBus  # noqa: TID253
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus  # noqa: TID253
 
-from drivers.can import medium, slcan_port, socketcand
-from drivers.can.bus import BusModel
-from drivers.can.hub import Hub
+from drivers.can.bus import codec, slcan, socketcand
+from drivers.can.bus.hub import Hub
+from drivers.can.bus.model import BusModel
+from drivers.can.bus.outlet import Outlet
+from drivers.can.bus.slcan import Lines, SlcanPort
+from drivers.can.bus.socketcand import CommandError, SocketcandServer, Splitter
 from drivers.can.interface import HubBus
-from drivers.can.outlet import Outlet
-from drivers.can.slcan_port import Lines, SlcanPort
-from drivers.can.socketcand import CommandError, SocketcandServer, Splitter
 from drivers.can.timing import speed
 from drivers.twins import Twins
 from rig.cli.can_outlets import CanOutlets
@@ -335,11 +335,11 @@ def test_error_frames_reach_the_client(hub_bench: Bench) -> None:
     other, server = hub_bench.bus(), hub_bench.serve()
     client = hub_bench.socketcand(server)
     (outlet,) = server._clients
-    outlet._put(outlet._show(medium.message_of(medium.error_record(10**9, medium.BUS_OFF))) or b"")
+    outlet._put(outlet._show(codec.message_of(codec.error_record(10**9, codec.BUS_OFF))) or b"")
     other.send(CLASSIC[0])
     first, second = read(client, 2)
     assert first.is_error_frame
-    assert first.arbitration_id == medium.BUS_OFF
+    assert first.arbitration_id == codec.BUS_OFF
     assert first.timestamp == 1.0
     assert same(second, CLASSIC[0])
 
@@ -586,12 +586,12 @@ def test_status_flags_tell_what_error_frames_say(bench: Bench) -> None:
     with Terminal(port) as terminal:
         terminal.ask("O")
         for record, flags in [
-            (medium.overflow(0), 0x09),
-            (medium.error_record(0, medium.CONTROLLER, data=bytes((0, 0x20, 0, 0, 0, 0, 0, 0))), 0x20),
-            (medium.error_record(0, medium.BUS_ERROR | medium.PROTOCOL), 0x80),
-            (medium.error_record(0, medium.BUS_OFF), 0xA0),
+            (codec.overflow(0), 0x09),
+            (codec.error_record(0, codec.CONTROLLER, data=bytes((0, 0x20, 0, 0, 0, 0, 0, 0))), 0x20),
+            (codec.error_record(0, codec.BUS_ERROR | codec.PROTOCOL), 0x80),
+            (codec.error_record(0, codec.BUS_OFF), 0xA0),
         ]:
-            assert port._show(medium.message_of(record)) is None
+            assert port._show(codec.message_of(record)) is None
             assert terminal.ask("F") == b"F%02X\r" % flags
             assert terminal.ask("F") == b"F00\r"
 
@@ -662,9 +662,9 @@ def test_lines_come_in_any_portions() -> None:
 
 def test_lines_and_frames_are_each_others_inverse() -> None:
     for each in CLASSIC + REMOTE + FD:
-        line = slcan_port.show(each)
+        line = slcan.show(each)
         assert line is not None
-        assert same(slcan_port.parse(line.decode().rstrip("\r")), each)
+        assert same(slcan.parse(line.decode().rstrip("\r")), each)
 
 
 # What they share.

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from drivers.accelerometer.driver import Accelerometer, AsyncAccelerometer
-from drivers.can.bus import BusModel
-from drivers.can.hub import Hub
+from drivers.can.bus.hub import Hub
+from drivers.can.bus.model import BusModel
 from drivers.daq import Daq
 from drivers.drive.driver import AsyncDrive, Drive
 from drivers.force.driver import AsyncForce, Force

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from drivers.can.frame import (
+from drivers.can.bus.frame import (
     BRS,
     CLASSIC_WIDTH,
     ERROR,
@@ -116,7 +116,7 @@ class Joined(Outside):
     epoch_ns: Count
 
 
-class MediumError(ValueError):
+class CodecError(ValueError):
     """A payload is not a message of this medium."""
 
 
@@ -215,18 +215,18 @@ def kind_of(payload: bytes) -> int:
     """Whether a message has FRAMES or REPORTS; its length is checked too.
 
     Raises:
-        MediumError: It is no message of this medium.
+        CodecError: It is no message of this medium.
     """
     if len(payload) < _HEADER.size:
-        raise MediumError(f"{len(payload)} bytes, fewer than a header has")
+        raise CodecError(f"{len(payload)} bytes, fewer than a header has")
     magic, kind, width, count = _HEADER.unpack_from(payload)
     if magic != _MAGIC or kind not in (FRAMES, REPORTS):
-        raise MediumError("no header of this medium")
+        raise CodecError("no header of this medium")
     size = _REPORT.size if kind == REPORTS else PACKINGS[width].size if width in PACKINGS else 0
     if not size or (kind == REPORTS and width != size):
-        raise MediumError(f"records of unknown width {width}")
+        raise CodecError(f"records of unknown width {width}")
     if count > MAX_RECORDS or len(payload) != _HEADER.size + count * size:
-        raise MediumError(f"{len(payload)} bytes for {count} records of {size} bytes")
+        raise CodecError(f"{len(payload)} bytes for {count} records of {size} bytes")
     return kind
 
 
@@ -234,10 +234,10 @@ def decode(payload: bytes) -> Iterator[Record]:
     """The frames of a message, in order.
 
     Raises:
-        MediumError: It is no message of frames.
+        CodecError: It is no message of frames.
     """
     if kind_of(payload) != FRAMES:
-        raise MediumError("reports where frames were expected")
+        raise CodecError("reports where frames were expected")
     layout = PACKINGS[payload[5]]
     for time_ns, word, length, flags, node, data in layout.iter_unpack(memoryview(payload)[_HEADER.size :]):
         yield Record(time_ns, word, length, flags, node, b"" if word & REMOTE else data[:length])
@@ -247,10 +247,10 @@ def decode_array(payload: bytes) -> np.ndarray:
     """The frames of a message as a read-only array of one of the `RECORDS` layouts, shape (frames,).
 
     Raises:
-        MediumError: It is no message of frames.
+        CodecError: It is no message of frames.
     """
     if kind_of(payload) != FRAMES:
-        raise MediumError("reports where frames were expected")
+        raise CodecError("reports where frames were expected")
     return np.frombuffer(payload, RECORDS[payload[5]], offset=_HEADER.size)
 
 
@@ -258,10 +258,10 @@ def decode_reports(payload: bytes) -> list[Report]:
     """The node reports of a message.
 
     Raises:
-        MediumError: It is no message of reports.
+        CodecError: It is no message of reports.
     """
     if kind_of(payload) != REPORTS:
-        raise MediumError("frames where reports were expected")
+        raise CodecError("frames where reports were expected")
     rows = _REPORT.iter_unpack(memoryview(payload)[_HEADER.size :])
     return [Report(node, state, *counts) for node, state, _, *counts in rows]
 
@@ -270,11 +270,11 @@ def record_of(message: can.Message) -> Record:
     """A python-can message as an offered frame.
 
     Raises:
-        MediumError: Its identifier has more than 29 bits.
+        CodecError: Its identifier has more than 29 bits.
     """
     word = message.arbitration_id
     if not 0 <= word <= EXTENDED_MASK:
-        raise MediumError(f"identifier {word:#x} does not have 29 bits")
+        raise CodecError(f"identifier {word:#x} does not have 29 bits")
     if message.is_extended_id:
         word |= EXTENDED
     flags = 0
@@ -296,11 +296,11 @@ def offered(message: can.Message, *, fd: bool = True) -> Record:
         fd: Whether the bus takes CAN FD frames.
 
     Raises:
-        MediumError: None can; it says why.
+        CodecError: None can; it says why.
     """
     record = record_of(message)
     if (fault := fault_of(record, fd=fd)) is not None:
-        raise MediumError(fault)
+        raise CodecError(fault)
     return record
 
 

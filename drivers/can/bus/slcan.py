@@ -25,9 +25,9 @@ import tty
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from drivers.can import medium
-from drivers.can.frame import FD_LENGTHS
-from drivers.can.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
+from drivers.can.bus import codec
+from drivers.can.bus.frame import FD_LENGTHS
+from drivers.can.bus.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
 from drivers.can.timing import Speed
 
 if TYPE_CHECKING:
@@ -112,8 +112,8 @@ def parse(line: str) -> can.Message:
         data=None if remote else data,
     )
     try:
-        medium.offered(message)
-    except medium.MediumError as error:
+        codec.offered(message)
+    except codec.CodecError as error:
         raise FrameError(str(error)) from None
     return message
 
@@ -322,12 +322,12 @@ def flags_of(message: can.Message) -> int:
     """The status flags that an error frame sets; its classes are those of SocketCAN."""
     kind, data = message.arbitration_id, bytes(message.data).ljust(8, b"\0")
     flags = 0
-    if kind & medium.CONTROLLER:
+    if kind & codec.CONTROLLER:
         flags |= RECEIVE_FULL | OVERRUN if data[1] & 0x01 else 0
         flags |= TRANSMIT_FULL if data[1] & 0x02 else 0
         flags |= ERROR_WARNING if data[1] & 0x0C else 0
         flags |= ERROR_PASSIVE if data[1] & 0x30 else 0
     flags |= ARBITRATION_LOST if kind & 0x002 else 0
-    flags |= BUS_ERROR if kind & (medium.PROTOCOL | medium.BUS_ERROR | medium.NO_ACKNOWLEDGE) else 0
-    flags |= ERROR_PASSIVE | BUS_ERROR if kind & medium.BUS_OFF else 0
+    flags |= BUS_ERROR if kind & (codec.PROTOCOL | codec.BUS_ERROR | codec.NO_ACKNOWLEDGE) else 0
+    flags |= ERROR_PASSIVE | BUS_ERROR if kind & codec.BUS_OFF else 0
     return flags

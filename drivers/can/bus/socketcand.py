@@ -24,9 +24,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from drivers.can import medium
-from drivers.can.health import Guard
-from drivers.can.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
+from drivers.can.bus import codec
+from drivers.can.bus.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
+from drivers.health import Guard
 from rig.errors import InputError
 from rig.transport.endpoint import parse_loopback
 
@@ -115,8 +115,8 @@ def parse_frame(words: list[str], *, remote: bool = False) -> can.Message:
         data=None if remote else bytes(int(byte, 16) for byte in given),
     )
     try:
-        medium.offered(message)
-    except medium.MediumError as error:
+        codec.offered(message)
+    except codec.CodecError as error:
         raise CommandError(str(error)) from None
     return message
 
@@ -273,7 +273,7 @@ class _Client(Outlet):
         return text
 
     def _overflow(self) -> bytes:
-        return f"< error {medium.CONTROLLER:03X} {time.time():.6f} >".encode()
+        return f"< error {codec.CONTROLLER:03X} {time.time():.6f} >".encode()
 
     def _tick(self) -> None:
         now = time.monotonic()

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from drivers.can import frame as frames
-from drivers.can import kernels
+from drivers.can.bus import frame as frames
+from drivers.can.bus import kernels
 from drivers.can.timing import Speed, speed
 from rig.errors import InputError
 
@@ -311,7 +311,8 @@ class BusModel:
         """`offer` for many frames.
 
         Args:
-            offers: Array of `drivers.can.frame.RECORD`, best in the order of its times; `node` by whom, `time_ns` when.
+            offers: Array of `drivers.can.bus.frame.RECORD`, best in the order of its times; `node` by whom, `time_ns`
+                when.
         """
         if not self.speed.fd and (offers["flags"] & frames.FD).any():
             raise InputError("frame", f"classic on a bus of {self.speed}", "a CAN FD frame")

@@ -11,7 +11,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from drivers.can.health import Guard, Rising
+from drivers.health import Guard, Rising
 
 if TYPE_CHECKING:
     import can

@@ -23,9 +23,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import pydantic
 
-from drivers.can import medium
-from drivers.can.frame import STANDARD_MASK, octets
-from drivers.can.health import Guard, Rising
+from drivers.can.bus import codec
+from drivers.can.bus.frame import STANDARD_MASK, octets
 from drivers.can.schedule import SLOT_S, Schedule
 from drivers.can.signals import (
     ABSENT,
@@ -40,6 +39,7 @@ from drivers.can.signals import (
     default_messages,
     parse_command,
 )
+from drivers.health import Guard, Rising
 from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
@@ -49,7 +49,7 @@ from rig.transport import Client, NoReplyError
 if TYPE_CHECKING:
     import can
 
-_RECORD = medium.RECORDS[medium.FD_WIDTH]
+_RECORD = codec.RECORDS[codec.FD_WIDTH]
 _SYNC_S = 0.1
 _STATUS_S = 0.5
 _HEARTBEAT_S = 1.0
@@ -591,7 +591,7 @@ class Gateway:
                 self._send_records(records, timeout)
                 given = len(records)
             else:
-                for message in medium.messages_of(records):
+                for message in codec.messages_of(records):
                     self._bus.send(message, timeout)
                     given += 1
         except (can.CanError, OSError):
@@ -772,10 +772,10 @@ def _streams(table: ChannelTable, steps: dict[bool, int]) -> list[_Stream]:
 
 
 def _records(message: Message, data: np.ndarray) -> np.ndarray:
-    """Frames as an array of the widest layout of `drivers.can.medium`, shape (frames,)."""
+    """Frames as an array of the widest layout of `drivers.can.bus.codec`, shape (frames,)."""
     records = np.zeros(len(data), _RECORD)
     records["identifier"] = message.identifier
     records["length"] = message.length
-    records["flags"] = medium.FD | medium.BRS if message.fd else 0
+    records["flags"] = codec.FD | codec.BRS if message.fd else 0
     octets(records)[:, : message.length] = data
     return records

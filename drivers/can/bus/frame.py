@@ -225,7 +225,7 @@ def _unpack(_: int, word: int, length: int, flags: int, __: int, data: bytes) ->
 def check_records(array: np.ndarray, *, fd: bool = True) -> np.ndarray:
     """The same array, if a controller can send all its frames; else an InputError that names the first bad one."""
     if array.dtype.itemsize != RECORD.itemsize or array.dtype.names != RECORD.names:
-        raise InputError("frames", "an array of drivers.can.frame.RECORD", array.dtype)
+        raise InputError("frames", "an array of drivers.can.bus.frame.RECORD", array.dtype)
     array = np.ascontiguousarray(array).view(RECORD)
     if not (good := sendable(array, fd=fd)).all():
         (bad,) = PACKINGS[FD_WIDTH].iter_unpack(array[~good][:1].tobytes())
@@ -250,7 +250,7 @@ def resized(array: np.ndarray, width: int = FD_WIDTH) -> np.ndarray:
 
 def encode(frame: Frame) -> Encoded:
     """All bits of a frame on the bus."""
-    from drivers.can import kernels
+    from drivers.can.bus import kernels
 
     record = records([frame])[0]
     bits = np.zeros(kernels.LONGEST, np.uint8)
@@ -276,7 +276,7 @@ def frame_bits(frame: Frame) -> tuple[int, int]:
 
 def bits_of(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """`frame_bits` for an array of `RECORD`: nominal bits and fast bits, int64, shape (frames,)."""
-    from drivers.can import kernels
+    from drivers.can.bus import kernels
 
     array = check_records(array)
     nominal = np.zeros(len(array), np.int64)

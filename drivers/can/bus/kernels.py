@@ -1,7 +1,7 @@
 """Compiled part of the bus: bits of frames, arbitration, queues, faults and error counters.
 
 All compiled code of the package is in this one file: numba's cache looks only at the file of the function it loads, so
-that a kernel calling another file's kernel could be served stale. What is imported from `drivers.can.frame` are numbers
+that a kernel calling another file's kernel could be served stale. What is imported from `drivers.can.bus.frame` are numbers
 of the standard, which do not change.
 
 Bits of frames follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and extended format). Levels: 0 dominant,
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from drivers.can.frame import BRS, ESI, EXTENDED, FD, FD_LENGTHS, FD_WIDTH, INTERMISSION, ONE_SHOT, REMOTE
+from drivers.can.bus.frame import BRS, ESI, EXTENDED, FD, FD_LENGTHS, FD_WIDTH, INTERMISSION, ONE_SHOT, REMOTE
 
 # Kinds of an encoded bit, added up.
 FAST = 1
@@ -81,7 +81,7 @@ class Bus(NamedTuple):
         nodes: One row a node, shape (nodes, NODE_COLUMNS).
         queues: Slots in each node's queue, in no order, shape (nodes, capacity).
         slots: One row a frame that is queued or will be, shape (slots, SLOT_COLUMNS).
-        store: The frames of the slots, records of `drivers.can.frame.RECORD`, shape (slots,).
+        store: The frames of the slots, records of `drivers.can.bus.frame.RECORD`, shape (slots,).
         arrivals: Slots that are not queued yet, by time, shape (slots,).
         unused: Stack of free slots, shape (slots,).
         senders: Slots on the wire now; more than one only where nodes send the same identifier, shape (nodes,).

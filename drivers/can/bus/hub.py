@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivers.can import medium
-from drivers.can.bus import OUTCOMES, STATES, BusModel, warm_up
-from drivers.can.frame import CLASSIC_WIDTH, FD_WIDTH, Record, fault_of, pack, resized, sendable
-from drivers.can.health import Guard, Rising
+from drivers.can.bus import codec
+from drivers.can.bus.frame import CLASSIC_WIDTH, FD_WIDTH, Record, fault_of, pack, resized, sendable
+from drivers.can.bus.model import OUTCOMES, STATES, BusModel, warm_up
+from drivers.health import Guard, Rising
 from rig import wire
 from rig.errors import InputError
 from rig.outside import check
@@ -60,20 +60,20 @@ _PARTING_S = 1.0
 _TOKENLESS_S = 10.0
 """How long an endpoint may be without a token; it comes before the request to join, but on another way."""
 _MOST_TOKENS = 16 * MAX_ENDPOINTS
-_LARGEST = 8 + medium.MAX_RECORDS * medium.RECORDS[FD_WIDTH].itemsize
+_LARGEST = 8 + codec.MAX_RECORDS * codec.RECORDS[FD_WIDTH].itemsize
 _FAILED_S = 0.05
 """How long the bus rests where its model has failed."""
 _FEW = 8
 """Frames that are offered one by one; arrays would cost more than they save."""
 
 _ON_WIRE = {
-    "bit error": (medium.PROTOCOL | medium.BUS_ERROR, bytes((0, 0, 0x80, 0))),
-    "collision of equal identifiers": (medium.PROTOCOL | medium.BUS_ERROR, bytes((0, 0, 0x80, 0))),
-    "no acknowledge": (medium.PROTOCOL | medium.BUS_ERROR | medium.NO_ACKNOWLEDGE, bytes((0, 0, 0x80, 0x19))),
+    "bit error": (codec.PROTOCOL | codec.BUS_ERROR, bytes((0, 0, 0x80, 0))),
+    "collision of equal identifiers": (codec.PROTOCOL | codec.BUS_ERROR, bytes((0, 0, 0x80, 0))),
+    "no acknowledge": (codec.PROTOCOL | codec.BUS_ERROR | codec.NO_ACKNOWLEDGE, bytes((0, 0, 0x80, 0x19))),
 }
 """Error frames of what all nodes see: class and first bytes as SocketCAN has them (0x80: on transmission; 0x19: in the
 acknowledge slot); other outcomes are the sender's affair."""
-_CONTROLLER_STATES = (medium.ACTIVE_AGAIN, medium.TRANSMIT_PASSIVE)
+_CONTROLLER_STATES = (codec.ACTIVE_AGAIN, codec.TRANSMIT_PASSIVE)
 
 
 @dataclass(slots=True)
@@ -93,7 +93,7 @@ class _Endpoint:
     dropped: int = 0
     left_s: float | None = None
     """When it was found to have gone."""
-    reported: medium.Report | None = None
+    reported: codec.Report | None = None
     bus_offs: int = 0
     """How often it had been bus-off when last reported."""
 
@@ -130,7 +130,7 @@ class Hub:
         acknowledge: bool = True,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        if not medium.is_name(channel):
+        if not codec.is_name(channel):
             raise InputError("channel", "letters, digits, - and _, such as can0", channel)
         self.channel = channel
         self._model = model
@@ -144,7 +144,7 @@ class Hub:
         self._stopping = False
         self._endpoints: dict[str, _Endpoint] = {}
         self._by_node: dict[int, _Endpoint] = {}
-        self._numbers = np.full(256, medium.NO_NODE, np.uint16)
+        self._numbers = np.full(256, codec.NO_NODE, np.uint16)
         """Number on the medium by number in the model."""
         self._locals: dict[str, _Local] = {}
         self._tokens: dict[str, None] = {}
@@ -174,14 +174,14 @@ class Hub:
         """Take endpoints, and let the bus run on a thread of its own."""
         warm_up()
         if self._server is not None:
-            for name in medium.REQUESTS:
-                self._server.answer(medium.request_key(self.channel, name), partial(self._reply, name))
+            for name in codec.REQUESTS:
+                self._server.answer(codec.request_key(self.channel, name), partial(self._reply, name))
             self._server.on_trouble(self._guard.tell)
-            self._server.watch(medium.node_key(self.channel, "*"), self._watch)
-            self._server.hear(medium.offer_key(self.channel, "*"), self._hear)
+            self._server.watch(codec.node_key(self.channel, "*"), self._watch)
+            self._server.hear(codec.offer_key(self.channel, "*"), self._hear)
         self._thread.start()
         if self._server is not None:
-            self._server.announce(medium.alive_key(self.channel))
+            self._server.announce(codec.alive_key(self.channel))
 
     def close(self) -> None:
         """End the bus; the server stays open and is its owner's to close."""
@@ -234,19 +234,19 @@ class Hub:
             if endpoint is None or endpoint.left_s is not None:
                 self._counts["strange"] += 1
                 return
-            if not _same(endpoint.secret, payload[: medium.SECRET_BYTES].hex()):
+            if not _same(endpoint.secret, payload[: codec.SECRET_BYTES].hex()):
                 self._counts["forged"] += 1
                 return
             try:
-                if len(payload) > medium.SECRET_BYTES + _LARGEST:
-                    raise medium.MediumError("too long")
-                self._offer(endpoint, payload[medium.SECRET_BYTES :])
-            except medium.MediumError:
+                if len(payload) > codec.SECRET_BYTES + _LARGEST:
+                    raise codec.CodecError("too long")
+                self._offer(endpoint, payload[codec.SECRET_BYTES :])
+            except codec.CodecError:
                 self._counts["malformed"] += 1
         self._wake.set()
 
     def _offer(self, endpoint: _Endpoint, payload: bytes) -> None:
-        records = medium.decode_array(payload)
+        records = codec.decode_array(payload)
         fd, node, now = self._model.speed.fd, endpoint.node, self._now()
         room = 0 if endpoint.listen_only else max(0, WINDOW - (endpoint.offered - endpoint.done))
         if len(records) > _FEW:
@@ -256,7 +256,7 @@ class Hub:
             taken["node"], taken["time_ns"] = node, now
             self._model.take(taken.tobytes())
         else:
-            rows = [row for row in medium.decode(payload) if fault_of(row, fd=fd) is None]
+            rows = [row for row in codec.decode(payload) if fault_of(row, fd=fd) is None]
             invalid, count = len(records) - len(rows), min(room, len(rows))
             for row in rows[:count]:
                 self._model.take(pack(row._replace(node=node, time_ns=now)))
@@ -274,23 +274,23 @@ class Hub:
 
         Args:
             name: Which.
-            document: Its arguments, as in `drivers.can.medium`, or what came.
+            document: Its arguments, as in `drivers.can.bus.codec`, or what came.
 
         Raises:
             InputError: It is none, or not from the endpoint that it names.
         """
-        request = check(medium.REQUESTS[name], document, field=name)
-        if isinstance(request, medium.Joining):
+        request = check(codec.REQUESTS[name], document, field=name)
+        if isinstance(request, codec.Joining):
             with self._lock:
                 return self._join(request)
-        if not isinstance(request, medium.Flushing):
+        if not isinstance(request, codec.Flushing):
             return self.status()
         with self._lock:
             endpoint = self._endpoints.get(request.endpoint)
             if endpoint is None:
                 raise InputError("endpoint", "one that has joined", request.endpoint)
             self._check_owner(endpoint.name, endpoint.secret, request.secret)
-            if isinstance(request, medium.Setting):
+            if isinstance(request, codec.Setting):
                 endpoint.listen_only = request.listen_only
             # Both restart the controller, as real ones must be for the one and mostly are for the other.
             self._detach(endpoint)
@@ -307,7 +307,7 @@ class Hub:
                 self._counts["refused"] += 1
             return wire.encode_document({"error": str(error), "field": error.field, "must": error.must})
 
-    def _join(self, request: medium.Joining) -> dict[str, Any]:
+    def _join(self, request: codec.Joining) -> dict[str, Any]:
         name = request.endpoint
         local, known = self._locals.get(name), self._endpoints.get(name)
         if local is not None:
@@ -322,7 +322,7 @@ class Hub:
         number = self._next_number
         # Numbers are used again only after all others: a late frame must not be taken for one's own.
         while True:
-            self._next_number = self._next_number % (medium.NO_NODE - 1) + 1
+            self._next_number = self._next_number % (codec.NO_NODE - 1) + 1
             if all(self._next_number != endpoint.number for endpoint in self._endpoints.values()):
                 break
         secret = _new_secret() if local is None else local.secret
@@ -439,7 +439,7 @@ class Hub:
             reports = self._reports(now)
             if reports:
                 # They count what was sent before them.
-                payloads += [*self._empty_outbox(), medium.encode_reports(reports)]
+                payloads += [*self._empty_outbox(), codec.encode_reports(reports)]
             self._report_due = False
             self._last_report_ns = now
             self._next_report_ns = now + _REPORT_NS
@@ -468,10 +468,10 @@ class Hub:
             if endpoint is not None:
                 endpoint.done += 1
                 endpoint.dropped += outcome != 0
-        records = results["frame"].view(medium.RECORDS[FD_WIDTH])
+        records = results["frame"].view(codec.RECORDS[FD_WIDTH])
         records["time_ns"] += np.uint64(self.epoch_ns)
         records["node"] = self._numbers[results["node"]]
-        records["flags"] &= medium.FD | medium.BRS | medium.ESI
+        records["flags"] &= codec.FD | codec.BRS | codec.ESI
         if results["outcome"].any():
             records = self._with_errors(records, results)
         self._counts["frames"] += len(results) - int(np.count_nonzero(results["outcome"]))
@@ -490,7 +490,7 @@ class Hub:
                 self._counts["errors"] += 1
                 kind, data = _ON_WIRE[text]
                 number = int(records["node"][row])
-                error = medium.error_record(self.epoch_ns + end_ns, kind, data=data + bytes(4), node=number)
+                error = codec.error_record(self.epoch_ns + end_ns, kind, data=data + bytes(4), node=number)
                 records[row] = _array(error)[0]
             else:
                 self._counts["unsent"] += 1
@@ -512,10 +512,10 @@ class Hub:
         self._outbox.clear()
         if records["length"].max() <= CLASSIC_WIDTH:
             records = resized(records, CLASSIC_WIDTH)
-        size = medium.MAX_RECORDS
-        return [medium.encode_array(records[first : first + size]) for first in range(0, len(records), size)]
+        size = codec.MAX_RECORDS
+        return [codec.encode_array(records[first : first + size]) for first in range(0, len(records), size)]
 
-    def _reports(self, now: int) -> list[medium.Report]:
+    def _reports(self, now: int) -> list[codec.Report]:
         """What has changed at the endpoints; those that have gone are forgotten."""
         found = []
         seconds = time.monotonic()
@@ -535,30 +535,30 @@ class Hub:
             # A recovery may be over before anybody has looked.
             bus_offs = self._model.node(endpoint.node).bus_offs
             if bus_offs > endpoint.bus_offs:
-                self._tell(now, report, medium.BUS_OFF, 0)
+                self._tell(now, report, codec.BUS_OFF, 0)
             state = 2 if bus_offs > endpoint.bus_offs else 0 if before is None else before.state
             endpoint.bus_offs = bus_offs
             if state == 2 and report.state < 2:
-                self._tell(now, report, medium.RESTARTED, 0)
+                self._tell(now, report, codec.RESTARTED, 0)
             elif report.state != state:
-                self._tell(now, report, medium.CONTROLLER, _CONTROLLER_STATES[report.state])
+                self._tell(now, report, codec.CONTROLLER, _CONTROLLER_STATES[report.state])
         return found
 
-    def _tell(self, now: int, report: medium.Report, kind: int, detail: int) -> None:
+    def _tell(self, now: int, report: codec.Report, kind: int, detail: int) -> None:
         """An error frame about one node's controller."""
         counters = (min(report.transmit_errors, 255), min(report.receive_errors, 255))
         data = bytes((0, detail, 0, 0, 0, 0, *counters))
-        change = medium.error_record(self.epoch_ns + now, kind | medium.COUNTERS, data=data, node=report.node)
+        change = codec.error_record(self.epoch_ns + now, kind | codec.COUNTERS, data=data, node=report.node)
         self._outbox.append(_array(change))
 
-    def _report(self, endpoint: _Endpoint) -> medium.Report:
+    def _report(self, endpoint: _Endpoint) -> codec.Report:
         node = self._model.node(endpoint.node)
         state = STATES.index(node.state)
-        return medium.Report(endpoint.number, state, node.tec, node.rec, endpoint.done, endpoint.dropped)
+        return codec.Report(endpoint.number, state, node.tec, node.rec, endpoint.done, endpoint.dropped)
 
     def _publish(self, payload: bytes) -> None:
         if self._server is not None:
-            self._guard(self._server.publish, medium.bus_key(self.channel), payload)
+            self._guard(self._server.publish, codec.bus_key(self.channel), payload)
         for local in list(self._locals.values()):
             self._guard(local.take, payload)
 
@@ -592,11 +592,11 @@ class Hub:
 
 
 def _array(record: Record) -> np.ndarray:
-    return np.frombuffer(bytearray(pack(record)), medium.RECORDS[FD_WIDTH])
+    return np.frombuffer(bytearray(pack(record)), codec.RECORDS[FD_WIDTH])
 
 
 def _new_secret() -> str:
-    return secrets.token_hex(medium.SECRET_BYTES)
+    return secrets.token_hex(codec.SECRET_BYTES)
 
 
 def _same(secret: str, given: str) -> bool:
