@@ -252,20 +252,10 @@ def encode(frame: Frame) -> Encoded:
     """All bits of a frame on the bus."""
     from drivers.can.bus import kernels
 
-    record = records([frame])[0]
-    bits = np.zeros(kernels.LONGEST, np.uint8)
-    kinds = np.zeros(kernels.LONGEST, np.uint8)
-    count, crc = kernels.encode(
-        int(record["identifier"]), int(record["length"]), int(record["flags"]), record["data"], bits, kinds
-    )
-    kinds = kinds[:count]
-    return Encoded(
-        bits[:count],
-        kinds & kernels.FAST != 0,
-        kinds & kernels.STUFF != 0,
-        kinds & kernels.FIXED != 0,
-        int(crc),
-    )
+    work = np.zeros((3, kernels.LONGEST), np.uint8)
+    count, crc = kernels.encode(records([frame])[0], work)
+    bits, kinds = work[:2, :count]
+    return Encoded(bits, kinds & kernels.FAST != 0, kinds & kernels.STUFF != 0, kinds & kernels.FIXED != 0, int(crc))
 
 
 def frame_bits(frame: Frame) -> tuple[int, int]:
