@@ -21,9 +21,8 @@ import can  # noqa: TID253 - the subject
 import numpy as np
 import pytest
 
-from drivers.can.bus import codec, slcan, socketcand
-from drivers.can.bus import hub as hubs
-from drivers.can.bus.frame import fault_of
+from drivers.can.bus import codec, endpoints, slcan, socketcand
+from drivers.can.bus.frame import fault_of, packed
 from drivers.can.bus.hub import Hub
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.slcan import SlcanPort
@@ -235,7 +234,7 @@ def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[co
         length = int(random.choice((0, 1, 7, 8, 9, 12, 48, 63, 64, 200)))
         flags = int(random.choice((0, 0, 0, 1, 3, 7, 2, 16, 255)))
         rows.append(codec.Record(0, word, length, flags, int(random.integers(1 << 16)), random.bytes(min(length, 64))))
-    message = codec.encode(rows)
+    message = codec.encode(packed(rows))
     kind = random.integers(8)
     if kind == 0:
         return mutated(random, secret + message), []
@@ -260,10 +259,10 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
         HubBus(hub, rx_queue_size=10_000) as receiver,
         HubBus(hub) as villain,
     ):
-        names = [sender._name, receiver._name, villain._name, "ghost", "", "x" * 100, "a/b"]
+        names = [sender.name, receiver.name, villain.name, "ghost", "", "x" * 100, "a/b"]
         for example in examples[1:3]:
-            example["endpoint"] = sender._name
-        secret = bytes.fromhex(villain._secret or "")
+            example["endpoint"] = sender.name
+        secret = bytes.fromhex(villain.secret or "")
         requests = documents(random, inputs(1500), examples)
         got: list[int] = []
         strangers = sent = 0
@@ -283,16 +282,15 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
             payload, _ = an_offer(random, secret)
             victim = names[random.integers(len(names))]
             # Under another's name always with a wrong secret; under its own no more than leaves the bus some room.
-            if victim == villain._name and hub._waiting > 5:
+            if victim == villain.name and hub.endpoints.waiting > 5:
                 payload = payload[1:]
             hub.offer(victim, payload)
             if number % 3 == 0:
-                hub._reply("join", b'{"endpoint": "ghost%d"}' % number)
-            hub._reply(("join", "set", "flush", "status")[random.integers(4)], request)
-            hub._watch(
-                f"rig/can/can0/node/{names[random.integers(3, 7)]}{random.integers(3000)}", random.random() < 0.7
-            )
-            villain._take(payload[16:])
+                hub.reply("join", b'{"endpoint": "ghost%d"}' % number)
+            hub.reply(("join", "set", "flush", "status")[random.integers(4)], request)
+            hub.watch(f"rig/can/can0/node/{names[random.integers(3, 7)]}{random.integers(3000)}", random.random() < 0.7)
+            with contextlib.suppress(codec.CodecError):
+                villain.hear(codec.decode(payload[16:]))
             if number % 20 == 0:
                 sender.send(
                     can.Message(arbitration_id=1, data=sent.to_bytes(4, "big"), is_extended_id=False), timeout=5.0
@@ -307,11 +305,11 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
         for name in ("malformed", "invalid", "refused", "forged", "strange", "evicted"):
             assert counts[name] > 3, name
         assert hub._guard.failures == 0
-        assert sum(row["name"] not in names[:3] for row in status["nodes"]) <= hubs.MAX_ENDPOINTS
-        assert len(hub._tokens) <= 16 * hubs.MAX_ENDPOINTS
+        assert sum(row["name"] not in names[:3] for row in status["nodes"]) <= endpoints.MAX_ENDPOINTS
+        assert len(hub.endpoints.tokens) <= 16 * endpoints.MAX_ENDPOINTS
         rows = {row["name"]: row for row in status["nodes"]}
-        assert rows[sender._name]["listen_only"] is False
-        assert rows[sender._name]["dropped"] == 0
+        assert rows[sender.name]["listen_only"] is False
+        assert rows[sender.name]["dropped"] == 0
         assert hub._thread.is_alive()
 
 

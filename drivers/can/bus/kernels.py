@@ -1,9 +1,9 @@
-"""Compiled part of the bus, in one file: numba's cache looks only at the file of the function that it loads, so that a
-kernel which calls another file's kernel could be served stale.
+"""Compiled part of the bus, in one file though it is long: numba's cache looks only at the file of what it loads.
 
-In order: bits of frames, arbitration, queues, faults and error counters. What is imported from `drivers.can.bus.frame`
-are numbers of the standard, which do not change. Bits follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and
-extended format). Levels: 0 dominant, 1 recessive. Time is an integer [ns]; bit times are integers [ps].
+A kernel that calls another file's kernel could be served stale. In order: bits of frames, arbitration, queues, faults,
+error counters. What is imported from `drivers.can.bus.frame` are numbers of the standard, which do not change. Bits
+follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and extended format). Levels: 0 dominant, 1 recessive. Time
+is an integer [ns]; bit times are integers [ps].
 """
 
 from __future__ import annotations
@@ -144,7 +144,9 @@ def header_and_data(identifier, length, flags, data, raw):
     n = _write(raw, n, _CODES[length], 4)
     if remote == 0:
         for i in range(length):
-            n = _write(raw, n, np.int64(data[i]), 8)
+            for k in range(7, -1, -1):
+                raw[n] = (data[i] >> k) & 1
+                n += 1
     return n, switch
 
 
