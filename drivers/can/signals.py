@@ -338,14 +338,24 @@ _STOP_SIGNALS = (
     Signal("reserved", 16, 32, label="Always 0"),
     *_HEAD,
 )
+LIMITS = {"force_n": (1.0, 1000.0), "duration_ms": (0.5, 50.0)}
+"""Least and largest value of a command's field that the rig takes [N], [ms]; the drive's top speed is its parameter."""
 _HAMMER, _SPEED, _RELEASE = (int(Kind.HAMMER),), (int(Kind.SPEED),), (int(Kind.RELEASE),)
+
+
+def _within(label: str, name: str) -> str:
+    return "{}, {:g} to {:g}".format(label, *LIMITS[name])
+
+
 _COMMAND_SIGNALS = (
     Signal(
         "kind", 0, 8, label="What to do", selects=True,
         choices={value: name for value, name in _choices(Kind).items() if value != Kind.STOP},
     ),
-    Signal("force", 16, 16, scale=0.1, unit="N", label="Peak force, 1 to 1000", selected_by=_HAMMER),
-    Signal("duration", 32, 8, scale=0.25, unit="ms", label="Of the half sine, 0.5 to 50", selected_by=_HAMMER),
+    Signal("force", 16, 16, scale=0.1, unit="N", label=_within("Peak force", "force_n"), selected_by=_HAMMER),
+    Signal(
+        "duration", 32, 8, scale=0.25, unit="ms", label=_within("Of the half sine", "duration_ms"), selected_by=_HAMMER
+    ),
     Signal("direction", 40, 8, scale=1.5, unit="deg", label="From x (EAST) toward y (up)", selected_by=_HAMMER),
     Signal("speed", 16, 24, scale=0.001, unit="Hz", label="Speed that the drive holds", selected_by=_SPEED),
     Signal("reserved_speed", 40, 8, label="Always 0", selected_by=_SPEED),

@@ -13,6 +13,7 @@ import re
 import select
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -46,6 +47,7 @@ from tests.hostile.documents import documents
 from tests.unit.instruments_fake import FakeRig
 from tests.unit.test_transport_zenoh import until
 
+THREADS = {"can gateway sends", "can gateway receives", "can gateway asks"}
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(3600)]
 _channels = itertools.count()
 
@@ -160,30 +162,30 @@ def test_a_command_is_carried_out_only_where_its_frame_is_exactly_valid() -> Non
     ):
         valid = 0
         for number in range(inputs(3000)):
-            message = a_frame(random, gateway._counter)
-            good = is_command(message, gateway._counter)
+            message = a_frame(random, gateway.commands.counter)
+            good = is_command(message, gateway.commands.counter)
             before = len(rig.taken)
-            gateway._take_message(message)
+            gateway.commands.take_message(message)
             if good:
                 valid += 1
-                until(lambda: len(rig.taken) > before and not gateway._asked)  # noqa: B023
+                until(lambda: len(rig.taken) > before and not gateway.commands.waiting)  # noqa: B023
             assert len(rig.taken) == before + good, message
             if number % 100 == 0:
                 while other.recv(0) is not None:
                     pass
         assert valid > number // 10
-        assert gateway.counts.accepted > 0
-        assert gateway.counts.refused.total() > number // 10
-        assert all(thread.is_alive() for thread in gateway._threads)
+        assert gateway.commands.accepted > 0
+        assert gateway.commands.refused.total() > number // 10
+        assert {thread.name for thread in threading.enumerate()} >= THREADS
         assert gateway.warnings() == []
         # The bus itself, and what the gateway's own thread makes of it.
         for _ in range(2000):
             with contextlib.suppress(can.CanError, ValueError):
-                other.send(a_frame(random, gateway._counter))
+                other.send(a_frame(random, gateway.commands.counter))
         before = len(rig.taken)
         time.sleep(0.3)
-        until(lambda: not gateway._asked)
-        identifier, data = command_frame(Kind.SPEED, gateway._counter + 1, speed_hz=5.0)
+        until(lambda: not gateway.commands.waiting)
+        identifier, data = command_frame(Kind.SPEED, gateway.commands.counter + 1, speed_hz=5.0)
         other.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
         until(lambda: rig.taken[-1][1].get("speed_hz") == 5.0)
 
@@ -207,14 +209,14 @@ def test_blocks_events_and_states_that_lie_do_not_stop_a_gateway() -> None:
         Gateway(MemoryClient(rig.server), own, Schedule(1000, 10_000)) as gateway,
     ):
         for number, document in enumerate(documents(random, inputs(1000), events)):
-            gateway._guard(gateway._unpack, keys[random.integers(len(keys))], document)
-            gateway._guard(gateway._unpack, keys[random.integers(len(keys))], mutated(random, block))
+            gateway.guard(gateway.unpack, keys[random.integers(len(keys))], document)
+            gateway.guard(gateway.unpack, keys[random.integers(len(keys))], mutated(random, block))
             if number % 100 == 0:
                 while other.recv(0) is not None:
                     pass
-        gateway._slots.clear()
-        assert all(thread.is_alive() for thread in gateway._threads)
-        assert gateway._waiting_frames <= gateway._room + 512
+        assert {thread.name for thread in threading.enumerate()} >= THREADS
+        # A quarter of a second of what is sent.
+        assert gateway.outbox.waiting <= 0.25 * 13_000 + 512
         identifier = default_messages().by_name["Heartbeat"].identifier
         while (found := other.recv(5.0)) is not None and found.arbitration_id != identifier:
             pass

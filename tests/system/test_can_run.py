@@ -136,8 +136,8 @@ def test_a_blow_from_the_bus_causes_the_whirl_and_wrong_ones_do_nothing(tmp_path
         assert (reply["result"], reply["counter"]) == (Result.ACCEPTED, 2)
         assert rig.ask(*blow)["result"] == Result.STALE_COUNTER
         rig.console.step(1_600_000)
-        assert rig.gateway.counts.accepted == 1
-        assert dict(rig.gateway.counts.refused) == {"bad_checksum": 1, "out_of_range": 1, "stale_counter": 2}
+        assert rig.gateway.commands.accepted == 1
+        assert dict(rig.gateway.commands.refused) == {"bad_checksum": 1, "out_of_range": 1, "stale_counter": 2}
         rig.read()
     compared = check_against_recording(rig.frames, rig.path, rates={True: 10_000, False: 1000})
     assert compared == 15 * 20_000 + 15 * 2000
