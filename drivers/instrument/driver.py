@@ -18,9 +18,10 @@ from drivers.instrument import protocol
 from drivers.instrument.protocol import Codec, Message, ProtocolError
 from drivers.instrument.sheet import Sheet, parse_sheet
 from drivers.link import ROOM, Link, LinkError, LinkTimeoutError, open_link
-from drivers.samples import Pile, Samples, Sequence, StreamEndedError
+from drivers.samples import Pile, Samples, StreamEndedError, follow
 from rig.channels import Group
 from rig.errors import InputError, RefusedError
+from rig.wire import Continuity
 
 M = TypeVar("M", bound=Message)
 _SLICE_S = 1.0
@@ -170,7 +171,7 @@ class Sampler(Instrument):
         super().__init__(link, timeout_s=timeout_s)
         self._group: Group | None = None
         self._stream: int | None = None
-        self._rows = Sequence()
+        self._rows = Continuity()
         self._pile = Pile()
         self._ended: str | None = None
 
@@ -204,7 +205,7 @@ class Sampler(Instrument):
         if self._group is None:
             self.configure()
         self._pile.clear()
-        self._rows = Sequence()
+        self._rows = Continuity()
         self._ended = None
         self._stream = self._ask(protocol.Start(), protocol.Started).stream
 
@@ -291,5 +292,5 @@ class Sampler(Instrument):
             units=tuple(channel.unit for channel in group.channels),
             values=group.engineering(rows.counts),
         )
-        if (new := self._rows.follow(came)) is not None:
+        if (new := follow(self._rows, came)) is not None:
             self._pile.add(new)

@@ -20,6 +20,7 @@ from drivers.link import Port
 from drivers.stream import RigStream, thin, whole_step
 from rig import wire
 from rig.channels import Group
+from rig.desk import one_line
 from rig.errors import InputError
 from rig.transport import NoReplyError
 
@@ -86,11 +87,11 @@ class Twin:
             reply = self._carry_out(request)
         except ProtocolError as error:
             sequence = error.sequence
-            reply = protocol.Refused(error.reason, _one_line(error))
+            reply = protocol.Refused(error.reason, one_line(error))
         except InputError as error:
-            reply = protocol.Refused(Reason.REFUSED, _one_line(error))
+            reply = protocol.Refused(Reason.REFUSED, one_line(error))
         except NoReplyError as error:
-            reply = protocol.Refused(Reason.UNAVAILABLE, _one_line(error))
+            reply = protocol.Refused(Reason.UNAVAILABLE, one_line(error))
         self.refused += isinstance(reply, protocol.Refused)
         return self.CODEC.encode(reply, sequence)
 
@@ -267,7 +268,3 @@ class Twin:
         if self._leave is not None:
             self._leave()
         self._port.close()
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())

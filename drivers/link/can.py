@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from drivers.link import FORMS, ROOM, Address, LinkClosedError, LinkTimeoutError
+from rig.desk import one_line
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class CanMedium:
         try:
             self.bus: can.BusABC = can.Bus(channel, interface, can_filters=filters, **settings)  # pyright: ignore
         except (can.CanError, OSError, ValueError, TypeError) as error:
-            raise InputError("can", f"a bus that can be opened ({' '.join(str(error).split())})", spec) from None
+            raise InputError("can", f"a bus that can be opened ({one_line(error)})", spec) from None
         self._receivers: dict[int, Callable[[can.Message], None]] = {}
         self.fd = settings.get("fd") is True or self.bus.protocol is can.CanProtocol.CAN_FD
         self._notifier = can.Notifier(self.bus, [self._take], timeout=0.1)

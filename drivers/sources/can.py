@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivers.can.signals import Message, MessageTable, State, default_messages
+from drivers.can.message import Message, MessageTable
+from drivers.can.signals import State, default_messages
 from drivers.samples import Samples
 from drivers.stream import RIG_GONE, whole_step
 from rig.errors import InputError

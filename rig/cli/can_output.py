@@ -191,7 +191,13 @@ class CanOutput:
         return (
             f"CAN {self.interface}:{self.channel} at {self.speed}, all channels at {sent}; "
             f"load at most {100 * self.load:.1f} %"
-        ) + "".join(f"\nrig: {line}" for line in (self._outlets.lines() if self._outlets is not None else []))
+        ) + "".join(
+            f"\nrig: {line}"
+            for line in (
+                *(f"warning: {warning}" for warning in self.schedule.warnings(self.speed)),
+                *(self._outlets.lines() if self._outlets is not None else []),
+            )
+        )
 
     def _figures(self) -> dict[str, float]:
         if self._gateway is None:

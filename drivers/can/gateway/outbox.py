@@ -13,8 +13,8 @@ import numpy as np
 
 from drivers.can.bus import codec
 from drivers.can.gateway.samples import records_of
+from drivers.can.message import Message
 from drivers.can.schedule import SLOT_S
-from drivers.can.signals import Message
 from rig import wire
 
 if TYPE_CHECKING:

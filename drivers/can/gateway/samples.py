@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from drivers.can.bus.frame import BRS, FD, FD_WIDTH, RECORDS, octets
+from drivers.can.message import ABSENT, Message
 from drivers.can.schedule import Schedule
-from drivers.can.signals import ABSENT, Message, default_messages
+from drivers.can.signals import default_messages
 from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
