@@ -52,10 +52,7 @@ class CanMedium:
 
         interface, channel, settings = parse_spec(spec)
         filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in receive]
-        try:
-            self.bus: can.BusABC = can.Bus(channel, interface, can_filters=filters, **settings)  # pyright: ignore
-        except (can.CanError, OSError, ValueError, TypeError) as error:
-            raise InputError("can", f"a bus that can be opened ({one_line(error)})", spec) from None
+        self.bus = open_bus(interface, channel, can_filters=filters, **settings)
         self._receivers: dict[int, Callable[[can.Message], None]] = {}
         self.fd = settings.get("fd") is True or self.bus.protocol is can.CanProtocol.CAN_FD
         self._notifier = can.Notifier(self.bus, [self._take], timeout=0.1)
@@ -77,6 +74,21 @@ class CanMedium:
         """Leave the bus."""
         self._notifier.stop(timeout=2.0)
         self.bus.shutdown()
+
+
+def open_bus(interface: str, channel: str, **settings: Any) -> can.BusABC:
+    """One of python-can's buses.
+
+    Raises:
+        InputError: There is no such bus, or it cannot be opened.
+    """
+    import can
+
+    try:
+        return can.Bus(channel, interface, **settings)
+    except (can.CanError, OSError, ValueError, TypeError) as error:
+        must = f"a bus that can be opened ({one_line(error)})"
+        raise InputError("can", must, f"{interface}:{channel}") from None
 
 
 def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:

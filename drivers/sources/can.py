@@ -21,7 +21,7 @@ from drivers.stream import RIG_GONE, whole_step
 from rig.errors import InputError
 
 if TYPE_CHECKING:
-    import can
+    pass
 
 _PATIENCE_S = 3.0
 """A bus that is silent for so long has no rig any more, whose heart beats once a second."""
@@ -113,9 +113,7 @@ class CanSource:
     """
 
     def __init__(self, spec: str, *, wait_s: float = 3.0, table: MessageTable | None = None) -> None:
-        import can
-
-        from drivers.link.can import parse_spec
+        from drivers.link.can import open_bus, parse_spec
 
         interface, channel, settings = parse_spec(spec)
         self._wish = settings.pop("layout", None)
@@ -123,10 +121,7 @@ class CanSource:
             raise InputError("layout", "fd or classic", self._wish)
         self._table = table or default_messages()
         self._wait_s = wait_s
-        try:
-            self._bus: can.BusABC = can.Bus(channel, interface, **settings)  # pyright: ignore[reportArgumentType]
-        except (can.CanError, OSError, ValueError, TypeError) as error:
-            raise InputError("can", f"a bus that can be opened ({' '.join(str(error).split())})", spec) from None
+        self._bus = open_bus(interface, channel, **settings)
         self._lock = threading.Lock()
         self._rates: dict[str, int] | None = None
         self._started = (0, 0)

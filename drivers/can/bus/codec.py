@@ -114,7 +114,7 @@ class Joined(Outside):
 
 
 class CodecError(ValueError):
-    """A payload is not a message of this bus."""
+    """A payload is not a message of this bus, or a frame none that a controller can send."""
 
 
 class Report(NamedTuple):

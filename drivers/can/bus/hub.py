@@ -169,29 +169,21 @@ class Hub:
 
     def offer(self, name: str, payload: bytes) -> None:
         """Take a message of frames from an endpoint: its secret, then the message."""
+        records = None
+        with contextlib.suppress(codec.CodecError):
+            if len(payload) <= codec.SECRET_BYTES + _LARGEST:
+                records = codec.decode(payload[codec.SECRET_BYTES :])
+        self.offer_records(name, payload[: codec.SECRET_BYTES].hex(), records)
 
-        def read() -> np.ndarray:
-            if len(payload) > codec.SECRET_BYTES + _LARGEST:
-                raise codec.CodecError("too long")
-            records = codec.decode(payload[codec.SECRET_BYTES :])
-            if not isinstance(records, np.ndarray):
-                raise codec.CodecError("reports where frames were expected")
-            return records
-
-        self._take_offer(name, payload[: codec.SECRET_BYTES].hex(), read)
-
-    def offer_records(self, name: str, secret: str, records: np.ndarray) -> None:
-        """`offer` within this process: frames as an array of one of the `RECORDS` layouts, which is not kept."""
-        self._take_offer(name, secret, lambda: records)
-
-    def _take_offer(self, name: str, secret: str, read: Callable[[], np.ndarray]) -> None:
+    def offer_records(self, name: str, secret: str, records: codec.Said | None) -> None:
+        """`offer` within this process: an array of one of the `RECORDS` layouts, which is not kept."""
         with self._lock:
             endpoint = self.endpoints.owner(name, secret)
             if endpoint is None:
                 return
-            try:
-                self._report_due |= self.endpoints.offer(endpoint, read(), self._now())
-            except codec.CodecError:
+            if isinstance(records, np.ndarray):
+                self._report_due |= self.endpoints.offer(endpoint, records, self._now())
+            else:
                 self._counts["malformed"] += 1
         self._wake.set()
 

@@ -149,11 +149,9 @@ class BusModel:
             width = max(queue, bus.queues.shape[1])
             queues = np.zeros((rows, width), np.int64)
             queues[: len(bus.queues), : bus.queues.shape[1]] = bus.queues
-            nodes = np.zeros((rows, kernels.NODE_COLUMNS), np.int64)
-            nodes[: len(bus.nodes)] = bus.nodes
-            senders = np.zeros(rows, np.int64)
-            senders[: len(bus.senders)] = bus.senders
-            self._bus = bus = bus._replace(queues=queues, nodes=nodes, senders=senders)
+            self._bus = bus = bus._replace(
+                queues=queues, nodes=_longer(bus.nodes, rows), senders=_longer(bus.senders, rows)
+            )
             # One step of the kernel ends at most one transmission, or empties each queue once.
             self._results = np.zeros((rows * (width + 2) + _GROWTH, kernels.RESULT_COLUMNS), np.int64)
         if node == len(self._names):
@@ -372,18 +370,13 @@ class BusModel:
         bus = self._bus
         before = len(bus.slots)
         after = max(2 * before, before + missing, _GROWTH)
-        free = int(bus.cells[kernels.FREE_SLOTS])
-        slots = np.zeros((after, kernels.SLOT_COLUMNS), np.int64)
-        slots[:before] = bus.slots
-        store = np.zeros(after, frames.RECORD)
-        store[:before] = bus.store
-        arrivals = np.zeros(after, np.int64)
-        arrivals[:before] = bus.arrivals
-        unused = np.zeros(after, np.int64)
-        unused[:free] = bus.unused[:free]
-        unused[free : free + after - before] = np.arange(before, after)
-        bus.cells[kernels.FREE_SLOTS] = free + after - before
-        self._bus = bus._replace(slots=slots, store=store, arrivals=arrivals, unused=unused)
+        self._bus = bus._replace(
+            slots=_longer(bus.slots, after),
+            store=_longer(bus.store, after),
+            arrivals=_longer(bus.arrivals, after),
+            unused=_longer(bus.unused, after),
+        )
+        self._free(np.arange(before, after))
 
     def _collect(self, rows: np.ndarray) -> np.ndarray:
         slots = rows[:, kernels.R_SLOT]
@@ -405,3 +398,10 @@ class BusModel:
         free = int(cells[kernels.FREE_SLOTS])
         self._bus.unused[free : free + len(slots)] = slots
         cells[kernels.FREE_SLOTS] = free + len(slots)
+
+
+def _longer(array: np.ndarray, rows: int) -> np.ndarray:
+    """The same rows and more, which are zero."""
+    found = np.zeros((rows, *array.shape[1:]), array.dtype)
+    found[: len(array)] = array
+    return found
