@@ -52,7 +52,7 @@ class CanMedium:
 
         interface, channel, settings = parse_spec(spec)
         filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in receive]
-        self.bus = open_bus(interface, channel, can_filters=filters, **settings)
+        self.bus = open_bus(spec, interface, channel, can_filters=filters, **settings)
         self._receivers: dict[int, Callable[[can.Message], None]] = {}
         self.fd = settings.get("fd") is True or self.bus.protocol is can.CanProtocol.CAN_FD
         self._notifier = can.Notifier(self.bus, [self._take], timeout=0.1)
@@ -76,8 +76,8 @@ class CanMedium:
         self.bus.shutdown()
 
 
-def open_bus(interface: str, channel: str, **settings: Any) -> can.BusABC:
-    """One of python-can's buses.
+def open_bus(spec: str, interface: str, channel: str, **settings: Any) -> can.BusABC:
+    """One of python-can's buses; the specification is what an error names.
 
     Raises:
         InputError: There is no such bus, or it cannot be opened.
@@ -87,8 +87,7 @@ def open_bus(interface: str, channel: str, **settings: Any) -> can.BusABC:
     try:
         return can.Bus(channel, interface, **settings)
     except (can.CanError, OSError, ValueError, TypeError) as error:
-        must = f"a bus that can be opened ({one_line(error)})"
-        raise InputError("can", must, f"{interface}:{channel}") from None
+        raise InputError("can", f"a bus that can be opened ({one_line(error)})", spec) from None
 
 
 def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:

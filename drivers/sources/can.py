@@ -121,7 +121,7 @@ class CanSource:
             raise InputError("layout", "fd or classic", self._wish)
         self._table = table or default_messages()
         self._wait_s = wait_s
-        self._bus = open_bus(interface, channel, **settings)
+        self._bus = open_bus(spec, interface, channel, **settings)
         self._lock = threading.Lock()
         self._rates: dict[str, int] | None = None
         self._started = (0, 0)

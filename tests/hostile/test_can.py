@@ -33,7 +33,6 @@ from drivers.can.interface import HubBus
 from drivers.can.schedule import Schedule
 from drivers.can.signals import AHEAD, KEY, Kind, checksum, command_frame, default_messages
 from drivers.instrument.protocol import Codec, ProtocolError
-from drivers.link import memory
 from drivers.link.can import TO_INSTRUMENT, CanLink, CanMedium
 from drivers.link.frames import Deframer, frame, unstuff
 from drivers.link.port import MessagePort
@@ -44,6 +43,7 @@ from rig.channels import default_table
 from rig.transport.memory import MemoryClient, MemoryServer
 from tests.hostile import inputs
 from tests.hostile.documents import documents
+from tests.unit import link_memory as memory
 from tests.unit.instruments_fake import FakeRig
 from tests.unit.test_transport_zenoh import until
 

@@ -28,7 +28,7 @@ from drivers.instrument.aio import AsyncInstrument, AsyncSampler
 from drivers.instrument.driver import Instrument, Sampler
 from drivers.instrument.protocol import ProtocolError
 from drivers.instrument.twin import Twin
-from drivers.link import Address, Link, LinkClosedError, LinkError, LinkTimeoutError, frames, memory, open_link
+from drivers.link import Address, Link, LinkClosedError, LinkError, LinkTimeoutError, frames, open_link
 from drivers.link.port import MessagePort
 from drivers.link.serial import open_pty, open_serial
 from drivers.magnet.driver import AsyncMagnet, Magnet
@@ -40,6 +40,7 @@ from rig.channels import default_table
 from rig.errors import InputError, RefusedError
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.unit import link_memory as memory
 from tests.unit.instruments_fake import BLOCK, FakeRig, values_of
 from tests.unit.test_transport_zenoh import free_endpoint, until
 
