@@ -64,7 +64,7 @@ class Instrument:
     CODEC: ClassVar[Codec]
 
     def __init__(self, link: Link, *, timeout_s: float = 3.0) -> None:
-        self._link = link
+        self.link = link
         self._timeout_s = timeout_s
         # From anywhere, so that a late reply to whoever had the line before is not taken for ours.
         self._sequence = random.getrandbits(32)
@@ -93,7 +93,7 @@ class Instrument:
 
     def identify(self) -> Sheet:
         """Identification and calibration, as the instrument tells them now."""
-        self._sheet = parse_sheet(self._ask(protocol.Identify(), protocol.Identity).sheet)
+        self._sheet = parse_sheet(self.ask(protocol.Identify(), protocol.Identity).sheet)
         return self._sheet
 
     @property
@@ -104,11 +104,11 @@ class Instrument:
     @property
     def lost(self) -> int:
         """Messages that were dropped or spoilt at this end of the link; lost rows show as gaps as well."""
-        return self._link.lost + self.dropped + self.malformed
+        return self.link.lost + self.dropped + self.malformed
 
     def close(self) -> None:
         """Close the link; may be called again."""
-        self._link.close()
+        self.link.close()
 
     def __enter__(self) -> Self:
         return self
@@ -123,13 +123,19 @@ class Instrument:
             RefusedError: It refuses, for the reason in the message.
             LinkError: No reply came; whether it was done is not known.
         """
-        done = self._ask(act, protocol.Done)
+        done = self.ask(act, protocol.Done)
         return Done(id=done.id, tick=done.tick, time_s=done.time_s)
 
-    def _ask(self, request: Message, expected: type[M]) -> M:
+    def ask(self, request: Message, expected: type[M]) -> M:
+        """Send a request of the protocol; returns the reply, which must be of that kind.
+
+        Raises:
+            RefusedError: The instrument refuses, for the reason in the message.
+            LinkError: It could not answer, or did not in time.
+        """
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         deadline = time.monotonic() + self._timeout_s
-        self._link.send(self.CODEC.encode(request, self._sequence), timeout_s=self._timeout_s)
+        self.link.send(self.CODEC.encode(request, self._sequence), timeout_s=self._timeout_s)
         while (left := deadline - time.monotonic()) > 0:
             received = self._receive(left)
             if received is None:
@@ -148,7 +154,7 @@ class Instrument:
         )
 
     def _receive(self, timeout_s: float) -> tuple[int, Message] | None:
-        data = self._link.receive(timeout_s=timeout_s)
+        data = self.link.receive(timeout_s=timeout_s)
         if data is None:
             return None
         try:
@@ -190,7 +196,7 @@ class Sampler(Instrument):
         sheet = self.identify()
         wanted = sheet.group(tuple(channels)).names if channels else tuple(row.name for row in sheet.channels)
         mask = sum(1 << n for n, row in enumerate(sheet.channels) if row.name in wanted)
-        reply = self._ask(protocol.Configure(rate_hz=float(rate_hz), channels=mask), protocol.Configured)
+        reply = self.ask(protocol.Configure(rate_hz=float(rate_hz), channels=mask), protocol.Configured)
         names = tuple(row.name for n, row in enumerate(sheet.channels) if reply.channels >> n & 1)
         self._group = group = sheet.group(names)
         self._stream = None
@@ -207,7 +213,7 @@ class Sampler(Instrument):
         self._pile.clear()
         self._rows = Continuity()
         self._ended = None
-        self._stream = self._ask(protocol.Start(), protocol.Started).stream
+        self._stream = self.ask(protocol.Start(), protocol.Started).stream
 
     def stop(self) -> None:
         """End the stream; what came before can still be read."""
@@ -223,7 +229,7 @@ class Sampler(Instrument):
         super().close()
 
     def _stop(self, *, discard: bool) -> None:
-        self._ask(protocol.Stop(self._stream or 0, int(discard)), protocol.Stopped)
+        self.ask(protocol.Stop(self._stream or 0, int(discard)), protocol.Stopped)
 
     def read(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Samples:
         """The next rows of the stream.

@@ -75,6 +75,11 @@ class Twin:
         port.serve(self.answer, self._on_idle)
 
     @property
+    def running(self) -> bool:
+        """Whether a stream is on its way to the host."""
+        return self._running is not None
+
+    @property
     def url(self) -> str:
         """What a host opens."""
         return self._port.url

@@ -60,6 +60,10 @@ class Splitter:
     def __init__(self) -> None:
         self._text = b""
 
+    def __len__(self) -> int:
+        """Bytes that wait for the rest of their command."""
+        return len(self._text)
+
     def feed(self, data: bytes) -> Iterator[str | None]:
         """The commands that are complete with this data, without brackets; None stands for text that is none.
 
