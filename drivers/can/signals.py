@@ -292,20 +292,16 @@ def _classic_messages(table: ChannelTable) -> list[Message]:
     return found
 
 
-@cache
-def _default_messages() -> MessageTable:
-    return make_table(default_table())
-
-
 def make_table(channels: ChannelTable) -> MessageTable:
     """All messages for a channel table."""
     rows = [*_other_messages(), *_fd_messages(channels), *_classic_messages(channels)]
     return MessageTable(tuple(sorted(rows, key=lambda row: row.identifier)))
 
 
+@cache
 def default_messages() -> MessageTable:
     """The messages of the rig's own channel table."""
-    return _default_messages()
+    return make_table(default_table())
 
 
 def _crc_table() -> bytes:
@@ -378,16 +374,12 @@ def command_frame(
         speed_hz: Speed that the drive holds [Hz], to 0.001.
     """
     message = default_messages().by_name["Stop" if kind is Kind.STOP else "Command"]
-    raw = {"kind": int(kind), "counter": counter & 0xFF, "key": KEY}
-    if kind is Kind.HAMMER:
-        raw |= {
-            "force": round(force_n / 0.1),
-            "duration": round(duration_ms / 0.25),
-            "direction": round(direction / 1.5) % _DIRECTIONS,
-        }
-    elif kind is Kind.SPEED:
-        raw["speed"] = round(speed_hz / 0.001)
-    data = message.encode(**raw)
+    values = {"force_n": force_n, "duration_ms": duration_ms, "direction": direction, "speed_hz": speed_hz}
+    scales = {signal.name: signal.scale for signal in message.signals}
+    raw = {key: round(values[name] / scales[key]) for key, name in _REQUEST_FIELDS[kind].items()}
+    if "direction" in raw:
+        raw["direction"] %= _DIRECTIONS
+    data = message.encode(kind=int(kind), counter=counter & 0xFF, key=KEY, **raw)
     return message.identifier, data[:7] + bytes([checksum(message.identifier, data)])
 
 

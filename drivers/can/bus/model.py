@@ -237,20 +237,11 @@ class BusModel:
         results = self.advance_records(until_ns)
         if not len(results):
             return []
-        sent = frames.frames(results["frame"])
-        rows = zip(
-            results["node"].tolist(),
-            results["start_ns"].tolist(),
-            results["end_ns"].tolist(),
-            results["outcome"].tolist(),
-            results["offered_ns"].tolist(),
-            results["attempt"].tolist(),
-            results["final"].tolist(),
-            strict=True,
-        )
+        names = ("node", "start_ns", "end_ns", "outcome", "offered_ns", "attempt", "final")
+        rows = zip(frames.frames(results["frame"]), *(results[name].tolist() for name in names), strict=True)
         return [
             Delivery(frame, node, start, end, OUTCOMES[outcome], offered, attempt, final != 0)
-            for frame, (node, start, end, outcome, offered, attempt, final) in zip(sent, rows, strict=True)
+            for frame, node, start, end, outcome, offered, attempt, final in rows
         ]
 
     def advance_records(self, until_ns: int) -> np.ndarray:
