@@ -106,9 +106,9 @@ class Pile:
             oldest = self._parts.popleft()
             self.rows -= len(oldest)
             self.dropped += len(oldest)
-            heir = self._parts[0]
-            if heir.index > oldest.index:
-                self._parts[0] = replace(heir, gap=heir.gap + len(oldest) + oldest.gap)
+            following = self._parts[0]
+            if following.index > oldest.index:
+                self._parts[0] = replace(following, gap=following.gap + len(oldest) + oldest.gap)
 
     def take(self, rows: int | None, *, ended: bool) -> Samples | None:
         """The lowest rows, if there are as many as asked for, or all that there will be before a gap or the end.

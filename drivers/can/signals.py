@@ -12,8 +12,8 @@ folds back, which is the receiver's to know.
 
 A command must not arise from noise. It has a kind (4 of 256 values), a counter that goes on by 1 to 15 from that of
 the last command that reached the rig, a constant key, reserved bits at zero, and a CRC-8 over identifier and data; a
-blow is also limited in force and duration. Of random frames of 8 bytes on the very identifier of commands, one of
-`ODDS` passes all that.
+hammer pulse is also limited in force and duration. Of random frames of 8 bytes on the very identifier of commands, one
+of `ODDS` passes all that.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ KEY = 0x9D
 AHEAD = 15
 """How far the counter of a command may be ahead of that of the last one that reached the rig."""
 ODDS = 2.7e9
-"""Random frames of 8 bytes on the identifier of commands for one that is taken: a blow of the hammer by nearly all of
+"""Random frames of 8 bytes on the identifier of commands for one that is taken: a hammer pulse by nearly all of
 it, 256 kinds x 256 / 15 counters x 256 keys x 256 checksums x 1 / (0.15 forces x 0.78 durations x 0.94 directions)."""
 
 RIG = "Rig"
@@ -172,7 +172,7 @@ def _other_messages() -> list[Message]:
                 Signal("event", 0, 8, label="What", choices=_choices(EventKind)),
                 Signal("number", 8, 8, label="Running number, modulo 256"),
                 Signal("time", 16, 32, unit="us", label=_TIME),
-                Signal("value", 48, 16, scale=0.1, label="Force of a blow, N, or speed, Hz; else 0"),
+                Signal("value", 48, 16, scale=0.1, label="Peak force of a hammer pulse, N, or speed, Hz; else 0"),
             ),
         ),
         Message(

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Self, TypeVar
 
 from drivers.instrument import protocol
+from drivers.instrument.datasheet import Datasheet, parse_datasheet
 from drivers.instrument.protocol import Codec, Message, ProtocolError
-from drivers.instrument.sheet import Sheet, parse_sheet
 from drivers.link import ROOM, Link, LinkError, LinkTimeoutError, open_link
 from drivers.samples import Pile, Samples, StreamEndedError, follow
 from rig.channels import Group
@@ -69,7 +69,7 @@ class Instrument:
         # From anywhere, so that a late reply to whoever had the line before is not taken for ours.
         self._sequence = random.getrandbits(32)
         self._data: deque[Message] = deque()
-        self._sheet: Sheet | None = None
+        self._datasheet: Datasheet | None = None
         self.malformed = 0
         """Messages that were none of this protocol."""
         self.dropped = 0
@@ -91,15 +91,15 @@ class Instrument:
             raise
         return instrument
 
-    def identify(self) -> Sheet:
+    def identify(self) -> Datasheet:
         """Identification and calibration, as the instrument tells them now."""
-        self._sheet = parse_sheet(self.ask(protocol.Identify(), protocol.Identity).sheet)
-        return self._sheet
+        self._datasheet = parse_datasheet(self.ask(protocol.Identify(), protocol.Identity).datasheet)
+        return self._datasheet
 
     @property
-    def sheet(self) -> Sheet:
+    def datasheet(self) -> Datasheet:
         """Identification and calibration, as the instrument told them last."""
-        return self._sheet or self.identify()
+        return self._datasheet or self.identify()
 
     @property
     def lost(self) -> int:
@@ -185,20 +185,20 @@ class Sampler(Instrument):
         """Choose what to measure; a stream that runs ends.
 
         Args:
-            channels: Names from the sheet; all of them where none are given. They come in the sheet's order.
-            rate_hz: Rows per second [Hz], a whole fraction of the sheet's rate; every n-th row is taken, with the
-                conditioner's own low-pass and no further filter. 0 is the sheet's rate.
+            channels: Names from the datasheet; all of them where none are given. They come in the datasheet's order.
+            rate_hz: Rows per second [Hz], a whole fraction of the datasheet's rate; every n-th row is taken, with the
+                conditioner's own low-pass and no further filter. 0 is the datasheet's rate.
 
         Raises:
             InputError: There is no such channel.
             RefusedError: There is no such rate.
         """
-        sheet = self.identify()
-        wanted = sheet.group(tuple(channels)).names if channels else tuple(row.name for row in sheet.channels)
-        mask = sum(1 << n for n, row in enumerate(sheet.channels) if row.name in wanted)
+        datasheet = self.identify()
+        wanted = datasheet.group(tuple(channels)).names if channels else tuple(row.name for row in datasheet.channels)
+        mask = sum(1 << n for n, row in enumerate(datasheet.channels) if row.name in wanted)
         reply = self.ask(protocol.Configure(rate_hz=float(rate_hz), channels=mask), protocol.Configured)
-        names = tuple(row.name for n, row in enumerate(sheet.channels) if reply.channels >> n & 1)
-        self._group = group = sheet.group(names)
+        names = tuple(row.name for n, row in enumerate(datasheet.channels) if reply.channels >> n & 1)
+        self._group = group = datasheet.group(names)
         self._stream = None
         return Configuration(names, tuple(row.unit for row in group.channels), reply.rate_hz)
 

@@ -79,7 +79,7 @@ class Configure(Message):
 
     Attributes:
         rate_hz: Rows per second [Hz]; 0 is the instrument's own rate.
-        channels: Bit n is channel n of the sheet; 0 is all.
+        channels: Bit n is channel n of the datasheet; 0 is all.
     """
 
     KIND = 0x02
@@ -120,11 +120,11 @@ class Act(Message):
 
 @dataclass(frozen=True, slots=True)
 class Identity(Message):
-    """The sheet (`drivers.instrument.sheet`) as JSON."""
+    """The datasheet (`drivers.instrument.datasheet`) as JSON."""
 
     KIND = 0x81
     TAIL = Tail.TEXT
-    sheet: str
+    datasheet: str
 
 
 @dataclass(frozen=True, slots=True)

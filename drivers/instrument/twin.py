@@ -14,8 +14,8 @@ import numpy as np
 
 from drivers.console import Accepted, Console
 from drivers.instrument import protocol
+from drivers.instrument.datasheet import Datasheet
 from drivers.instrument.protocol import Codec, Message, ProtocolError, Reason
-from drivers.instrument.sheet import Sheet
 from drivers.link import Port
 from drivers.stream import RigStream, thin, whole_step
 from rig import wire
@@ -111,7 +111,7 @@ class Twin:
 
     def _carry_out(self, request: Message) -> Message:
         if isinstance(request, protocol.Identify):
-            return protocol.Identity(self._sheet().model_dump_json())
+            return protocol.Identity(self._datasheet().model_dump_json())
         if isinstance(request, protocol.Act):
             accepted = self.act(request)
             return protocol.Done(id=accepted.id, tick=accepted.tick, time_s=accepted.time_s)
@@ -123,10 +123,10 @@ class Twin:
             return self._stop(request)
         raise ProtocolError(Reason.KIND, f"kind must be a request; instead received {type(request).__name__}")
 
-    def _sheet(self) -> Sheet:
+    def _datasheet(self) -> Datasheet:
         name = self.CODEC.address.name
         group = self._measured() if self.GROUP else None
-        return Sheet(
+        return Datasheet(
             manufacturer=MANUFACTURER,
             model=f"{name} (virtual)",
             serial=f"VIRTUAL-{self.CODEC.address.number:03d}",

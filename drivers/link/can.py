@@ -36,7 +36,7 @@ _LOGGER = "drivers.link.can"
 logging.getLogger(_LOGGER).addHandler(logging.NullHandler())
 
 
-class CanMedium:
+class CanNode:
     """One node of a bus, for any number of links.
 
     Args:
@@ -110,25 +110,23 @@ class CanLink:
     """One end of the way between a host and an instrument.
 
     Args:
-        spec: The bus, as `CanMedium` takes it.
+        spec: The bus, as `CanNode` takes it.
         address: The instrument.
-        medium: A node to share instead of one of its own.
+        node: A node to share instead of one of its own.
         instrument: Whether this is the instrument's end.
 
     Raises:
         InputError: There is no such bus.
     """
 
-    def __init__(
-        self, spec: str, address: Address, *, medium: CanMedium | None = None, instrument: bool = False
-    ) -> None:
+    def __init__(self, spec: str, address: Address, *, node: CanNode | None = None, instrument: bool = False) -> None:
         import isotp
 
         down, up = TO_INSTRUMENT + address.number, FROM_INSTRUMENT + address.number
         send, receive = (up, down) if instrument else (down, up)
-        self._own = medium is None
-        self._medium = CanMedium(spec, [receive]) if medium is None else medium
-        fd = self._medium.fd
+        self._own = node is None
+        self._node = CanNode(spec, [receive]) if node is None else node
+        fd = self._node.fd
         self._name = address.name
         self._receive_identifier = receive
         self._frames: queue.SimpleQueue[can.Message | None] = queue.SimpleQueue()
@@ -155,7 +153,7 @@ class CanLink:
         self.max_bytes = _MAX_BYTES
         self.lost = 0
         self._stack.start()
-        self._medium.listen(receive, self._frames.put)
+        self._node.listen(receive, self._frames.put)
         self._reader = threading.Thread(target=self._read, name=f"can {address.name} reads", daemon=True)
         self._reader.start()
 
@@ -183,7 +181,7 @@ class CanLink:
             bitrate_switch=message.bitrate_switch,
         )
         try:
-            self._medium.bus.send(frame, timeout=_SEND_S)
+            self._node.bus.send(frame, timeout=_SEND_S)
         except can.CanError:
             self.lost += 1
 
@@ -234,11 +232,11 @@ class CanLink:
                 return
             self._closed = True
             self._changed.notify_all()
-        self._medium.leave(self._receive_identifier)
+        self._node.leave(self._receive_identifier)
         # Both wake their readers.
         self._frames.put(None)
         self._stack.rx_queue.put(bytearray())
         self._reader.join(timeout=2.0)
         self._stack.stop()
         if self._own:
-            self._medium.close()
+            self._node.close()

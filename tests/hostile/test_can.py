@@ -33,7 +33,7 @@ from drivers.can.interface import HubBus
 from drivers.can.schedule import Schedule
 from drivers.can.signals import AHEAD, KEY, Kind, checksum, command_frame, default_messages
 from drivers.instrument.protocol import Codec, ProtocolError
-from drivers.link.can import TO_INSTRUMENT, CanLink, CanMedium
+from drivers.link.can import TO_INSTRUMENT, CanLink, CanNode
 from drivers.link.frames import Deframer, frame, unstuff
 from drivers.link.port import MessagePort
 from drivers.sources.can import CanSource
@@ -673,11 +673,11 @@ def test_frames_that_lie_to_a_daq_stop_nothing_and_are_counted() -> None:
         source.close()
 
 
-def test_a_medium_for_links_outlives_frames_of_all_kinds() -> None:
+def test_a_node_for_links_outlives_frames_of_all_kinds() -> None:
     random = np.random.default_rng(11)
     channel = f"hostile-{next(_channels)}"
     heard: list[can.Message] = []
-    node = CanMedium(f"virtual:{channel}", [0x601])
+    node = CanNode(f"virtual:{channel}", [0x601])
     try:
         node.listen(0x601, heard.append)
         with can.Bus(channel, interface="virtual", ignore_config=True) as villain:

@@ -341,16 +341,16 @@ def test_a_run_without_the_clock_waits_for_the_bus() -> None:
         assert setup.gateway.blocks_dropped == 0
 
 
-def test_a_hammer_blow_is_acknowledged_with_its_time() -> None:
+def test_a_hammer_pulse_is_acknowledged_with_its_time() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
         reply = setup.tap.ask(*command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
         assert (reply["counter"], reply["result"]) == (1, Result.ACCEPTED)
         until(lambda: any(row["event"] == 3 for row in setup.tap.decoded("Event")))
-        blow = next(row for row in setup.tap.decoded("Event") if row["event"] == 3)
+        pulse = next(row for row in setup.tap.decoded("Event") if row["event"] == 3)
         # The fake carries it out at the start of the next block.
-        assert blow["time"] == reply["time"]
+        assert pulse["time"] == reply["time"]
         assert reply["time"] % BLOCK == 0
         until(lambda: any(row["counter"] == 1 for row in setup.tap.decoded("Heartbeat")))
 

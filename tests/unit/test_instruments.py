@@ -682,7 +682,7 @@ def test_a_line_that_nobody_reads_holds_nobody_up() -> None:
 
 
 def samples(driver: Sampler, values: np.ndarray) -> Samples:
-    group = driver.sheet.group()
+    group = driver.datasheet.group()
     return Samples(0, 0, 1000.0, 1e6, group.names, tuple(row.unit for row in group.channels), values)
 
 

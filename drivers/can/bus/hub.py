@@ -39,7 +39,7 @@ _BURST = 50
 """Frames that may travel alone on a bus that is idle in between; beyond, they wait for the tick as well."""
 _ERRORS_A_SECOND = 1000
 _ERROR_BURST = 100
-"""Error frames that endpoints are told of; a bus that nothing works on has ten times as many."""
+"""Error frames that reach the endpoints; a bus that nothing works on has ten times as many."""
 _REPORT_NS = 100_000_000
 _HASTE_NS = 10_000_000
 """How soon a report may follow another, and how often, where something has happened."""

@@ -78,7 +78,7 @@ class NodeBus(can.BusABC):
         self.waiting = 0
         """Frames in the batches."""
         self._overflowed = False
-        """Whether frames were lost of which the reader has not been told."""
+        """Whether frames were lost that the reader does not know of yet."""
         self.node = codec.NO_NODE
         self.secret: str | None = None
         """What shows the hub that this node's name is its own."""
