@@ -1,6 +1,7 @@
 """Engines: one integration method a file, one protocol, chosen by name in a scene.
 
-An engine is a module with `start(constants, inputs, y, memory, step_ticks, tolerance)` and
+An engine is a module with `METHOD`, a one-step method that `rig.engines.march` takes through events (see
+`rig.engines.method`), or with its own `start(constants, inputs, y, memory, step_ticks, tolerance)` and
 `advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)`: it moves state `y` and `memory` (shape
 (MEMORY,), counters first, see `rig.engines.memory`) on in place by `steps` steps of `step_ticks` and writes one row of
 `rig.kernels.signals.ROW` every `stride` steps, the first at the start. It knows no clock, no I/O and no threads, and
@@ -9,8 +10,9 @@ its result does not depend on how a run is cut into calls.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module
-from types import ModuleType
 from typing import NamedTuple
 
 
@@ -51,6 +53,19 @@ ENGINES = {
 """Engines, the default first."""
 
 
-def load_engine(name: str) -> ModuleType:
-    """The engine of one of those names (imported only now)."""
-    return import_module(f"rig.engines.{name.replace('-', '_')}")
+class Engine(NamedTuple):
+    """An engine that is ready to run."""
+
+    start: Callable[..., None]
+    advance: Callable[..., None]
+    order: int
+
+
+def load_engine(name: str) -> Engine:
+    """The engine of one of those names (imported only now): a module of its own, or a one-step method for the march."""
+    module = import_module(f"rig.engines.{name.replace('-', '_')}")
+    if hasattr(module, "METHOD"):
+        from rig.engines import march
+
+        return Engine(march.start, partial(march.advance, module.METHOD), module.ORDER)
+    return Engine(module.start, module.advance, module.ORDER)

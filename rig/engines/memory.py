@@ -14,6 +14,10 @@ PEAK_FORCE = 6
 STEPS, EVALUATIONS, REJECTED, CEILING = 7, 8, 9, 10
 """Steps taken; evaluations of the equations; steps taken again shorter; steps at the least length with an estimate
 still above the tolerance, or grids given up for want of parts."""
-OWN = 11
+TOLERANCE, SIZE = 11, 12
+"""Scaled error a step that is asked for; length proposed for the next part [ticks]."""
+BEFORE, BEFORE_SPAN, LAST = 13, 14, 15
+"""Normal force before the last [N], time between both [ticks], last normal force [N]."""
+OWN = 16
 """From here on an engine's own."""
 MEMORY = 800

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rig.engines import parts
 from rig.engines.runge_kutta import Tableau
 
 ORDER = 4
-TABLEAU = Tableau(
+METHOD = Tableau(
     a=np.array([[0, 0, 0, 0], [1 / 2, 0, 0, 0], [0, 1 / 2, 0, 0], [0, 0, 1, 0]]),
     b=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
     c=np.array([0, 1 / 2, 1 / 2, 1]),
@@ -17,10 +16,3 @@ TABLEAU = Tableau(
     order=0.0,
     rows=5,
 )
-
-start = parts.start
-
-
-def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.parts.advance`."""
-    parts.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rig.engines import parts
 from rig.engines.runge_kutta import Tableau
 
 ORDER = 8
@@ -29,10 +28,4 @@ def _tableau() -> Tableau:
     )
 
 
-TABLEAU = _tableau()
-start = parts.start
-
-
-def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.parts.advance`."""
-    parts.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
+METHOD = _tableau()

@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rig.engines import parts
-from rig.engines.parts import FUNCTIONS, PER_SCALE, Functions, rates
+from rig.engines.method import FUNCTIONS, PER_SCALE, Functions, rates
 from rig.kernels import signals as S
 
 ORDER = 4
@@ -59,7 +58,7 @@ _INCREMENTS = 1e-8 * S.STATE_SCALE
 
 
 class Rosenbrock(NamedTuple):
-    """The method, as `rig.engines.parts` takes it."""
+    """The method, as `rig.engines.march` takes it."""
 
     rows: int = _ROWS
     order: float = 4.0
@@ -70,7 +69,7 @@ METHOD = Rosenbrock()
 
 
 @njit(cache=True, error_model="numpy")
-def _prepare(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, out):
+def _prepare(method, constants, inputs, step, y, k, z, out):
     """Jacobian of all rates by the state and by time, as forward differences."""
     for j in range(S.N_STATE):
         for i in range(S.N_STATE):
@@ -78,13 +77,13 @@ def _prepare(method, constants, inputs, tick, fraction, ticks, onset_speed, phas
         z[j] = y[j] + _INCREMENTS[j]
         per_change = 1.0 / (z[j] - y[j])
         column = k[_J + j]
-        rates(constants, inputs, tick, fraction, onset_speed, phase, False, z, column, out)
+        rates(constants, inputs, step.tick, step.fraction, step.onset_speed, step.phase, False, z, column, out)
         for i in range(S.N_VECTOR):
             column[i] = (column[i] - k[0, i]) * per_change
-    ahead = 1e-3 * ticks
+    ahead = 1e-3 * step.ticks
     per_change = 1.0 / (ahead * inputs.tick_s)
     column = k[_BY_TIME]
-    rates(constants, inputs, tick, fraction + ahead, onset_speed, phase, False, y, column, out)
+    rates(constants, inputs, step.tick, step.fraction + ahead, step.onset_speed, step.phase, False, y, column, out)
     for i in range(S.N_VECTOR):
         column[i] = (column[i] - k[0, i]) * per_change
     return S.N_STATE + 1
@@ -145,8 +144,8 @@ def _solve(k, g, u):
 
 
 @njit(cache=True, error_model="numpy")
-def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
-    h = ticks * inputs.tick_s
+def _step(method, constants, inputs, step, y, k, z, end, out):
+    h = step.ticks * inputs.tick_s
     _factor(k, _GAMMA * h)
     state, right = k[_STATE], k[_RIGHT]
     for stage in range(_STAGES):
@@ -159,9 +158,8 @@ def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, 
             for j in range(stage):
                 for i in range(S.N_VECTOR):
                     state[i] += _A[stage, j] * k[_U + j, i]
-            rates(
-                constants, inputs, tick, fraction + _ALPHA[stage] * ticks, onset_speed, phase, False, state, right, out
-            )
+            fraction = step.fraction + _ALPHA[stage] * step.ticks
+            rates(constants, inputs, step.tick, fraction, step.onset_speed, step.phase, False, state, right, out)
             for j in range(stage):
                 weight = _C[stage, j] / h
                 for i in range(S.N_VECTOR):
@@ -184,9 +182,3 @@ def _error(method, h, k, scratch):
 
 
 FUNCTIONS[Rosenbrock] = Functions(step=_step, error=_error, prepare=_prepare)
-start = parts.start
-
-
-def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.parts.advance`."""
-    parts.advance(METHOD, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

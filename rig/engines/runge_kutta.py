@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta steps: the methods are the tableaus of `rk4`, `tsit5` and `rk8`; where steps end is `parts`'."""
+"""Explicit Runge-Kutta steps: the methods are the tableaus of `rk4`, `tsit5` and `rk8`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rig.engines.parts import FUNCTIONS, PER_SCALE, Functions, nothing_to_prepare
+from rig.engines.method import FUNCTIONS, PER_SCALE, Functions, nothing_to_prepare
 from rig.kernels import signals as S
 from rig.kernels.dynamics import evaluate
 
@@ -26,10 +26,10 @@ class Tableau(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
+def _step(method, constants, inputs, step, y, k, z, end, out):
     """One step; k holds the stages' rates, then those at the end."""
     a, b, c = method.a, method.b, method.c
-    h = ticks * inputs.tick_s
+    h = step.ticks * inputs.tick_s
     for stage in range(1, len(b)):
         for i in range(S.N_STATE):
             z[i] = 0.0
@@ -40,7 +40,8 @@ def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, 
                     z[i] += weight * k[j, i]
         for i in range(S.N_STATE):
             z[i] += y[i]
-        evaluate(constants, inputs, tick, fraction + c[stage] * ticks, onset_speed, phase, False, z, k[stage], out)
+        fraction = step.fraction + c[stage] * step.ticks
+        evaluate(constants, inputs, step.tick, fraction, step.onset_speed, step.phase, False, z, k[stage], out)
     for i in range(S.N_VECTOR):
         z[i] = 0.0
     for stage in range(len(b)):

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 from numba import njit
 
-from rig.engines import parts
-from rig.engines.parts import FUNCTIONS, Functions, no_estimate, nothing_to_prepare
+from rig.engines.method import FUNCTIONS, Functions, no_estimate, nothing_to_prepare
 from rig.kernels import signals as S
 
 ORDER = 1
@@ -18,7 +17,7 @@ _N = S.N_STATE // 2
 
 
 class SemiImplicitEuler(NamedTuple):
-    """The method, as `rig.engines.parts` takes it."""
+    """The method, as `rig.engines.march` takes it."""
 
     rows: int = 2
     order: float = 0.0
@@ -29,8 +28,8 @@ METHOD = SemiImplicitEuler()
 
 
 @njit(cache=True, error_model="numpy")
-def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
-    h = ticks * inputs.tick_s
+def _step(method, constants, inputs, step, y, k, z, end, out):
+    h = step.ticks * inputs.tick_s
     for i in range(_N):
         end[_N + i] = y[_N + i] + h * k[0, _N + i]
         end[i] = y[i] + h * end[_N + i]
@@ -40,9 +39,3 @@ def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, 
 
 
 FUNCTIONS[SemiImplicitEuler] = Functions(step=_step, error=no_estimate, prepare=nothing_to_prepare)
-start = parts.start
-
-
-def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.parts.advance`."""
-    parts.advance(METHOD, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rig.engines import parts
 from rig.engines.runge_kutta import Tableau
 
 ORDER = 5
@@ -20,7 +19,7 @@ _A[3, :3] = [2.8971530571054935, -6.359448489975075, 4.3622954328695815]
 _A[4, :4] = [5.325864828439257, -11.748883564062828, 7.4955393428898365, -0.09249506636175525]
 _A[5, :5] = [5.86145544294642, -12.92096931784711, 8.159367898576159, -0.071584973281401, -0.028269050394068383]
 
-TABLEAU = Tableau(
+METHOD = Tableau(
     a=_A,
     b=np.array(
         [0.09646076681806523, 0.01, 0.4798896504144996, 1.379008574103742, -3.290069515436081, 2.324710524099774]
@@ -36,10 +35,3 @@ TABLEAU = Tableau(
     order=5.0,
     rows=7,
 )  # fmt: skip
-
-start = parts.start
-
-
-def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.parts.advance`."""
-    parts.advance(TABLEAU, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

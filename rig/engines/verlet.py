@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 from numba import njit
 
-from rig.engines import parts
-from rig.engines.parts import FUNCTIONS, Functions, no_estimate, nothing_to_prepare, rates
+from rig.engines.method import FUNCTIONS, Functions, no_estimate, nothing_to_prepare, rates
 from rig.kernels import signals as S
 
 ORDER = 2
@@ -20,7 +19,7 @@ _N = S.N_STATE // 2
 
 
 class Verlet(NamedTuple):
-    """The method, as `rig.engines.parts` takes it."""
+    """The method, as `rig.engines.march` takes it."""
 
     rows: int = 3
     order: float = 0.0
@@ -31,13 +30,13 @@ METHOD = Verlet()
 
 
 @njit(cache=True, error_model="numpy")
-def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, y, k, z, end, out):
-    h = ticks * inputs.tick_s
+def _step(method, constants, inputs, step, y, k, z, end, out):
+    h = step.ticks * inputs.tick_s
     half = 0.5 * h
     for i in range(_N):
         z[i] = y[i] + h * (y[_N + i] + half * k[0, _N + i])
         z[_N + i] = y[_N + i] + h * k[0, _N + i]
-    rates(constants, inputs, tick, fraction + ticks, onset_speed, phase, False, z, k[1], out)
+    rates(constants, inputs, step.tick, step.fraction + step.ticks, step.onset_speed, step.phase, False, z, k[1], out)
     for i in range(_N):
         end[i] = z[i]
     for i in range(_N, S.N_VECTOR):
@@ -46,9 +45,3 @@ def _step(method, constants, inputs, tick, fraction, ticks, onset_speed, phase, 
 
 
 FUNCTIONS[Verlet] = Functions(step=_step, error=no_estimate, prepare=nothing_to_prepare)
-start = parts.start
-
-
-def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines` and `rig.engines.parts.advance`."""
-    parts.advance(METHOD, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)

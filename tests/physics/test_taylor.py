@@ -186,7 +186,7 @@ def test_first_impacts_agree_with_heyoka() -> None:
 
 def scaled(motion: np.ndarray) -> np.ndarray:
     """States over what counts as 1 in each."""
-    from rig.engines.parts import PER_SCALE
+    from rig.engines.method import PER_SCALE
 
     return motion * PER_SCALE
 

@@ -14,8 +14,8 @@ X0, X1, X2, X3, Y0, Y1, Y2, Y3 = (next(_next) for _ in range(8))
 SLID, DEPTH, RATE, AGO = (next(_next) for _ in range(4))
 """Sliding speed after the last kick, nan before the first of a contact; penetration, its rate and the time since the
 last kick in flight."""
-BEFORE, LAST, BEFORE_SPAN, LAST_STEP = (next(_next) for _ in range(4))
-"""Normal force at the last kick but one, and at the last [N]; time between both; length of the last's step [s]."""
+LAST_STEP = next(_next)
+"""Length of the last kick's step [s]; spans between forces are in seconds too."""
 WANTED, SETTLED, BOUNCE = (next(_next) for _ in range(3))
 """Level asked for in contact, calm kicks in a row, mean rate of the gap in the last kick."""
 REST, SPRING_X, SPRING_Y, ENGAGED = (next(_next) for _ in range(4))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rig.engines.memory import CLAMPS, CONTACT_STEPS, CONTACTS, FLOORED, ONSET, PEAK_FORCE
+from rig.engines.memory import BEFORE, BEFORE_SPAN, CLAMPS, CONTACT_STEPS, CONTACTS, FLOORED, LAST, ONSET, PEAK_FORCE
 from rig.engines.peak import peak
 from rig.engines.split.impulse import (
     Impulse,
@@ -19,7 +19,7 @@ from rig.engines.split.impulse import (
 )
 from rig.engines.split.inner_motion import Houses, inlined
 from rig.engines.split.levels import contact_level, roughness
-from rig.engines.split.place import BEFORE, BEFORE_SPAN, BOUNCE, LAST, LAST_STEP, SETTLED
+from rig.engines.split.place import BOUNCE, LAST_STEP, SETTLED
 from rig.engines.split.state import Touch
 from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING

@@ -7,7 +7,7 @@ Experimental Mathematics 14 (2005) 99-117). Their code, `rig.engines.taylor.seri
 
 Events are roots of polynomials: onset, lift-off, a sliding speed that comes to 0, friction that rolling needs beyond
 mu F_n, a normal law that asks for tension, a transducer that loses its preload. Steps end there; friction by Filippov,
-as in `rig.engines.parts`.
+as in `rig.engines.events`.
 
 Contact. delta^1.5 has branch points at onset and lift-off, next to which a series in time converges as far as to the
 nearer one: a hundred steps a contact. While it slides, the series is therefore in tau with dt = s dtau, s the root of
@@ -39,8 +39,9 @@ from rig.engines.memory import (
     PEAK_FORCE,
     PHASE,
     STEPS,
+    TOLERANCE,
 )
-from rig.engines.parts import PER_SCALE, rates
+from rig.engines.method import PER_SCALE, rates
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT, TIME, WIDTH
 from rig.engines.taylor.place import (
     EAST,
@@ -58,7 +59,6 @@ from rig.engines.taylor.place import (
     SPAN,
     STALLED,
     TICK,
-    TOLERANCE,
 )
 from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
 from rig.engines.taylor.series import LANES, flight, rolling, sliding

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from rig.engines.memory import OWN
 
-TOLERANCE = OWN
-"""Scaled error a step."""
 TICK, FRACTION, END_TICK, END_FRACTION = range(OWN + 1, OWN + 5)
 """Start and end of the series: whole tick and ticks beyond."""
 SPAN, LENGTH = OWN + 5, OWN + 6
