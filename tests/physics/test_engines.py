@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import dataclasses
+from importlib import import_module
 from itertools import product
 from typing import Any
 
