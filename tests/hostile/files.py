@@ -191,10 +191,10 @@ class Layout:
         made.metadata, made.attachments = copy.deepcopy(self.metadata), dict(self.attachments)
         made.messages = list(self.messages)
         for _ in range(int(rng.integers(1, 4))):
-            made._spoil(rng)
+            made.spoil(rng)
         return made
 
-    def _spoil(self, rng: Rng) -> None:
+    def spoil(self, rng: Rng) -> None:
         kind = int(rng.integers(0, 10))
         at = int(rng.integers(0, len(self.messages)))
         topic, payload, time_ns = self.messages[at]
@@ -295,7 +295,7 @@ def uses() -> dict[str, Use]:
     def told(path: Path, _: Path) -> object:
         recording = join([path])
         with unheard():
-            info._print(recording, info.describe(recording, quick=False))
+            info.info([path])
             return json.dumps(info.describe(recording, quick=True))
 
     def exported(suffix: str) -> Use:

@@ -69,18 +69,16 @@ def test_a_failure_half_way_leaves_what_was_there(tmp_path: Path, monkeypatch: p
     folder = tmp_path / "keys"
     make(folder)
     before = files(folder)
-    from rig.transport import certificates
-
     written: list[Path] = []
-    write = certificates._write
+    write = Path.write_bytes
 
-    def fail(folder: Path, *rest: object) -> None:
-        written.append(folder)
-        if len(written) == 3:
+    def fail(path: Path, data: bytes) -> int:
+        written.append(path)
+        if len(written) == 7:  # three files a folder: the first of the third
             raise OSError(28, "No space left on device")
-        write(folder, *rest)  # type: ignore[arg-type]
+        return write(path, data)
 
-    monkeypatch.setattr(certificates, "_write", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(OSError, match="No space"):
         make(folder, force=True)
     assert files(folder) == before

@@ -121,7 +121,10 @@ def test_picture_labels_every_axis_and_law(monkeypatch: pytest.MonkeyPatch, tmp_
     legends = [{text.get_text() for text in legend.get_texts()} for axes in panels if (legend := axes.get_legend())]
     assert set(DAMPING) in legends
     assert any(set(STIFFNESS) < legend for legend in legends)
-    styles = [(line.get_color(), line.get_linestyle(), line._unscaled_dash_pattern) for line in panels[0].lines[:11]]  # pyright: ignore[reportAttributeAccessIssue]
+    styles = [
+        (line.get_color(), line.get_linestyle(), line._unscaled_dash_pattern)  # noqa: SLF001 (dashes are told apart by nothing public)
+        for line in panels[0].lines[:11]
+    ]
     assert len(set(map(str, styles))) == len(DAMPING)
 
 

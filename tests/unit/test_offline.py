@@ -45,7 +45,6 @@ def test_the_lines_of_the_docstring_work(shown: dict[str, Any]) -> None:
 
 
 def test_everything_is_the_public_interface() -> None:
-    assert sorted(rig.__all__) == sorted(rig._HOMES)
     for name in rig.__all__:
         assert getattr(rig, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
