@@ -1,7 +1,7 @@
-"""Who may import whom (pyproject.toml), that each contract sees its breach, and that `rig --help` waits for nothing heavy.
+"""Who may import whom (pyproject.toml), that each contract sees its breach, and what `rig --help` does not import.
 
-A breach is an import that is added to the graph of all imports, not to a file, so that the files are read once. The last
-test of this kind puts one in a file, to show that a line of code comes to the same.
+A breach is an import that is added to the graph of all imports, not to a file: so the files are read once only. One is
+written to a copy of the files, to show that a line of code comes to the same.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Every contact law in every engine that takes it, against `rk8` at a tolerance of 1e-12.
 
-| the engine's                               | must agree with        | because                                          |
-|--------------------------------------------|------------------------|--------------------------------------------------|
-| motion through impacts, each damping law   | rk8's at 1e-12         | an engine with its own copy of a law can err     |
-| motion through impacts, each stiffness law | the same               | the same                                         |
-| limits below, but for order 1              | a law stronger by 10 % | a limit that lets a wrong law pass shows nothing |
+| the engine's                               | must agree with        | because                                      |
+|--------------------------------------------|------------------------|----------------------------------------------|
+| motion through impacts, each damping law   | rk8's at 1e-12         | an engine with its own copy of a law can err |
+| motion through impacts, each stiffness law | the same               | the same                                     |
+| limits below, but for order 1              | a law stronger by 10 % | limits that it passes show nothing           |
 
 A shaft that turns falls by 27 um on the ring, off its lowest point, and bounces on it 3 to 10 times in 20 ms.
 """
