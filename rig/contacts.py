@@ -483,7 +483,7 @@ def free_impact(law: NormalLaw, *, mass: float, speed: float, speed_floor: float
         speed_floor: Floor of v0 [m/s].
 
     Example:
-        >>> law = NormalLaw(stiffness=2.86e10, exponent=1.5, damping_factor=restitution_factor(0.9), viscous_damping=0.0)
+        >>> law = NormalLaw(2.86e10, exponent=1.5, damping_factor=restitution_factor(0.9), viscous_damping=0.0)
         >>> impact = free_impact(law, mass=1.0, speed=0.145)
         >>> f"e = {impact.restitution:.3f}, {impact.peak_force:.0f} N, {1e3 * impact.duration:.3f} ms"
         'e = 0.900, 1628 N, 0.315 ms'
