@@ -20,6 +20,7 @@ from importlinter import Contract
 from importlinter.api import read_configuration
 from importlinter.contracts.acyclic_siblings import AcyclicSiblingsContract
 from importlinter.contracts.forbidden import ForbiddenContract
+from importlinter.contracts.independence import IndependenceContract
 from importlinter.contracts.layers import LayersContract
 from importlinter.contracts.protected import ProtectedContract
 
@@ -32,7 +33,14 @@ CONFIGURATION = read_configuration(str(ROOT / "pyproject.toml"))
 PACKAGES = CONFIGURATION["session_options"]["root_packages"]
 TYPES: dict[str, type[Contract]] = {
     kind.type_name: kind
-    for kind in (AcyclicSiblingsContract, AllowanceContract, ForbiddenContract, LayersContract, ProtectedContract)
+    for kind in (
+        AcyclicSiblingsContract,
+        AllowanceContract,
+        ForbiddenContract,
+        IndependenceContract,
+        LayersContract,
+        ProtectedContract,
+    )
 }
 
 # What is added, and the word of the contract's name that must see it.
@@ -51,6 +59,7 @@ BREACHES = [
     # Layers inside the packages.
     ("rig.engines.rk4", "rig.simulation", "Inside the rig"),
     ("rig.wire", "rig.transport", "Inside the rig"),
+    ("rig.engines.tsit5", "rig.engines.rk8", "An engine does not know"),
     ("drivers.link", "drivers.daq", "Inside the drivers"),
     ("drivers.daq", "drivers.twins", "Inside the drivers"),
     ("drivers.hammer.driver", "drivers.hammer.twin", "Inside a device"),
