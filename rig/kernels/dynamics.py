@@ -214,7 +214,7 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, 
     drive = drive_torque(constants, inputs, tick, fraction, state)
     Lx, Ly = torques(constants, magnets, disk)
     Fx, Fy, Ft = ring.Fx, ring.Fy, ring.Ft
-    if phase == ROLLING or (phase == TOUCHING and levels.friction == SWITCH and ring.Fn > 0.0):
+    if phase == ROLLING or (levels.friction == SWITCH and phase == TOUCHING and ring.Fn > 0.0):
         free = accelerations(constants, inputs, state, pose, stator, Lx, Ly, drive, Fx, Fy, 0.0)
         Ft = holding_friction(constants, inputs, phase, state, pose, e, ring, free)
         Fx += Ft * ring.ny
