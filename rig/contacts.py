@@ -1,5 +1,7 @@
 """The family of normal contact laws, each resolved to the four numbers that the kernels take.
 
+It is long because all laws stand here, each with its formula and source.
+
 F_n = K delta^n (1 + c delta'/v0) + D delta', clamped at 0 (`rig.kernels.contact.normal_force`). A stiffness law gives K
 and n, a damping law c (and D, for the one without memory). Stiffness laws that are no power of delta are fitted over
 the rig's working range, and the fit says how far off it is.

@@ -109,7 +109,11 @@ def box_of(name: str, rows: dict[str, list[list[str]]], graph: grimp.ImportGraph
     """A package with its layers, those below opened where they are to be."""
     if name in ROOTS or name in OPENED:
         inside = [
-            [box_of(f"{name}.{part}", rows, graph) for part in row if f"{name}.{part}" != COMMANDS]
+            [
+                box_of(f"{name}.{part}", rows, graph)
+                for part in row
+                if f"{name}.{part}" in graph.modules and f"{name}.{part}" != COMMANDS
+            ]
             for row in rows[name]
         ]
         return Box(name, f"{name.rpartition('.')[2]}/: {TITLES[name]}", [row for row in inside if row])

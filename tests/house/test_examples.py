@@ -10,12 +10,10 @@ import pytest
 
 import rig
 from drivers.daq import Daq
-from recorder.reader import Recording
 from rig import contacts, magnets
 
 MODULES = (
     "drivers.daq",
-    "recorder.reader",
     "rig.contacts",
     "rig.magnets",
     "rig.offline",
@@ -25,7 +23,7 @@ MODULES = (
 CALLED = (
     rig.simulate, rig.load_scene, rig.load_parameters, contacts.restitution_factor, contacts.returned_restitution,
     contacts.linear_damping_ratio, contacts.fit_power, contacts.free_impact, magnets.field_sum_force,
-    magnets.cylinder_force, magnets.pair_force, Recording, Daq,
+    magnets.cylinder_force, magnets.pair_force, Daq,
 )  # fmt: skip
 
 
