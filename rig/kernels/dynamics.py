@@ -44,22 +44,6 @@ class Motion(NamedTuple):
 
 
 @stage
-def turning_of(levels, state, pose):
-    """Gamma' beta', and Gamma'^2 sin b cos b, of large tilts [rad^2/s^2]."""
-    if levels.euler:
-        return state.dG * state.db, state.dG * state.dG * pose.sb * pose.cb
-    return 0.0, 0.0
-
-
-@stage
-def share_of(levels, pose, turning, ddG):
-    """Rate of Gamma' sin b, the share of Gamma' along the shaft, by which the spin differs from theta' [rad/s^2]."""
-    if levels.euler:
-        return ddG * pose.sb + turning * pose.cb
-    return 0.0
-
-
-@stage
 def spin_of(constants, inputs, share, drive, Ft):
     """Acceleration of the spin [rad/s^2] and torque of the drive [N m]."""
     shaft = constants.shaft
@@ -103,26 +87,25 @@ def accelerations(constants, inputs, state, pose, stator, Lx, Ly, drive, Fx, Fy,
     cG, sb, cb, w = pose.cG, pose.sb, pose.cb, pose.w
     Lx += shaft.arm_ring * Fx
     Ly += shaft.arm_ring * Fy
-    turning, drag = turning_of(constants.levels, state, pose)
+    turning = pose.large * (dG * db)
     ddG = ((-cG * Ly - Izz * w * db) * per_Ixx + 2.0 * turning * sb) / cb
-    ddb = (cb * Lx + pose.cross * Ly + Izz * w * dG * cb) * per_Ixx - drag
-    share = share_of(constants.levels, pose, turning, ddG)
+    ddb = (cb * Lx + pose.cross * Ly + Izz * w * dG * cb) * per_Ixx - pose.large * (dG * dG * sb * cb)
+    # The share of Gamma' along the shaft, by which the spin exceeds theta': its rate.
+    share = pose.large * (ddG * sb) + turning * cb
     dw, torque = spin_of(constants, inputs, share, drive, Ft)
     ax_ih, ay_ih = inner_house_of(constants, stator, Fx, Fy)
     return Motion(ddG, ddb, dw - share, dw, torque, ax_ih, ay_ih, stator.ax_oh, stator.ay_oh)
 
 
 @stage
-def axis_acceleration(levels, state, pose, ddG, ddb):
+def axis_acceleration(state, pose, ddG, ddb):
     """Second derivative of the axis's direction u, x, y and z [1/s^2]."""
-    if not levels.euler:
-        return ddb, -ddG, 0.0
     sG, cG, sb, cb, dG, db = pose.sG, pose.cG, pose.sb, pose.cb, state.dG, state.db
-    spread, turning = dG * dG + db * db, dG * db
+    spread, turning = pose.large * (dG * dG + db * db), pose.large * (dG * db)
     return (
-        cb * ddb - sb * db * db,
-        -cG * cb * ddG + sG * sb * ddb + sG * cb * spread + 2.0 * cG * sb * turning,
-        -sG * cb * ddG - cG * sb * ddb - cG * cb * spread + 2.0 * sG * sb * turning,
+        cb * ddb - pose.large * (sb * db * db),
+        -cG * cb * ddG + pose.cross * ddb + sG * cb * spread + 2.0 * cG * sb * turning,
+        pose.large * (-sG * cb * ddG - cG * sb * ddb - cG * cb * spread + 2.0 * sG * sb * turning),
     )
 
 
@@ -130,7 +113,7 @@ def axis_acceleration(levels, state, pose, ddG, ddb):
 def sliding_acceleration(constants, state, pose, e, ring, motion):
     """Rate of the sliding speed [m/s^2]."""
     arm, both = constants.shaft.arm_ring, constants.contact.gap_counts_outer
-    ddux, dduy, _ = axis_acceleration(constants.levels, state, pose, motion.ddG, motion.ddb)
+    ddux, dduy, _ = axis_acceleration(state, pose, motion.ddG, motion.ddb)
     ax = arm * ddux - motion.ax_ih - both * motion.ax_oh
     ay = arm * dduy - motion.ay_ih - both * motion.ay_oh
     along = e.vy * ring.nx - e.vx * ring.ny
@@ -262,5 +245,5 @@ def evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, 
     out[S.SLIDING_SPEED] = ring.sliding
     if observe:
         out[S.ONSET_SPEED] = onset_speed
-        acceleration = axis_acceleration(levels, state, pose, motion.ddG, motion.ddb)
+        acceleration = axis_acceleration(state, pose, motion.ddG, motion.ddb)
         write_observed(constants, state, pose, ring, magnets, disk, stator, support, motion, acceleration, Fx, Fy, out)

@@ -42,6 +42,7 @@ class Pose(NamedTuple):
     sb: float  # sin beta
     cb: float
     w: float  # spin about the axis, theta' + Gamma' sin b [rad/s]
+    large: float  # 1, or 0 with small angles
     cross: float  # sin b sin G; 0 with small angles
     ux: float  # direction of the axis
     uy: float
@@ -60,16 +61,29 @@ class Eccentricity(NamedTuple):
 
 
 @stage
+def large_of(levels):
+    """1 where tilts count as large, else 0: a factor of everything that small angles leave out."""
+    return 1.0 if levels.euler else 0.0
+
+
+@stage
+def sines_of(levels, angle):
+    """Sine and cosine of a tilt; with small angles the angle and 1."""
+    if levels.euler:
+        return sin_cos(angle)
+    return angle, 1.0
+
+
+@stage
 def pose_of(levels, state):
     """Pose of the shaft in a state."""
-    dG, db, dth = state.dG, state.db, state.dth
-    if levels.euler:
-        sG, cG = sin_cos(state.Gamma)
-        sb, cb = sin_cos(state.beta)
-        cross = sb * sG
-        uy, uz = -sG * cb, cG * cb
-        return Pose(sG, cG, sb, cb, dth + dG * sb, cross, sb, uy, uz, cb * db, -cG * cb * dG + sG * sb * db)
-    return Pose(state.Gamma, 1.0, state.beta, 1.0, dth, 0.0, state.beta, -state.Gamma, 1.0, db, -dG)
+    dG, db = state.dG, state.db
+    sG, cG = sines_of(levels, state.Gamma)
+    sb, cb = sines_of(levels, state.beta)
+    large = large_of(levels)
+    cross = large * (sb * sG)
+    w = state.dth + large * (dG * sb)
+    return Pose(sG, cG, sb, cb, w, large, cross, sb, -sG * cb, cG * cb, cb * db, -cG * cb * dG + cross * db)
 
 
 @stage

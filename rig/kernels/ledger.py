@@ -28,6 +28,14 @@ class Powers(NamedTuple):
 
 
 @stage
+def gap_power(contact, Fx, Fy, state):
+    """Power that a gap makes which counts the outer house as well [W]."""
+    if contact.gap_counts_outer == 0.0:
+        return 0.0
+    return contact.gap_counts_outer * (Fx * state.vx_oh + Fy * state.vy_oh)
+
+
+@stage
 def powers_of(constants, state, pose, ring, magnets, disk, stator, support, Lx, Ly, Fx, Fy, Ft, torque):
     """Rates of the integrals.
 
@@ -47,10 +55,10 @@ def powers_of(constants, state, pose, ring, magnets, disk, stator, support, Lx, 
         Ft: Friction force [N].
         torque: Of the drive [N m].
     """
-    shaft, house, both = constants.shaft, constants.house, constants.contact.gap_counts_outer
+    shaft, house = constants.shaft, constants.house
     lA, lB, lI = shaft.arm_ring, shaft.arm_magnet, shaft.arm_disk
     ux, uy, uz, dux, duy = pose.ux, pose.uy, pose.uz, pose.dux, pose.duy
-    vx_oh, vy_oh = state.vx_oh, state.vy_oh
+    vy_oh = state.vy_oh
     _, _, east, west, beam_y = support
     Lx += lA * Fx
     Ly += lA * Fy
@@ -59,7 +67,7 @@ def powers_of(constants, state, pose, ring, magnets, disk, stator, support, Lx, 
         drive_work=torque * pose.w,
         hammer_work=lI * (disk.hammer_x * dux + disk.hammer_y * duy),
         unbalance_work=lI * (disk.unbalance_x * dux + disk.unbalance_y * duy),
-        gap_work=both * (Fx * vx_oh + Fy * vy_oh),
+        gap_work=gap_power(constants.contact, Fx, Fy, state),
         release_work=0.0,
         bearing_loss=-lB * (magnets.damping_x * dux + magnets.damping_y * duy),
         house_loss=house.inner_beam_damping * stator.slip * stator.slip + house.outer_beam_damping * vy_oh * vy_oh,

@@ -24,7 +24,7 @@ SERIES = Path(__file__).parents[1] / "taylor" / "series.py"
 """Where the code lies."""
 WAVE_LANES = 36
 """Lanes of a complex power: enough for 64 magnets."""
-_VECTOR = 8
+_VECTOR = 4
 """Lanes come in multiples of this many."""
 
 _HEAD = '''"""Coefficients of the Taylor series, by phase. Made by `rig.engines.tape.taylor`: do not edit."""
@@ -35,8 +35,10 @@ import math
 
 from numba import njit
 
-from rig.engines.taylor.place import EAST, NORTH, ONSET, ORDER, PHASE, SLACK
+from rig.engines.memory import ONSET, PHASE
+from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
+from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
 
 
@@ -48,7 +50,7 @@ def product(below, left_0, right_0, later, left, right):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def quotient(below, first, divisor, dividend, inverse):
-    """The k-th coefficient of a quotient that begins with `first` (given as 0 for k = 0), by the inverse of the divisor's."""
+    """The k-th coefficient of a quotient that begins with `first` (for k = 0: 0), by the inverse of the divisor's."""
     return (dividend - below - divisor * first) * inverse
 '''
 
@@ -64,28 +66,31 @@ class _Code:
         self._lanes = 0
         self._unknown: set[int] = set()
         """Numbers of nodes that depend on the unknown friction."""
+        self._first: set[int] = set()
+        """Numbers of nodes that what it keeps at 0 is made of."""
         self._lane_of: dict[int, int] = {}
-        self.widest = 0
-        self.wave = False
+        self.widest = self.rarest = 0
 
     def function(self) -> str:
         """The function's source."""
         tape = self._tape
         outputs = self._outputs()
         residual = tape.events.get("residual")
-        self._mark(tape.items, [*outputs.values(), residual])
         if residual is not None:
+            self._mark(tape.items, [residual])
+            self._first = set(self._needed)
             self._depend(tape.items)
-        self._number_lanes(tape.items, 0)
+        self._mark(tape.items, [*outputs.values(), residual])
+        self._number_lanes(tape.items, 0, rare=False)
+        self.rarest = _whole(self.widest)
+        self._number_lanes(tape.items, self.rarest, rare=True)
         body = list(self._lines(tape.items, first=residual is not None))
         if residual is not None:
             body += [f"friction = {self._value(residual)} * per_friction", *self._lines(tape.items, again=True)]
         for text, value in outputs.items():
             body.append(f"{text} = {self._value(value)}")
-        lanes = -(-self.widest // _VECTOR) * _VECTOR
-        wide = -(-(self.widest + WAVE_LANES) // _VECTOR) * _VECTOR
-        body = [line.replace("WAVE", str(self.widest)) for line in body]
-        turns = [TURNS[angle] + side for angle in sorted(tape.turns) for side in (0, 1)]
+        lanes, wide = _whole(self.widest), _whole(self.rarest + WAVE_LANES)
+        body = [line.replace("WAVE", str(self.rarest)) for line in body]
         lines = [
             "", "", '@njit(cache=True, error_model="numpy")',
             f"def {tape.phase}(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc):",
@@ -100,10 +105,11 @@ class _Code:
             f"    Y[0, {S.N_VECTOR + 1}], Y[0, {S.N_VECTOR + 2}] = math.sin(along), math.cos(along)",
         ]  # fmt: skip
         for angle in sorted(tape.turns):
-            lines.append(f"    turned = {tape.turns[angle]}")
-            lines.append(f"    Y[0, {TURNS[angle]}], Y[0, {TURNS[angle] + 1}] = math.sin(turned), math.cos(turned)")
+            begin = tape.turns[angle]
+            value = f"math.sin({begin}), math.cos({begin})" if angle == S.THETA else f"sines_of(levels, {begin})"
+            lines.append(f"    Y[0, {TURNS[angle]}], Y[0, {TURNS[angle] + 1}] = {value}")
         lines += [
-            "    wide = inputs.magnet_engaged and magnet.terms == RIPPLED",
+            f"    wide = {_WIDE}",
             f"    for p in range({wide}):",
             "        A[0, p] = B[0, p] = 0.0",
             "    z, later = 1.0, 0.0",
@@ -118,7 +124,6 @@ class _Code:
             "            for j in range(1, k):",
             f"                for p in range({lanes}):",
             "                    acc[p] += A[j, p] * B[k - j, p]",
-            "        " + " = ".join(f"D[k, {column}]" for column in turns) + " = 0.0",
             *(f"        {line}" for line in body),
             "        portion = 1.0 / (k + 1.0)",
         ]
@@ -167,17 +172,25 @@ class _Code:
     def _wanted(self, item: Node | Fork, again: bool) -> bool:
         if isinstance(item, Fork):
             return any(self._wanted(each, again) for each in (*item.yes, *item.no, *item.joined))
-        return item.number in self._needed and (not again or item.number in self._unknown)
+        late = item.number in self._unknown
+        return item.number in self._needed and (late if again else not late or item.number in self._first)
 
-    def _number_lanes(self, items: list[Node | Fork], lane: int) -> int:
-        """Both branches of a fork share their lanes."""
+    def _number_lanes(self, items: list[Node | Fork], lane: int, *, rare: bool, now: bool = False) -> int:
+        """Both branches of a fork share their lanes. What few scenes ask for comes behind the others."""
         for item in items:
             if isinstance(item, Fork):
-                lane = max(self._number_lanes(item.yes, lane), self._number_lanes(item.no, lane))
-            elif item.number in self._needed and item.kind in _LANES:
+                sides = [
+                    self._number_lanes(branch, lane, rare=rare, now=now or _RARE.get(item.condition) is answer)
+                    for branch, answer in ((item.yes, True), (item.no, False))
+                ]
+                lane = max(sides)
+            elif item.number in self._needed and item.kind in _LANES and now is rare:
                 self._lane_of[item.number] = lane
                 lane += _LANES[item.kind]
-        self.widest = max(self.widest, lane)
+        if rare:
+            self.rarest = max(self.rarest, lane)
+        else:
+            self.widest = max(self.widest, lane)
         return lane
 
     # Code.
@@ -302,7 +315,25 @@ class _Code:
         yield from body.splitlines()
 
 
+_RARE = {
+    "contact.exponent == 1.0": False,
+    "contact.gap_counts_outer == 0.0": False,
+    "levels.friction == SMOOTHED": True,
+    "magnet.terms == RADIAL": False,
+}
+"""Conditions by which few scenes go, and the answer then."""
+_WIDE = """(
+        contact.gap_counts_outer != 0.0
+        or (contact.exponent != 1.5 and contact.exponent != 1.0)
+        or levels.friction == SMOOTHED
+        or (inputs.magnet_engaged and magnet.terms == RIPPLED)
+    )"""
+"""Whether a scene is one of these."""
 _LANES = {"product": 1, "quotient": 1, "reciprocal": 1, "root": 1, "tanh": 2, "power": 2}
+
+
+def _whole(lanes: int) -> int:
+    return -(-lanes // _VECTOR) * _VECTOR
 
 
 def _name(node: Node) -> str:
@@ -331,7 +362,7 @@ def source() -> str:
     assert os.environ.get("NUMBA_DISABLE_JIT") == "1", "the tapes need kernels in plain Python: NUMBA_DISABLE_JIT=1"
     codes = [_Code(record(phase)) for phase in PHASES]
     functions = [code.function() for code in codes]
-    lanes = -(-(max(code.widest for code in codes) + WAVE_LANES) // _VECTOR) * _VECTOR
+    lanes = max(_whole(code.rarest + WAVE_LANES) for code in codes)
     return f"{_HEAD}\n\nLANES = {lanes}\n" + "\n".join(functions) + "\n"
 
 

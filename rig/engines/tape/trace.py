@@ -20,7 +20,7 @@ from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 from rig.engines.tape.columns import PULSE_COSINE, PULSE_SINE, ROOT, TIME, TURNS
-from rig.kernels import contact, dynamics, forces, geometry, house, magnet
+from rig.kernels import contact, dynamics, forces, geometry, house, ledger, magnet
 from rig.kernels import signals as S
 from rig.kernels.constants import Constants, Contact, House, Inputs, Levels, Magnet, Shaft
 
@@ -169,8 +169,7 @@ class Symbol:
             if one.node.kind == "reciprocal":
                 quotient = self.tape.enter("quotient", two.node, one.node.arguments[0])
                 return quotient.scaled(one.coefficient * two.coefficient)
-        pair = sorted((self.node, other.node), key=lambda node: node.number)
-        return self.tape.enter("product", *pair).scaled(self.coefficient * other.coefficient)
+        return self.tape.product(self.node, other.node).scaled(self.coefficient * other.coefficient)
 
     __rmul__ = __mul__
 
@@ -190,7 +189,9 @@ class Symbol:
         if isinstance(other, Symbol):
             if other.node is self.node:
                 return self.scaled((self.coefficient + other.coefficient) * inverse(self.coefficient))
-            return self.tape.enter("sum", self.coefficient, self.node, other.coefficient, other.node)
+            return self._factored(other) or self.tape.enter(
+                "sum", self.coefficient, self.node, other.coefficient, other.node
+            )
         if isinstance(other, int | float) and other == 0.0:
             return self
         # (x - c) + c
@@ -198,6 +199,19 @@ class Symbol:
         if kind == "shifted" and self.coefficient == Known() and known(other) == -arguments[2]:
             return Symbol(self.tape, arguments[1], arguments[0])
         return self.tape.enter("shifted", self.coefficient, self.node, known(other))
+
+    def _factored(self, other: Symbol) -> Symbol | None:
+        """A f + b f as (a + b) f: one product less."""
+        one, two = self.node, other.node
+        if one.kind == two.kind == "product":
+            for factor in one.arguments:
+                if factor in two.arguments:
+                    left, right = (
+                        each.arguments[0] if each.arguments[1] is factor else each.arguments[1] for each in (one, two)
+                    )
+                    total = Symbol(self.tape, left, self.coefficient) + Symbol(self.tape, right, other.coefficient)
+                    return total * Symbol(self.tape, factor)
+        return None
 
     __radd__ = __add__
 
@@ -251,14 +265,35 @@ class Tape:
 
     def enter(self, kind: str, *arguments: Any) -> Symbol:
         """The symbol of an operation, entered where it is new."""
-        key = (kind, *(each.number if isinstance(each, Node) else each for each in arguments))
-        for scope in self._scopes:
-            if key in scope:
-                return Symbol(self, scope[key])
+        there = self.find(kind, *arguments)
+        if there is not None:
+            return Symbol(self, there)
         node = Node(next(self._numbers), kind, arguments)
-        self._scopes[-1][key] = node
+        self._scopes[-1][_key(kind, arguments)] = node
         self._open[-1].append(node)
         return Symbol(self, node)
+
+    def find(self, kind: str, *arguments: Any) -> Node | None:
+        """The node of an operation that is there already, in this branch or before it."""
+        key = _key(kind, arguments)
+        return next((scope[key] for scope in self._scopes if key in scope), None)
+
+    def product(self, one: Node, two: Node) -> Symbol:
+        """The symbol of a product, of products that are there already where a b x or a b c d can be put together so."""
+        pairs = [node.arguments for node in (one, two) if node.kind == "product"]
+        if len(pairs) == 2:
+            (a, b), (c, d) = pairs
+            for left, right in (((a, c), (b, d)), ((a, d), (b, c))):
+                first, second = self.find("product", *_sorted(*left)), self.find("product", *_sorted(*right))
+                if first is not None and second is not None:
+                    return self.enter("product", *_sorted(first, second))
+        for chain, factor in ((one, two), (two, one)):
+            if chain.kind == "product":
+                for kept, other in (chain.arguments, chain.arguments[::-1]):
+                    there = self.find("product", *_sorted(kept, factor))
+                    if there is not None and there is not chain:
+                        return self.enter("product", *_sorted(other, there))
+        return self.enter("product", *_sorted(one, two))
 
     def column(self, number: int) -> Symbol:
         """A column of the series."""
@@ -335,6 +370,14 @@ class Tape:
         return named(f"({known(yes).text} if {fork.condition} else {known(no).text})")
 
 
+def _key(kind: str, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    return (kind, *(each.number if isinstance(each, Node) else each for each in arguments))
+
+
+def _sorted(one: Node, two: Node) -> tuple[Node, Node]:
+    return (one, two) if one.number <= two.number else (two, one)
+
+
 class _UndecidedError(Exception):
     def __init__(self, condition: str) -> None:
         self.condition = condition
@@ -345,6 +388,8 @@ def record(phase: str) -> Tape:
     tape = Tape(phase)
     columns = [tape.column(number) for number in range(S.N_VECTOR)]
     rates: list[Any] = [0.0] * S.N_VECTOR
+    # Shared by two terms that would not find it by themselves.
+    tape.product(columns[S.GAMMA_RATE].node, tape.column(TURNS[S.BETA] + 1).node)
     phases = {getattr(contact, name): name for name in PHASES[phase]}
     with _on_symbols(tape):
         dynamics.evaluate(
@@ -360,6 +405,10 @@ def record(phase: str) -> Tape:
     return tape
 
 
+_COMPARED = ("exponent", "gap_counts_outer")
+"""Numbers of the contact that laws are chosen by."""
+
+
 def _fields(kind: type, prefix: str, **given: Any) -> Any:
     return kind(**{name: given.get(name, named(f"{prefix}.{name}")) for name in kind._fields})
 
@@ -372,7 +421,7 @@ def _constants(tape: Tape) -> Constants:
         levels=Levels(**flags, friction=Choice(tape, "levels.friction", laws)),  # type: ignore[arg-type]
         shaft=_fields(Shaft, "shaft"),
         magnet=_fields(Magnet, "magnet", terms=Choice(tape, "magnet.terms", maps)),
-        contact=_fields(Contact, "contact", exponent=Choice(tape, "contact.exponent")),
+        contact=_fields(Contact, "contact", **{name: Choice(tape, f"contact.{name}") for name in _COMPARED}),
         house=_fields(House, "house"),
         torque_gain=named("constants.torque_gain"),  # type: ignore[arg-type]
     )
@@ -392,7 +441,7 @@ def _on_symbols(tape: Tape) -> Iterator[None]:
         before.append((module, name, vars(module).get(name)))
         setattr(module, name, value)
 
-    modules = (geometry, forces, house, magnet, contact, dynamics)
+    modules = (geometry, forces, house, magnet, contact, ledger, dynamics)
     for module in modules:
         for name, value in list(vars(module).items()):
             if isinstance(value, FunctionType) and value.__module__.startswith(__name__.partition(".")[0]):
@@ -422,8 +471,9 @@ class _Meanings:
         plain(*arguments)
 
     @staticmethod
-    def sin_cos(tape: Tape, plain: Any, angle: Symbol) -> tuple[Symbol, Symbol]:
-        return _turn(tape, angle)
+    def sines_of(tape: Tape, plain: Any, levels: Any, angle: Symbol) -> tuple[Symbol, Symbol]:
+        """Columns for small angles too: the sine's rate is the angle's where the cosine stays 1."""
+        return _turn(tape, angle, geometry.large_of(levels))
 
     @staticmethod
     def hammer_force(tape: Tape, plain: Any, inputs: Inputs, *when: Any) -> Any:
@@ -475,7 +525,7 @@ class _Meanings:
         return tape.motion
 
 
-def _turn(tape: Tape, angle: Symbol) -> tuple[Symbol, Symbol]:
+def _turn(tape: Tape, angle: Symbol, large: Any = 1.0) -> tuple[Symbol, Symbol]:
     """Sine and cosine of an angle of the state, which may be shifted: two columns with rates of their own."""
     node, begin = angle.node, ""
     if node.kind == "shifted":
@@ -485,7 +535,7 @@ def _turn(tape: Tape, angle: Symbol) -> tuple[Symbol, Symbol]:
     sine, cosine = tape.column(TURNS[state]), tape.column(TURNS[state] + 1)
     rate = tape.column(S.GAMMA_RATE + state)
     tape.turns[state] = f"Y[0, {state}]{begin}"
-    for column, value in ((TURNS[state], cosine * rate), (TURNS[state] + 1, -(sine * rate))):
+    for column, value in ((TURNS[state], cosine * rate), (TURNS[state] + 1, -(sine * rate) * large)):
         tape.enter("rate", column, value.coefficient, value.node)
     return sine, cosine
 

@@ -28,7 +28,18 @@ import math
 import numpy as np
 from numba import njit
 
-from rig.engines.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, EVALUATIONS, FLOORED, PEAK_FORCE, STEPS
+from rig.engines.memory import (
+    CEILING,
+    CLAMPS,
+    CONTACT_STEPS,
+    CONTACTS,
+    EVALUATIONS,
+    FLOORED,
+    ONSET,
+    PEAK_FORCE,
+    PHASE,
+    STEPS,
+)
 from rig.engines.parts import PER_SCALE, rates
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT, TIME, WIDTH
 from rig.engines.taylor.place import (
@@ -41,9 +52,7 @@ from rig.engines.taylor.place import (
     KNOWN,
     LENGTH,
     NORTH,
-    ONSET,
     ORDER,
-    PHASE,
     SERIES,
     SLACK,
     SPAN,

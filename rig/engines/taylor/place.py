@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from rig.engines.memory import ONSET, OWN, PHASE
-
-__all__ = ["ONSET", "PHASE"]
+from rig.engines.memory import OWN
 
 TOLERANCE = OWN
 """Scaled error a step."""
