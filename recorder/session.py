@@ -15,6 +15,7 @@ from recorder.payload import block_in
 from recorder.series import Limits, Series, check_room, check_series
 from recorder.trigger import Capture, Captures, check_captures
 from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_view_rate
+from rig.bounded_queue import BoundedQueue
 from rig.channels import ChannelTable
 from rig.errors import InputError
 from rig.intake import Catalogue, Intake
@@ -206,59 +207,6 @@ class Sink(Protocol):
         ...
 
 
-class _Inbox:
-    """Bounded by bytes; a full one refuses blocks rather than make the transport wait, for that would stall the rig.
-
-    What it refuses shows as a gap of the row numbers. Documents are small and rare, and have room of their own.
-    """
-
-    def __init__(self, capacity_bytes: int) -> None:
-        self._capacity = capacity_bytes
-        self._items: deque[tuple[str, bytes, int]] = deque()
-        self._bytes = 0
-        self._taken_bytes = 0
-        self._closed = False
-        self._ready = threading.Condition()
-        self.dropped = 0
-        self.high_water_bytes = 0
-
-    def __len__(self) -> int:
-        return len(self._items)
-
-    def put(self, key: str, payload: bytes, wall_ns: int) -> None:
-        with self._ready:
-            if self._closed:
-                return
-            capacity = self._capacity + (_DOCUMENTS_BYTES if schema_of(key) is None else 0)
-            if self._bytes + len(payload) > capacity:
-                self.dropped += 1
-                return
-            self._items.append((key, payload, wall_ns))
-            self._bytes += len(payload)
-            self.high_water_bytes = max(self.high_water_bytes, self._bytes)
-            self._ready.notify()
-
-    @property
-    def waiting_bytes(self) -> int:
-        return self._bytes
-
-    def take(self, timeout_s: float) -> list[tuple[str, bytes, int]] | None:
-        """What waits, oldest first, when all that was taken before is done with; None when closed and empty."""
-        with self._ready:
-            self._bytes -= self._taken_bytes
-            self._taken_bytes = 0
-            if not self._items and not self._closed:
-                self._ready.wait(timeout_s)
-            items = [self._items.popleft() for _ in range(min(_PORTION, len(self._items)))]
-            self._taken_bytes = sum(len(payload) for _, payload, _ in items)
-            return None if self._closed and not items else items
-
-    def close(self) -> None:
-        with self._ready:
-            self._closed = True
-            self._ready.notify()
-
-
 class RecordingSession:
     """Records what a rig publishes until the stream ends, somebody stops it, or the rig or the disk is gone.
 
@@ -336,7 +284,11 @@ class RecordingSession:
         self._force = force
         self._wall_ns = wall_ns
         self._monotonic_s = monotonic_s
-        self._inbox = _Inbox(inbox_bytes)
+        self._inbox: BoundedQueue[tuple[str, bytes, int]] = BoundedQueue(
+            inbox_bytes, size=lambda item: len(item[1]), holds=True
+        )
+        """Payloads that wait to be written; a full one refuses blocks, for a transport that waits would stall the rig.
+        What it refuses shows as a gap of the row numbers. Documents are small and rare, and have room of their own."""
         self._misses: deque[tuple[str, int, int]] = deque()
         self._wake = threading.Event()
         self._stop_reason = ""
@@ -453,21 +405,21 @@ class RecordingSession:
         wall_ns = self._wall_ns()
         if schema_of(key) is None:
             if not self._replaced:
-                self._inbox.put(key, payload, wall_ns)
+                self._inbox.offer((key, payload, wall_ns), room=self._inbox.room + _DOCUMENTS_BYTES)
             return
         due = self._intake.next.get(key, 0)
         try:
             taken = self._intake.take(key, payload, wall_ns)
         except ValueError:
             if self._intake.knows(key):
-                self._inbox.put(key, payload, wall_ns)  # kept as it came, for the reader to judge
+                self._inbox.offer((key, payload, wall_ns))  # kept as it came, for the reader to judge
             return
         if taken:
             # Whoever goes on after the rig was lost and counts from the start again is another one in its place.
             self._replaced = self._replaced or (self._rig_lost and taken[0].block.index < due)
             self._heard_s = self._monotonic_s()
         for each in taken if not self._replaced else ():
-            self._inbox.put(each.key, each.payload, each.wall_ns)
+            self._inbox.offer((each.key, each.payload, each.wall_ns))
 
     def _on_miss(self, key: str, messages: int) -> None:
         self._misses.append((key, messages, self._wall_ns()))
@@ -487,8 +439,8 @@ class RecordingSession:
 
     def _write_all(self, writer: Sink) -> None:
         try:
-            while (items := self._inbox.take(0.1)) is not None:
-                for key, payload, wall_ns in items:
+            while not self._inbox.ended:
+                for key, payload, wall_ns in self._inbox.take_many(_PORTION, 0.1):
                     if not self._is_in_time(key, payload):
                         continue
                     document = writer.write(key, payload, wall_ns)
@@ -598,7 +550,7 @@ class RecordingSession:
             lost=sum(counts.lost.values()),
             size_bytes=counts.size_bytes,
             waiting=len(self._inbox),
-            backlog_bytes=self._inbox.waiting_bytes,
+            backlog_bytes=self._inbox.used,
             dropped=self._inbox.dropped,
             files=len(writer.files),
             remarks=(*writer.remarks, *self._remarks),
@@ -618,7 +570,7 @@ class RecordingSession:
                 writer.note_short(self._end_rows, self._wall_ns())
             notes = {
                 "dropped_payloads": str(self._inbox.dropped),
-                "backlog_high_water_bytes": str(self._inbox.high_water_bytes),
+                "backlog_high_water_bytes": str(self._inbox.high_water),
                 "refused_blocks": str(self._intake.refused),
                 "foreign_messages": str(self._client.foreign),
             }
@@ -651,7 +603,7 @@ class RecordingSession:
             size_bytes=sum(file.stat().st_size for file in files if file.exists()),
             files=files,
             removed=writer.removed,
-            high_water_bytes=self._inbox.high_water_bytes,
+            high_water_bytes=self._inbox.high_water,
             received_s=counts.extent_ns / NS,
             fired=writer.fired if isinstance(writer, Captures) else None,
             remarks=(*writer.remarks, *self._remarks),

@@ -5,8 +5,10 @@ Everything outside the physics (wire, drivers, recorder, viewer, exports) knows 
 
 from __future__ import annotations
 
+import difflib
 import math
 import tomllib
+from collections.abc import Collection, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
 from rig.errors import InputError
-from rig.outside import input_error, parse_toml
+from rig.outside import check, input_error, parse_toml
 
 TABLE = Path(__file__).with_name("channels.toml")
 
@@ -158,7 +160,10 @@ def parse_table(text: str) -> ChannelTable:
         groups = {}
         for name, body in parse_toml(text, field="channel table")["groups"].items():
             shared = {**body.get("defaults", {}), "group": name, "rate_hz": body["rate_hz"], "kind": body["kind"]}
-            rows = [{**shared, **row} for row in body["channels"]]
+            rows = [
+                check(Channel, {**shared, **row}, field=f"channel {row.get('name', number)}").model_dump()
+                for number, row in enumerate(body["channels"], 1)
+            ]
             groups[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": rows}
         return ChannelTable.model_validate({"groups": groups})
     except ValidationError as error:
@@ -169,6 +174,24 @@ def parse_table(text: str) -> ChannelTable:
         raise InputError("channel table", "[groups.NAME] with title, rate_hz, kind and channels", text[:80]) from None
     except tomllib.TOMLDecodeError as error:
         raise InputError("channel table", "a TOML file", str(error)) from None
+
+
+def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:
+    """Refuse channels that feel a signal that the model does not have.
+
+    Args:
+        channels: The channels.
+        known: Names of the model's signals.
+
+    Raises:
+        InputError: The first of them.
+    """
+    for channel in channels:
+        if channel.signal not in known:
+            close = difflib.get_close_matches(channel.signal, known, n=3) or list(known)
+            raise InputError(
+                f"channel {channel.name}.signal", f"one of the model's, such as {', '.join(close)}", channel.signal
+            )
 
 
 @cache

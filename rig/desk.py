@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from rig import wire
+from rig.bounded_queue import BoundedQueue
 from rig.errors import InputError, RefusedError
 from rig.outside import LARGEST, Name, Outside, a_line, check, read_json
 from rig.text import printable
@@ -140,7 +140,7 @@ class Desk:
         self._wake = wake
         self._tell = tell
         self._limit = limit or CommandLimit()
-        self._pending: deque[Pending] = deque()
+        self._pending: BoundedQueue[Pending] = BoundedQueue(_PENDING_COMMANDS)
         self._lock = threading.Lock()
         self._ended = ""
         self._kinds: set[str] = set()
@@ -163,12 +163,10 @@ class Desk:
         name = key.removeprefix(wire.command_key(""))
         try:
             pending = self._parse(name, payload)
-            with self._lock:
+            if not self._pending.offer(pending):
                 if self._ended:
                     raise InputError(name, f"sent while {self._running}", self._ended)
-                if len(self._pending) >= _PENDING_COMMANDS:
-                    raise InputError("commands", f"at most {_PENDING_COMMANDS} at a time", len(self._pending) + 1)
-                self._pending.append(pending)
+                raise InputError("commands", f"at most {_PENDING_COMMANDS} at a time", _PENDING_COMMANDS + 1)
         except InputError as error:
             return wire.encode_document(refusal(error))
         self._wake()
@@ -189,10 +187,9 @@ class Desk:
     def taken(self) -> Iterator[Pending]:
         """The commands that have come, oldest first, as many as may be taken between two blocks."""
         for _ in range(_AT_ONCE):
-            with self._lock:
-                if not self._pending:
-                    return
-                pending = self._pending.popleft()
+            pending = self._pending.take(0.0)
+            if pending is None:
+                return
             yield pending
         self._wake()  # there may be more
 
@@ -203,11 +200,9 @@ class Desk:
             ended: What the command met instead of a run.
             also: Commands that were taken and cannot be done any more.
         """
-        with self._lock:
-            self._ended = ended
-            waiting = [*self._pending, *also]
-            self._pending.clear()
-        for pending in waiting:
+        self._ended = ended
+        self._pending.close()
+        for pending in [*self._pending.take_many(_PENDING_COMMANDS), *also]:
             pending.refuse(InputError("command", f"sent while {self._running}", ended))
 
     def trouble(self, where: str, error: BaseException) -> None:

@@ -165,7 +165,8 @@ class Intake:
         self._most = len(self._promises) + _MOST_OTHERS
         self._waiting: dict[str, list[Taken]] = {}
         """Blocks behind a step, as they came, until another one tells whose line goes on."""
-        self.next: dict[str, int] = {}
+        self._rows = wire.Continuity()
+        self.next = self._rows.next
         """Number of the row that is due next, by key."""
         self.refused = 0
         """Blocks that cannot be of this rig, or were of no line."""
@@ -204,7 +205,6 @@ class Intake:
         if block.index - due > _MOST_STEP:
             return self._refuse(key, f"row {block.index} is {block.index - due} rows ahead")
         waiting = self._waiting.setdefault(key, [])
-        self.next.setdefault(key, due)
         place = next((n for n, each in enumerate(waiting) if each.end == block.index), None)
         if block.index != due and place is None:
             waiting.append(new)
@@ -218,8 +218,7 @@ class Intake:
             else:
                 self._refuse_step(each)
         waiting.clear()
-        self.next[key] = new.end
-        return line
+        return self._believe(line)
 
     def rest(self, rows: Mapping[str, int] | None, key: str | None = None) -> list[Taken]:
         """At the end: the blocks that still wait and are part of what was published.
@@ -250,8 +249,12 @@ class Intake:
             self._refuse_step(each)
         chosen = waiting[place]
         del waiting[: place + 1]
-        self.next[key] = chosen.end
-        return [chosen]
+        return self._believe([chosen])
+
+    def _believe(self, line: list[Taken]) -> list[Taken]:
+        for each in line:
+            self._rows.follow(each.key, each.block.index, len(each.block.values))
+        return line
 
     def _refuse_step(self, waiting: Taken) -> None:
         due = self.next[waiting.key]

@@ -8,9 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 from rig import wire
-from rig.channels import Channel, default_table
+from rig.channels import Channel
+from rig.commands import COMMANDS
 from rig.kernels import signals
-from rig.scenes import COMMANDS, SensorChoice
+from rig.scenes import SensorChoice, rig_table
 from rig.transport.access import DOORS, PLAIN, ROLES, TRUTH, Verb
 
 _DOCUMENTS = {
@@ -56,7 +57,7 @@ def page() -> str:
 
 
 def _blocks() -> list[str]:
-    table = default_table()
+    table = rig_table()
     lines = [
         "# Keys, messages and units",
         "",

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rig.errors import InputError
 from rig.text import printable
@@ -39,6 +39,29 @@ class Outside(BaseModel):
     """A document, or part of one, from outside: `"100"` and true are no numbers, and there are no further fields."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Written(BaseModel):
+    """A table that a person writes, into a scene or another file; further fields are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_truth_for_a_number(cls, data: Any) -> Any:
+        # Python takes true for 1; a file that says so means something else.
+        for name, value in data.items() if isinstance(data, dict) else ():
+            if isinstance(value, bool) and name in cls.model_fields and cls.model_fields[name].annotation is not bool:
+                raise InputError(name, "something else than true or false", value)
+            if (
+                isinstance(value, str)
+                and value[:1].isdigit()
+                and not cls.model_config.get("strict")
+                and name in cls.model_fields
+                and cls.model_fields[name].annotation in (int, float)
+            ):
+                raise InputError(name, "a number", value)
+        return data
 
 
 def a_line(most: int) -> AfterValidator:
@@ -176,6 +199,18 @@ def check_depth(document: Any, *, field: str) -> None:
         if not level:
             return
     raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper")
+
+
+def table_in(data: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """A table in a document; an empty one where there is none.
+
+    Raises:
+        InputError: It is something else.
+    """
+    table = data.get(name, {})
+    if not isinstance(table, dict):
+        raise InputError(name, "a table of named fields", table)
+    return table
 
 
 _LONG_NUMBER = re.compile(r"\d[\d_]{4000,}")

@@ -65,14 +65,15 @@ class Histogram:
     def __init__(self, *, low: float = 1e-6, high: float = 1e3, bins_a_decade: int = 50) -> None:
         self._low = low
         self._a_decade = bins_a_decade
-        self._counts = [0] * (math.ceil(math.log10(high / low) * bins_a_decade) + 1)
+        self.counts = [0] * (math.ceil(math.log10(high / low) * bins_a_decade) + 1)
+        """Values in each bin."""
         self.count = 0
         self.largest = 0.0
 
     def add(self, value: float) -> None:
         """Count one value."""
         at = 0 if value <= self._low else math.ceil(math.log10(value / self._low) * self._a_decade)
-        self._counts[min(at, len(self._counts) - 1)] += 1
+        self.counts[min(at, len(self.counts) - 1)] += 1
         self.count += 1
         self.largest = max(self.largest, value)
 
@@ -80,7 +81,7 @@ class Histogram:
         """The value that `fraction` of all values do not exceed; 0 where there are none."""
         rank = math.ceil(fraction * self.count)
         seen = 0
-        for at, count in enumerate(self._counts):
+        for at, count in enumerate(self.counts):
             seen += count
             if count and seen >= rank:
                 return min(self._low * 10 ** (at / self._a_decade), self.largest)

@@ -3,122 +3,31 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 import json
-import math
 import tomllib
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from rig.channels import default_table
+from rig.channels import ChannelTable, check_signals, default_table
+from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand
 from rig.engines import ENGINES
 from rig.errors import InputError
+from rig.kernels.signals import COLUMN
 from rig.levels import ModelLevels
-from rig.outside import check, parse_toml, read_toml
+from rig.outside import Written, check, parse_toml, read_toml, table_in
 from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
+from rig.pick import Pick, digest, equations_digest
 
 SCENES = Path(__file__).with_name("scenes")
 _APART_S = 0.01
 """Least time between two points of a speed profile [s]: well above any step."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _no_truth_for_a_number(cls, data: Any) -> Any:
-        # Python takes true for 1; a file that says so means something else.
-        for name, value in data.items() if isinstance(data, dict) else ():
-            if isinstance(value, bool) and name in cls.model_fields and cls.model_fields[name].annotation is not bool:
-                raise InputError(name, "something else than true or false", value)
-            if (
-                isinstance(value, str)
-                and value[:1].isdigit()
-                and not cls.model_config.get("strict")
-                and name in cls.model_fields
-                and cls.model_fields[name].annotation in (int, float)
-            ):
-                raise InputError(name, "a number", value)
-        return data
-
-
-_DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0), "-x": (-1.0, 0.0), "-y": (0.0, -1.0)}
-
-
-class _Command(_Part):
-    # `"100"` is no number, be it in a file or on a wire.
-    model_config = ConfigDict(strict=True)
-
-
-class HammerCommand(_Command):
-    """A blow of the pendulum hammer at the disk: a half-sine pulse."""
-
-    command: Literal["hammer"] = "hammer"
-    force_n: Annotated[FiniteFloat, Field(ge=1.0, le=1000.0)] = 100.0
-    """Peak force [N]."""
-    duration_ms: Annotated[FiniteFloat, Field(ge=0.5, le=50.0)] = 5.0
-    """Length of the pulse [ms]; the paper gives none."""
-    direction: str | float = "x"
-    """Along x (EAST), y (up), or at an angle from x toward y [degrees]."""
-
-    @field_validator("direction")
-    @classmethod
-    def _a_direction(cls, direction: str | float) -> str | float:
-        good = direction in _DIRECTIONS if isinstance(direction, str) else -360.0 <= direction <= 360.0
-        if not good:
-            raise ValueError(f"{', '.join(_DIRECTIONS)}, or an angle from -360 to 360 degrees")
-        return direction
-
-    @property
-    def cosines(self) -> tuple[float, float]:
-        """Direction as a unit vector (x, y)."""
-        if isinstance(self.direction, str):
-            return _DIRECTIONS[self.direction]
-        angle = math.radians(self.direction)
-        return math.cos(angle), math.sin(angle)
-
-
-class SpeedCommand(_Command):
-    """A new speed, approached at the drive's ramp rate."""
-
-    command: Literal["speed"] = "speed"
-    speed_hz: Annotated[FiniteFloat, Field(ge=0.0)]
-    """Target [Hz]; the parameter drive.top_speed limits it further."""
-
-
-class ReleaseCommand(_Command):
-    """The drop device: the magnets let go of the shaft."""
-
-    command: Literal["release"] = "release"
-
-
-Command = HammerCommand | SpeedCommand | ReleaseCommand
-COMMANDS: dict[str, type[Command]] = {"hammer": HammerCommand, "speed": SpeedCommand, "release": ReleaseCommand}
-
-
-def parse_command(name: str, request: dict[str, Any]) -> Command:
-    """Check a command that came from outside.
-
-    Raises:
-        InputError: No such command, an unknown field, or a value out of its range; the message names the range.
-    """
-    if name not in COMMANDS:
-        raise InputError("command", f"one of {', '.join(COMMANDS)}", name)
-    return check(COMMANDS[name], request, field=name)
-
-
-class TimedCommand(_Part):
+class TimedCommand(Written):
     """A command at a fixed time of the scene."""
 
     at_s: Annotated[FiniteFloat, Field(ge=0.0)]
@@ -133,7 +42,7 @@ class TimedCommand(_Part):
         return data
 
 
-class Initial(_Part):
+class Initial(Written):
     """Where the shaft is at time zero, at rest but for its spin."""
 
     position: Literal["equilibrium", "top", "bottom", "given"] = "equilibrium"
@@ -145,7 +54,7 @@ class Initial(_Part):
     """False: the magnets have let go already."""
 
 
-class Drive(_Part):
+class Drive(Written):
     """What the motor aims at."""
 
     mode: Literal["torque", "ideal"] = "torque"
@@ -166,7 +75,7 @@ class Drive(_Part):
         return profile
 
 
-class EngineChoice(_Part):
+class EngineChoice(Written):
     """How the equations are integrated."""
 
     name: str = next(iter(ENGINES))
@@ -191,10 +100,22 @@ class EngineChoice(_Part):
         return {"step_us": method.step_us, "tolerance": method.tolerance, **data}
 
 
-class SensorChoice(_Part):
+@cache
+def rig_table() -> ChannelTable:
+    """The rig's own channel table, held against the model.
+
+    Raises:
+        InputError: A channel feels a signal that the model does not have.
+    """
+    table = default_table()
+    check_signals(table.channels.values(), COLUMN)
+    return table
+
+
+class SensorChoice(Written):
     """What is measured, and how often."""
 
-    groups: tuple[str, ...] = tuple(default_table().groups)
+    groups: tuple[str, ...] = tuple(rig_table().groups)
     rate_hz: Annotated[int, Field(ge=100, le=1_000_000)] = 20_000
     """Sample rate of every channel [Hz]."""
     truth_rate_hz: Annotated[int, Field(ge=10, le=1_000_000)] = 2_000
@@ -207,86 +128,20 @@ class SensorChoice(_Part):
     @field_validator("groups")
     @classmethod
     def _known(cls, groups: tuple[str, ...]) -> tuple[str, ...]:
-        known = default_table().groups
+        known = rig_table().groups
         if not groups or any(group not in known for group in groups) or len(set(groups)) < len(groups):
             raise ValueError(f"a list of different names out of {', '.join(known)}")
         return groups
 
 
-class PickedQuantity(_Part):
-    """One quantity that a pick was made for, with its errors as `rig ladder` measured them."""
-
-    quantity: str
-    unit: str = ""
-    tolerance: FiniteFloat
-    """Error allowed, as a part of the quantity's scale."""
-    value: FiniteFloat | str
-    """By the picked model and engine [unit]."""
-    reference: FiniteFloat | str
-    """By the full model and the engine of the reference [unit]."""
-    model_error: FiniteFloat
-    """Of the picked levels against the full model, both converged."""
-    numerical_error: FiniteFloat
-    """Of the picked engine against a converged one on the picked levels."""
-    total_error: FiniteFloat
-    reference_error: FiniteFloat
-    """Of the reference itself: its distance from an unlike engine."""
-
-
-class Pick(_Part):
-    """The cheapest model, engine and step that `rig ladder` found good enough, with what they were picked on."""
-
-    magnet: str
-    shaft: str
-    stator: str
-    contact: str
-    friction: str
-    drive: Literal["torque", "ideal"]
-    sensors: Literal["ideal", "full"]
-    engine: str
-    step_us: int
-    engine_tolerance: FiniteFloat = 0.0
-    quantities: tuple[PickedQuantity, ...]
-    wall_s: FiniteFloat
-    """Wall time of a simulated second of the pick, with the scene's sensors [s]."""
-    wall_given_s: FiniteFloat
-    """The same of the scene as it is given [s]."""
-    wall_full_s: FiniteFloat
-    """The same of the full model on the engine of the reference [s]."""
-    reference_engine: str = ""
-    unlike_engine: str = ""
-    """Whose distance from the reference is the reference's own error."""
-    date: str = ""
-    rig: str = ""
-    """Version of the rig."""
-    commit: str = ""
-    machine: str = ""
-    seed: int = 0
-    scene_digest: str
-    parameters_digest: str
-    code_digest: str
-
-    def apply(self, data: dict[str, Any]) -> dict[str, Any]:
-        """The fields of a scene with the pick's in their place."""
-        levels = {name: getattr(self, name) for name in ModelLevels.model_fields}
-        engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
-        return {
-            **data,
-            "model": levels,
-            "engine": engine,
-            "drive": {**_table_in(data, "drive"), "mode": self.drive},
-            "sensors": {**_table_in(data, "sensors"), "chain": self.sensors},
-        }
-
-
-class Scene(_Part):
+class Scene(Written):
     """One run: initial state, drive, timed commands, engine, sensors, seed, and the parameters it runs on."""
 
     name: str = "scene"
     title: str = ""
     parameters: str = DEFAULT_SET
     """Name of a parameter set, or the path of a file."""
-    set: dict[str, Any] = {}
+    set: dict[str, Any] = Field(default={})
     """Parameters changed for this scene, each in its own unit."""
     duration_s: Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)] = 2.0
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
@@ -483,28 +338,15 @@ def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scen
 
 
 _PICKED = ("drive.mode", "sensors.chain")
-_EQUATIONS = ("kernels", "engines", "contacts.py", "levels.py", "magnets.py", "model.py")
 
 
 def pick_digests(scene: Scene) -> tuple[str, str, str]:
     """What a pick depends on: digests of the scene as given, of its parameters, and of equations and engines."""
-
-    def digest(*parts: bytes) -> str:
-        total = hashlib.sha256()
-        for part in parts:
-            total.update(len(part).to_bytes(8, "big") + part)
-        return total.hexdigest()[:16]
-
     # Neither its name nor the seed of the sensors' noise changes what a scene does.
     left_out = {"name", "title", "seed", "parameters", "set", "model", "engine", "fidelity", "pick"}
     given = scene.model_dump_json(exclude=left_out)
     values = {key: [entry.value, entry.unit] for key, entry in scene.load_parameters().entries.items()}
-    package = Path(__file__).parent
-    files = [file for name in _EQUATIONS for file in ((package / name).glob("*.py") if (package / name).is_dir() else
-             [package / name])]  # fmt: skip
-    # Line ends differ between systems.
-    code = [part for file in sorted(files) for part in (file.name.encode(), file.read_bytes().replace(b"\r\n", b"\n"))]
-    return digest(given.encode()), digest(json.dumps(values, sort_keys=True).encode()), digest(*code)
+    return digest(given.encode()), digest(json.dumps(values, sort_keys=True).encode()), equations_digest()
 
 
 def parse_scene(data: dict[str, Any]) -> Scene:
@@ -518,7 +360,7 @@ def parse_scene(data: dict[str, Any]) -> Scene:
 
 def _override(data: dict[str, Any], key: str, value: Any) -> None:
     if key in load_parameters().entries:
-        data["set"] = {**_table_in(data, "set"), key: value}
+        data["set"] = {**table_in(data, "set"), key: value}
         return
     *path, last = key.split(".")
     fields: Any = Scene
@@ -533,18 +375,11 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
         fields = known[part].annotation
     place = data
     for part in path:
-        place[part] = dict(_table_in(place, part))
+        place[part] = dict(table_in(place, part))
         place = place[part]
     place[last] = value
     if key == "drive.speed_hz":
         place.pop("profile", None)
-
-
-def _table_in(data: dict[str, Any], name: str) -> dict[str, Any]:
-    table = data.get(name, {})
-    if not isinstance(table, dict):
-        raise InputError(name, "a table of named fields", table)
-    return table
 
 
 def _scene_keys() -> list[str]:

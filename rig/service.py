@@ -11,17 +11,21 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rig import wire
-from rig.desk import Desk, Note, Pending, Step, finite, one_line
+from rig.bounded_queue import BoundedQueue
+from rig.desk import Note, Pending, Step, finite
 from rig.errors import InputError
-from rig.pacing import Clock, Lockstep, RealTime, StepTimeoutError, short_collections
+from rig.pacing import Clock, Lockstep, RealTime
+from rig.served_run import ServedRun
 from rig.transport import Server
 from rig.transport.limit import CommandLimit
+
+if TYPE_CHECKING:
+    from rig.simulation import Frame, Simulation
 
 SIMULATION_COMMANDS = ("hammer", "speed", "release")
 """Commands that the simulation itself checks and carries out."""
@@ -37,92 +41,6 @@ _TAKEN_BYTES = 500_000
 """What is told to latecomers of the commands so far; the oldest go first, and are counted."""
 
 
-class Frame(Protocol):
-    """Everything that one `advance` produced; its arrays are not written to again."""
-
-    @property
-    def tick(self) -> int:
-        """Start [ticks]."""
-        ...
-
-    @property
-    def ticks(self) -> int:
-        """Length [ticks]."""
-        ...
-
-    @property
-    def samples(self) -> Mapping[str, wire.Block]:
-        """ADC counts by sensor group."""
-        ...
-
-    @property
-    def edges(self) -> wire.Block | None:
-        """Keyphasor edges, where there were any."""
-        ...
-
-    @property
-    def truth(self) -> Mapping[str, wire.Block]:
-        """Model values by truth table."""
-        ...
-
-    @property
-    def events(self) -> list[dict[str, Any]]:
-        """What took effect: event, tick, time_s and further fields."""
-        ...
-
-
-class Simulation(Protocol):
-    """What the service needs of `rig.simulation.Simulation`."""
-
-    @property
-    def tick(self) -> int:
-        """Where it stands [ticks]."""
-        ...
-
-    @property
-    def tick_rate_hz(self) -> int:
-        """Ticks per simulated second."""
-        ...
-
-    @property
-    def block_ticks(self) -> int:
-        """Every advance is a whole multiple of this [ticks]."""
-        ...
-
-    @property
-    def end_tick(self) -> int | None:
-        """Where it ends, or None."""
-        ...
-
-    def advance(self, ticks: int, /) -> Frame:
-        """Simulate on."""
-        ...
-
-    def submit(self, command: str, request: dict[str, Any], /) -> int:
-        """Check a command and take it; returns the tick at which it takes effect. Raises InputError."""
-        ...
-
-    def catalogue(self) -> dict[str, Any]:
-        """Channels and truth tables."""
-        ...
-
-    def parameters_document(self) -> dict[str, Any]:
-        """All parameters with unit, source and kind."""
-        ...
-
-    def scene_document(self) -> dict[str, Any]:
-        """Name, scene and seed."""
-        ...
-
-    def health(self) -> dict[str, Any]:
-        """`spin_hz`, `energy` and `warnings`."""
-        ...
-
-    def warm_up(self) -> None:
-        """Compile and run all kernels once."""
-        ...
-
-
 @dataclass(slots=True)
 class _Entry:
     """What the publisher sends in one go: events, a block of everything, events; then replies that waited for it."""
@@ -133,72 +51,13 @@ class _Entry:
     replies: list[tuple[Pending, dict[str, Any]]] = field(default_factory=list)
 
 
-class _Queue:
-    """Queue of entries between two threads, bounded in its blocks; events and replies are few and never dropped."""
-
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self.high_water = 0
-        self.dropped = 0
-        self._entries: deque[_Entry] = deque()
-        self._blocks = 0
-        self._changed = threading.Condition()
-        self._closed = False
-
-    def __len__(self) -> int:
-        return self._blocks
-
-    def put(self, entry: _Entry) -> int:
-        """Append without waiting; returns how many blocks had to be dropped for it."""
-        dropped = 0
-        with self._changed:
-            while entry.frame is not None and self._blocks >= self.capacity:
-                oldest = self._entries.popleft()
-                heir = self._entries[0] if self._entries else entry
-                heir.before = [*oldest.before, *oldest.after, *heir.before]
-                heir.replies = [*oldest.replies, *heir.replies]
-                if oldest.frame is not None:
-                    self._blocks -= 1
-                    dropped += 1
-            self._entries.append(entry)
-            self._blocks += entry.frame is not None
-            self.dropped += dropped
-            self.high_water = max(self.high_water, self._blocks)
-            self._changed.notify_all()
-        return dropped
-
-    def take(self, timeout_s: float) -> _Entry | None:
-        """The oldest entry, or None after the time or at the end."""
-        with self._changed:
-            if not self._entries and not self._closed:
-                self._changed.wait(timeout_s)
-            if not self._entries:
-                return None
-            entry = self._entries.popleft()
-            self._blocks -= entry.frame is not None
-            self._changed.notify_all()
-            return entry
-
-    def wait_for_room(self, timeout_s: float) -> bool:
-        """Whether another block fits, at the latest after the time."""
-        with self._changed:
-            if self._blocks >= self.capacity:
-                self._changed.wait(timeout_s)
-            return self._blocks < self.capacity
-
-    def close(self) -> None:
-        """Nothing will be put any more."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-    @property
-    def finished(self) -> bool:
-        """Closed and empty."""
-        return self._closed and not self._entries
+def _inherit(dropped: _Entry, following: _Entry) -> None:
+    """Events and replies are few, and are not dropped with their block."""
+    following.before = [*dropped.before, *dropped.after, *following.before]
+    following.replies = [*dropped.replies, *following.replies]
 
 
-class Service:
+class Service(ServedRun):
     """Runs one simulation to its end and serves it.
 
     Args:
@@ -230,38 +89,35 @@ class Service:
     ) -> None:
         if block_ticks <= 0 or block_ticks % simulation.block_ticks:
             raise InputError("block_ticks", f"a whole multiple of {simulation.block_ticks} ticks", block_ticks)
-        self._simulation = simulation
-        self._server = server
-        self._clock = clock
-        self._block_ticks = block_ticks
-        self._status_period_s = status_period_s
-        self._linger_s = linger_s
-        self._rate = simulation.tick_rate_hz
-        self._queue = _Queue(max(2, math.ceil(queue_seconds * self._rate / block_ticks)))
-        self._may_drop = isinstance(clock, RealTime)
-
-        self._scene = simulation.scene_document()
-        self._tick = simulation.tick
-        self._state = "running"
-        self._prepared = False
-        self._stop_requested = False
-        self._health: dict[str, Any] = {}
-        self._next_health_s = 0.0
-        self._overflowing = False
-
-        self._desk = Desk(
+        super().__init__(
             server,
+            clock,
+            scene=simulation.scene_document(),
+            tick_rate_hz=simulation.tick_rate_hz,
             commands=COMMANDS,
             others={
                 name: f"{name} is for a recording that is replayed (rig replay); this is a simulator, which runs on"
                 for name in REPLAY_COMMANDS
             },
             running="the rig runs",
-            wake=clock.wake,
-            tell=self._warn,
+            linger_s=linger_s,
             limit=limit,
         )
-        self._accepted = 0
+        self._simulation = simulation
+        self._block_ticks = block_ticks
+        self._status_period_s = status_period_s
+        self._queue: BoundedQueue[_Entry] = BoundedQueue(
+            max(2, math.ceil(queue_seconds * self._rate / block_ticks)),
+            size=lambda entry: int(entry.frame is not None),
+            inherit=_inherit,
+        )
+        self._publisher = threading.Thread(target=self._publish_all, name="publisher", daemon=True)
+        self._may_drop = isinstance(clock, RealTime)
+        self._overflowing = False
+        self._tick = simulation.tick
+        self._health: dict[str, Any] = {}
+        self._next_health_s = 0.0
+
         self._taken: tuple[dict[str, Any], ...] = ()
         """Commands that the simulation took: whoever comes later cannot run the scene again without them."""
         self._taken_bytes = 0
@@ -273,123 +129,61 @@ class Service:
         self._rows = wire.Continuity()
         self._samples_rate_hz = 0.0
         self._samples_published = 0
-        self._congestion: dict[str, float] = {}
 
     # ---- from any thread ----
 
-    def stop(self) -> None:
-        """End the run at the next block boundary; from any thread or signal handler."""
-        self._stop_requested = True
-        self._clock.wake()
+    @property
+    def published(self) -> int:
+        """Row after the last one published, of the stream that clients report on."""
+        return self._samples_published
 
     def status(self) -> dict[str, Any]:
         """The status document (see rig/KEYS.md)."""
-        health = self._health
-        warnings = list(health.get("warnings", []))
-        if self._queue.dropped:
-            warnings.append(f"{self._queue.dropped} blocks dropped: the publisher did not keep up")
-        waiting_s = len(self._queue) * self._block_ticks / self._rate
+        queue, end_tick = self._queue, self._simulation.end_tick
+        warnings = list(self._health.get("warnings", []))
+        if queue.dropped:
+            warnings.append(f"{queue.dropped} blocks dropped: the publisher did not keep up")
+        waiting_s = queue.used * self._block_ticks / self._rate
         if self._may_drop and waiting_s > _HELD_UP_S:
             warnings.append(f"{waiting_s:.1f} s of blocks wait: a client holds up the publisher")
-        warnings += self._desk.warnings()
-        return finite(
-            {
-                "scene": self._scene.get("name"),
-                "tick": self._tick,
-                "time_s": self._tick / self._rate,
-                "end_s": None if self._simulation.end_tick is None else self._simulation.end_tick / self._rate,
-                "wall_s": time.time(),
-                "state": self._state,
-                "pace": self._clock.pace,
-                "block_ms": 1e3 * self._block_ticks / self._rate,
-                **self._clock.statistics(),
-                "queue": {
-                    "depth": len(self._queue),
-                    "capacity": self._queue.capacity,
-                    "high_water": self._queue.high_water,
-                    "dropped": self._queue.dropped,
-                },
-                "congestion": self._congestion,
-                "clients": self._desk.clients.rows(self._samples_published, self._samples_rate_hz),
-                "spin_hz": health.get("spin_hz"),
-                "energy": health.get("energy", {}),
-                "engine": health.get("engine", {}),
-                "warnings": warnings,
-                "samples_published": self._samples_published,
-                "commands": self._accepted,
-            }
+        return self._status(
+            tick=self._tick,
+            end_s=None if end_tick is None else end_tick / self._rate,
+            pace=self._clock.pace,
+            block_ms=1e3 * self._block_ticks / self._rate,
+            queue={
+                "depth": queue.used,
+                "capacity": queue.room,
+                "high_water": queue.high_water,
+                "dropped": queue.dropped,
+            },
+            rate_hz=self._samples_rate_hz,
+            health=self._health,
+            warnings=warnings,
         )
+
+    def _warn(self, text: str) -> None:
+        self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
 
     # ---- on the simulation thread ----
 
-    def prepare(self) -> None:
-        """Compile everything, answer requests and show the rig's token; `run` does it where it was not done before."""
-        if self._prepared:
-            return
+    def _get_ready(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Compile everything."""
         self._simulation.warm_up()
         self._health = self._simulation.health()
-        catalogue, parameters = self._simulation.catalogue(), self._simulation.parameters_document()
-        self._desk.open(
-            {
-                wire.CATALOGUE: lambda: catalogue,
-                wire.PARAMETERS: lambda: parameters,
-                wire.SCENE: self._scene_now,
-                wire.STATUS: self.status,
-            }
-        )
-        self._prepared = True
+        return self._simulation.catalogue(), self._simulation.parameters_document()
 
     def _scene_now(self) -> dict[str, Any]:
         forgotten = {"forgotten": self._forgotten} if self._forgotten else {}
         return {**self._scene, "taken": self._taken, **forgotten}
 
-    def run(self) -> dict[str, Any]:
-        """Run to the end, to a stop, or to a failure, which is raised after the stream has been ended.
-
-        Returns:
-            Summary: reason, tick, time_s, wall_s, rows by key, and the last status's figures.
-        """
+    def _go(self) -> str:
         simulation = self._simulation
-        self.prepare()
         start = {"scene": self._scene.get("name"), "seed": self._scene.get("seed"), "pace": self._clock.pace}
-        self._queue.put(_Entry([self._event("start", **start)]))
-        publisher = threading.Thread(target=self._publish_all, name="publisher", daemon=True)
-        publisher.start()
-        started = time.monotonic()
-        reason = "failed: the service itself failed"
-        try:
-            with short_collections():
-                started = time.monotonic()
-                self._clock.start(simulation.tick, self._rate)
-                reason = self._advance_all()
-        except KeyboardInterrupt:
-            reason = "stopped"
-            raise
-        except StepTimeoutError as error:
-            reason = f"failed: {error}"
-            raise
-        except BaseException as error:
-            reason = f"failed: {type(error).__name__}: {one_line(error)}"
-            raise
-        finally:
-            wall_s = time.monotonic() - started
-            self._finish(reason)
-            publisher.join(timeout=60.0)
-            # Where the publisher failed, nobody else answers the steps that it left.
-            while (entry := self._queue.take(0.0)) is not None:
-                self._answer(entry)
-            self._linger()
-        status = self.status()
-        kept = ("scene", "pace", "tick", "time_s", "real_time_factor", "lateness_ms", "overruns", "queue", "congestion")
-        return {
-            "reason": reason,
-            "wall_s": wall_s,
-            **{name: status[name] for name in kept},
-            "samples_published": self._samples_published,
-            "commands": self._accepted,
-            "rows": dict(self._rows.next),
-            "troubles": self._desk.troubles,
-        }
+        self._queue.push(_Entry([self._event("start", simulation.tick, **start)]))
+        self._publisher.start()
+        self._clock.start(simulation.tick, self._rate)
+        return self._advance_all()
 
     def _advance_all(self) -> str:
         """The loop; returns why it ended."""
@@ -398,7 +192,7 @@ class Service:
         while True:
             events = self._take_commands()
             if self._stop_requested or (end is not None and simulation.tick >= end):
-                queue.put(_Entry(events))
+                queue.push(_Entry(events))
                 return "stopped" if self._stop_requested else "completed"
             want = self._block_ticks
             if end is not None:
@@ -418,57 +212,40 @@ class Service:
                 answered += self._take_commands()
             self._tick = simulation.tick
             after = [{**event, "wall_s": time.time()} for event in frame.events]
-            self._overflow(queue.put(_Entry(events, frame, [*after, *answered], self._finished_steps())))
+            self._overflow(queue.push(_Entry(events, frame, [*after, *answered], self._finished_steps())))
             self._refresh_health()
 
     def _defer(self, events: list[dict[str, Any]]) -> None:
         """Publish events without a block, where the next block is not yet to be run."""
         if events:
-            self._queue.put(_Entry(events))
+            self._queue.push(_Entry(events))
 
     def _overflow(self, dropped: int) -> None:
         """Say once for each time that the queue overflows; the count is in the status."""
         if dropped and not self._overflowing:
             text = "the publisher does not keep up: the oldest blocks in the queue are dropped"
-            self._queue.put(_Entry([self._event("warning", text=text)]))
+            self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
         self._overflowing = bool(dropped)
 
-    def _take_commands(self) -> list[dict[str, Any]]:
-        """Carry out all commands that have arrived; returns their events."""
-        events = []
-        for pending in self._desk.taken():
-            try:
-                events.append(self._carry_out(pending))
-            except InputError as error:
-                pending.refuse(error)
-            except Exception as error:
-                # A request that the simulation's own checks let through must not end the run.
-                pending.refuse(InputError(pending.command, "readable", one_line(error)))
-                self._desk.trouble(pending.command, error)
-        return events
-
     def _carry_out(self, pending: Pending) -> dict[str, Any]:
-        simulation = self._simulation
-        tick, done_tick = simulation.tick, None
+        asked, tick, done_tick = pending.asked, self._simulation.tick, None
         if pending.command == "stop":
             self._stop_requested = True
-        elif isinstance(pending.asked, Step):
-            done_tick = self._check_step(pending.asked)
-        elif not isinstance(pending.asked, Note):
-            tick = simulation.submit(pending.command, dict(pending.request))
+        elif isinstance(asked, Step):
+            done_tick = self._check_step(asked)
+        elif not isinstance(asked, Note):
+            tick = self._simulation.submit(pending.command, dict(pending.request))
             self._keep({"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request})
-        self._accepted += 1
-        reply = {"accepted": True, "id": self._accepted, "command": pending.command}
+        reply = self._accept(pending, tick if done_tick is None else done_tick)
         if done_tick is None:
-            pending.answer({**reply, "tick": tick, "time_s": tick / self._rate})
+            pending.answer(reply)
         else:
-            reply |= {"tick": done_tick, "time_s": done_tick / self._rate}
             self._steps.append((done_tick, pending, reply))
-        if isinstance(pending.asked, Note):
+        if isinstance(asked, Note):
             # An event of its own: it does nothing to the rig, so whoever repeats the commands can pass over it.
-            return {**self._event("note", id=self._accepted), **pending.asked.model_dump(), "from": pending.sender}
+            return {**self._event("note", tick, id=self._accepted), **asked.model_dump(), "from": pending.sender}
         detail = {"id": self._accepted, "command": pending.command, "request": pending.request, "from": pending.sender}
-        return self._event("command", tick=tick, **detail)
+        return self._event("command", tick, **detail)
 
     def _keep(self, taken: dict[str, Any]) -> None:
         """Remember a command for latecomers, within bounds."""
@@ -518,34 +295,26 @@ class Service:
         for text in self._health.get("warnings", []):
             self._desk.warn(text)
 
-    def _warn(self, text: str) -> None:
-        """Put a warning into the stream; on any thread."""
-        self._queue.put(_Entry([self._event("warning", text=text)]))
+    def _unanswered(self) -> list[Pending]:
+        return [pending for _, pending, _ in self._steps]
 
-    def _event(self, name: str, *, tick: int | None = None, **fields: Any) -> dict[str, Any]:
-        tick = self._simulation.tick if tick is None else tick
-        return {"event": name, "tick": tick, "time_s": tick / self._rate, "wall_s": time.time(), **fields}
-
-    def _finish(self, reason: str) -> None:
-        """Refuse what is still waiting, and put the end of the stream into the queue."""
-        self._state = "ended"
-        self._desk.close(f"a run that ended: {reason}", [pending for _, pending, _ in self._steps])
-        self._queue.put(_Entry([self._event("end", reason=reason)]))
+    def _end(self, reason: str) -> None:
+        self._queue.push(_Entry([self._event("end", self._simulation.tick, reason=reason)]))
         self._queue.close()
+        if self._publisher.ident is not None:
+            self._publisher.join(timeout=60.0)
+        # Where the publisher failed, nobody else answers the steps that it left.
+        while (entry := self._queue.take(0.0)) is not None:
+            self._answer(entry)
 
-    def _linger(self) -> None:
-        """Keep the cache until everybody who is connected has everything."""
-
-        def see(counts: dict[str, float]) -> None:
-            self._congestion = counts
-
-        self._desk.clients.settle(self._server, self._samples_published, patience_s=self._linger_s, see=see)
+    def _counts(self) -> dict[str, Any]:
+        return {"rows": dict(self._rows.next)}
 
     # ---- on the publisher thread ----
 
     def _publish_all(self) -> None:
         next_status_s = time.monotonic()
-        while not self._queue.finished:
+        while not self._queue.ended:
             entry = self._queue.take(max(0.0, next_status_s - time.monotonic()))
             if entry is not None:
                 self._publish_entry(entry)
@@ -567,7 +336,7 @@ class Service:
         for event in entry.before:
             self._guarded("publishing events", self._publish_event, event)
         if entry.frame is not None:
-            for key, block in blocks_of(entry.frame):
+            for key, block in entry.frame.blocks():
                 self._guarded(f"publishing {key}", self._publish_block, key, block)
             self._count_samples(entry.frame)
         for event in entry.after:
@@ -584,7 +353,6 @@ class Service:
         self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
 
     def _publish_status(self) -> None:
-        self._congestion = self._server.congestion()
         self._server.publish(wire.STATUS, wire.encode_document(self.status()))
 
     def _count_samples(self, frame: Frame) -> None:
@@ -598,16 +366,6 @@ class Service:
     def _answer(entry: _Entry) -> None:
         for pending, document in entry.replies:
             pending.answer(document)
-
-
-def blocks_of(frame: Frame) -> Iterator[tuple[str, wire.Block]]:
-    """Keys and blocks of a frame, in the order in which they are published."""
-    for group, block in frame.samples.items():
-        yield wire.sensor_key(group), block
-    if frame.edges is not None:
-        yield wire.EDGES, frame.edges
-    for table, block in frame.truth.items():
-        yield wire.truth_key(table), block
 
 
 def _size(taken: dict[str, Any]) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from bisect import insort
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
@@ -16,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from rig.channels import ChannelTable, default_table
+from rig.channels import ChannelTable
+from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.engines import ENGINES, load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, STEPS
 from rig.errors import InputError, SimulationError
@@ -25,10 +27,10 @@ from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
-from rig.scenes import HammerCommand, ReleaseCommand, Scene, SpeedCommand, parse_command, scene_document
+from rig.scenes import Scene, rig_table, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
-from rig.wire import ROOT, Block
+from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key
 
 TICK_RATE_HZ = 1_000_000
 ROW_TICKS = 25
@@ -67,6 +69,15 @@ class Frame:
     truth: dict[str, Block]
     events: list[dict[str, Any]]
     rows: np.ndarray = field(repr=False)
+
+    def blocks(self) -> Iterator[tuple[str, Block]]:
+        """Keys and blocks, in the order in which they are published."""
+        for group, block in self.samples.items():
+            yield sensor_key(group), block
+        if self.edges is not None:
+            yield EDGES, self.edges
+        for table, block in self.truth.items():
+            yield truth_key(table), block
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +136,7 @@ class Simulation:
         self.row_ticks = self._stride * self._step_ticks
         self.block_ticks = math.lcm(*periods)
         self.end_tick = math.ceil(round(scene.duration_s * TICK_RATE_HZ) / self.block_ticks) * self.block_ticks
-        self.table: ChannelTable = default_table().only(sensors.groups, sensors.rate_hz)
+        self.table: ChannelTable = rig_table().only(sensors.groups, sensors.rate_hz)
         self._conditioner = Conditioner(
             tuple(self.table.groups.values()),
             row_rate_hz=TICK_RATE_HZ // self.row_ticks,
@@ -210,7 +221,7 @@ class Simulation:
         Raises:
             InputError: Unknown, malformed, out of range, or not possible now.
         """
-        command = parse_command(name, request)
+        command = check_command(name, request)
         waiting = [other for tick, other in self._pending if tick <= self.tick]
         if isinstance(command, HammerCommand):
             busy_until = self._blow[2] if self._blow is not None else 0

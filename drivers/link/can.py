@@ -12,11 +12,11 @@ import logging
 import queue
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from drivers.link import FORMS, ROOM, Address, LinkClosedError, LinkTimeoutError
+from rig.bounded_queue import BoundedQueue
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class CanLink:
             self._receive_frame,
             self._send_frame,
             address=isotp.Address(isotp.AddressingMode.Normal_11bits, txid=send, rxid=receive),
-            error_handler=self._spoilt,
+            error_handler=self._count_spoilt,
             params={
                 "stmin": 0,
                 "blocksize": 0,
@@ -137,18 +137,24 @@ class CanLink:
             },
         )
         self._sending = threading.Lock()
-        self._changed = threading.Condition()
-        self._messages: deque[bytes] = deque()
+        self._closing = threading.Lock()
+        # The library's own queue has no bound.
+        self._messages: BoundedQueue[bytes] = BoundedQueue(ROOM)
         self._closed = False
+        self._spoilt = 0
         self.max_bytes = _MAX_BYTES
-        self.lost = 0
         self._stack.start()
         self._medium.listen(receive, self._frames.put)
         self._reader = threading.Thread(target=self._read, name=f"can {address.name} reads", daemon=True)
         self._reader.start()
 
-    def _spoilt(self, _: Exception) -> None:
-        self.lost += 1
+    @property
+    def lost(self) -> int:
+        """Messages that were spoilt, found no room, or did not get onto the bus."""
+        return self._spoilt + self._messages.dropped
+
+    def _count_spoilt(self, _: Exception) -> None:
+        self._spoilt += 1
 
     def _receive_frame(self, _: float) -> isotp.CanMessage | None:
         """The next frame for the library; waits longer than asked, and is woken by `close`."""
@@ -173,20 +179,13 @@ class CanLink:
         try:
             self._medium.bus.send(frame, timeout=_SEND_S)
         except can.CanError:
-            self.lost += 1
+            self._spoilt += 1
 
     def _read(self) -> None:
-        # The library's own queue has no bound.
         while not self._closed:
             message = self._stack.recv(block=True, timeout=1.0)
-            if not message:
-                continue
-            with self._changed:
-                if len(self._messages) >= ROOM:
-                    self._messages.popleft()
-                    self.lost += 1
-                self._messages.append(bytes(message))
-                self._changed.notify_all()
+            if message:
+                self._messages.push(bytes(message))
 
     def send(self, message: bytes, *, timeout_s: float) -> None:
         """Send one message; returns when its last frame has been handed to the bus."""
@@ -209,19 +208,18 @@ class CanLink:
 
     def receive(self, *, timeout_s: float) -> bytes | None:
         """The next message, or None where none came in time."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._messages or self._closed, timeout_s)
-            if self._closed:
-                raise LinkClosedError("the link is closed")
-            return self._messages.popleft() if self._messages else None
+        message = self._messages.take(timeout_s)
+        if self._closed:
+            raise LinkClosedError("the link is closed")
+        return message
 
     def close(self) -> None:
         """Close; leaves the bus where the node is its own."""
-        with self._changed:
+        with self._closing:
             if self._closed:
                 return
             self._closed = True
-            self._changed.notify_all()
+        self._messages.close()
         self._medium.leave(self._receive_identifier)
         # Both wake their readers.
         self._frames.put(None)

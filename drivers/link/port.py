@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable
 
 from drivers.link import FAREWELL_S, ROOM, Link, LinkClosedError, LinkError
+from rig.bounded_queue import BoundedQueue, take_first
 
 _ROOM_BYTES = 1 << 20
 """About 3 s of four channels at 20 kHz."""
@@ -25,13 +25,12 @@ class Outbox:
 
     def __init__(self, send: Callable[[bytes], bool], name: str, *, room: int = _ROOM_BYTES) -> None:
         self._send = send
-        self._room = room
-        self._replies: deque[bytes] = deque()
-        self._data: deque[bytes] = deque()
         self._changed = threading.Condition()
-        self._bytes = 0
+        self._replies: BoundedQueue[bytes] = BoundedQueue(ROOM, changed=self._changed)
+        self._data: BoundedQueue[bytes] = BoundedQueue(
+            room, size=lambda message: min(len(message), room), changed=self._changed
+        )
         self._busy = False
-        self._closed = False
         self._on_idle: Callable[[], None] = lambda: None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
@@ -47,52 +46,39 @@ class Outbox:
 
     def push(self, message: bytes) -> bool:
         """Queue data; False where the queue is full."""
-        with self._changed:
-            if self._closed or (self._data and self._bytes + len(message) > self._room):
-                return False
-            self._data.append(message)
-            self._bytes += len(message)
-            self._changed.notify_all()
-            return True
+        return self._data.offer(message)
 
     def reply(self, message: bytes) -> None:
         """Queue a reply, which goes before all data; waits while many wait."""
-        with self._changed:
-            # A host that asks and asks and takes no answer waits here, not in our memory.
-            self._changed.wait_for(lambda: self._closed or len(self._replies) < ROOM)
-            self._replies.append(message)
-            self._changed.notify_all()
+        # A host that asks and asks and takes no answer waits here, not in our memory.
+        self._replies.put(message)
 
     def discard(self) -> None:
         """Forget data that wait."""
-        with self._changed:
-            self._data.clear()
-            self._bytes = 0
-            self._changed.notify_all()
+        self._data.clear()
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._replies or self._data or self._closed)
-                if self._closed:
+                message = take_first(self._changed, (self._replies, self._data))
+                if message is None or self._data.closed:
                     return
-                if self._replies:
-                    message = self._replies.popleft()
-                else:
-                    message = self._data.popleft()
-                    self._bytes -= len(message)
                 self._busy = True
-                self._changed.notify_all()
             there = False
             try:
                 there = self._send(message)
             finally:
                 with self._changed:
                     self._busy = False
-                    self._closed = self._closed or not there
                     self._changed.notify_all()
+                    if not there:
+                        self._end()
             if self.idle:
                 self._on_idle()
+
+    def _end(self) -> None:
+        self._replies.close()
+        self._data.close()
 
     def close(self, *, before_join: Callable[[], None] = lambda: None) -> None:
         """Send what waits, if that is soon done; then end the thread.
@@ -102,9 +88,8 @@ class Outbox:
         """
         with self._changed:
             if self._thread.is_alive() and self._thread is not threading.current_thread():
-                self._changed.wait_for(lambda: self._closed or (self.idle and not self._replies), FAREWELL_S)
-            self._closed = True
-            self._changed.notify_all()
+                self._changed.wait_for(lambda: self._data.closed or (self.idle and not self._replies), FAREWELL_S)
+            self._end()
         before_join()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable
 
 from drivers.link import ROOM, Address, LinkClosedError, LinkTimeoutError
 from drivers.link.port import Outbox
+from rig.bounded_queue import BoundedQueue, take_first
 from rig.transport import NoReplyError, Server
 
 _ROOT = "rig/instruments"
@@ -45,15 +45,15 @@ class ZenohLink:
         self._name = address.name
         self._endpoint = endpoint
         self._changed = threading.Condition()
-        self._replies: deque[bytes] = deque()
-        self._data: deque[bytes] = deque()
-        self._closed = False
+        self._replies: BoundedQueue[bytes] = BoundedQueue(ROOM, changed=self._changed)
+        # Never waits: a host that does not read loses the oldest, and sees it in the numbers of the rows.
+        self._data: BoundedQueue[bytes] = BoundedQueue(ROOM, changed=self._changed)
+        self._missed = 0
         self.max_bytes = _MAX_BYTES
-        self.lost = 0
         try:
             self._client = ZenohClient(endpoint, wait_s=wait_s)
             try:
-                self._client.subscribe(data_key(address.name), self._take, on_miss=self._missed)
+                self._client.subscribe(data_key(address.name), self._take, on_miss=self._count_missed)
             except BaseException:
                 self._client.close()
                 raise
@@ -62,48 +62,40 @@ class ZenohLink:
                 f"no instruments answer at {endpoint}; start them with: rig twins --zenoh (see rig twins --help)"
             ) from None
 
-    def _take(self, _: str, payload: bytes) -> None:
-        with self._changed:
-            # Never waits: a host that does not read loses the oldest, and sees it in the numbers of the rows.
-            if len(self._data) >= ROOM:
-                self._data.popleft()
-                self.lost += 1
-            self._data.append(payload)
-            self._changed.notify_all()
+    @property
+    def lost(self) -> int:
+        """Messages that did not come, or found no room."""
+        return self._missed + self._data.dropped
 
-    def _missed(self, _: str, count: int) -> None:
-        self.lost += count
+    def _take(self, _: str, payload: bytes) -> None:
+        self._data.push(payload)
+
+    def _count_missed(self, _: str, count: int) -> None:
+        self._missed += count
 
     def send(self, message: bytes, *, timeout_s: float) -> None:
         """Ask; when this returns, the reply is there to be received."""
-        if self._closed:
+        if self._replies.closed:
             raise LinkClosedError("the link is closed")
         try:
             reply = self._client.request(request_key(self._name), message, timeout_s=timeout_s)
         except NoReplyError:
             raise LinkTimeoutError(f"no {self._name} answers at {self._endpoint}") from None
-        with self._changed:
-            self._replies.append(reply)
-            self._changed.notify_all()
+        self._replies.push(reply)
 
     def receive(self, *, timeout_s: float) -> bytes | None:
         """The next reply, or else the next data, or None where none came in time."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._replies or self._data or self._closed, timeout_s)
-            if self._closed:
-                raise LinkClosedError("the link is closed")
-            for queue in (self._replies, self._data):
-                if queue:
-                    return queue.popleft()
-            return None
+        message = take_first(self._changed, (self._replies, self._data), timeout_s)
+        if self._replies.closed:
+            raise LinkClosedError("the link is closed")
+        return message
 
     def close(self) -> None:
         """Close the connection."""
         with self._changed:
-            if self._closed:
+            if self._replies.closed:
                 return
-            self._closed = True
-            self._changed.notify_all()
+            self._replies.close()
         self._client.close()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 from replays.player.edit import Edit, Stamp
@@ -68,9 +67,8 @@ class Outlet:
         else:
             self._publish(key, item.payload)
 
-    def tell(self, name: str, tick: int, **fields: Any) -> None:
+    def tell(self, event: dict[str, Any]) -> None:
         """Publish an event that the recording does not have."""
-        event = {"event": name, "tick": tick, "time_s": tick / self._tick_rate_hz, "wall_s": time.time(), **fields}
         if self._stamp is not None:
             event = self._stamp.document(event, self._tick_rate_hz)
         if (key := self._edit.key(wire.EVENTS)) is not None:

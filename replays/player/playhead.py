@@ -10,6 +10,8 @@ from rig.pacing import FreeRun, RealTime
 
 NS = 1_000_000_000
 LEAST_RATE, GREATEST_RATE = 0.01, 1000.0
+_BEHIND_S = 0.5
+"""Lateness that is told: a busy machine is late by tens of milliseconds, and catches up."""
 
 
 class Playhead:
@@ -43,6 +45,16 @@ class Playhead:
         since_s = self._since_s
         ran_s = self._ran_s + (0.0 if since_s is None else time.monotonic() - since_s)
         return self.play_ns / NS / ran_s if ran_s > 0.0 else 0.0
+
+    @property
+    def behind_s(self) -> float:
+        """How late the last payload was, where that is more than a passing hold-up [s]; else 0."""
+        late_s = self._clock.last_late_s
+        return late_s if late_s > _BEHIND_S else 0.0
+
+    def release(self, at_ns: int) -> bool:
+        """Return True when it is that instant, False before that after a `wake` of the clock."""
+        return self._clock.release(at_ns)
 
     def now_ns(self, due_ns: int | None) -> int:
         """The instant that it is now, never past what is still to go out.

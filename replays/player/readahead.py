@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
+
+from rig.bounded_queue import BoundedQueue
 
 _BYTES = 16 << 20
 """What may wait: about 5 s of the default streams."""
@@ -21,15 +22,9 @@ class ReadAhead(Generic[T]):
     """
 
     def __init__(self, batches: Iterator[T], *, size: Callable[[T], int]) -> None:
-        self._batches = batches
-        self._size = size
-        self._waiting: deque[T] = deque()
-        self._bytes = 0
-        self._changed = threading.Condition()
-        self._done = False
-        self._closed = False
+        self._waiting: BoundedQueue[T] = BoundedQueue(_BYTES, size=lambda batch: min(size(batch), _BYTES))
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._read, name="read-ahead", daemon=True)
+        self._thread = threading.Thread(target=self._read, args=(batches,), name="read-ahead", daemon=True)
         self._thread.start()
 
     def __len__(self) -> int:
@@ -42,49 +37,29 @@ class ReadAhead(Generic[T]):
         Raises:
             BaseException: What ended the reading, once all that came before it was taken.
         """
-        with self._changed:
-            if not self._done or self._waiting:
-                return False
-        if self._error is not None:
+        if self._waiting.ended and self._error is not None:
             raise self._error
-        return True
+        return self._waiting.ended
 
     def ready(self, timeout_s: float) -> bool:
-        """Whether something can be taken, at the latest after the time."""
-        with self._changed:
-            if not self._waiting and not self._done:
-                self._changed.wait(timeout_s)
-            return bool(self._waiting)
+        """Whether something can be taken, at the latest after the time [s]."""
+        return self._waiting.wait_for_item(timeout_s)
 
-    def take(self) -> T:
-        """The next; only after `ready`."""
-        with self._changed:
-            batch = self._waiting.popleft()
-            self._bytes -= self._size(batch)
-            self._changed.notify_all()
-            return batch
+    def take(self, timeout_s: float = 0.0) -> T | None:
+        """The next, or None where there is none in time [s]."""
+        return self._waiting.take(timeout_s)
 
     def close(self) -> None:
         """Read no more."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+        self._waiting.close()
         self._thread.join(timeout=5.0)
 
-    def _read(self) -> None:
+    def _read(self, batches: Iterator[T]) -> None:
         try:
-            for batch in self._batches:
-                with self._changed:
-                    while self._bytes >= _BYTES and not self._closed:
-                        self._changed.wait()
-                    if self._closed:
-                        return
-                    self._waiting.append(batch)
-                    self._bytes += self._size(batch)
-                    self._changed.notify_all()
+            for batch in batches:
+                if not self._waiting.put(batch):
+                    return
         except BaseException as error:  # raised where it is taken
             self._error = error
         finally:
-            with self._changed:
-                self._done = True
-                self._changed.notify_all()
+            self._waiting.close()

@@ -60,7 +60,7 @@ class Timeline:
     """
 
     def __init__(self, tape: Tape, by: By = By.SIMULATED) -> None:
-        self._tape = tape
+        self.tape = tape
         self.by = by
 
     def play(self, from_ns: int, to_ns: int | None = None) -> Iterator[Batch]:
@@ -80,7 +80,7 @@ class Timeline:
             yield batch
 
     def _in_order(self, from_ns: int, to_ns: int | None) -> Iterator[Item]:
-        chunks = self._tape.chunks
+        chunks = self.tape.chunks
         # Nothing that begins earlier than this stands in a chunk or in any after it.
         beginnings = list(accumulate((chunk.begin_ns for chunk in reversed(chunks)), min))[::-1]
         waiting: list[tuple[int, int, Item]] = []
@@ -94,7 +94,7 @@ class Timeline:
             if self.by is By.SIMULATED:
                 while waiting and waiting[0][0] <= beginning_ns:
                     yield heapq.heappop(waiting)[2]
-            for message in self._tape.read(chunk):
+            for message in self.tape.read(chunk):
                 item = ages.item(message)
                 if message.time_ns < from_ns or (to_ns is not None and item.position_ns > to_ns):
                     continue

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from recorder.reader import Recording
+from rig.commands import COMMANDS
 from rig.errors import InputError
 from rig.offline import Run, SentCommand, frames, simulate
 from rig.parameters import DEFAULT_SET, load_parameters, set_names
-from rig.scenes import COMMANDS, Scene, change_scene, parse_scene
+from rig.scenes import Scene, change_scene, parse_scene
 from rig.simulation import TICK_RATE_HZ, Frame, Simulation
 from rig.wire import EDGES, sensor_key, truth_key
 

@@ -22,7 +22,6 @@ from replays.recordings.formats.export import check_output
 from rig import wire
 from rig.errors import whole_file
 from rig.kernels.signals import ROW
-from rig.service import blocks_of
 from rig.simulation import Frame, Simulation
 
 SUFFIXES = (".mcap", ".parquet", ".csv")
@@ -199,7 +198,7 @@ class McapRun:
     def _write(self, frame: Frame) -> None:
         for event in frame.events:
             self._event(event)
-        for key, block in blocks_of(frame):
+        for key, block in frame.blocks():
             self._writer.write(key, wire.encode_block(block), self._wall(frame.tick))
             self._rows.follow(key, block.index, len(block.values))
 

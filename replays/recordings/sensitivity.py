@@ -19,10 +19,11 @@ import numpy as np
 
 from replays.recordings.experiment import Experiment
 from replays.recordings.prediction import Measured, Prediction, bare, lagrange, predict
+from rig.commands import check_command
 from rig.errors import InputError, SimulationError
 from rig.model import build_model
 from rig.parameters import load_parameters
-from rig.scenes import Scene, TimedCommand, change_scene, parse_command, parse_scene
+from rig.scenes import Scene, TimedCommand, change_scene, parse_scene
 from rig.simulation import ROW_TICKS, TICK_RATE_HZ
 
 CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
@@ -136,7 +137,7 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
         command = commands[place]
         request = command.request.model_dump(exclude={"command"}) | {k: v for k, v in fields.items() if k != "at_s"}
         at_s = fields.get("at_s", command.at_s)
-        kept.append(TimedCommand(at_s=at_s, request=parse_command(command.request.command, request)))
+        kept.append(TimedCommand(at_s=at_s, request=check_command(command.request.command, request)))
     left = tuple(entry for place, entry in enumerate(sent, start=len(timed)) if place not in own)
     data = scene.model_dump() | {"commands": [entry.model_dump() for entry in kept]}
     return replace(changed, scene=parse_scene(data), commands=left)
@@ -333,7 +334,7 @@ def _shorter(step: float, least: float) -> Iterator[float]:
 def _commands(experiment: Experiment) -> list[TimedCommand]:
     """Every command: the scene's own, then those that were sent."""
     sent = [
-        TimedCommand(at_s=command.tick / TICK_RATE_HZ, request=parse_command(command.name, command.request))
+        TimedCommand(at_s=command.tick / TICK_RATE_HZ, request=check_command(command.name, command.request))
         for command in experiment.commands
     ]
     return [*experiment.scene.commands, *sent]

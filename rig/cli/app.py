@@ -4,50 +4,14 @@ from __future__ import annotations
 
 import errno
 import sys
+from importlib import import_module
+from keyword import iskeyword
 from typing import Annotated, Any, NoReturn
 
 import typer
 
-from rig.cli import (
-    bench,
-    can,
-    can_messages,
-    chart,
-    cut,
-    demo,
-    export,
-    hammer,
-    identify,
-    import_,
-    info,
-    keys,
-    ladder,
-    laws,
-    magnets,
-    note,
-    paper,
-    params,
-    pause,
-    rate,
-    record,
-    recover,
-    release,
-    replay,
-    resume,
-    run,
-    scenes,
-    seek,
-    sessions,
-    simulate,
-    speed,
-    stability,
-    status,
-    step,
-    stop,
-    twins,
-    validate,
-    view,
-)
+from rig.cli import can, can_messages, keys
+from rig.cli.groups import grouped
 from rig.errors import DiskError, InputError, SimulationError
 from rig.text import printable
 
@@ -66,55 +30,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_PANELS: dict[str, dict[str, Any]] = {
-    "Start here": {
-        "demo": demo.demo,
-        "scenes": scenes.scenes,
-        "params": params.params,
-        "laws": laws.laws,
-        "magnets": magnets.magnets,
-    },
-    "The rig as a service": {
-        "run": run.run,
-        "hammer": hammer.hammer,
-        "speed": speed.speed,
-        "release": release.release,
-        "step": step.step,
-        "note": note.note,
-        "status": status.status,
-        "stop": stop.stop,
-        "twins": twins.twins,
-    },
-    "A recording as the rig": {
-        "replay": replay.replay,
-        "pause": pause.pause,
-        "resume": resume.resume,
-        "seek": seek.seek,
-        "rate": rate.rate,
-    },
-    "Recordings": {
-        "record": record.record,
-        "view": view.view,
-        "info": info.info,
-        "cut": cut.cut,
-        "recover": recover.recover,
-        "import": import_.import_,
-        "export": export.export,
-    },
-    "Recordings against the model": {
-        "validate": validate.validate,
-        "identify": identify.identify,
-        "sessions": sessions.sessions,
-    },
-    "Without a clock": {
-        "simulate": simulate.simulate,
-        "bench": bench.bench,
-        "ladder": ladder.ladder,
-        "chart": chart.chart,
-        "stability": stability.stability,
-        "paper": paper.paper,
-    },
+_PANELS = {
+    "Start here": ("demo", "scenes", "params", "laws", "magnets"),
+    "The rig as a service": ("run", "hammer", "speed", "release", "step", "note", "status", "stop", "twins"),
+    "A recording as the rig": ("replay", "pause", "resume", "seek", "rate"),
+    "Recordings": ("record", "view", "info", "cut", "recover", "import", "export"),
+    "Recordings against the model": ("validate", "identify", "sessions"),
+    "Without a clock": ("simulate", "bench", "ladder", "chart", "stability", "paper"),
 }
+"""Each command is the function of its name in the module of its name, behind which an underscore stands if need be."""
 
 
 @app.callback()
@@ -131,15 +55,17 @@ def _rig(
         typer.echo(context.get_help())
 
 
-for _panel, _commands in _PANELS.items():
-    for _name, _function in _commands.items():
+for _panel, _names in _PANELS.items():
+    for _name in _names:
+        _module = _name + "_" * iskeyword(_name)
+        _function = grouped(getattr(import_module(f"rig.cli.{_module}"), _module))
         # A negative value such as `rig speed -1` is a value, not an option: the rig explains what is wrong with it.
         _settings = {"ignore_unknown_options": True} if _name in ("speed", "rate", "seek", "step") else {}
         app.command(_name, rich_help_panel=_panel, context_settings=_settings)(_function)
 
 app.add_typer(keys.app, name="keys", rich_help_panel="Start here")
 can.app.command()(can_messages.dbc)
-can.app.command()(can_messages.load)
+can.app.command()(grouped(can_messages.load))
 app.add_typer(can.app, name="can", rich_help_panel="The rig as a service")
 
 

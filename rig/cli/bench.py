@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.options import Json
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.tables import echo, echo_json, new_table, table_console
 
 
 def bench(
@@ -20,8 +20,6 @@ def bench(
     frames: Annotated[int, typer.Option(min=0, max=1_000_000, help="Single frames of 1 ms to time.")] = 10_000,
 ) -> None:
     """Measure simulated over processor time with the error beside it; medians of several runs, compile time apart."""
-    import json
-
     from replays.studies.bench import measure
 
     def progress(text: str) -> None:
@@ -29,12 +27,12 @@ def bench(
 
     report = measure(runs=runs, peers=peers, frames=frames, progress=progress)
     if json_output:
-        echo(json.dumps(report, indent=2))
+        echo_json(report)
         return
-    table = new_table(f"times real time, {runs} runs")
-    table.add_column("case")
-    for heading in ("median", "min", "max", "of the first", "error", "energy residual", "goal"):
-        table.add_column(heading, justify="right")
+    table = new_table(
+        f"times real time, {runs} runs",
+        *("case", ">median", ">min", ">max", ">of the first", ">error", ">energy residual", ">goal"),
+    )
     for case in report["cases"]:
         goal = "" if case["goal"] is None else f"{case['goal']:g}"
         if case["error_goal"] is not None:

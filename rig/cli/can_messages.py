@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.can_output import CanBitrate, CanClassic, CanFd, CanRate, plan
+from rig.cli.can_output import CanMessages
 from rig.cli.tables import echo
 from rig.errors import whole_file
 
@@ -18,7 +18,9 @@ def dbc(
 ) -> None:
     """Show the DBC of the rig's messages, made from the channel table, or write it to a file."""
     from drivers.can.dbc import text
+    from rig.scenes import rig_table
 
+    rig_table()
     if out is None:
         echo(text(), nl=False)
         return
@@ -27,30 +29,15 @@ def dbc(
     echo(f"{out} written")
 
 
-def load(
-    *,
-    rate: CanRate = None,
-    classic: CanClassic = False,
-    fd: CanFd = False,
-    bitrate: CanBitrate = None,
-) -> None:
+def load(*, messages: CanMessages) -> None:
     """Show every message of the rig with its period, share of the bus and longest response time."""
     from rig.cli.tables import new_table, table_console
+    from rig.scenes import rig_table
 
-    schedule, speed = plan(classic=classic, fd=fd, rate_hz=rate, bitrate=bitrate)
-    table = new_table(f"CAN at {speed}, every frame at its longest")
-    for name in (
-        "id",
-        "message",
-        "from",
-        "bytes",
-        "every, ms",
-        "frame, us",
-        "load, %",
-        "worst response, ms",
-        "in time",
-    ):
-        table.add_column(name, justify="left" if name in ("message", "from") else "right")
+    rig_table()
+    schedule, speed = messages.plan()
+    numbers = (">bytes", ">every, ms", ">frame, us", ">load, %", ">worst response, ms", ">in time")
+    table = new_table(f"CAN at {speed}, every frame at its longest", ">id", "message", "from", *numbers)
     for message, row in schedule.response_times(speed):
         table.add_row(
             f"{message.identifier:#05x}",

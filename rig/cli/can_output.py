@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+from rig.cli.groups import panel
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,59 +22,73 @@ if TYPE_CHECKING:
     from rig.cli.can_outlets import CanOutlets
     from rig.transport import Server
 
-_PANEL = "CAN"
-CanBus = Annotated[
-    str | None,
-    typer.Option(
-        "--can",
-        metavar="INTERFACE:CHANNEL",
-        help="Also be a node of a CAN bus: zenoh:can0 (with its hub), virtual:rig, socketcan:vcan0, slcan:/dev/pts/3; "
-        "python-can's further settings as ?NAME=VALUE&...",
-        rich_help_panel=_PANEL,
-    ),
-]
-CanRate = Annotated[
-    int | None,
-    typer.Option(
-        "--can-rate", metavar="HZ", help="Rate of samples: usually 1000 classic, 10000 FD.", rich_help_panel=_PANEL
-    ),
-]
-CanClassic = Annotated[
-    bool, typer.Option("--can-classic", help="Samples in classic frames; so by default.", rich_help_panel=_PANEL)
-]
-CanFd = Annotated[
-    bool, typer.Option("--can-fd", help="Samples in CAN FD frames, counts as recorded.", rich_help_panel=_PANEL)
-]
-CanBitrate = Annotated[
-    str | None,
-    typer.Option(
-        "--can-bitrate",
-        metavar="RATE[/RATE]",
-        help="Bit rate, and that of the data phase of CAN FD; 1M and 1M/8M by default.",
-        rich_help_panel=_PANEL,
-    ),
-]
-CanOverload = Annotated[
-    bool,
-    typer.Option(
-        "--can-overload",
-        help="Run even where the bus cannot carry all: frames that find no room are dropped and counted.",
-        rich_help_panel=_PANEL,
-    ),
-]
-CanSocketcand = Annotated[
-    str | None,
-    typer.Option(
-        "--can-socketcand",
-        metavar="HOST:PORT",
-        help="Serve the bus to socketcand clients (classic frames), usually at 127.0.0.1:29536.",
-        rich_help_panel=_PANEL,
-    ),
-]
-CanSlcan = Annotated[
-    bool,
-    typer.Option("--can-slcan", help="Play an SLCAN adapter of the bus on a port of its own.", rich_help_panel=_PANEL),
-]
+_can = panel("CAN")
+
+
+@dataclass(frozen=True)
+class CanMessages:
+    """Which frames carry the samples, how often, at which bit rates."""
+
+    can_rate: Annotated[int | None, _can("Rate of samples: usually 1000 classic, 10000 FD.", metavar="HZ")] = None
+    can_classic: Annotated[bool, _can("Samples in classic frames; so by default.", "--can-classic")] = False
+    can_fd: Annotated[bool, _can("Samples in CAN FD frames, counts as recorded.", "--can-fd")] = False
+    can_bitrate: Annotated[
+        str | None,
+        _can("Bit rate, and that of the data phase of CAN FD; 1M and 1M/8M by default.", metavar="RATE[/RATE]"),
+    ] = None
+
+    def plan(self) -> tuple[Schedule, Speed]:
+        """What is sent at which bit rates.
+
+        Raises:
+            InputError: There is no such rate.
+        """
+        from drivers.can.schedule import schedule_from
+        from drivers.can.timing import speed
+
+        schedule = schedule_from(classic=self.can_classic, fd=self.can_fd, rate_hz=self.can_rate)
+        return schedule, speed(self.can_bitrate or ("1M" if schedule.fd_hz is None else "1M/8M"))
+
+
+@dataclass(frozen=True)
+class CanOptions:
+    """A CAN bus that the rig is a node of, if any, and what it does there."""
+
+    can: Annotated[
+        str | None,
+        _can(
+            "Also be a node of a CAN bus: zenoh:can0 (with its hub), virtual:rig, socketcan:vcan0, "
+            "slcan:/dev/pts/3; python-can's further settings as ?NAME=VALUE&...",
+            metavar="INTERFACE:CHANNEL",
+        ),
+    ] = None
+    messages: CanMessages = CanMessages()
+    can_overload: Annotated[
+        bool,
+        _can(
+            "Run even where the bus cannot carry all: frames that find no room are dropped and counted.",
+            "--can-overload",
+        ),
+    ] = False
+    can_socketcand: Annotated[
+        str | None,
+        _can("Serve the bus to socketcand clients (classic frames), usually at 127.0.0.1:29536.", metavar="HOST:PORT"),
+    ] = None
+    can_slcan: Annotated[bool, _can("Play an SLCAN adapter of the bus on a port of its own.", "--can-slcan")] = False
+
+    def output(self) -> CanOutput | None:
+        """The bus that is asked for, if any; as for `CanOutput`.
+
+        Raises:
+            InputError: There is none such, or it is only said how it should be.
+        """
+        if self.can is not None:
+            return CanOutput(self.can, self)
+        if self != CanOptions():
+            raise InputError("--can", "given with the other --can options", None)
+        return None
+
+
 _SHARED = ("zenoh", "virtual", "socketcan")
 """Interfaces on which one process can have many nodes."""
 
@@ -84,30 +98,15 @@ class CanOutput:
 
     Args:
         spec: INTERFACE:CHANNEL, with ?NAME=VALUE&... for more of python-can's settings.
-        classic: Send the classic layout.
-        fd: Send the FD layout.
-        rate_hz: Rate of samples [Hz]; None: the usual ones.
-        bitrate: Bit rates; None: 1M, or 1M/8M with FD frames.
-        overload: Run even where the bus cannot carry all.
-        socketcand: HOST:PORT of a server for socketcand clients, or none.
-        slcan: Whether to play an SLCAN adapter of the bus.
+        options: What the rig does there.
 
     Raises:
         InputError: What was asked for does not make a bus, or not one that can carry the messages.
     """
 
-    def __init__(
-        self,
-        spec: str,
-        *,
-        classic: bool = False,
-        fd: bool = False,
-        rate_hz: int | None = None,
-        bitrate: str | None = None,
-        overload: bool = False,
-        socketcand: str | None = None,
-        slcan: bool = False,
-    ) -> None:
+    def __init__(self, spec: str, options: CanOptions | None = None) -> None:
+        options = options or CanOptions()
+        socketcand, slcan = options.can_socketcand, options.can_slcan
         from rig.transport.endpoint import parse_loopback
         from rig.transport.memory import MemoryServer
 
@@ -117,8 +116,8 @@ class CanOutput:
             parse_loopback(socketcand, field="--can-socketcand")
         if self.interface == "zenoh" and "endpoint" in self._settings:
             parse_loopback(str(self._settings["endpoint"]), field="--can")
-        self.schedule, self.speed = plan(classic=classic, fd=fd, rate_hz=rate_hz, bitrate=bitrate)
-        if overload:
+        self.schedule, self.speed = options.messages.plan()
+        if options.can_overload:
             self.load = self.schedule.load(self.speed)
         else:
             self.load = self.schedule.check(self.speed)
@@ -248,38 +247,6 @@ class CanOutput:
             yield bus
 
 
-def can_output(
-    spec: str | None,
-    *,
-    classic: bool,
-    fd: bool,
-    rate_hz: int | None,
-    bitrate: str | None,
-    overload: bool,
-    socketcand: str | None,
-    slcan: bool,
-) -> CanOutput | None:
-    """The bus that the --can options ask for, or None; as for `CanOutput`.
-
-    Raises:
-        InputError: They ask for none that there is, or only for how it should be.
-    """
-    settings: dict[str, Any] = {
-        "classic": classic,
-        "fd": fd,
-        "rate_hz": rate_hz,
-        "bitrate": bitrate,
-        "overload": overload,
-        "socketcand": socketcand,
-        "slcan": slcan,
-    }
-    if spec is not None:
-        return CanOutput(spec, **settings)
-    if any(setting is not None and setting is not False for setting in settings.values()):
-        raise InputError("--can", "given with the other --can options", None)
-    return None
-
-
 def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
     """Interface, channel and further settings of INTERFACE:CHANNEL?NAME=VALUE&...
 
@@ -293,12 +260,3 @@ def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
     except InputError:
         must = "INTERFACE:CHANNEL such as zenoh:can0, with ?NAME=VALUE&... for more settings"
         raise InputError("--can", must, spec) from None
-
-
-def plan(*, classic: bool, fd: bool, rate_hz: int | None, bitrate: str | None) -> tuple[Schedule, Speed]:
-    """What is sent at which bit rates."""
-    from drivers.can.schedule import schedule_from
-    from drivers.can.timing import speed
-
-    schedule = schedule_from(classic=classic, fd=fd, rate_hz=rate_hz)
-    return schedule, speed(bitrate or ("1M" if schedule.fd_hz is None else "1M/8M"))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.progress import reporting
+from rig.cli.progress import reporting, tell_of_compiling
 from rig.cli.tables import echo, table_console
 
 
@@ -31,13 +31,11 @@ def chart(
     """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
     from replays.studies.chart.session import Progress, make_chart
     from rig.errors import InputError
-    from rig.kernels import COMPILE_NOTICE, compiled_before
 
     if quick and full:
         raise InputError("--quick, --full", "one of the two", "both")
     mode = "full" if full else "quick"
-    if not compiled_before():
-        echo(COMPILE_NOTICE, err=True)
+    tell_of_compiling()
     console = table_console(stderr=True)
     with reporting() as reporter:
         reporter.say("references")

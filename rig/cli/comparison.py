@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rig.cli.tables import echo
+from rig.cli.tables import echo, echo_json
 
 Subject = TypeVar("Subject")
 
@@ -30,13 +30,11 @@ def answer(
         plot: File for the picture.
         as_json: The document itself instead of tables.
     """
-    import json
-
     if plot is not None:
         draw(subject, plot)
     document = compare(subject)
     if as_json:
-        echo(json.dumps(document, indent=2, allow_nan=False))
+        echo_json(document)
         return
     show(document)
     if plot is not None:

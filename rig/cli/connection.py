@@ -3,51 +3,117 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.display import end_with, showing
+from rig.cli.groups import panel
+from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
 from rig.errors import InputError, RefusedError
-from rig.transport import EXPOSED_PORT
+from rig.transport import DEFAULT_ENDPOINT, EXPOSED_PORT, NoReplyError
 
 if TYPE_CHECKING:
     from drivers.console import Accepted, Console
-    from rig.transport.zenoh import Exposure, ZenohServer
+    from rig.cli.can_output import CanOutput
+    from rig.served_run import ServedRun
+    from rig.transport import Server
+    from rig.transport.zenoh import Exposure, ZenohClient, ZenohServer
 
-Connect = Annotated[str, typer.Option(metavar="HOST:PORT", help="Where the rig listens.")]
-Tls = Annotated[
-    Path | None,
-    typer.Option(
-        "--tls", metavar="DIR", envvar="RIG_TLS", help="Folder with the keys of a role, for a rig that is exposed."
-    ),
-]
+_exposure = panel("For other computers")
 
 
-@contextmanager
-def console(connect: str, command: str, tls: Path | None) -> Iterator[Console]:
-    """A console connected to the rig, closed afterwards.
+@dataclass(frozen=True)
+class Connection:
+    """Which rig a command is for."""
 
-    Args:
-        connect: HOST:PORT of the rig.
-        command: Name of the command, which signs its requests.
-        tls: Folder with the keys of a role, or none.
+    connect: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where the rig listens.")] = DEFAULT_ENDPOINT
+    tls: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", envvar="RIG_TLS", help="Folder with the keys of a role, for a rig that is exposed."
+        ),
+    ] = None
 
-    Raises:
-        RefusedError: No rig answers there, or it denies this.
-    """
-    from drivers.console import Console
-    from rig.transport import NoReplyError
-    from rig.transport.zenoh import ZenohClient
+    @contextmanager
+    def client(self, *, wait_s: float = 1.0) -> Iterator[ZenohClient]:
+        """A client of the rig, closed afterwards.
 
-    try:
-        with ZenohClient(connect, tls=tls) as client:
+        Args:
+            wait_s: How long to wait for the rig to be there [s].
+
+        Raises:
+            RefusedError: No rig answers there, or it denies this.
+        """
+        from rig.transport.zenoh import ZenohClient
+
+        try:
+            with ZenohClient(self.connect, wait_s=wait_s, tls=self.tls) as client:
+                yield client
+        except NoReplyError as error:
+            raise RefusedError(str(error)) from None
+
+    @contextmanager
+    def console(self, command: str) -> Iterator[Console]:
+        """A console connected to the rig, closed afterwards.
+
+        Args:
+            command: Name of the command, which signs its requests.
+
+        Raises:
+            RefusedError: No rig answers there, or it denies this.
+        """
+        from drivers.console import Console
+
+        with self.client() as client:
             yield Console(client, name=f"rig {command} pid {os.getpid()}")
-    except NoReplyError as error:
-        raise RefusedError(str(error)) from None
+
+
+@dataclass(frozen=True)
+class Serving:
+    """Where a rig is served."""
+
+    listen: Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where to listen, on 127.0.0.1.")] = (
+        DEFAULT_ENDPOINT
+    )
+    expose: Annotated[
+        str | None,
+        _exposure(
+            "Listen at this address of this computer as well, with --tls; port 7463 unless given.",
+            metavar="HOST[:PORT]",
+        ),
+    ] = None
+    tls: Annotated[Path | None, _exposure("Made by `rig keys init`: who may connect, and do what.", metavar="DIR")] = (
+        None
+    )
+    plaintext: Annotated[
+        bool, _exposure("Instead of --tls: let everybody in, and do everything, unencrypted.", "--plaintext")
+    ] = False
+
+    def exposure(self) -> Exposure | None:
+        """Where a rig is to listen beyond the loopback, if anywhere.
+
+        Raises:
+            InputError: It is not said who may connect there, or that without a place.
+        """
+        if self.expose is None:
+            if self.tls is not None or self.plaintext:
+                raise InputError("--tls" if self.tls is not None else "--plaintext", "given with --expose HOST", None)
+            return None
+        if (self.tls is not None) == self.plaintext:
+            made = f"rig keys init DIR --host {self.expose.partition(':')[0]}"
+            must = f"given with --tls DIR (made by: {made}), or --plaintext"
+            raise InputError("--expose", must, "both" if self.plaintext else "neither")
+        from rig.transport.certificates import holder_in
+        from rig.transport.zenoh import Exposure
+
+        endpoint = self.expose if ":" in self.expose else f"{self.expose}:{EXPOSED_PORT}"
+        return Exposure(endpoint, None if self.tls is None else holder_in(self.tls, server=True))
 
 
 def show(accepted: Accepted, what: str) -> None:
@@ -55,24 +121,45 @@ def show(accepted: Accepted, what: str) -> None:
     echo(f"{what} accepted: number {accepted.id}, at {accepted.time_s:.6f} s (tick {accepted.tick})")
 
 
-def exposure(expose: str | None, keys: Path | None, *, plaintext: bool) -> Exposure | None:
-    """Where a rig is to listen beyond the loopback, if anywhere.
+def serve(
+    make: Callable[[Server], ServedRun],
+    words: Callable[[dict[str, Any]], list[str]],
+    tell: Callable[[dict[str, Any]], None],
+    *,
+    serving: Serving,
+    bus: CanOutput | None,
+    paced: bool,
+    wait: bool,
+) -> None:
+    """Serve a run to its end, with exit status 1 where something failed that did not end it.
 
-    Raises:
-        InputError: It is not said who may connect there, or that without a place.
+    Args:
+        make: Makes the run, given the transports that it is served on.
+        words: What a line of progress says of a status.
+        tell: Prints the summary.
+        serving: Where it is served.
+        bus: A CAN bus that it is served on as well.
+        paced: The run goes by the wall clock.
+        wait: Whether it waits for clients that stall.
     """
-    if expose is None:
-        if keys is not None or plaintext:
-            raise InputError("--tls" if keys is not None else "--plaintext", "given with --expose HOST", None)
-        return None
-    if (keys is not None) == plaintext:
-        must = f"given with --tls DIR (made by: rig keys init DIR --host {expose.partition(':')[0]}), or --plaintext"
-        raise InputError("--expose", must, "both" if plaintext else "neither")
-    from rig.transport.certificates import holder_in
-    from rig.transport.zenoh import Exposure
+    from rig.pacing import rare_collections
+    from rig.transport.zenoh import ZenohServer
 
-    endpoint = expose if ":" in expose else f"{expose}:{EXPOSED_PORT}"
-    return Exposure(endpoint, None if keys is None else holder_in(keys, server=True))
+    exposed = serving.exposure()
+    with ZenohServer(serving.listen, exposed=exposed, wait=wait) as server, bus or nullcontext():
+        with rare_collections():
+            run = make(server if bus is None else bus.beside(server))
+            run.prepare()
+            if bus is not None:
+                bus.start(paced=paced)
+                echo(f"rig: {bus}", err=True)
+        tell_where(server, exposed)
+        with stopping_on_signals(run.stop), showing(run.status, words):
+            summary = run.run()
+    tell(summary)
+    if bus is not None:
+        echo(bus.summary())
+    end_with(summary["troubles"])
 
 
 def tell_where(server: ZenohServer, exposed: Exposure | None) -> None:

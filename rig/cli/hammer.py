@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, Tls, console, show
-from rig.transport import DEFAULT_ENDPOINT
+from rig.cli.connection import Connection, show
 
 
 def hammer(
@@ -17,11 +16,10 @@ def hammer(
     direction: Annotated[
         str, typer.Option(metavar="x|y|-x|-y|ANGLE", help="Along x or y, or at an angle from x towards y, in degrees.")
     ] = "x",
-    connect: Connect = DEFAULT_ENDPOINT,
-    tls: Tls = None,
+    connection: Connection,
 ) -> None:
     """Hit the shaft of a running rig at the disk."""
-    with console(connect, "hammer", tls) as rig:
+    with connection.console("hammer") as rig:
         show(rig.hammer(force_n=force_n, duration_ms=duration_ms, direction=_direction(direction)), "hammer")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,53 +21,119 @@ from rig.cli.options import (
     names_of,
     pairs,
 )
-from rig.cli.progress import reporting
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.progress import reporting, tell_of_compiling
+from rig.cli.tables import echo, echo_json, new_table, table_console
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
     from replays.recordings.experiment import Experiment
     from replays.recordings.identification import Identification
+    from replays.recordings.identification.question import Question
 
 
-def identify(
-    files: RecordingFiles,
-    *,
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of a recording."""
+
     fit: Annotated[
         list[str],
         typer.Option(
             metavar="KEY,...",
             help="What is asked for: a parameter, a number of the scene, or of a blow (hammer.1.force_n).",
         ),
-    ],
+    ]
     start: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="Where the search begins; else as recorded.")
-    ] = None,
-    bounds: Annotated[list[str] | None, typer.Option(metavar="KEY=LOW:HIGH", help="Least and largest value.")] = None,
+    ] = None
+    bounds: Annotated[list[str] | None, typer.Option(metavar="KEY=LOW:HIGH", help="Least and largest value.")] = None
     prior: Annotated[
         list[str] | None,
         typer.Option(metavar="KEY=VALUE+-SIGMA", help="What is known from elsewhere: mean and standard deviation."),
-    ] = None,
-    from_s: FromS = None,
-    to_s: ToS = None,
-    channels: Channels = None,
-    parameters: Parameters = None,
+    ] = None
+    from_s: FromS = None
+    to_s: ToS = None
+    channels: Channels = None
+    parameters: Parameters = None
     scene: Annotated[
         str | None, typer.Option(metavar="SCENE", help="What was done, where the recording does not tell.")
-    ] = None,
-    engine: Engine = None,
+    ] = None
+    engine: Engine = None
+
+    def question(self, recording: Recording, *, exact: bool) -> tuple[Question, list[str]]:
+        """The question, and what is fitted along because an imported log does not tell it.
+
+        Raises:
+            InputError: The recording, its scene or the model has no such thing.
+        """
+        from replays.recordings.identification import ask
+        from replays.recordings.identification.nuisance import (
+            asked_along,
+            check_begin,
+            is_imported,
+            shortly_before,
+            turned,
+        )
+
+        keys, from_s = [key for part in self.fit for key in names_of(part)], self.from_s
+        experiment = self._experiment(recording)
+        known = pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
+        priors = {key: _two("prior", text, "+-") for key, text in known.items()}
+        along: dict[str, tuple[float, float] | None] = {}
+        if is_imported(recording) and not exact:
+            check_begin(experiment, self.to_s)
+            experiment = turned(recording, experiment)
+            along = asked_along(experiment, keys)
+            keys += list(along)
+            priors = {key: told for key, told in along.items() if told is not None} | priors
+            from_s = shortly_before(experiment) if from_s is None else from_s
+        starts = pairs("--start", self.start, "KEY=VALUE")
+        bounds = pairs("--bounds", self.bounds, "KEY=LOW:HIGH")
+        question = ask(
+            recording,
+            experiment,
+            keys,
+            start={key: _number("start", text) for key, text in starts.items()},
+            bounds={key: _two("bounds", text, ":") for key, text in bounds.items()},
+            priors=priors,
+            along=along,
+            channels=names_of(self.channels) or None,
+            window=(from_s, self.to_s),
+        )
+        return question, list(along)
+
+    def _experiment(self, recording: Recording) -> Experiment:
+        from replays.recordings.experiment import Experiment
+        from rig.scenes import load_scene
+
+        experiment = Experiment.of(recording) if self.scene is None else Experiment(scene=load_scene(self.scene))
+        if self.parameters is not None:
+            experiment = experiment.changed({"parameters": self.parameters, "set": {}})
+        return experiment if self.engine is None else experiment.changed({"engine.name": self.engine})
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the numbers are looked for."""
+
+    precision: Annotated[
+        float, typer.Option(min=1e-9, help="Relative half width of the intervals that is fine enough.")
+    ] = 1e-4
+    spread: Annotated[float, typer.Option(min=1e-6, max=1.0, help="How far off the start may be, relatively.")] = 0.1
+    robust: Annotated[bool, typer.Option("--robust", help="Let single samples that are far off count less.")] = False
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Go on as far as the model stays linear, even if it no longer fits.")
+    ] = False
+
+
+def identify(
+    files: RecordingFiles,
+    *,
+    asked: Asked,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE.toml", help="Write the fitted parameter set.")
     ] = None,
     report: ReportFile = None,
-    precision: Annotated[
-        float, typer.Option(min=1e-9, help="Relative half width of the intervals that is fine enough.")
-    ] = 1e-4,
-    spread: Annotated[float, typer.Option(min=1e-6, max=1.0, help="How far off the start may be, relatively.")] = 0.1,
-    robust: Annotated[bool, typer.Option("--robust", help="Let single samples that are far off count less.")] = False,
-    whole: Annotated[
-        bool, typer.Option("--whole", help="Go on as far as the model stays linear, even if it no longer fits.")
-    ] = False,
+    search: Search,
     exact: Annotated[
         bool,
         typer.Option(
@@ -77,55 +144,28 @@ def identify(
     force: Force = False,
 ) -> None:
     """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell."""
-    import json
-
     from recorder.reader import join
-    from replays.recordings.identification import ask
     from replays.recordings.identification import identify as run
     from replays.recordings.identification.document import check_set, fitted_set, identification_document, write_set
-    from replays.recordings.identification.nuisance import asked_along, check_begin, is_imported, shortly_before, turned
     from replays.recordings.identification.summary import report_of
     from replays.report import check_report
-    from rig.kernels import COMPILE_NOTICE, compiled_before
 
     if output is not None:
         check_set(output, force=force)
     if report is not None:
         check_report(report, force=force)
-    keys = [key for part in fit for key in names_of(part)]
     recording = join(files)
     name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
-    experiment = _experiment(recording, parameters=parameters, scene=scene, engine=engine)
-    priors = {key: _two("prior", text, "+-") for key, text in pairs("--prior", prior, "KEY=VALUE+-SIGMA").items()}
-    along: dict[str, tuple[float, float] | None] = {}
-    if is_imported(recording) and not exact:
-        check_begin(experiment, to_s)
-        experiment = turned(recording, experiment)
-        along = asked_along(experiment, keys)
-        keys += list(along)
-        priors = {key: known for key, known in along.items() if known is not None} | priors
-        from_s = shortly_before(experiment) if from_s is None else from_s
-    question = ask(
-        recording,
-        experiment,
-        keys,
-        start={key: _number("start", text) for key, text in pairs("--start", start, "KEY=VALUE").items()},
-        bounds={key: _two("bounds", text, ":") for key, text in pairs("--bounds", bounds, "KEY=LOW:HIGH").items()},
-        priors=priors,
-        along=along,
-        channels=names_of(channels) or None,
-        window=(from_s, to_s),
-    )
-    if not compiled_before():
-        echo(COMPILE_NOTICE, err=True)
+    question, along = asked.question(recording, exact=exact)
+    tell_of_compiling()
     with reporting() as reporter:
-        found = run(question, precision=precision, spread=spread, robust=robust, whole=whole, progress=reporter.step)
+        found = run(question, **asdict(search), progress=reporter.step)
     if output is not None:
         write_set(fitted_set(found, recording=name), output)
     if report is not None:
         report_of(found, recording=name).write(report)
     if json_output:
-        echo(json.dumps(identification_document(found, recording=name), indent=2, allow_nan=False))
+        echo_json(identification_document(found, recording=name))
         return
     _show(found, name)
     if along:
@@ -134,16 +174,6 @@ def identify(
         echo(f"written  {output}: a parameter set, as in `rig run hammer --parameters {output}`")
     if report is not None:
         echo(f"written  {report}")
-
-
-def _experiment(recording: Recording, *, parameters: str | None, scene: str | None, engine: str | None) -> Experiment:
-    from replays.recordings.experiment import Experiment
-    from rig.scenes import load_scene
-
-    experiment = Experiment(scene=load_scene(scene)) if scene is not None else Experiment.of(recording)
-    if parameters is not None:
-        experiment = experiment.changed({"parameters": parameters, "set": {}})
-    return experiment.changed({"engine.name": engine}) if engine is not None else experiment
 
 
 def _number(option: str, text: str) -> float:
@@ -170,18 +200,16 @@ def _show(found: Identification, name: str) -> None:
     from replays.recordings.identification.summary import HEADINGS, cells, fit_line, spread_line, window_line
 
     console = table_console(width=200, highlight=False)
-    table = new_table(f"{name}: what it tells")
-    for heading in HEADINGS:
-        table.add_column(Text(heading), justify="right" if heading in ("start", "result", "95 % interval") else "left")
+    numbers = ("start", "result", "95 % interval")
+    headings = (f">{heading}" if heading in numbers else heading for heading in HEADINGS)
+    table = new_table(f"{name}: what it tells", *headings)
     for finding in found.judgement.findings:
         good = finding.standing == "identified"
         table.add_row(*(Text(cell) for cell in cells(finding)), style=None if good else "yellow")
     console.print(table)
     keys = found.question.keys
     if len(keys) > 1:
-        table = new_table("correlation")
-        for key in ("", *keys):
-            table.add_column(key, justify="right" if key else "left")
+        table = new_table("correlation", "", *(f">{key}" for key in keys))
         for key, row in zip(keys, found.judgement.correlation, strict=True):
             table.add_row(key, *("-" if value != value else f"{value:+.4f}" for value in row))
         console.print()

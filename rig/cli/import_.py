@@ -42,6 +42,9 @@ def import_(
     """
     if (template is None) == (mapping is None):
         raise InputError("import", "given either --mapping or --template", "both" if mapping else "neither")
+    from rig.scenes import rig_table
+
+    rig_table()
     if template is not None:
         if output is not None:
             raise InputError("--output", "left out with --template", str(output))
@@ -104,10 +107,8 @@ def _tell(conversion: Conversion, output: Path) -> None:
     console.print(f"{output}: {len(conversion.channels)} channels, {seconds:.6g} s, {size:.1f} MB, from "
                   f"{conversion.start.isoformat()}", soft_wrap=True)  # fmt: skip
     columns = _columns(conversion)
-    table = new_table("")
-    for heading in columns:
-        text = heading in ("channel", "source", "value", "unit")
-        table.add_column(heading, justify="left" if text else "right", no_wrap=True, overflow="ellipsis")
+    words = ("channel", "source", "value", "unit")
+    table = new_table("", *(heading if heading in words else f">{heading}" for heading in columns), whole=words)
     for row, channel in zip(zip(*columns.values(), strict=True), conversion.channels, strict=True):
         trouble = channel.missing or channel.overrange
         table.add_row(*row, style="yellow" if trouble else None)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.options import Json, RecordingFiles
-from rig.cli.tables import echo, shown
+from rig.cli.tables import echo, new_table, shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -164,9 +164,7 @@ def _number(value: float | None, noise: float) -> str:
 
 
 def _print_parts(console: Console, parts: list[dict[str, Any]]) -> None:
-    from rich.table import Table
-
-    table = Table("part", "MB", "from, s", "to, s", "ended", box=None, header_style="bold")
+    table = new_table("", "part", "MB", "from, s", "to, s", "ended")
     for part in parts:
         end = part["end"]
         times = (f"{float(end[name]):.4f}" if name in end else "?" for name in ("first_time_s", "last_time_s"))
@@ -175,11 +173,7 @@ def _print_parts(console: Console, parts: list[dict[str, Any]]) -> None:
 
 
 def _print_streams(console: Console, streams: dict[str, dict[str, Any]]) -> None:
-    from rich.table import Table
-
-    table = Table("stream", box=None, header_style="bold")
-    for heading in ("blocks", "rows", "from, s", "to, s", "lost"):
-        table.add_column(heading, justify="right")
+    table = new_table("", "stream", ">blocks", ">rows", ">from, s", ">to, s", ">lost")
     for key, stream in streams.items():
         times = (f"{stream['first_time_s']:.4f}", f"{stream['last_time_s']:.4f}")
         counts = (str(stream["messages"]), str(stream["rows"]))
@@ -189,18 +183,11 @@ def _print_streams(console: Console, streams: dict[str, dict[str, Any]]) -> None
 
 
 def _print_channels(console: Console, recording: Recording, health: dict[str, Any] | None) -> None:
-    from rich.table import Table
-
     from rig.wire import sensor_key
 
     found = {channel["name"]: channel for channel in (health or {}).get("channels", [])}
-    table = Table("channel", "unit", "range", "step", "rate", box=None, header_style="bold")
-    if found:
-        for heading in ("mean", "low", "high", "noise", "calibrated"):
-            table.add_column(heading, justify="right")
-        table.add_column("health")
-    else:
-        table.add_column("label")
+    more = (">mean", ">low", ">high", ">noise", ">calibrated", "health") if found else ("label",)
+    table = new_table("", "channel", "unit", "range", "step", "rate", *more)
     for group in recording.table.groups.values():
         if sensor_key(group.name) not in recording.messages:
             continue

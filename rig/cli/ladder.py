@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import Changes, SceneName
-from rig.cli.progress import reporting
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.options import Changes, SceneChanges, SceneName
+from rig.cli.progress import reporting, tell_of_compiling
+from rig.cli.tables import echo, echo_json, new_table, table_console
 from rig.errors import whole_file
 
 if TYPE_CHECKING:
@@ -48,17 +48,14 @@ def ladder(
     from replays.studies.ladder.pick import check_target, write_pick
     from replays.studies.ladder.quantity import parse_quantities
     from replays.studies.ladder.search import search
-    from rig.cli.run import scene_overrides
-    from rig.kernels import COMPILE_NOTICE, compiled_before
     from rig.scenes import load_scene
 
     tolerances = parse_quantities(quantity, tolerance)
     # A pick is made anew from what the scene is without one.
-    loaded = load_scene(scene, {**scene_overrides(changes or []), "fidelity": "given"})
+    loaded = load_scene(scene, {**SceneChanges(changes=changes).overrides(), "fidelity": "given"})
     if write is not None:
         check_target(write, scene, loaded)
-    if not compiled_before():
-        echo(COMPILE_NOTICE, err=True)
+    tell_of_compiling()
     with reporting() as reporter:
         found = search(
             loaded,
@@ -78,7 +75,7 @@ def ladder(
     if write is not None:
         write_pick(write, scene, pick_of(found))
     if json_output:
-        echo(json.dumps(document, indent=2, allow_nan=False))
+        echo_json(document)
         return
     _show(document)
     for path in paths:
@@ -125,12 +122,10 @@ def _error(value: float | None) -> str:
 
 def _levels_table(document: dict[str, Any]) -> Table:
     names = [entry["name"] for entry in document["quantities"]]
-    table = new_table(f"Levels of the model in scene {document['scene']}: model error, each against the full model")
-    table.add_column("level")
-    for name in names:
-        table.add_column(name, justify="right")
-    for header in ("ms a second", "ns a step", "on", "", ""):
-        table.add_column(header, justify="left" if header in ("on", "") else "right")
+    table = new_table(
+        f"Levels of the model in scene {document['scene']}: model error, each against the full model",
+        *("level", *(f">{name}" for name in names), ">ms a second", ">ns a step", "on", "", ""),
+    )
     for step in document["steps"]:
         if step["stage"] not in ("full", "single", "together"):
             continue
@@ -149,12 +144,10 @@ def _levels_table(document: dict[str, Any]) -> Table:
 
 def _engines_table(document: dict[str, Any]) -> Table:
     names = [entry["name"] for entry in document["quantities"]]
-    table = new_table("Engines and steps on the picked model: numerical error, total error")
-    table.add_column("engine")
-    for name in names:
-        table.add_column(name, justify="right")
-    for header in ("ms a second", "ns a step", "", ""):
-        table.add_column(header, justify="left" if not header else "right")
+    table = new_table(
+        "Engines and steps on the picked model: numerical error, total error",
+        *("engine", *(f">{name}" for name in names), ">ms a second", ">ns a step", "", ""),
+    )
     for step in document["steps"]:
         if step["stage"] not in ("engine", "verified"):
             continue

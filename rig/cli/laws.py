@@ -70,15 +70,11 @@ def _show(document: dict[str, Any]) -> None:
 
 
 def _damping_table(document: dict[str, Any], *, notes: bool) -> Table:
-    from rich.text import Text  # brackets are units here, not markup
+    from rich.text import Text
 
-    table = new_table(f"damping laws at e = {document['restitution']:g} ({document['set']})")
-    for heading in ("", "law"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("c", "D [N s/m]", "returned", "off by", "peak [N]", "contact [ms]"):
-        table.add_column(Text(heading), justify="right", no_wrap=True)
-    if notes:
-        table.add_column("formula and source")
+    headings = ("", "law", ">c", ">D [N s/m]", ">returned", ">off by", ">peak [N]", ">contact [ms]")
+    title = f"damping laws at e = {document['restitution']:g} ({document['set']})"
+    table = new_table(title, *headings, *(["formula and source"] if notes else []), whole=("", "law"))
     for law in document["damping"]:
         table.add_row(
             ">" if law["in_use"] else "",
@@ -98,13 +94,8 @@ def _damping_table(document: dict[str, Any], *, notes: bool) -> Table:
 def _stiffness_table(document: dict[str, Any], *, notes: bool) -> Table:
     from rich.text import Text
 
-    table = new_table("stiffness laws")
-    for heading in ("", "law"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("K [N/m^n]", "n", "fit", "from - to [um]", "5 um [N]", "10 um [N]"):
-        table.add_column(Text(heading), justify="right", no_wrap=True)
-    if notes:
-        table.add_column("holds for; source")
+    headings = ("", "law", ">K [N/m^n]", ">n", ">fit", ">from - to [um]", ">5 um [N]", ">10 um [N]")
+    table = new_table("stiffness laws", *headings, *(["holds for; source"] if notes else []), whole=("", "law"))
     for law in document["stiffness"]:
         if law["refused"]:
             table.add_row("", law["name"], *["-"] * 6, *([Text(law["refused"])] if notes else []))

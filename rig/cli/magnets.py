@@ -53,14 +53,8 @@ def _show(document: dict[str, Any]) -> None:
 
 
 def _force_table(document: dict[str, Any], column: str, title: str) -> Table:
-    from rich.text import Text  # brackets are units here, not markup
-
-    table = new_table(title)
-    table.add_column("model", no_wrap=True)
-    table.add_column("runs as", no_wrap=True)
-    table.add_column(Text("K [kN/m]"), justify="right", no_wrap=True)
-    for place in document["displacement_mm"]:
-        table.add_column(Text(f"{place:.3g} mm [N]"), justify="right", no_wrap=True)
+    places = (f">{place:.3g} mm [N]" for place in document["displacement_mm"])
+    table = new_table(title, "model", "runs as", ">K [kN/m]", *places, whole=("model", "runs as"))
     scaled = column == "force_at_stiffness_used_n"
     for model in document["models"]:
         stiffness = document["stiffness_used_n_m"] if scaled else model["stiffness_n_m"]
@@ -70,12 +64,10 @@ def _force_table(document: dict[str, Any], column: str, title: str) -> Table:
 
 
 def _error_table(document: dict[str, Any]) -> Table:
-    table = new_table("errors")
-    for heading in ("model", "against", "with the same"):
-        table.add_column(heading, no_wrap=True)
     travel = min(document["travel_mm"], document["reach_mm"])
-    for radius in (travel, document["reach_mm"]):
-        table.add_column(f"over {radius:.3g} mm", justify="right", no_wrap=True)
+    radii = (f">over {radius:.3g} mm" for radius in (travel, document["reach_mm"]))
+    names = ("model", "against", "with the same")
+    table = new_table("errors", *names, *radii, whole=names)
     for error in document["errors"]:
         numbers = (f"{error[key]:.3%}" for key in ("over_travel", "over_reach"))
         table.add_row(error["model"], error["against"], error["equal"], *numbers)

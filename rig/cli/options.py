@@ -6,6 +6,7 @@ s of simulated time; names are joined by commas; what is KEY=VALUE is repeated.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,8 +21,6 @@ Changes = Annotated[
 ]
 Parameters = Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")]
 Engine = Annotated[str | None, typer.Option(help="Integration method.")]
-DurationS = Annotated[float | None, typer.Option(help="Length of the run, in s.")]
-Seed = Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")]
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")]
 Json = Annotated[bool, typer.Option("--json", help="As a JSON document.")]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap), finished or cut off.")]
@@ -37,31 +36,32 @@ Force = Annotated[bool, typer.Option("--force", help="Replace what is there alre
 ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="FILE", help="Write a report with pictures, .html or .pdf.")
 ]
-Listen = Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where to listen, on 127.0.0.1.")]
-_EXPOSURE = "For other computers"
-Expose = Annotated[
-    str | None,
-    typer.Option(
-        "--expose",
-        metavar="HOST[:PORT]",
-        help="Listen at this address of this computer as well, with --tls; port 7463 unless given.",
-        rich_help_panel=_EXPOSURE,
-    ),
-]
-Keys = Annotated[
-    Path | None,
-    typer.Option(
-        "--tls", metavar="DIR", help="Made by `rig keys init`: who may connect, and do what.", rich_help_panel=_EXPOSURE
-    ),
-]
-Plaintext = Annotated[
-    bool,
-    typer.Option(
-        "--plaintext",
-        help="Instead of --tls: let everybody in, and do everything, unencrypted.",
-        rich_help_panel=_EXPOSURE,
-    ),
-]
+
+
+@dataclass(frozen=True)
+class SceneChanges:
+    """What a run has in another way than its scene."""
+
+    parameters: Parameters = None
+    changes: Changes = None
+    engine: Engine = None
+    duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None
+    seed: Annotated[int | None, typer.Option(help="Seed of the sensors' noise.")] = None
+
+    def overrides(self) -> dict[str, str]:
+        """The changes by dotted key.
+
+        Raises:
+            InputError: One is not of the form KEY=VALUE.
+        """
+        overrides = pairs("--set", self.changes, "KEY=VALUE, such as drive.speed_hz=5.2")
+        named = {
+            "parameters": self.parameters,
+            "engine.name": self.engine,
+            "duration_s": self.duration_s,
+            "seed": self.seed,
+        }
+        return overrides | {key: str(value) for key, value in named.items() if value is not None}
 
 
 def names_of(text: str | None) -> list[str]:

@@ -9,8 +9,8 @@ import typer
 
 from rig.cli.folder import check_folder
 from rig.cli.options import Force, Json
-from rig.cli.progress import reporting
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.progress import reporting, tell_of_compiling
+from rig.cli.tables import echo, echo_json, new_table, table_console
 
 if TYPE_CHECKING:
     from replays.studies.paper.document import Findings
@@ -32,18 +32,14 @@ def paper(
     json_output: Json = False,
 ) -> None:
     """Make the paper's figures, tables and claims again, as printed and corrected, each with a verdict."""
-    import json
-
     from replays.report import check_report
     from replays.studies.paper.document import draw_pictures, find, steps, write_up
-    from rig.kernels import COMPILE_NOTICE, compiled_before
 
     if output is not None:
         check_report(output, force=force)
     if pictures is not None:
         check_folder(pictures, field="--pictures")
-    if not compiled_before():
-        echo(COMPILE_NOTICE, err=True)
+    tell_of_compiling()
     with reporting() as reporter:
         reporter.begin(steps(quick=quick))
         findings = find(quick=quick, processes=processes, progress=reporter.step)
@@ -55,7 +51,7 @@ def paper(
             pictures.mkdir(exist_ok=True)
             drawn = draw_pictures(findings, pictures)
     if json_output:
-        echo(json.dumps(summary(findings), indent=2, allow_nan=False))
+        echo_json(summary(findings))
         return
     _show(findings)
     for path in drawn:
@@ -87,10 +83,8 @@ def _show(findings: Findings) -> None:
 
     from replays.studies.paper.document import JUDGED_BY, count
 
-    table = new_table("the paper's statements, and ours")
-    for heading in ("statement", "the paper", "as-printed", "corrected", "verdict"):
-        right = heading in ("as-printed", "corrected")
-        table.add_column(heading, justify="right" if right else "left", no_wrap=right)
+    headings = ("statement", "the paper", ">as-printed", ">corrected", "verdict")
+    table = new_table("the paper's statements, and ours", *headings)
     colours = {"good": "green", "bad": "bold red", "open": "yellow", "plain": ""}
     lines = [*findings.lines, *findings.claims]
     for line in lines:

@@ -4,36 +4,24 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rig.cli.options import Changes, Json, SetName
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.options import Changes, Json, SceneChanges, SetName
+from rig.cli.tables import echo_json, new_table, table_console
 
 if TYPE_CHECKING:
     from rig.parameters import ParameterSet
 
 
-def params(
-    name: SetName = "corrected",
-    *,
-    changes: Changes = None,
-    json_output: Json = False,
-) -> None:
+def params(name: SetName = "corrected", *, changes: Changes = None, json_output: Json = False) -> None:
     """Show a parameter set: value, unit, source and kind of each; what is assumed is marked."""
-    import json
-
     from rig.model import build_model, describe
     from rig.parameters import set_names
 
     document = describe(build_model(changed_parameters(name, changes)))
     if json_output:
-        echo(json.dumps(document, indent=2))
+        echo_json(document)
         return
-    table = new_table(f"{document['set']}: {document['title']}")
-    table.add_column("parameter", no_wrap=True)
-    table.add_column("symbol")
-    table.add_column("value", justify="right")
-    table.add_column("unit", no_wrap=True)
-    table.add_column("kind", no_wrap=True)
-    table.add_column("source")
+    headings = ("parameter", "symbol", ">value", "unit", "kind", "source")
+    table = new_table(f"{document['set']}: {document['title']}", *headings, whole=("parameter", "unit", "kind"))
     for key, entry in document["values"].items():
         value = entry["value"]
         shown = f"{value} = {entry['resolved']:.6g}" if isinstance(value, str) else f"{value:g}"
@@ -62,10 +50,7 @@ def params(
             "(see `rig laws`)",
             highlight=False,
         )
-    console.print(
-        f"sets: {', '.join(set_names())}",
-        highlight=False,
-    )
+    console.print(f"sets: {', '.join(set_names())}", highlight=False)
 
 
 def changed_parameters(name: str, changes: list[str] | None, also: dict[str, Any] | None = None) -> ParameterSet:
@@ -79,9 +64,8 @@ def changed_parameters(name: str, changes: list[str] | None, also: dict[str, Any
     Raises:
         InputError: No such set or key, or a value that the model does not take.
     """
-    from rig.cli.run import scene_overrides
     from rig.parameters import load_parameters
     from rig.scenes import read_value
 
-    values = {key: read_value(text) for key, text in scene_overrides(changes or []).items()}
+    values = {key: read_value(text) for key, text in SceneChanges(changes=changes).overrides().items()}
     return load_parameters(name).override(values | (also or {}), source="--set")

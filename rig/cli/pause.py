@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rig.cli.connection import Connect, Tls, console, show
-from rig.transport import DEFAULT_ENDPOINT
+from rig.cli.connection import Connection, show
 
 
-def pause(*, connect: Connect = DEFAULT_ENDPOINT, tls: Tls = None) -> None:
+def pause(*, connection: Connection) -> None:
     """Hold the replay of a recording: nothing more goes out until `rig resume`, `rig step` or `rig seek`."""
-    with console(connect, "pause", tls) as rig:
+    with connection.console("pause") as rig:
         show(rig.pause(), "pause")

@@ -56,6 +56,14 @@ class Reporter:
         echo(f"{count}{text}", err=True)
 
 
+def tell_of_compiling() -> None:
+    """Say why nothing is seen at first, where the kernels were never compiled on this machine."""
+    from rig.kernels import COMPILE_NOTICE, compiled_before
+
+    if not compiled_before():
+        echo(COMPILE_NOTICE, err=True)
+
+
 @contextmanager
 def reporting() -> Iterator[Reporter]:
     """Show the progress of what is done inside."""

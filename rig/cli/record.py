@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.connection import Connect, Tls
+from rig.cli.connection import Connection
+from rig.cli.groups import panel
 from rig.cli.options import Force
 from rig.cli.tables import echo, plain, table_console
-from rig.errors import InputError, RefusedError
-from rig.transport import DEFAULT_ENDPOINT, NoReplyError
+from rig.errors import InputError
 
 if TYPE_CHECKING:
+    from recorder.series import Limits
     from recorder.session import Progress, RecordingSession, Summary
+    from recorder.trigger import Capture
+    from rig.transport.zenoh import ZenohClient
 
-_FILES, _TRIGGERS, _DISK = "Several files", "Around triggers", "The disk"
+_files, _triggers, _disk = panel("Several files"), panel("Around triggers"), panel("The disk")
 
 
 class WhenFull(StrEnum):
@@ -39,11 +44,101 @@ _LINK_S = 1.0
 """Time that the connection to a rig that is there may take [s]."""
 
 
+@dataclass(frozen=True)
+class Rotation:
+    """When a new file begins."""
+
+    rotate_mb: Annotated[float | None, _files("A new file at about this size, in MB: NAME.0000.mcap, ...")] = None
+    rotate_s: Annotated[float | None, _files("A new file after this simulated time, in s.")] = None
+
+
+@dataclass(frozen=True)
+class Triggers:
+    """What it is recorded around, if not all of the time."""
+
+    trigger: Annotated[
+        list[str] | None,
+        _triggers(
+            "Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
+            "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
+            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ..."
+        ),
+    ] = None
+    pre_s: Annotated[
+        float | None, _triggers("Simulated time kept before a trigger, in s.", show_default=f"{_PRE_S:g}")
+    ] = None
+    post_s: Annotated[
+        float | None, _triggers("Simulated time kept after a trigger, in s.", show_default=f"{_POST_S:g}")
+    ] = None
+    longest_s: Annotated[
+        float | None, _triggers("Longest length of a capture, in s of simulated time.", show_default="60")
+    ] = None
+    trigger_count: Annotated[int | None, _triggers("End after so many captures.")] = None
+    again: Annotated[
+        Again | None,
+        _triggers(
+            "What a trigger does during a capture: make it longer, or nothing.",
+            show_default="extend for events, ignore for levels",
+        ),
+    ] = None
+
+    def capture(self) -> Capture | None:
+        """What is recorded of a run; None: all of it.
+
+        Raises:
+            InputError: A trigger is none, or there is none that the other options are for.
+        """
+        from recorder.trigger import Capture, Trigger
+
+        around = {
+            "pre_s": self.pre_s,
+            "post_s": self.post_s,
+            "count": self.trigger_count,
+            "again": None if self.again is None else Again(self.again).value,
+            "longest_s": self.longest_s,
+        }
+        given = {name: value for name, value in around.items() if value is not None}
+        triggers = tuple(Trigger.parse(text) for text in self.trigger or ())
+        if given and not triggers:
+            name, value = next(iter(given.items()))
+            raise InputError("trigger_count" if name == "count" else name, "used with --trigger", value)
+        return Capture(triggers, **{"pre_s": _PRE_S, "post_s": _POST_S, **given}) if triggers else None
+
+
+@dataclass(frozen=True)
+class Disk:
+    """What a recording may take of the disk and of memory."""
+
+    budget_mb: Annotated[float | None, _disk("What all files of this recording may take, in MB.")] = None
+    keep_free_mb: Annotated[float, _disk("Room to leave on the disk, in MB.")] = 100.0
+    when_full: Annotated[WhenFull, _disk("At the budget, or with no more room: end, or remove the oldest file.")] = (
+        WhenFull.STOP
+    )
+    backlog_mb: Annotated[float, _disk("What may wait in memory for a slow disk, in MB; more is a gap.")] = 256.0
+
+    def limits(self, rotation: Rotation) -> Limits:
+        """Size of the files, and what they may take.
+
+        Raises:
+            InputError: There cannot be so much memory.
+        """
+        from recorder.series import Limits
+
+        if not 1.0 <= self.backlog_mb <= 1e5:
+            raise InputError("backlog_mb", "from 1 to 1e5", self.backlog_mb)
+        return Limits(
+            rotate_mb=rotation.rotate_mb,
+            rotate_s=rotation.rotate_s,
+            budget_mb=self.budget_mb,
+            keep_free_mb=self.keep_free_mb,
+            when_full=WhenFull(self.when_full).value,
+        )
+
+
 def record(
     output: Annotated[Path, typer.Option("--output", "-o", help="File to record to, ends in .mcap.")],
     *,
-    connect: Connect = DEFAULT_ENDPOINT,
-    tls: Tls = None,
+    connection: Connection,
     duration_s: Annotated[
         float | None, typer.Option(help="Simulated time to record, in s; without it until the rig's run ends.")
     ] = None,
@@ -65,67 +160,9 @@ def record(
         ),
     ] = 10.0,
     force: Force = False,
-    rotate_mb: Annotated[
-        float | None,
-        typer.Option(help="A new file at about this size, in MB: NAME.0000.mcap, ...", rich_help_panel=_FILES),
-    ] = None,
-    rotate_s: Annotated[
-        float | None, typer.Option(help="A new file after this simulated time, in s.", rich_help_panel=_FILES)
-    ] = None,
-    trigger: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
-            "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
-            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
-            rich_help_panel=_TRIGGERS,
-        ),
-    ] = None,
-    pre_s: Annotated[
-        float | None,
-        typer.Option(
-            help="Simulated time kept before a trigger, in s.", rich_help_panel=_TRIGGERS, show_default=f"{_PRE_S:g}"
-        ),
-    ] = None,
-    post_s: Annotated[
-        float | None,
-        typer.Option(
-            help="Simulated time kept after a trigger, in s.", rich_help_panel=_TRIGGERS, show_default=f"{_POST_S:g}"
-        ),
-    ] = None,
-    longest_s: Annotated[
-        float | None,
-        typer.Option(
-            help="Longest length of a capture, in s of simulated time.", rich_help_panel=_TRIGGERS, show_default="60"
-        ),
-    ] = None,
-    trigger_count: Annotated[
-        int | None, typer.Option(help="End after so many captures.", rich_help_panel=_TRIGGERS)
-    ] = None,
-    again: Annotated[
-        Again | None,
-        typer.Option(
-            help="What a trigger does during a capture: make it longer, or nothing.",
-            rich_help_panel=_TRIGGERS,
-            show_default="extend for events, ignore for levels",
-        ),
-    ] = None,
-    budget_mb: Annotated[
-        float | None, typer.Option(help="What all files of this recording may take, in MB.", rich_help_panel=_DISK)
-    ] = None,
-    keep_free_mb: Annotated[
-        float, typer.Option(help="Room to leave on the disk, in MB.", rich_help_panel=_DISK)
-    ] = 100.0,
-    when_full: Annotated[
-        WhenFull,
-        typer.Option(
-            help="At the budget, or with no more room: end, or remove the oldest file.", rich_help_panel=_DISK
-        ),
-    ] = WhenFull.STOP,
-    backlog_mb: Annotated[
-        float,
-        typer.Option(help="What may wait in memory for a slow disk, in MB; more is a gap.", rich_help_panel=_DISK),
-    ] = 256.0,
+    rotation: Rotation,
+    triggers: Triggers,
+    disk: Disk,
 ) -> None:
     """Record all streams of a running rig to FILE.mcap, losslessly; Ctrl-C ends the recording well.
 
@@ -134,34 +171,10 @@ def record(
     """
     import os
 
-    from recorder.series import MB, Limits
+    from recorder.series import MB
     from recorder.session import RecordingSession
-    from recorder.trigger import Capture, Trigger
-    from rig.transport.zenoh import ZenohClient
 
-    if not 1.0 <= backlog_mb <= 1e5:
-        raise InputError("backlog_mb", "from 1 to 1e5", backlog_mb)
-    limits = Limits(
-        rotate_mb=rotate_mb,
-        rotate_s=rotate_s,
-        budget_mb=budget_mb,
-        keep_free_mb=keep_free_mb,
-        when_full=WhenFull(when_full).value,
-    )
-    triggers = tuple(Trigger.parse(text) for text in trigger or ())
-    around = {
-        "pre_s": pre_s,
-        "post_s": post_s,
-        "count": trigger_count,
-        "again": None if again is None else Again(again).value,
-        "longest_s": longest_s,
-    }
-    given = {name: value for name, value in around.items() if value is not None}
-    if given and not triggers:
-        name, value = next(iter(given.items()))
-        option = "trigger_count" if name == "count" else name
-        raise InputError(option, "used with --trigger", value)
-    capture = Capture(triggers, **{"pre_s": _PRE_S, "post_s": _POST_S, **given}) if triggers else None
+    limits, capture = disk.limits(rotation), triggers.capture()
 
     def session_of(client: ZenohClient | None) -> RecordingSession:
         return RecordingSession(
@@ -176,17 +189,14 @@ def record(
             force=force,
             limits=limits,
             capture=capture,
-            inbox_bytes=round(backlog_mb * MB),
+            inbox_bytes=round(disk.backlog_mb * MB),
         )
 
     session_of(None)  # whatever is wrong with the options is said before a rig is looked for
-    try:
-        with table_console(stderr=True).status(plain(f"waiting for a rig at {connect}")):
-            rig = ZenohClient(connect, wait_s=max(_LINK_S, wait_s), tls=tls)
-        with rig as client:
-            summary = run_session(session_of(client))
-    except NoReplyError as error:
-        raise RefusedError(str(error)) from None
+    with ExitStack() as stack:
+        with table_console(stderr=True).status(plain(f"waiting for a rig at {connection.connect}")):
+            client = stack.enter_context(connection.client(wait_s=max(_LINK_S, wait_s)))
+        summary = run_session(session_of(client))
     tell(summary)
     if not summary.good:
         raise typer.Exit(1)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rig.cli.connection import Connect, Tls, console, show
-from rig.transport import DEFAULT_ENDPOINT
+from rig.cli.connection import Connection, show
 
 
-def release(*, connect: Connect = DEFAULT_ENDPOINT, tls: Tls = None) -> None:
+def release(*, connection: Connection) -> None:
     """Make the magnets of a running rig let go of the shaft."""
-    with console(connect, "release", tls) as rig:
+    with connection.console("release") as rig:
         show(rig.release(), "release")

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.can_output import (
-    CanBitrate,
-    CanBus,
-    CanClassic,
-    CanFd,
-    CanOverload,
-    CanRate,
-    CanSlcan,
-    CanSocketcand,
-    can_output,
-)
-from rig.cli.connection import exposure, tell_where
-from rig.cli.display import all_lateness, end_with, lateness, showing
-from rig.cli.options import Channels, Expose, FromS, Keys, Listen, Plaintext, RecordingFiles, ToS, names_of, pairs
-from rig.cli.signals import stopping_on_signals
+from rig.cli.can_output import CanOptions
+from rig.cli.connection import Serving, serve
+from rig.cli.display import all_lateness, lateness
+from rig.cli.groups import panel
+from rig.cli.options import Channels, FromS, RecordingFiles, ToS, names_of, pairs
 from rig.cli.tables import echo
 from rig.errors import InputError
-from rig.transport import DEFAULT_ENDPOINT
 
-_PART, _CHANGE = "What is played", "What is changed"
+if TYPE_CHECKING:
+    from replays.player.edit import Edit
+    from replays.player.passes import Part
+    from replays.player.player import Player
+    from replays.player.tape import Tape
+    from rig.transport import Server
+
+_part, _change = panel("What is played"), panel("What is changed")
 
 
 class Spacing(StrEnum):
@@ -50,6 +46,64 @@ class Only(StrEnum):
     SENSORS = "sensors"
 
 
+@dataclass(frozen=True)
+class Played:
+    """What is played, and when it begins."""
+
+    from_s: FromS = None
+    to_s: ToS = None
+    start_s: Annotated[float | None, _part("Where the first pass begins, in s.", "--start", metavar="S")] = None
+    loop: Annotated[int, _part("Passes through it; 0: endless.", metavar="N", min=0)] = 1
+    pause: Annotated[bool, _part("Wait for `rig resume`, or `rig step`.", "--pause")] = False
+    wait_for: Annotated[
+        int,
+        _part(
+            "Begin once N clients listen (recorders, DAQs, viewers), so that they get all of it.", metavar="N", min=0
+        ),
+    ] = 0
+    wait_s: Annotated[float, _part("Fail where they are not there after S s.", metavar="S")] = 60.0
+
+    def part(self) -> Part:
+        """Which part of the recording, and how often."""
+        from replays.player.passes import Part
+
+        return Part(from_s=self.from_s, to_s=self.to_s, start_s=self.start_s, loops=self.loop or None)
+
+
+@dataclass(frozen=True)
+class Changed:
+    """What is changed between the recording and the wire."""
+
+    time: Annotated[
+        Numbers, _change("Ticks and row numbers as recorded, or new ones that run on through loops and seeks.")
+    ] = Numbers.ORIGINAL
+    only: Annotated[Only | None, _change("Leave out what no instrument could know.")] = None
+    remap: Annotated[
+        list[str] | None, _change("The same payloads on another key; may be repeated.", metavar="KEY=KEY")
+    ] = None
+    channels: Channels = None
+    rename: Annotated[list[str] | None, _change("Another name for a channel, as if wired so.", metavar="NAME=NAME")] = (
+        None
+    )
+
+    def edit(self, tape: Tape) -> Edit:
+        """Which payloads go out, on which key, and which columns they have.
+
+        Raises:
+            InputError: The recording has no such key or channel, or two would get the same.
+        """
+        from replays.player.edit import Edit
+        from rig.wire import CATALOGUE
+
+        return Edit(
+            tape.documents[CATALOGUE],
+            keys=pairs("--remap", self.remap, "KEY=KEY"),
+            channels=None if self.channels is None else names_of(self.channels),
+            names=pairs("--rename", self.rename, "NAME=NAME"),
+            truth=self.only is None,
+        )
+
+
 def replay(
     files: RecordingFiles,
     *,
@@ -60,139 +114,58 @@ def replay(
     spacing: Annotated[
         Spacing, typer.Option("--by", help="By simulated time, or as it had arrived at the recorder.")
     ] = Spacing.SIMULATED,
-    from_s: FromS = None,
-    to_s: ToS = None,
-    start_s: Annotated[
-        float | None,
-        typer.Option("--start", metavar="S", help="Where the first pass begins, in s.", rich_help_panel=_PART),
-    ] = None,
-    loop: Annotated[
-        int, typer.Option(metavar="N", help="Passes through it; 0: endless.", rich_help_panel=_PART, min=0)
-    ] = 1,
-    pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for `rig resume`, or `rig step`.", rich_help_panel=_PART)
-    ] = False,
-    wait_for: Annotated[
-        int,
-        typer.Option(
-            "--wait-for",
-            metavar="N",
-            help="Begin once N clients listen (recorders, DAQs, viewers), so that they get all of it.",
-            rich_help_panel=_PART,
-            min=0,
-        ),
-    ] = 0,
-    wait_s: Annotated[
-        float, typer.Option(metavar="S", help="Fail where they are not there after S s.", rich_help_panel=_PART)
-    ] = 60.0,
-    time: Annotated[
-        Numbers,
-        typer.Option(
-            help="Ticks and row numbers as recorded, or new ones that run on through loops and seeks.",
-            rich_help_panel=_CHANGE,
-        ),
-    ] = Numbers.ORIGINAL,
-    only: Annotated[
-        Only | None, typer.Option(help="Leave out what no instrument could know.", rich_help_panel=_CHANGE)
-    ] = None,
-    remap: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KEY=KEY", help="The same payloads on another key; may be repeated.", rich_help_panel=_CHANGE
-        ),
-    ] = None,
-    channels: Channels = None,
-    rename: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=NAME", help="Another name for a channel, as if wired so.", rich_help_panel=_CHANGE),
-    ] = None,
-    listen: Listen = DEFAULT_ENDPOINT,
-    expose: Expose = None,
-    tls: Keys = None,
-    plaintext: Plaintext = False,
-    can: CanBus = None,
-    can_rate: CanRate = None,
-    can_classic: CanClassic = False,
-    can_fd: CanFd = False,
-    can_bitrate: CanBitrate = None,
-    can_overload: CanOverload = False,
-    can_socketcand: CanSocketcand = None,
-    can_slcan: CanSlcan = False,
+    played: Played,
+    changed: Changed,
+    serving: Serving,
+    can: CanOptions,
 ) -> None:
     """Play a recording to whoever listens, as if it were the rig.
 
     From another terminal: `rig pause`, `rig resume`, `rig seek S`, `rig rate X`, `rig step`, `rig stop`, `rig status`.
     """
-    exposed = exposure(expose, tls, plaintext=plaintext)
+    serving.exposure()  # what is wrong with that is said first
     from rig.pacing import FreeRun, RealTime, rare_collections
 
     with rare_collections():
-        from replays.player.edit import Edit
-        from replays.player.player import Part, Player
+        from replays.player.player import Player
         from replays.player.playhead import check_rate
         from replays.player.tape import Tape
         from replays.player.timeline import By
-        from rig.transport.zenoh import ZenohServer
-        from rig.wire import CATALOGUE
 
         check_rate(rate)
         if burst and rate != 1.0:
             raise InputError("rate", "left out with --burst", rate)
-        if wait_for and pause:
-            raise InputError("--wait-for", "left out with --pause", wait_for)
+        if played.wait_for and played.pause:
+            raise InputError("--wait-for", "left out with --pause", played.wait_for)
         tape = Tape(files)
-        edit = Edit(
-            tape.documents[CATALOGUE],
-            keys=pairs("--remap", remap, "KEY=KEY"),
-            channels=None if channels is None else names_of(channels),
-            names=pairs("--rename", rename, "NAME=NAME"),
-            truth=only is None,
-        )
-        bus = can_output(
-            can,
-            classic=can_classic,
-            fd=can_fd,
-            rate_hz=can_rate,
-            bitrate=can_bitrate,
-            overload=can_overload,
-            socketcand=can_socketcand,
-            slcan=can_slcan,
-        )
-    # What the transport keeps for those who miss it lasts shorter when it goes faster, so there it waits for them.
-    with ZenohServer(listen, exposed=exposed, wait=burst or rate > 1.0) as server, ExitStack() as stack:
-        if bus is not None:
-            stack.enter_context(bus)
+        edit = changed.edit(tape)
+        bus = can.output()
+
+    def make(server: Server) -> Player:
         player = Player(
             tape,
-            server if bus is None else bus.beside(server),
+            server,
             FreeRun() if burst else RealTime(),
-            part=Part(from_s=from_s, to_s=to_s, start_s=start_s, loops=loop or None),
+            part=played.part(),
             edit=edit,
             by=By(spacing),
             rate=rate,
-            renumber=time is Numbers.NEW,
-            paused=pause,
-            wait_for=wait_for,
-            wait_s=wait_s,
+            renumber=changed.time is Numbers.NEW,
+            paused=played.pause,
+            wait_for=played.wait_for,
+            wait_s=played.wait_s,
         )
-        player.prepare()
-        if bus is not None:
-            bus.start(paced=not burst)
-            echo(f"rig: {bus}", err=True)
         begin_s, end_s = player.reach_s
         if not tape.complete:
             echo("rig: the recording was cut off; it is played as far as it goes", err=True)
-        what = "paused" if pause else "burst" if burst else f"x{rate:g}"
-        if wait_for:
-            what += f", waiting for {_clients(wait_for)}"
+        what = "paused" if played.pause else "burst" if burst else f"x{rate:g}"
+        if played.wait_for:
+            what += f", waiting for {_clients(played.wait_for)}"
         echo(f"rig: replay of {', '.join(map(str, files))}, {begin_s:g} to {end_s:g} s, {what}", err=True)
-        tell_where(server, exposed)
-        with stopping_on_signals(player.stop), showing(player.status, _words):
-            summary = player.run()
-    _tell(summary)
-    if bus is not None:
-        echo(bus.summary())
-    end_with(summary["troubles"])
+        return player
+
+    # What the transport keeps for those who miss it lasts shorter when it goes faster, so there it waits for them.
+    serve(make, _words, _tell, serving=serving, bus=bus, paced=not burst, wait=burst or rate > 1.0)
 
 
 def _clients(count: int) -> str:

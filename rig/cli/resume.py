@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rig.cli.connection import Connect, Tls, console, show
-from rig.transport import DEFAULT_ENDPOINT
+from rig.cli.connection import Connection, show
 
 
-def resume(*, connect: Connect = DEFAULT_ENDPOINT, tls: Tls = None) -> None:
+def resume(*, connection: Connection) -> None:
     """Let the replay of a recording go on."""
-    with console(connect, "resume", tls) as rig:
+    with connection.console("resume") as rig:
         show(rig.resume(), "resume")

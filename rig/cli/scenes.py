@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.tables import echo, table_console
+from rig.cli.tables import echo, new_table, table_console
 
 
 def scenes(
@@ -17,8 +17,6 @@ def scenes(
     """List the scenes that come with the rig, or show one. Your own is a TOML file of the same form."""
     import json
 
-    from rich.table import Table
-
     from rig.scenes import load_scene, scene_document, scene_names, scene_path
 
     if name is not None:
@@ -26,9 +24,7 @@ def scenes(
         text = json.dumps(scene_document(scene), indent=2) if json_output else scene_path(name).read_text("utf-8")
         echo(text.rstrip())
         return
-    table = Table(box=None, header_style="bold")
-    for heading in ("scene", "seconds", "what happens"):
-        table.add_column(heading)
+    table = new_table("", "scene", "seconds", "what happens")
     for each in scene_names():
         scene = load_scene(each)
         table.add_row(each, f"{scene.duration_s:g}", scene.title)

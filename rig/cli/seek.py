@@ -6,16 +6,14 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, Tls, console, show
-from rig.transport import DEFAULT_ENDPOINT
+from rig.cli.connection import Connection, show
 
 
 def seek(
     seconds: Annotated[float, typer.Argument(help="Simulated time in the recording, in s.")],
     *,
-    connect: Connect = DEFAULT_ENDPOINT,
-    tls: Tls = None,
+    connection: Connection,
 ) -> None:
     """Let the replay of a recording go on from another position; one that is paused stays so."""
-    with console(connect, "seek", tls) as rig:
+    with connection.console("seek") as rig:
         show(rig.seek(seconds), "seek")

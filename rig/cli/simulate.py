@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.options import Changes, DurationS, Engine, Force, Parameters, SceneName, Seed
-from rig.cli.progress import reporting
+from rig.cli.options import Force, SceneChanges, SceneName
+from rig.cli.progress import reporting, tell_of_compiling
 from rig.cli.tables import echo
 
 
@@ -16,11 +16,7 @@ def simulate(
     scene: SceneName,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .mcap, .parquet or .csv.")],
-    parameters: Parameters = None,
-    changes: Changes = None,
-    engine: Engine = None,
-    duration_s: DurationS = None,
-    seed: Seed = None,
+    scene_changes: SceneChanges,
     check: Annotated[bool, typer.Option("--check", help="Run it again by finer steps and tell the error.")] = False,
     force: Force = False,
 ) -> None:
@@ -31,24 +27,18 @@ def simulate(
 
     with rare_collections():
         from replays.recordings.export import check_run_output, writer_for
-        from rig.cli.run import scene_overrides
         from rig.scenes import load_scene
 
         check_run_output(output, force=force)
-        overrides = scene_overrides(
-            changes or [], parameters=parameters, engine=engine, duration_s=duration_s, seed=seed
-        )
-        loaded = load_scene(scene, overrides)
+        loaded = load_scene(scene, scene_changes.overrides())
 
-        from rig.kernels import COMPILE_NOTICE, compiled_before
         from rig.offline import frames
         from rig.simulation import Simulation
 
         simulation = Simulation(loaded)
         if loaded.fidelity_line:
             echo(loaded.fidelity_line, err=True)
-        if not compiled_before():
-            echo(COMPILE_NOTICE, err=True)
+        tell_of_compiling()
         simulation.warm_up()
     with reporting() as reporter, writer_for(output, simulation, force=force) as writer:
         begin = time.perf_counter()

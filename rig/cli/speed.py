@@ -6,16 +6,14 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, Tls, console, show
-from rig.transport import DEFAULT_ENDPOINT
+from rig.cli.connection import Connection, show
 
 
 def speed(
     hz: Annotated[float, typer.Argument(metavar="HZ", help="Spin speed [Hz], approached at the drive's ramp rate.")],
     *,
-    connect: Connect = DEFAULT_ENDPOINT,
-    tls: Tls = None,
+    connection: Connection,
 ) -> None:
     """Set the spin speed of a running rig."""
-    with console(connect, "speed", tls) as rig:
+    with connection.console("speed") as rig:
         show(rig.speed(hz), f"speed {hz:g} Hz")

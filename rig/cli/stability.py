@@ -10,7 +10,7 @@ import typer
 
 from rig.cli.options import Json
 from rig.cli.progress import reporting
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.tables import echo, echo_json, new_table, table_console
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -36,8 +36,6 @@ def stability(
     json_output: Json = False,
 ) -> None:
     """Test where integration methods fail; exit status 1 if any does not do what theory expects."""
-    import json
-
     from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
 
     trials, names = chosen_trials(only), chosen_engines(engines)
@@ -59,7 +57,7 @@ def stability(
             "disagree": len(wrong),
             "pictures": [str(path) for path in pictures],
         }
-        echo(json.dumps(document, indent=2, allow_nan=False))
+        echo_json(document)
     else:
         _show(cells, names)
         for path in pictures:
@@ -75,11 +73,8 @@ def _show(cells: list[Cell], names: list[str]) -> None:
 
     console = table_console()
     ours = [cell for cell in cells if cell.method in names]
-    table = new_table("trials by engine: measured, and whether that holds")
-    table.add_column("trial", no_wrap=True)
-    table.add_column("case")
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
+    headings = ("trial", "case", *(f">{name}" for name in names))
+    table = new_table("trials by engine: measured, and whether that holds", *headings, whole=("trial",))
     rows = dict.fromkeys((cell.trial, cell.case) for cell in ours)
     seen = ""
     for trial, case in rows:
@@ -91,9 +86,8 @@ def _show(cells: list[Cell], names: list[str]) -> None:
     console.print(table)
     others = [cell for cell in cells if cell.method not in names]
     if others:
-        peers = new_table("\nother people's solvers, where they are known to fail or to hold")
-        for heading in ("trial", "case", "solver", "measured", "because"):
-            peers.add_column(heading)
+        headings = ("trial", "case", "solver", "measured", "because")
+        peers = new_table("\nother people's solvers, where they are known to fail or to hold", *headings)
         for cell in others:
             peers.add_row(cell.trial, Text(cell.case), cell.method, _text(cell), Text(cell.skipped or cell.because))
         console.print(peers)

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.connection import Connect, Tls, console
+from rig.cli.connection import Connection
 from rig.cli.tables import echo, shown, table_console
-from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,11 +22,10 @@ def status(
     *,
     as_json: Annotated[bool, typer.Option("--json", help="The whole status document, as JSON.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Again twice a second, until Ctrl-C or the end.")] = False,
-    connect: Connect = DEFAULT_ENDPOINT,
-    tls: Tls = None,
+    connection: Connection,
 ) -> None:
     """Show time, pace, lateness, losses, clients and doubts of a running rig."""
-    with console(connect, "status", tls) as rig:
+    with connection.console("status") as rig:
         if not watch:
             document = _ask(rig)
             if as_json:

@@ -6,10 +6,9 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.connection import Connect, Tls, console
+from rig.cli.connection import Connection
 from rig.cli.tables import echo
 from rig.errors import InputError
-from rig.transport import DEFAULT_ENDPOINT
 
 
 def step(
@@ -19,12 +18,11 @@ def step(
     ] = None,
     *,
     blocks: Annotated[int | None, typer.Option(help="A number of blocks instead; only for a replay.")] = None,
-    connect: Connect = DEFAULT_ENDPOINT,
-    tls: Tls = None,
+    connection: Connection,
 ) -> None:
     """Let a rig that runs with --pace lockstep simulate TICKS more, or a paused replay play them; returns when done."""
     if (ticks is None) == (blocks is None):
         raise InputError("step", "given TICKS or --blocks", "neither" if ticks is None else "both")
-    with console(connect, "step", tls) as rig:
+    with connection.console("step") as rig:
         done = rig.step(ticks) if ticks is not None else rig.step_blocks(blocks or 0)
         echo(f"stepped to {done.time_s:.6f} s (tick {done.tick})")

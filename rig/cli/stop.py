@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from rig.cli.connection import Connect, Tls, console, show
-from rig.transport import DEFAULT_ENDPOINT
+from rig.cli.connection import Connection, show
 
 
-def stop(*, connect: Connect = DEFAULT_ENDPOINT, tls: Tls = None) -> None:
+def stop(*, connection: Connection) -> None:
     """End the run of a rig; recordings of it close."""
-    with console(connect, "stop", tls) as rig:
+    with connection.console("stop") as rig:
         show(rig.stop(), "stop")

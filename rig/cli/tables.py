@@ -7,6 +7,7 @@ line breaks and marks that turn the direction of writing come out in their escap
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -45,12 +46,33 @@ def shown(document: Any) -> Any:
     return [shown(value) for value in document] if isinstance(document, list | tuple) else document
 
 
-def new_table(title: str) -> Table:
-    """A table without lines, under a title."""
+def new_table(title: str, *headings: str, whole: Collection[str] = ()) -> Table:
+    """A table without lines, under a title.
+
+    Args:
+        title: The title.
+        headings: Of its columns; behind a `>` stand numbers, which are aligned to the right and not wrapped.
+        whole: Of those columns that are not wrapped either.
+    """
     from rich.table import Table
     from rich.text import Text
 
-    return Table(title=Text(title), box=None, header_style="bold", title_justify="left")
+    table = Table(title=Text(title) if title else None, box=None, header_style="bold", title_justify="left")
+    for heading in headings:
+        number = heading.startswith(">")
+        table.add_column(
+            Text(heading.removeprefix(">")),  # brackets are units here, not markup
+            justify="right" if number else "left",
+            no_wrap=number or heading in whole,
+        )
+    return table
+
+
+def echo_json(document: Any) -> None:
+    """Print a document as JSON."""
+    import json
+
+    echo(json.dumps(document, indent=2, allow_nan=False))
 
 
 def table_console(*, width: int | None = 200, highlight: bool = True, stderr: bool = False) -> Console:

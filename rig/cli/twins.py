@@ -7,11 +7,10 @@ from typing import Annotated
 import typer
 
 from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
-from rig.cli.connection import Connect, Tls
+from rig.cli.connection import Connection
 from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
-from rig.errors import InputError, RefusedError
-from rig.transport import DEFAULT_ENDPOINT, NoReplyError
+from rig.errors import InputError
 
 
 def twins(
@@ -22,30 +21,25 @@ def twins(
         str | None, typer.Option(metavar="SPEC", help="Serve them on a CAN bus, INTERFACE:CHANNEL, such as zenoh:can0.")
     ] = None,
     listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where they listen with --zenoh.")] = INSTRUMENTS,
-    connect: Connect = DEFAULT_ENDPOINT,
-    tls: Tls = None,
+    connection: Connection,
 ) -> None:
     """Serve the six instruments of a running rig to their drivers; Ctrl-C switches them off."""
     import threading
 
     from drivers.twins import Twins
-    from rig.transport.zenoh import ZenohClient
 
     if not (zenoh or pty or can):
         raise InputError("rig twins", "given --zenoh, --pty or --can SPEC, or several of them", "none")
     done = threading.Event()
-    try:
-        with ZenohClient(connect, tls=tls) as client, Twins(client) as serving:
-            if zenoh:
-                serving.serve_zenoh(listen)
-            if pty:
-                serving.serve_pty()
-            if can:
-                serving.serve_can(can)
-            for twin in serving.twins:
-                echo(f"{twin.CODEC.address.name:14s}{twin.url}")
-            echo("rig: open one with its driver, such as drivers.hammer.driver.Hammer; Ctrl-C ends", err=True)
-            with stopping_on_signals(done.set):
-                done.wait()
-    except NoReplyError as error:
-        raise RefusedError(str(error)) from None
+    with connection.client() as client, Twins(client) as serving:
+        if zenoh:
+            serving.serve_zenoh(listen)
+        if pty:
+            serving.serve_pty()
+        if can:
+            serving.serve_can(can)
+        for twin in serving.twins:
+            echo(f"{twin.CODEC.address.name:14s}{twin.url}")
+        echo("rig: open one with its driver, such as drivers.hammer.driver.Hammer; Ctrl-C ends", err=True)
+        with stopping_on_signals(done.set):
+            done.wait()

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Changes, Engine, Force, Json, RecordingFiles, ReportFile
-from rig.cli.progress import reporting
-from rig.cli.tables import echo, new_table, shown, table_console
+from rig.cli.options import Changes, Engine, Force, Json, RecordingFiles, ReportFile, SceneChanges
+from rig.cli.progress import reporting, tell_of_compiling
+from rig.cli.tables import echo, echo_json, new_table, shown, table_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -45,23 +45,19 @@ def validate(
 
     Where a criterion fails, it says what explains the difference: a sensor, the time, or which number of the model.
     """
-    import json
-
     from recorder.reader import join
     from replays.recordings.validation import load_criteria
     from replays.recordings.validation import validate as hold
     from replays.report import check_report
-    from rig.cli.run import scene_overrides
-    from rig.kernels import COMPILE_NOTICE, compiled_before
     from rig.scenes import read_value
 
     if report is not None:
         check_report(report, force=force)
     rules = load_criteria(criteria)
-    overrides = {key: read_value(value) for key, value in scene_overrides(changes or [], engine=engine).items()}
+    given = SceneChanges(changes=changes, engine=engine).overrides()
+    overrides = {key: read_value(value) for key, value in given.items()}
     recording = join(files)
-    if not compiled_before():
-        echo(COMPILE_NOTICE, err=True)
+    tell_of_compiling()
     with reporting() as reporter:
         found = hold(recording, criteria=rules, changes=overrides, declared=declared, step=reporter.step)
         if report is not None:
@@ -70,7 +66,7 @@ def validate(
             reporter.step("report")
             make_report(found).write(report)
     if json_output:
-        echo(json.dumps(found.document(), indent=2, allow_nan=False))
+        echo_json(found.document())
     else:
         _show(found)
         if report is not None:
@@ -108,9 +104,8 @@ def _show(found: Validation) -> None:
 
 
 def _trajectory(found: Validation) -> Table:
-    table = new_table("Trajectory: residual over the channel's own noise")
-    for header in ("channel", "noise", "RMS", "limit", "largest", "drift", "first at", "verdict"):
-        table.add_column(header, justify="left" if header in ("channel", "verdict") else "right")
+    headings = ("channel", ">noise", ">RMS", ">limit", ">largest", ">drift", ">first at", "verdict")
+    table = new_table("Trajectory: residual over the channel's own noise", *headings)
     for one in found.residuals:
         table.add_row(
             one.channel,
@@ -126,18 +121,15 @@ def _trajectory(found: Validation) -> Table:
 
 
 def _truth(found: Validation) -> Table:
-    table = new_table("Truth: largest difference as a part of the column's largest value")
-    for header in ("table", "column that is off most", "off by", "limit", "verdict"):
-        table.add_column(header, justify="right" if header in ("off by", "limit") else "left")
+    headings = ("table", "column that is off most", ">off by", ">limit", "verdict")
+    table = new_table("Truth: largest difference as a part of the column's largest value", *headings)
     for one in found.truth:
         table.add_row(one.table, one.column, f"{one.relative:.1e}", f"{one.limit:.1e}", _SAID[one.good])
     return table
 
 
 def _statistics(found: Validation) -> Table:
-    table = new_table("Phases")
-    for header in ("phase", "quantity", "recorded", "foretold", "limit", "verdict"):
-        table.add_column(header, justify="right" if header in ("recorded", "foretold", "limit") else "left")
+    table = new_table("Phases", "phase", "quantity", ">recorded", ">foretold", ">limit", "verdict")
     for one in found.statistics:
         limit = "" if one.limit is None else f"+- {one.limit:.2g}"
         table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])
@@ -149,9 +141,8 @@ def _counts(one: Explanation) -> bool:
 
 
 def _explanations(explained: Explained) -> Table:
-    table = new_table("What explains the difference, each candidate alone")
-    for header in ("kind", "what", "change", "explains", "left", "seen to", "verdict"):
-        table.add_column(header, justify="right" if header in ("explains", "left", "seen to") else "left")
+    headings = ("kind", "what", "change", ">explains", ">left", ">seen to", "verdict")
+    table = new_table("What explains the difference, each candidate alone", *headings)
     for one in [one for one in explained.ranked if _counts(one)][:12]:
         told = "named" if one.name in explained.best else ""
         row = (one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s", told)

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.connection import Connect, Tls
+from rig.cli.connection import Connection
 from rig.cli.options import Force, OptionalRecordingFiles
 from rig.cli.tables import echo
 from rig.errors import DiskError, InputError, RefusedError, check_new_file, whole_file
-from rig.transport import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -27,8 +26,7 @@ def view(
     files: OptionalRecordingFiles = None,
     *,
     live: Annotated[bool, typer.Option("--live", help="View the running rig.")] = False,
-    connect: Connect = DEFAULT_ENDPOINT,
-    tls: Tls = None,
+    connection: Connection,
     wait_s: Annotated[float, typer.Option(help="Wait that long for the rig to be there, in s (with --live).")] = 5.0,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
     save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening a viewer.")] = None,
@@ -49,7 +47,7 @@ def view(
     try:
         with _interruptible():
             if live:
-                _view_live(connect, tls=tls, wait_s=wait_s, web=web, save=save)
+                _view_live(connection, wait_s=wait_s, web=web, save=save)
             elif files:
                 _view_file(files, web=web, save=save, screenshot=screenshot, at_s=at_s)
     except WindowError as error:
@@ -118,22 +116,13 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
             _wait_for_the_end(shown)
 
 
-def _view_live(connect: str, *, tls: Path | None, wait_s: float, web: bool, save: Path | None) -> None:
+def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path | None) -> None:
     from recorder.viewer import blueprint, live, window
     from recorder.viewer.canvas import Canvas, new_stream
-    from rig.transport import NoReplyError
-    from rig.transport.zenoh import ZenohClient
 
-    try:
-        client = ZenohClient(connect, wait_s=wait_s, tls=tls)
-    except NoReplyError as error:
-        raise RefusedError(str(error)) from None
-    with client:
-        try:
-            described = live.ask(client, wait_s=wait_s)
-        except NoReplyError as error:
-            raise RefusedError(str(error)) from None
-        stream = new_stream(f"rig at {connect}")
+    with connection.client(wait_s=wait_s) as client:
+        described = live.ask(client, wait_s=wait_s)
+        stream = new_stream(f"rig at {connection.connect}")
         plan = blueprint.layout(described.table, described.geometry, live=True)
         if save is not None:
             view = live.LiveView(client, Canvas(stream), described)
@@ -144,7 +133,7 @@ def _view_live(connect: str, *, tls: Path | None, wait_s: float, web: bool, save
             return
         with window.Window(_kind(web=web), memory="512MiB") as shown:
             stream.connect_grpc(shown.url, default_blueprint=plan)
-            _tell(shown, f"the rig at {connect}")
+            _tell(shown, f"the rig at {connection.connect}")
             try:
                 view = live.LiveView(client, Canvas(stream), described)
                 echo(view.run(stop=lambda: not shown.open))

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from rig.channels import Channel, Group
-from rig.errors import InputError
+from rig.channels import Channel, Group, check_signals
 from rig.kernels.signals import COLUMN
 from rig.sensors.noise import draw, noise_streams
 
@@ -173,9 +172,7 @@ class Conditioner:
         self.every = row_rate_hz // self.groups[0].rate_hz
         self.rows_seen = 0
         channels = [channel for group in self.groups for channel in group.channels]
-        for channel in channels:
-            if channel.signal not in COLUMN:
-                raise InputError(f"channel {channel.name}: signal", f"one of {', '.join(COLUMN)}", channel.signal)
+        check_signals(channels, COLUMN)
         self._columns = np.array([COLUMN[channel.signal] for channel in channels])
         self._spans: list[tuple[str, int, int]] = []
         for group in self.groups:

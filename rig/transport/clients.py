@@ -220,27 +220,18 @@ class Clients:
                 or (silent and now_s - row.heard_s >= _GONE_S)
             }
 
-    def settle(
-        self,
-        server: Server,
-        published: int,
-        *,
-        patience_s: float,
-        see: Callable[[dict[str, float]], None] = lambda counts: None,
-    ) -> None:
+    def settle(self, server: Server, published: int, *, patience_s: float) -> None:
         """Wait until everybody who is connected has everything, so that the cache may go.
 
         Args:
             server: Whose links are looked at.
             published: Number of the row after the last one published.
             patience_s: Longest wait [s].
-            see: Takes each count of the links.
         """
         deadline = time.monotonic() + patience_s
         quiet_since = strangers_since = time.monotonic()
         while (now := time.monotonic()) < deadline:
             counts = server.congestion()
-            see(counts)
             if not counts.get("links", 0) or now - quiet_since >= _QUIET_S:
                 return
             stalled = counts.get("stalled_links", 0) > 0

@@ -44,7 +44,8 @@ class CommandLimit:
         self._rate_hz, self._burst, self._now_s = rate_hz, burst, now_s
         self._lock = threading.Lock()
         self._all = _Bucket(_TOGETHER * rate_hz, _TOGETHER * burst, now_s())
-        self._senders: dict[str, _Bucket] = {}
+        self.senders: dict[str, _Bucket] = {}
+        """Those that are told apart, the one heard longest ago first."""
         self.refused = 0
         """Commands that were not let through."""
 
@@ -56,10 +57,10 @@ class CommandLimit:
         """
         now_s = self._now_s()
         with self._lock:
-            bucket = self._senders.pop(sender, None) or _Bucket(self._rate_hz, self._burst, now_s)
-            if len(self._senders) >= _MOST:
-                del self._senders[next(iter(self._senders))]  # the one that was heard longest ago
-            self._senders[sender] = bucket
+            bucket = self.senders.pop(sender, None) or _Bucket(self._rate_hz, self._burst, now_s)
+            if len(self.senders) >= _MOST:
+                del self.senders[next(iter(self.senders))]  # the one that was heard longest ago
+            self.senders[sender] = bucket
             if bucket.left(now_s) >= 1.0 and self._all.left(now_s) >= 1.0:
                 bucket.take()
                 self._all.take()

@@ -25,7 +25,9 @@ def key_matches(expression: str, key: str) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class _Subscription:
+class Subscription:
+    """What a client asked to be handed."""
+
     expression: str
     on_message: Callable[[str, bytes], None]
     owner: MemoryClient
@@ -41,7 +43,7 @@ class MemoryServer:
     def __init__(self, *, cache: int = 100_000) -> None:
         self._lock = threading.RLock()
         self._cache: deque[tuple[str, bytes]] = deque(maxlen=cache)
-        self._subscriptions: list[_Subscription] = []
+        self._subscriptions: list[Subscription] = []
         self._watchers: list[tuple[MemoryClient, Callable[[bool], None]]] = []
         self._handlers: dict[str, Callable[[str, bytes], bytes | Future[bytes]]] = {}
         self._listeners: list[tuple[str, Callable[[str, bytes], None]]] = []
@@ -82,6 +84,45 @@ class MemoryServer:
             watchers = list(self._watchers)
         for _, callback in watchers:
             callback(True)
+
+    # ---- for its clients ----
+
+    def subscribe(self, subscription: Subscription, *, history: bool) -> None:
+        """Hand over what was published, where that is wanted, and what will be."""
+        with self._lock:
+            for key, payload in list(self._cache) if history else ():
+                if key_matches(subscription.expression, key):
+                    subscription.on_message(key, payload)
+            self._subscriptions.append(subscription)
+
+    def handler_of(self, key: str) -> Callable[[str, bytes], bytes | Future[bytes]] | None:
+        """What answers requests on a key."""
+        with self._lock:
+            return next((take for expression, take in self._handlers.items() if key_matches(expression, key)), None)
+
+    def watch(self, watcher: MemoryClient, callback: Callable[[bool], None]) -> None:
+        """Call back when the token appears or vanishes."""
+        with self._lock:
+            self._watchers.append((watcher, callback))
+            announced = self._announced and not self._closed
+        if announced:
+            callback(True)
+
+    def take_report(self, key: str, payload: bytes) -> None:
+        """Take what a client reports."""
+        with self._lock:
+            listeners = list(self._listeners)
+        for expression, callback in listeners:
+            if key_matches(expression, key):
+                callback(key, payload)
+
+    def forget(self, client: MemoryClient) -> None:
+        """Forget a client's subscriptions and watches."""
+        with self._lock:
+            self._subscriptions = [row for row in self._subscriptions if row.owner is not client]
+            self._watchers = [row for row in self._watchers if row[0] is not client]
+
+    # ---- for the rig ----
 
     def congestion(self) -> dict[str, float]:
         """Nothing: a message has arrived when `publish` returns."""
@@ -127,13 +168,7 @@ class MemoryClient:
         lossless: bool = True,
     ) -> None:
         """Receive payloads in order; nothing is ever missed here, so `on_miss` and `lossless` change nothing."""
-        server = self._server
-        with server._lock:
-            if history:
-                for past_key, payload in list(server._cache):
-                    if key_matches(key, past_key):
-                        on_message(past_key, payload)
-            server._subscriptions.append(_Subscription(key, on_message, self))
+        self._server.subscribe(Subscription(key, on_message, self), history=history)
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Ask the rig and return its reply.
@@ -141,35 +176,23 @@ class MemoryClient:
         Raises:
             NoReplyError: Nobody answers on that key.
         """
-        with self._server._lock:
-            handlers = [take for expression, take in self._server._handlers.items() if key_matches(expression, key)]
-        if not handlers:
+        handler = self._server.handler_of(key)
+        if handler is None:
             raise NoReplyError(f"no rig answers {key} in this process")
-        reply = handlers[0](key, payload)
+        reply = handler(key, payload)
         return reply.result() if isinstance(reply, Future) else reply
 
     def watch(self, key: str, callback: Callable[[bool], None]) -> None:
         """Call back with True / False when the rig's token appears / vanishes."""
-        with self._server._lock:
-            self._server._watchers.append((self, callback))
-            announced = self._server._announced and not self._server._closed
-        if announced:
-            callback(True)
+        self._server.watch(self, callback)
 
     def report(self, key: str, payload: bytes) -> None:
         """Send one payload to the rig."""
-        with self._server._lock:
-            listeners = list(self._server._listeners)
-        for expression, callback in listeners:
-            if key_matches(expression, key):
-                callback(key, payload)
+        self._server.take_report(key, payload)
 
     def close(self) -> None:
         """Forget this client's subscriptions and watches."""
-        server = self._server
-        with server._lock:
-            server._subscriptions = [row for row in server._subscriptions if row.owner is not self]
-            server._watchers = [row for row in server._watchers if row[0] is not self]
+        self._server.forget(self)
 
     def __enter__(self) -> MemoryClient:
         return self

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from rig import wire
+from rig.commands import COMMANDS as DONE_TO_THE_RIG
+from rig.commands import check_command
 from rig.desk import REQUESTS
 from rig.pacing import Lockstep
-from rig.scenes import COMMANDS as DONE_TO_THE_RIG
-from rig.scenes import parse_command
 from rig.service import COMMANDS, Service
 from rig.transport.limit import CommandLimit
 from rig.transport.memory import MemoryClient, MemoryServer
@@ -44,7 +44,7 @@ class Checked(FakeSimulation):
         self.taken: list[Any] = []
 
     def submit(self, command: str, request: dict[str, Any]) -> int:
-        self.taken.append(parse_command(command, request))
+        self.taken.append(check_command(command, request))
         return self.tick
 
 

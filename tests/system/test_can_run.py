@@ -243,7 +243,10 @@ def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: lis
 
 
 def test_a_schedule_that_the_bus_cannot_carry_is_refused_before_anything_runs() -> None:
-    from rig.cli.run import run
+    from rig.cli.groups import grouped
+    from rig.cli.run import run as command
+
+    run = grouped(command)
 
     with pytest.raises(InputError, match=r"CAN load must be .*--can-overload.*received '125\.9 % of 1M/5M'"):
         run("hammer", can="virtual:x", can_fd=True, can_bitrate="1M/5M")

@@ -121,8 +121,8 @@ def publisher(port: int) -> Iterator[Publisher]:
 def recorder(path: Path, port: int, options: str = "", *, before: str = "") -> Iterator[subprocess.Popen[str]]:
     """`rig record` in a process of its own, ended by its own id whatever happens."""
     code = before + (
-        "import sys; from pathlib import Path; from rig.cli.record import record; "
-        f"record(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
+        "import sys; from pathlib import Path; from rig.cli.groups import grouped; from rig.cli.record import record; "
+        f"grouped(record)(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(path)],

@@ -22,10 +22,11 @@ from drivers.console import Console
 from drivers.daq import Daq
 from recorder.reader import Recording
 from recorder.session import RecordingSession
-from replays.player.player import Part, Player
+from replays.player.passes import Part
+from replays.player.player import Player
 from replays.player.tape import Tape
 from rig import wire
-from rig.cli.can_output import CanOutput
+from rig.cli.can_output import CanMessages, CanOptions, CanOutput
 from rig.errors import RefusedError
 from rig.pacing import FreeRun, RealTime
 from rig.transport.zenoh import ZenohClient, ZenohServer
@@ -125,11 +126,12 @@ def test_two_replays_at_one_place_are_refused(path: Path) -> None:
 def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
     channel = f"replay-{next(_channels)}"
     frames: dict[int, list[bytes]] = {}
+    both = CanOptions(messages=CanMessages(can_classic=True, can_fd=True), can_overload=True)
     with can.Bus(channel, interface="virtual", ignore_config=True) as bus:
         with (
             ZenohServer(free_endpoint()) as server,
             # What a bus of this speed could carry does not matter to the virtual one.
-            CanOutput(f"virtual:{channel}", classic=True, fd=True, overload=True) as output,
+            CanOutput(f"virtual:{channel}", both) as output,
         ):
             player = Player(Tape([path]), output.beside(server), FreeRun())
             player.prepare()

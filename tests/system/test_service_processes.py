@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from rig import wire
-from rig.cli import hammer, release, speed, status, step, stop
+from rig.cli.app import app
 from rig.errors import InputError, RefusedError
 from rig.transport.zenoh import ZenohClient, ZenohServer
 from tests.unit.test_transport_zenoh import free_endpoint, until
@@ -216,17 +215,9 @@ def test_a_script_that_never_closes_its_client_still_ends() -> None:
             assert child.wait(timeout=30.0) == 0
 
 
-APP = typer.Typer()
-for name, function in {
-    "hammer": hammer.hammer, "speed": speed.speed, "release": release.release,
-    "status": status.status, "step": step.step, "stop": stop.stop,
-}.items():  # fmt: skip
-    APP.command(name)(function)
-
-
 def invoke(endpoint: str, *arguments: str) -> str:
     """What a command prints; raises what it raises."""
-    result = CliRunner().invoke(APP, [*arguments, "--connect", endpoint], catch_exceptions=False)
+    result = CliRunner().invoke(app, [*arguments, "--connect", endpoint], catch_exceptions=False)
     assert result.exit_code == 0
     return result.output
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from drivers.console import Console
-from rig.cli.run import scene_overrides
+from rig.cli.options import SceneChanges
 from rig.errors import InputError
 from rig.transport.zenoh import ZenohClient
 from tests.unit.test_transport_zenoh import free_endpoint, until
@@ -21,10 +21,11 @@ from tests.unit.test_transport_zenoh import free_endpoint, until
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import sys, typer
+from rig.cli.groups import grouped
 from rig.cli.run import run
 from rig.errors import InputError
 app = typer.Typer(add_completion=False)
-app.command()(run)
+app.command()(grouped(run))
 try:
     app()
 except InputError as error:
@@ -104,14 +105,16 @@ def test_malformed_options_are_one_line(arguments: tuple[str, ...], message: str
 
 
 def test_options_become_changes_of_the_scene() -> None:
-    assert scene_overrides(["drive.speed_hz=5.2", " contact.friction = 0.3 ", "title=a=b"], seed=0, duration_s=1.5) == {
+    assert SceneChanges(
+        changes=["drive.speed_hz=5.2", " contact.friction = 0.3 ", "title=a=b"], seed=0, duration_s=1.5
+    ).overrides() == {
         "drive.speed_hz": "5.2",
         "contact.friction": "0.3",
         "title": "a=b",
         "seed": "0",
         "duration_s": "1.5",
     }
-    assert scene_overrides([], parameters="as-printed", engine="rk4") == {
+    assert SceneChanges(parameters="as-printed", engine="rk4").overrides() == {
         "parameters": "as-printed",
         "engine.name": "rk4",
     }
@@ -120,4 +123,4 @@ def test_options_become_changes_of_the_scene() -> None:
 @pytest.mark.parametrize("text", ["", "=", "key", "key=", "=1", "key= "])
 def test_a_change_without_key_or_value_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="--set must be KEY=VALUE"):
-        scene_overrides([text])
+        SceneChanges(changes=[text]).overrides()

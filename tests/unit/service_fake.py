@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from rig.errors import InputError
+from rig.simulation import Frame
 from rig.wire import Block
 
 GROUPS = {"probes": 4, "forces": 4, "accelerations": 4, "drive": 2, "hammer": 1}
@@ -20,16 +20,6 @@ TRUTH = {"state": 28, "contact": 6, "energy": 8}
 SAMPLE_TICKS = 50
 TRUTH_TICKS = 500
 EDGE_TICKS = 160_000
-
-
-@dataclass
-class FakeFrame:
-    tick: int
-    ticks: int
-    samples: dict[str, Block]
-    edges: Block | None
-    truth: dict[str, Block]
-    events: list[dict[str, Any]] = field(default_factory=list)
 
 
 def _rows(tick: int, ticks: int, every: int, columns: int, dtype: type) -> Block:
@@ -67,7 +57,7 @@ class FakeSimulation:
     def warm_up(self) -> None:
         self.warmed_up = True
 
-    def advance(self, ticks: int) -> FakeFrame:
+    def advance(self, ticks: int) -> Frame:
         assert self.warmed_up
         assert ticks > 0
         assert ticks % self.block_ticks == 0
@@ -75,13 +65,14 @@ class FakeSimulation:
             raise FloatingPointError("the shaft\nleft the rig")
         tick = self.tick
         edges = _rows(tick, ticks, EDGE_TICKS, 1, np.float64)
-        frame = FakeFrame(
+        frame = Frame(
             tick=tick,
             ticks=ticks,
             samples={name: _rows(tick, ticks, SAMPLE_TICKS, columns, np.int32) for name, columns in GROUPS.items()},
             edges=edges if len(edges.values) else None,
             truth={name: _rows(tick, ticks, TRUTH_TICKS, columns, np.float64) for name, columns in TRUTH.items()},
             events=self._scheduled,
+            rows=np.empty((0, 0)),
         )
         self._scheduled = []
         self.tick += ticks

@@ -32,7 +32,8 @@ from drivers.can.socketcand import CommandError, SocketcandServer, Splitter
 from drivers.can.timing import speed
 from drivers.twins import Twins
 from rig.cli.can_outlets import CanOutlets
-from rig.cli.can_output import CanOutput
+from rig.cli.can_output import CanOptions, CanOutput
+from rig.cli.groups import grouped
 from rig.cli.run import run
 from rig.errors import InputError
 from rig.transport.memory import MemoryClient, MemoryServer
@@ -433,10 +434,10 @@ def test_no_door_of_the_bus_is_open_to_other_machines_whatever_is_asked(place: s
         r"must be on 127\.0\.0\.1, since there is no password; from another machine: ssh -L 29536:127.0.0.1:29536 "
     )
     for opening in (
-        lambda: run("hammer", can="virtual:x", can_socketcand=place, listen=free_endpoint()),
-        lambda: CanOutput("virtual:x", socketcand=place),
+        lambda: grouped(run)("hammer", can="virtual:x", can_socketcand=place, listen=free_endpoint()),
+        lambda: CanOutput("virtual:x", CanOptions(can_socketcand=place)),
         lambda: CanOutlets({}, speed("1M"), socketcand=place),
-        lambda: run("hammer", can=f"zenoh:can0?endpoint={place}", listen=free_endpoint()),
+        lambda: grouped(run)("hammer", can=f"zenoh:can0?endpoint={place}", listen=free_endpoint()),
         lambda: hub(["can0"], socketcand=place),
         lambda: hub(["can0"], listen=place),
         lambda: Twins(MemoryClient(MemoryServer())).serve_zenoh(place),
@@ -812,6 +813,6 @@ def test_outlets_of_the_command_line() -> None:
     with pytest.raises(InputError, match="socketcand must be HOST:PORT"):
         CanOutlets({}, speed("1M"), socketcand="29536")
     with pytest.raises(InputError, match=r"--can must be on zenoh, virtual or socketcan with --can-socketcand"):
-        CanOutput("slcan:/dev/pts/99", slcan=True)
+        CanOutput("slcan:/dev/pts/99", CanOptions(can_slcan=True))
     with pytest.raises(InputError, match="--can must be given"):
-        run("hammer", can_slcan=True)
+        grouped(run)("hammer", can_slcan=True)

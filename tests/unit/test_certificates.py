@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from drivers.sources import open_source
-from rig.cli.connection import exposure, tell_where
+from rig.cli.connection import Serving, tell_where
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.transport.access import ROLES
@@ -69,12 +69,12 @@ def test_a_failure_half_way_leaves_what_was_there(tmp_path: Path, monkeypatch: p
     folder = tmp_path / "keys"
     make(folder)
     before = files(folder)
-    written: list[Path] = []
+    folders: set[Path] = set()
     write = Path.write_bytes
 
     def fail(path: Path, data: bytes) -> int:
-        written.append(path)
-        if len(written) == 7:  # three files a folder: the first of the third
+        folders.add(path.parent)
+        if len(folders) == 3:
             raise OSError(28, "No space left on device")
         return write(path, data)
 
@@ -130,26 +130,26 @@ def test_the_command_says_what_goes_where(tmp_path: Path, capsys: pytest.Capture
 
 def test_exposure_says_who_may_come_in(tmp_path: Path) -> None:
     make(tmp_path / "keys")
-    assert exposure(None, None, plaintext=False) is None
-    exposed = exposure("192.0.2.1", tmp_path / "keys", plaintext=False)
+    assert Serving().exposure() is None
+    exposed = Serving(expose="192.0.2.1", tls=tmp_path / "keys").exposure()
     assert exposed is not None
     assert exposed.endpoint == "192.0.2.1:7463"
     assert exposed.holder == holder_in(tmp_path / "keys" / "server", server=True)
-    assert exposure("lab.example:9000", None, plaintext=True) == ("lab.example:9000", None)
+    assert Serving(expose="lab.example:9000", plaintext=True).exposure() == ("lab.example:9000", None)
     with pytest.raises(
         InputError, match=r"--expose must be given with --tls DIR \(made by: rig keys init DIR --host lab"
     ):
-        exposure("lab.example:9000", None, plaintext=False)
+        Serving(expose="lab.example:9000").exposure()
     with pytest.raises(InputError, match="received 'both'"):
-        exposure("lab.example", tmp_path / "keys", plaintext=True)
+        Serving(expose="lab.example", tls=tmp_path / "keys", plaintext=True).exposure()
     for keys, plaintext in ((tmp_path / "keys", False), (None, True)):
         with pytest.raises(InputError, match="given with --expose HOST"):
-            exposure(None, keys, plaintext=plaintext)
+            Serving(tls=keys, plaintext=plaintext).exposure()
 
 
 def test_plain_exposure_says_what_is_open(capsys: pytest.CaptureFixture[str]) -> None:
     server = SimpleNamespace(endpoint="127.0.0.1:7460")
-    tell_where(server, exposure("192.0.2.1", None, plaintext=True))  # type: ignore[arg-type]
+    tell_where(server, Serving(expose="192.0.2.1", plaintext=True).exposure())  # type: ignore[arg-type]
     errors = capsys.readouterr().err
     assert "WARNING: 192.0.2.1:7463 is open to everybody who reaches it, unencrypted" in errors
     assert "commands, notes, truth" in errors

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from rig import channels
 from rig.channels import TABLE, Channel, ChannelTable, default_table, parse_table
+from rig.cli.app import start
+from rig.commands import HammerCommand
 from rig.errors import InputError
 from rig.kernels.signals import ROW
-from rig.scenes import HammerCommand
+from rig.scenes import rig_table
 from rig.sensors.conditioning import Conditioner
 
 TABLE_TEXT = TABLE.read_text()
@@ -144,15 +148,69 @@ def test_a_name_stands_once() -> None:
 
 
 def test_unknown_field_in_a_row_is_refused() -> None:
-    with pytest.raises(InputError, match=r"channel table.groups.g.channels.0.colour must be left out"):
+    with pytest.raises(InputError, match=r"channel c\.colour must be left out"):
         parse_table(one_channel('colour = "red"'))
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("keys",),
+        ("can", "load"),
+        ("can", "dbc"),
+        ("simulate", "drop", "-o", "x.csv"),
+        ("import", "x.csv", "--template", "x.toml"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("was", "becomes", "line"),
+    [
+        (
+            'sensitivity_v = 7.87, label = "Shaft in the ring, horizontal',
+            'label = "Shaft in the ring, horizontal',
+            "rig: channel ring_x.sensitivity_v must be given; instead received nothing",
+        ),
+        (
+            'signal = "ring_x"',
+            'signal = "rinx"',
+            "rig: channel ring_x.signal must be one of the model's, such as ring_x",
+        ),
+    ],
+    ids=["a missing field", "a wrong signal"],
+)
+def test_every_command_that_uses_the_table_says_in_a_line_what_is_wrong_with_it(
+    command: tuple[str, ...],
+    was: str,
+    becomes: str,
+    line: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert was in TABLE_TEXT
+    wrong = tmp_path / "channels.toml"
+    wrong.write_text(TABLE_TEXT.replace(was, becomes))
+    monkeypatch.setattr(channels, "TABLE", wrong)
+    monkeypatch.chdir(tmp_path)
+    default_table.cache_clear()
+    rig_table.cache_clear()
+    try:
+        with pytest.raises(SystemExit) as ended:
+            start(list(command))
+    finally:
+        default_table.cache_clear()
+        rig_table.cache_clear()
+    error = capsys.readouterr().err
+    assert error.startswith(line), error
+    assert error.count("\n") == 1
+    assert ended.value.code == 2
+
+
 def test_a_channel_without_a_sensitivity_and_one_of_no_signal_are_one_line() -> None:
-    with pytest.raises(InputError, match=r"channel table.groups.g.channels.0.sensitivity_v must be given"):
+    with pytest.raises(InputError, match=r"channel c\.sensitivity_v must be given; instead received nothing"):
         parse_table(one_channel().replace("sensitivity_v", "# "))
     table = parse_table(one_channel().replace('"disk_x"', '"endx"'))
-    with pytest.raises(InputError, match=r"channel c: signal must be one of .*received 'endx'"):
+    with pytest.raises(InputError, match=r"channel c\.signal must be one of the model's, such as .*received 'endx'"):
         Conditioner(list(table.groups.values()), row_rate_hz=20_000, seed=1, noise=True)
 
 

@@ -10,9 +10,9 @@ import rig
 from rig import wire
 from rig.channels import default_table
 from rig.cli.main import main
+from rig.commands import COMMANDS
 from rig.interface import page
 from rig.kernels.signals import ROW, TRUTH
-from rig.scenes import COMMANDS
 
 ROWS = page().splitlines()
 

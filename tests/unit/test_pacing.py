@@ -183,11 +183,11 @@ def test_histogram_holds_any_value_and_starts_at_zero() -> None:
 
 def test_histogram_memory_does_not_grow() -> None:
     histogram = Histogram()
-    bins = len(histogram._counts)
+    bins = len(histogram.counts)
     for n in range(100_000):
         histogram.add(n * 1e-6)
-    assert len(histogram._counts) == bins
-    assert sum(histogram._counts) == histogram.count == 100_000
+    assert len(histogram.counts) == bins
+    assert sum(histogram.counts) == histogram.count == 100_000
 
 
 def test_a_wake_ends_the_wait_for_a_deadline_once() -> None:

@@ -16,7 +16,8 @@ from drivers.console import Console
 from recorder.reader import Recording, join
 from replays.player import player as player_module
 from replays.player.edit import Edit
-from replays.player.player import Part, Player
+from replays.player.passes import Part
+from replays.player.player import Player
 from replays.player.tape import Tape
 from replays.player.timeline import By, Timeline
 from rig import wire

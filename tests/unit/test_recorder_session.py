@@ -300,19 +300,6 @@ def test_blocks_with_impossible_times_are_left_out_and_odd_documents_are_kept_an
         assert found[: len(found) - more] == [payload for each, payload in kept if each == key]
 
 
-def test_what_is_being_written_still_counts_against_the_backlog():
-    inbox = recorder.session._Inbox(100)
-    for _ in range(3):
-        inbox.put(PROBES, bytes(40), 0)
-    assert inbox.dropped == 1
-    assert len(inbox.take(0.0) or []) == 2
-    inbox.put(PROBES, bytes(40), 0)
-    assert inbox.dropped == 2
-    assert inbox.take(0.0) == []
-    inbox.put(PROBES, bytes(40), 0)
-    assert (inbox.dropped, inbox.waiting_bytes, inbox.high_water_bytes) == (2, 40, 80)
-
-
 def test_stop_keeps_everything_received(path):
     client = ScriptedClient()
     session = RecordingSession(client, path)

@@ -12,20 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.channels import default_table
+from rig.commands import COMMANDS, HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.errors import InputError
-from rig.scenes import (
-    COMMANDS,
-    HammerCommand,
-    ReleaseCommand,
-    Scene,
-    SpeedCommand,
-    load_scene,
-    parse_command,
-    parse_scene,
-    read_value,
-    scene_document,
-    scene_names,
-)
+from rig.scenes import Scene, load_scene, parse_scene, read_value, scene_document, scene_names
 
 PERIODS = [n for n in range(1, 10_001) if 1_000_000 % n == 0]
 """Whole numbers of ticks whose rates are whole as well [us]."""
@@ -321,12 +310,12 @@ def test_direction_turns_from_x_toward_y(direction: Any, cosines: tuple[float, f
     ],
 )
 def test_good_commands(name: str, request_: dict[str, Any], command: object) -> None:
-    assert parse_command(name, request_) == command
+    assert check_command(name, request_) == command
 
 
 def test_a_request_cannot_become_another_command() -> None:
     with pytest.raises(InputError, match=r"speed\.command must be 'speed'; instead received 'release'"):
-        parse_command("speed", {"speed_hz": 1.0, "command": "release"})
+        check_command("speed", {"speed_hz": 1.0, "command": "release"})
 
 
 def test_scenes_are_frozen() -> None:

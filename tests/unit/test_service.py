@@ -15,10 +15,11 @@ from drivers.console import Accepted, Console
 from rig import wire
 from rig.errors import InputError, RefusedError
 from rig.pacing import Clock, FreeRun, Lockstep, RealTime, StepTimeoutError
-from rig.service import Service, _Entry, _Queue
+from rig.service import Service
+from rig.simulation import Frame
 from rig.transport import NoReplyError
 from rig.transport.memory import MemoryClient, MemoryServer
-from tests.unit.service_fake import GROUPS, TRUTH, FakeFrame, FakeSimulation
+from tests.unit.service_fake import GROUPS, TRUTH, FakeSimulation
 
 BLOCK = 10_000
 
@@ -337,8 +338,9 @@ def test_a_refusal_names_the_field_and_what_it_must_be_for_programs_too() -> Non
 def test_what_latecomers_are_told_of_the_commands_is_bounded_in_bytes() -> None:
     simulation = FakeSimulation(duration_s=None)
     with Running(simulation, Lockstep()) as rig:
+        request = wire.encode_document({"force_n": 1.0, "padding": "x" * 9_900})
         for _ in range(60):
-            rig.console._command("hammer", force_n=1.0, padding="x" * 9_900)
+            assert b'"accepted":true' in rig.listener.client.request(wire.command_key("hammer"), request)
         payload = rig.listener.client.request(wire.SCENE)
         scene = wire.decode_document(payload)
         assert len(payload) < 600_000
@@ -377,9 +379,9 @@ def test_a_paced_run_drops_whole_blocks_and_counts_them_while_it_keeps_every_eve
         now[0] += round(seconds * 1e9)
 
     class Noted(FakeSimulation):
-        def advance(self, ticks: int) -> FakeFrame:
+        def advance(self, ticks: int) -> Frame:
             frame = super().advance(ticks)
-            frame.events = [{"event": "hammer", "tick": frame.tick, "time_s": 0.0}]
+            frame.events.append({"event": "hammer", "tick": frame.tick, "time_s": 0.0})
             if self.tick >= 1_000_000:
                 server.open.set()
             return frame
@@ -418,21 +420,6 @@ def test_an_unpaced_run_waits_for_the_publisher() -> None:
     thread.join(20.0)
     assert len(listener.blocks[wire.sensor_key("probes")]) == 100
     assert listener.statuses[-1]["queue"]["dropped"] == 0
-
-
-def test_the_queue_gives_the_events_of_a_dropped_block_to_the_next() -> None:
-    queue = _Queue(1)
-    frame = FakeSimulation()
-    frame.warm_up()
-    assert queue.put(_Entry([{"event": "start"}])) == 0
-    assert queue.put(_Entry([{"event": "a"}], frame.advance(BLOCK), [{"event": "b"}])) == 0
-    assert queue.put(_Entry([{"event": "c"}], frame.advance(BLOCK))) == 1
-    queue.close()
-    entry = queue.take(0.0)
-    assert entry is not None
-    assert [event["event"] for event in entry.before] == ["start", "a", "b", "c"]
-    assert queue.take(0.0) is None
-    assert queue.finished
 
 
 def test_reports_of_clients_are_in_the_status_with_their_lag() -> None:

@@ -15,10 +15,11 @@ from replays.recordings.experiment import Experiment
 from replays.recordings.prediction import Measured, measured
 from replays.recordings.sensitivity import ANGLE, CLOCK, scale_of, value_of, with_values
 from rig.channels import Channel
+from rig.commands import COMMANDS, HammerCommand
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN
 from rig.parameters import load_parameters
-from rig.scenes import COMMANDS, HammerCommand, Scene
+from rig.scenes import Scene
 from rig.simulation import TICK_RATE_HZ
 from rig.wire import sensor_key
 

@@ -14,7 +14,8 @@ from typing import Any
 from replays.studies.ladder.measurement import Measurement
 from replays.studies.ladder.quantity import QUANTITIES, Value
 from replays.studies.ladder.search import Errors, Ladder
-from rig.scenes import Pick, PickedQuantity, pick_digests
+from rig.pick import Pick, PickedQuantity
+from rig.scenes import pick_digests
 
 _PACKAGES = ("numba", "numpy", "scipy")
 

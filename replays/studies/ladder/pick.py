@@ -7,7 +7,8 @@ import tomllib
 from pathlib import Path
 
 from rig.errors import InputError
-from rig.scenes import Pick, Scene, load_scene, pick_digests, scene_path
+from rig.pick import Pick
+from rig.scenes import Scene, load_scene, pick_digests, scene_path
 
 _HEADER = re.compile(r"^\s*\[{1,2}\s*(?P<name>[^\]\[]+?)\s*\]{1,2}\s*(#.*)?$")
 _COMMENT = '# Written by `rig ladder`: what it measured. In force where the scene says fidelity = "auto".'

@@ -13,13 +13,14 @@ from typing import Literal
 
 import numpy as np
 
+from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand
 from rig.errors import InputError
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, TOUCHING
 from rig.kernels.signals import N_STATE, STATE_SCALE
 from rig.levels import FRICTION_LAWS
 from rig.model import Model, build_model
-from rig.scenes import HammerCommand, ReleaseCommand, Scene, SpeedCommand
+from rig.scenes import Scene
 
 TICK_S = 1e-6
 """Length of a tick [s]."""

@@ -1,0 +1,75 @@
+"""What can be done to the rig while it runs: a hammer's pulse, another speed, the release of the magnets."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, FiniteFloat, field_validator
+
+from rig.errors import InputError
+from rig.outside import Written, check
+
+_DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0), "-x": (-1.0, 0.0), "-y": (0.0, -1.0)}
+
+
+class _Command(Written):
+    # `"100"` is no number, be it in a file or on a wire.
+    model_config = ConfigDict(strict=True)
+
+
+class HammerCommand(_Command):
+    """An impact of the pendulum hammer on the disk: a half-sine pulse."""
+
+    command: Literal["hammer"] = "hammer"
+    force_n: Annotated[FiniteFloat, Field(ge=1.0, le=1000.0)] = 100.0
+    """Peak force [N]."""
+    duration_ms: Annotated[FiniteFloat, Field(ge=0.5, le=50.0)] = 5.0
+    """Length of the pulse [ms]; the paper gives none."""
+    direction: str | float = "x"
+    """Along x (EAST), y (up), or at an angle from x toward y [degrees]."""
+
+    @field_validator("direction")
+    @classmethod
+    def _a_direction(cls, direction: str | float) -> str | float:
+        good = direction in _DIRECTIONS if isinstance(direction, str) else -360.0 <= direction <= 360.0
+        if not good:
+            raise ValueError(f"{', '.join(_DIRECTIONS)}, or an angle from -360 to 360 degrees")
+        return direction
+
+    @property
+    def cosines(self) -> tuple[float, float]:
+        """Direction as a unit vector (x, y)."""
+        if isinstance(self.direction, str):
+            return _DIRECTIONS[self.direction]
+        angle = math.radians(self.direction)
+        return math.cos(angle), math.sin(angle)
+
+
+class SpeedCommand(_Command):
+    """A new speed, approached at the drive's ramp rate."""
+
+    command: Literal["speed"] = "speed"
+    speed_hz: Annotated[FiniteFloat, Field(ge=0.0)]
+    """Target [Hz]; the parameter drive.top_speed limits it further."""
+
+
+class ReleaseCommand(_Command):
+    """The drop device: the magnets let go of the shaft."""
+
+    command: Literal["release"] = "release"
+
+
+Command = HammerCommand | SpeedCommand | ReleaseCommand
+COMMANDS: dict[str, type[Command]] = {"hammer": HammerCommand, "speed": SpeedCommand, "release": ReleaseCommand}
+
+
+def check_command(name: str, request: dict[str, Any]) -> Command:
+    """Check a command that came from outside.
+
+    Raises:
+        InputError: No such command, an unknown field, or a value out of its range; the message names the range.
+    """
+    if name not in COMMANDS:
+        raise InputError("command", f"one of {', '.join(COMMANDS)}", name)
+    return check(COMMANDS[name], request, field=name)

@@ -1,0 +1,88 @@
+"""The one bounded queue: what it does where there is no room, and how it ends."""
+
+from __future__ import annotations
+
+import threading
+
+from rig.bounded_queue import BoundedQueue, take_first
+
+
+def test_a_full_queue_refuses_drops_the_oldest_or_waits() -> None:
+    queue = BoundedQueue[str](2)
+    assert [queue.offer(each) for each in "abc"] == [True, True, False]
+    assert (queue.used, queue.high_water, queue.dropped) == (2, 2, 1)
+    assert queue.offer("d", room=3), "documents have room of their own"
+    assert queue.push("e") == 2
+    assert not queue.put("f", timeout_s=0.0)
+    assert not queue.wait_for_room(0.0)
+    assert (queue.dropped, queue.high_water) == (3, 3)
+    assert queue.take_many(9) == ["d", "e"]
+    assert queue.wait_for_room(0.0)
+    assert queue.take(0.0) is None
+
+
+def test_whoever_waits_for_room_or_for_an_item_goes_on() -> None:
+    queue = BoundedQueue[int](1)
+    taken: list[int | None] = []
+    reader = threading.Thread(target=lambda: taken.extend(queue.take(10.0) for _ in range(3)))
+    reader.start()
+    assert queue.put(1, 10.0)
+    assert queue.put(2, 10.0)
+    assert queue.wait_for_room(10.0)
+    queue.close()
+    reader.join(10.0)
+    assert taken == [1, 2, None]
+
+
+def test_what_was_taken_counts_until_something_else_is_taken_where_it_is_held() -> None:
+    inbox = BoundedQueue[bytes](100, size=len, holds=True)
+    for _ in range(3):
+        inbox.offer(bytes(40))
+    assert inbox.dropped == 1
+    assert len(inbox.take_many(1000, 0.0)) == 2
+    inbox.offer(bytes(40))
+    assert inbox.dropped == 2
+    assert inbox.take_many(1000, 0.0) == []
+    inbox.offer(bytes(40))
+    assert (inbox.dropped, inbox.used, inbox.high_water) == (2, 40, 80)
+
+
+def test_the_next_item_inherits_from_one_that_is_dropped_and_what_takes_no_room_does_not_count() -> None:
+    queue = BoundedQueue[list[str]](
+        1, size=lambda item: "block" in item, inherit=lambda dropped, following: following.extend(dropped)
+    )
+    assert queue.push(["start"]) == 0
+    assert queue.push(["block", "a"]) == 0
+    assert queue.push(["block", "b"]) == 1
+    assert queue.dropped == 1
+    queue.close()
+    assert queue.push(["late"]) == 0
+    assert queue.take_many(9) == [["block", "b", "block", "a", "start"], ["late"]]
+    assert queue.ended
+
+
+def test_a_closed_queue_gives_what_waits_and_takes_no_more() -> None:
+    queue = BoundedQueue[int](5)
+    queue.offer(1)
+    queue.close()
+    assert (queue.closed, queue.ended) == (True, False)
+    assert not queue.offer(2)
+    assert not queue.put(3)
+    assert queue.dropped == 0, "the end is no want of room"
+    assert queue.wait_for_item(10.0)
+    assert queue.take() == 1
+    assert queue.ended
+    assert not queue.wait_for_item(10.0)
+
+
+def test_of_two_queues_the_first_goes_before_the_other() -> None:
+    changed = threading.Condition()
+    replies, data = BoundedQueue[str](5, changed=changed), BoundedQueue[str](5, changed=changed)
+    data.offer("data")
+    replies.offer("reply")
+    assert [take_first(changed, (replies, data), 0.0) for _ in range(3)] == ["reply", "data", None]
+    data.offer("forgotten")
+    data.clear()
+    assert data.used == 0
+    replies.close()
+    assert take_first(changed, (replies, data)) is None

@@ -1,0 +1,53 @@
+"""What a stored pick depends on: the code of the equations and engines, each file of it, and no other."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import rig
+from rig.pick import equations_digest
+
+RIG = Path(rig.__file__).parent
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(RIG, tmp_path / "rig", ignore=shutil.ignore_patterns("__pycache__")))
+
+
+def test_the_digest_is_that_of_the_files_wherever_they_lie(copy: Path) -> None:
+    assert equations_digest(copy) == equations_digest()
+    kernel = next(iter(sorted((copy / "kernels").glob("*.py"))))
+    kernel.write_bytes(kernel.read_bytes().replace(b"\n", b"\r\n"))
+    assert equations_digest(copy) == equations_digest(), "line ends differ between systems"
+
+
+@pytest.mark.parametrize("changed", ["model.py", "contacts.py", "magnets.py", "levels.py", "kernels/contact.py"])
+def test_a_changed_file_of_the_equations_is_seen(copy: Path, changed: str) -> None:
+    with (copy / changed).open("a") as file:
+        file.write("# changed\n")
+    assert equations_digest(copy) != equations_digest()
+
+
+def test_a_new_file_and_one_with_another_name_are_seen(copy: Path) -> None:
+    (copy / "engines" / "deep").mkdir()
+    (copy / "engines" / "deep" / "another.py").write_text("")
+    deeper = equations_digest(copy)
+    assert deeper != equations_digest()
+    (copy / "rolling.py").write_text("")
+    assert equations_digest(copy) == deeper, "nothing of the model uses it"
+    with (copy / "model.py").open("a") as file:
+        file.write("import rig.rolling\n")
+    used = equations_digest(copy)
+    (copy / "rolling.py").write_text("WORK = 0\n")
+    assert equations_digest(copy) != used
+
+
+@pytest.mark.parametrize("other", ["service.py", "scenes.py", "errors.py", "cli/run.py", "wire.py"])
+def test_what_computes_no_motion_does_not_count(copy: Path, other: str) -> None:
+    with (copy / other).open("a") as file:
+        file.write("# changed\n")
+    assert equations_digest(copy) == equations_digest()
