@@ -7,9 +7,7 @@ Tables have one row a sample: `time [s]`, every signal of the model as `truth.NA
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +15,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from replays.recordings.background import Background
 from replays.recordings.formats import columnar, delimited
 from replays.recordings.formats.export import check_output
 from rig import wire
@@ -55,7 +54,7 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
     check_run_output(path, force=force)
     if path.suffix == ".mcap":
         return McapRun(path, simulation, force=force)
-    return _TableRun(path, simulation, columnar.Rows if path.suffix == ".parquet" else delimited.Rows)
+    return _TableRun(path, simulation, columnar.ParquetRows if path.suffix == ".parquet" else delimited.CsvRows)
 
 
 def table_columns(simulation: Simulation) -> list[str]:
@@ -79,26 +78,6 @@ def table_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
     return np.hstack([times, truth, *sensors])
 
 
-class _Background:
-    """One thread that formats and writes while the simulation goes on, a few frames behind at most."""
-
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(max_workers=1)
-        self._due: deque[Future[None]] = deque()
-
-    def call(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Do this next; raises what an earlier call raised."""
-        self._due.append(self._pool.submit(function, *arguments))
-        while len(self._due) > 4:
-            self._due.popleft().result()
-
-    def finish(self) -> None:
-        """Wait for everything; raises what a call raised."""
-        self._pool.shutdown()
-        while self._due:
-            self._due.popleft().result()
-
-
 class _TableRun:
     """A table that grows frame by frame in a file of its own until it is whole."""
 
@@ -106,7 +85,7 @@ class _TableRun:
         self.path = path
         self.simulation = simulation
         self._open_table = open_table
-        self._background = _Background()
+        self._background = Background()
 
     def __enter__(self) -> Self:
         schema = columnar.float_schema(table_columns(self.simulation))
@@ -154,7 +133,7 @@ class McapRun:
         """
         self.path, self.simulation, self._force = path, simulation, force
         self._view_rate_hz, self._epoch_ns = view_rate_hz, epoch_ns
-        self._background = _Background()
+        self._background = Background()
 
     def __enter__(self) -> Self:
         from recorder.writer import RecordingWriter

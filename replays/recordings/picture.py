@@ -7,65 +7,29 @@ from pathlib import Path
 
 import numpy as np
 
-from recorder.reader import Recording, Samples
+from recorder.reader import Recording
 from replays.recordings.verdict import hammer_time_s
-from replays.recordings.whirl import parameter_si, whirl_figures
+from replays.recordings.whirl import parameter_si, reactions, whirl_figures
 from replays.report.canvas import new_figure, save
+from rig.orbit import SPECTRUM_HZ, full_spectrum, waterfall
 
-WATERFALL_HZ = 200.0
 _BEFORE, _IMPACTS, _WHIRL = "#4c9f70", "#d1495b", "#30638e"
-
-
-def full_spectrum(x: np.ndarray, y: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Two-sided spectrum of x + j y about its mean.
-
-    Args:
-        x: Horizontal, shape (n,).
-        y: Vertical, shape (n,).
-        rate_hz: Sample rate [Hz].
-
-    Returns:
-        Frequencies [Hz], forward positive, and amplitudes (of the rotating vector, in the unit of x), each shape (n,).
-    """
-    n = len(x)
-    window = np.hanning(n)
-    orbit = (x - x.mean()) + 1j * (y - y.mean())
-    amplitude = np.abs(np.fft.fftshift(np.fft.fft(orbit * window))) / window.sum()
-    return np.fft.fftshift(np.fft.fftfreq(n, 1.0 / rate_hz)), amplitude
-
-
-def waterfall(
-    probes: Samples, *, window_s: float = 0.5, hop_s: float = 0.1
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Full spectra of the disk's orbit over time.
-
-    Returns:
-        Times of the windows' centres [s], shape (t,); frequencies [Hz], shape (f,); amplitudes [mm], shape (t, f).
-    """
-    size, hop = round(window_s * probes.rate_hz), round(hop_s * probes.rate_hz)
-    x, y = probes.column("disk_x"), probes.column("disk_y")
-    starts = range(0, max(1, len(x) - size), hop)
-    spectra = [full_spectrum(x[s : s + size], y[s : s + size], probes.rate_hz) for s in starts]
-    frequency = spectra[0][0]
-    near = np.abs(frequency) <= WATERFALL_HZ
-    times = np.array([probes.times_s[min(s + size // 2, len(x) - 1)] for s in starts])
-    return times, frequency[near], np.array([amplitude[near] for _, amplitude in spectra])
 
 
 def draw(recording: Recording, path: Path) -> None:
     """Draw the picture and write it as PNG or SVG.
 
     Raises:
-        InputError: There is no hammer blow in the recording, or the file is neither .png nor .svg.
+        InputError: There is no hammer pulse in the recording, or the file is neither .png nor .svg.
     """
     probes, forces, drive = recording.samples("probes"), recording.samples("forces"), recording.samples("drive")
-    blow_s = hammer_time_s(recording)
+    hammer_s = hammer_time_s(recording)
     end_s = float(probes.times_s[-1])
-    figures = whirl_figures(recording, max(blow_s + 0.5, end_s - 2.0), end_s)
+    figures = whirl_figures(recording, max(hammer_s + 0.5, end_s - 2.0), end_s)
     scene, parameters = recording.scene["name"], recording.parameters["set"]
     figure = new_figure(
         (15.0, 10.0),
-        f"Virtual rotor-stator rig: scene {scene}, parameters {parameters}, hammer at {blow_s:.2f} s; "
+        f"Virtual rotor-stator rig: scene {scene}, parameters {parameters}, hammer at {hammer_s:.2f} s; "
         f"whirl {figures.frequency_hz:.2f} Hz at {figures.spin_hz:.3f} Hz spin (from the recorded samples)",
         title_size=13,
     )
@@ -82,9 +46,9 @@ def draw(recording: Recording, path: Path) -> None:
     )
     ax.plot(reach * np.cos(circle), reach * np.sin(circle), "k--", lw=1, label="clearance at rest")
     for label, color, low, high in (
-        ("impacts", _IMPACTS, blow_s, blow_s + 0.06),
+        ("impacts", _IMPACTS, hammer_s, hammer_s + 0.06),
         ("whirl", _WHIRL, end_s - 0.2, end_s),
-        ("before", _BEFORE, blow_s - 0.5, blow_s),
+        ("before", _BEFORE, hammer_s - 0.5, hammer_s),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
         ax.plot(probes.column("disk_x")[kept], probes.column("disk_y")[kept], color=color, lw=0.8, label=label)
@@ -94,7 +58,7 @@ def draw(recording: Recording, path: Path) -> None:
     # Displacement, whole run and first impacts.
     for ax, low, high, title in (
         (axes[0, 1], probes.times_s[0], end_s, "Displacement at the disk"),
-        (axes[0, 2], blow_s - 0.01, blow_s + 0.12, "First impacts"),
+        (axes[0, 2], hammer_s - 0.01, hammer_s + 0.12, "First impacts"),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
         # Over the whole run a whirl is a band: both must show through.
@@ -106,15 +70,14 @@ def draw(recording: Recording, path: Path) -> None:
 
     ax = axes[1, 0]
     ax.plot(drive.times_s[::20], drive.column("speed")[::20], color=_WHIRL, lw=0.8)
-    ax.axvline(blow_s, color="0.5", lw=0.8, ls=":")
+    ax.axvline(hammer_s, color="0.5", lw=0.8, ls=":")
     ax.set(title="Spin speed", xlabel="time [s]", ylabel="[Hz]", xlim=(drive.times_s[0], end_s))
     ax.set_ylim(bottom=0, top=1.1 * float(drive.column("speed").max()))
 
-    pair_x = forces.column("P_E") - forces.column("P_W")
-    pair_y = forces.column("P_N") - forces.column("P_S")
+    pair_x, pair_y = reactions(forces)
     for ax, low, high, title in (
         (axes[1, 1], forces.times_s[0], end_s, "Reactions"),
-        (axes[1, 2], blow_s - 0.01, blow_s + 0.12, "Reactions, first impacts"),
+        (axes[1, 2], hammer_s - 0.01, hammer_s + 0.12, "Reactions, first impacts"),
         (axes[2, 0], end_s - 0.05, end_s, "Reactions, settled whirl"),
     ):
         kept = (forces.times_s >= low) & (forces.times_s < high)
@@ -126,18 +89,19 @@ def draw(recording: Recording, path: Path) -> None:
 
     ax = axes[2, 1]
     kept = probes.times_s >= end_s - 2.0
-    frequency, amplitude = full_spectrum(probes.column("disk_x")[kept], probes.column("disk_y")[kept], probes.rate_hz)
-    near = np.abs(frequency) <= WATERFALL_HZ
+    disk_x, disk_y = probes.column("disk_x"), probes.column("disk_y")
+    frequency, amplitude = full_spectrum(disk_x[kept], disk_y[kept], probes.rate_hz)
+    near = np.abs(frequency) <= SPECTRUM_HZ
     ax.semilogy(frequency[near], np.maximum(amplitude[near], 1e-5), color=_WHIRL, lw=0.8)
     ax.axvline(figures.law_hz, color="0.4", ls=":", lw=1, label=f"-spin R_S/(r0+delta) = {figures.law_hz:.1f} Hz")
     ax.set(title="Full spectrum, settled whirl", xlabel="backward  -  frequency [Hz]  -  forward", ylabel="[mm]")
     ax.legend(loc="upper right", fontsize=8)
 
     ax = axes[2, 2]
-    times, frequency, amplitude = waterfall(probes)
+    times, frequency, amplitude = waterfall(probes.times_s, disk_x, disk_y, probes.rate_hz)
     level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
     mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
     figure.colorbar(mesh, ax=ax, label="[dB re 1 um]")
-    ax.axhline(blow_s, color="w", lw=0.8, ls=":")
+    ax.axhline(hammer_s, color="w", lw=0.8, ls=":")
     ax.set(title="Full-spectrum waterfall", xlabel="backward  -  frequency [Hz]  -  forward", ylabel="time [s]")
     save(figure, path)

@@ -1,4 +1,4 @@
-"""What the model foretells for the very rows of a recording: every channel without noise, and the truth.
+"""What the model predicts for the very rows of a recording: every channel without noise, and the truth.
 
 Channels are the recording's own, with its calibration, filters and noise, on its own clock.
 """
@@ -22,7 +22,7 @@ from rig.sensors.conditioning import Conditioner
 from rig.simulation import TICK_RATE_HZ, Frame
 
 _FINE_BITS = 32
-"""Bits of a foretold channel's converter: its steps are none of the recording's."""
+"""Bits of a predicted channel's converter: its steps are none of the recording's."""
 _QUIET = 2.0
 """Below so many steps of noise a channel's rounding is not random: its floor is a bound, not a deviation."""
 _CHUNK_S = 0.1
@@ -140,7 +140,7 @@ def measured(recording: Recording, sensors: SensorChoice, *, longest_s: float = 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is foretold.
+    """What is predicted.
 
     Attributes:
         values: Of each group, on the recording's rows, in its channels' units, shape (rows, channels).

@@ -1,9 +1,9 @@
 """What the sensors would show without noise, and how that changes with any number of the experiment.
 
 A value goes by its dotted key: a parameter (`contact.friction`, in its own unit), a number of the scene
-(`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first blow; `at_s`, `duration_ms` and `direction`
-[degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its clock,
-`shaft.angle_rad` where it begins).
+(`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first hammer pulse; `at_s`, `duration_ms` and
+`direction` [degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its
+clock, `shaft.angle_rad` where it begins).
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
 """How late the recording's clock is where its samples begin, and how much faster it goes: unit, change of size 1."""
 ANGLE = "shaft.angle_rad"
 """Angle of the shaft where the samples begin, on what the experiment has [rad]: whatever the speed before was."""
-SAME_SLOPE = 0.05
-"""Two step sizes may differ by this part before a derivative is called doubtful."""
 _STEP = 1e-5
 """Step of a difference quotient, as a part of the value's scale, ..."""
 _LEAST_STEP = 1e-8
@@ -54,25 +52,13 @@ class Derivatives:
 
     Attributes:
         base: The channels at the values themselves.
-        keys: The values' keys.
         slopes: d channel / d value, in their units, by group, each shape (rows, channels); one a key.
-        steps: Step of each difference quotient, in the value's unit, shape (keys,).
-        differences: By how large a part quotients of this step and of half of it differ (root mean square over the
-            window, channels weighted by their noise), shape (keys,).
         smooth: Whether the contacts were the same ones on both sides, shape (keys,).
     """
 
     base: Prediction
-    keys: tuple[str, ...]
     slopes: tuple[dict[str, np.ndarray], ...]
-    steps: np.ndarray
-    differences: np.ndarray
     smooth: np.ndarray
-
-    @property
-    def good(self) -> np.ndarray:
-        """Which derivatives can be relied on, shape (keys,)."""
-        return self.smooth & (self.differences < SAME_SLOPE)
 
 
 def value_of(experiment: Experiment, key: str) -> float:
@@ -188,7 +174,7 @@ class Predictor:
     def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
         """The channels at some values, shape (keys,).
 
-        What a simulation rounds to its rows (times and durations of blows) is interpolated between simulations.
+        What a simulation rounds to its rows (times and durations of hammer pulses) is interpolated between simulations.
 
         Raises:
             InputError: A value that the model does not take.
@@ -207,41 +193,27 @@ class Predictor:
             self._cache[values] = self._run(dict(zip(self.keys, values, strict=True)))
         return self._cache[values]
 
-    def derivatives(
-        self,
-        values: Sequence[float] | np.ndarray,
-        *,
-        steps: Mapping[str, float] | None = None,
-        check: bool = True,
-    ) -> Derivatives:
+    def derivatives(self, values: Sequence[float] | np.ndarray) -> Derivatives:
         """How the channels change with the values, by central differences; one-sided at the edge of what is possible.
 
-        A step over which the number of contacts changes, or the slope does, is shortened.
+        A step over which the number of contacts changes is shortened.
 
         Args:
             values: Where, shape (keys,).
-            steps: By key, in the value's unit, where others than the usual ones are wanted.
-            check: Also try half the step and tell the difference; else the differences are 0.
         """
         values = np.asarray(values, dtype=float)
         base = self.predict(values)
-        chosen = np.array([self._step(place, steps) for place in range(len(self.keys))])
         found: list[dict[str, np.ndarray]] = []
-        differences, smooth = np.zeros(len(self.keys)), np.zeros(len(self.keys), dtype=bool)
+        smooth = np.zeros(len(self.keys), dtype=bool)
         for place, key in enumerate(self.keys):
-            grid = _grid(key)
-            for step in _shorter(chosen[place], grid or _LEAST_STEP * self.scales[place]):
+            grid, scale = _grid(key), self.scales[place]
+            slope: dict[str, np.ndarray] = {}
+            for step in _shorter(grid or _STEP * scale, grid or _LEAST_STEP * scale):
                 slope, smooth[place] = self._quotient(values, place, step, base)
-                chosen[place] = step
-                if check and grid is None:
-                    half, same = self._quotient(values, place, step / 2.0, base)
-                    differences[place] = self._difference(half, slope)
-                    if same:  # Richardson: the error of both goes with the square of the step
-                        slope = {name: half[name] + (half[name] - slope[name]) / 3.0 for name in half}
-                if smooth[place] and differences[place] < SAME_SLOPE:
+                if smooth[place]:
                     break
-            found.append(slope)  # pyright: ignore[reportPossiblyUnboundVariable]
-        return Derivatives(base, self.keys, tuple(found), chosen, differences, smooth)
+            found.append(slope)
+        return Derivatives(base, tuple(found), smooth)
 
     def _later(self, key: str) -> bool:
         """Whether a command comes only behind the last row: nothing of it is seen."""
@@ -264,17 +236,6 @@ class Predictor:
             }
             return replace(found[0], values=both)  # pyright: ignore[reportArgumentType]
         raise InputError(self.keys[place], "a value that can be simulated, with its neighbours", values[place])
-
-    def _difference(self, quotient: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> float:
-        def size(slopes: dict[str, np.ndarray]) -> float:
-            return math.hypot(*(float(np.linalg.norm(v / self.parts[name].floor)) for name, v in slopes.items()))
-
-        whole = size(quotient)
-        return size({name: quotient[name] - other[name] for name in quotient}) / whole if whole > 0.0 else 0.0
-
-    def _step(self, place: int, steps: Mapping[str, float] | None) -> float:
-        own = (steps or {}).get(self.keys[place])
-        return own or _grid(self.keys[place]) or _STEP * self.scales[place]
 
     def _quotient(
         self, values: np.ndarray, place: int, step: float, base: Prediction

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.whirl import WhirlFigures, parameter_si, whirl_figures
+from replays.recordings.whirl import WhirlFigures, parameter_si, reactions, whirl_figures
 from rig.errors import InputError
 from rig.simulation import ENERGY_ALARM
 
@@ -18,7 +18,7 @@ PAPER_SPIN_HZ = 6.2
 
 
 @dataclass(frozen=True)
-class Row:
+class VerdictRow:
     """One line of the verdict; `good` is None where nothing is asked for."""
 
     quantity: str
@@ -31,7 +31,7 @@ class Row:
 class Verdict:
     """All lines, and whether all that were asked for are good."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[VerdictRow, ...]
 
     @property
     def good(self) -> bool:
@@ -40,7 +40,7 @@ class Verdict:
 
 
 def hammer_time_s(recording: Recording) -> float:
-    """Simulated time of the first blow [s].
+    """Simulated time of the first hammer pulse [s].
 
     Raises:
         InputError: There is none in the recording.
@@ -48,63 +48,63 @@ def hammer_time_s(recording: Recording) -> float:
     for event in recording.events:
         if event.get("event") == "hammer":
             return float(event["time_s"])
-    raise InputError("recording", "one with a hammer blow in it", str(recording.path))
+    raise InputError("recording", "one with a hammer pulse in it", str(recording.path))
 
 
 def judge(recording: Recording) -> Verdict:
-    """Judge a recording of a hammer blow that leads to whirl; the last two seconds are taken as settled.
+    """Judge a recording of a hammer pulse that leads to whirl; the last two seconds are taken as settled.
 
     Raises:
-        InputError: There is no blow in the recording, or it is too short after it.
+        InputError: There is no hammer pulse in the recording, or it is too short after it.
     """
-    blow_s = hammer_time_s(recording)
+    hammer_s = hammer_time_s(recording)
     end_s = float(recording.samples("probes").times_s[-1])
-    figures = whirl_figures(recording, max(blow_s + 0.5, end_s - 2.0), end_s)
+    figures = whirl_figures(recording, max(hammer_s + 0.5, end_s - 2.0), end_s)
     drive = recording.samples("drive")
     spin = drive.column("speed")
-    before, after = spin[drive.times_s < blow_s], spin[drive.times_s >= blow_s]
+    before, after = spin[drive.times_s < hammer_s], spin[drive.times_s >= hammer_s]
     before_hz = float(np.mean(before)) if len(before) else float("nan")
     rows = [
         *_law_rows(figures),
         _orbit_row(recording, figures),
         *_paper_rows(figures, before_hz=before_hz),
-        _told("reaction N/S, whirl", f"{figures.reaction_y_n:.0f} N"),
-        _impact_row(recording, blow_s),
+        _stated("reaction N/S, whirl", f"{figures.reaction_y_n:.0f} N"),
+        _impact_row(recording, hammer_s),
         _spin_row(figures, before_hz=before_hz, lowest_hz=float(after.min())),
         *stream_rows(recording),
     ]
     return Verdict(tuple(rows))
 
 
-def stream_rows(recording: Recording) -> list[Row]:
+def stream_rows(recording: Recording) -> list[VerdictRow]:
     """What a recording says about its own stream: losses and pace."""
     streams = recording.streams
     lost = sum(stream.lost for stream in streams.values())
     count = sum(stream.rows for key, stream in streams.items() if "/sensors/" in key)
     rows = [
-        _asked("samples lost", f"{lost} of {count} rows", "0", lost == 0 and not recording.gaps),
-        _asked("recording", recording.end_reason, "complete", recording.complete),
+        _judged("samples lost", f"{lost} of {count} rows", "0", lost == 0 and not recording.gaps),
+        _judged("recording", recording.end_reason, "complete", recording.complete),
     ]
     if recording.last_status is not None:
         rows += _status_rows(recording.last_status)
     return rows
 
 
-def _asked(quantity: str, measured: str, expected: str, good: bool) -> Row:
+def _judged(quantity: str, measured: str, expected: str, good: bool) -> VerdictRow:
     # Comparisons of numpy numbers give numpy's own truth, of which none `is False`.
-    return Row(quantity, measured, expected, bool(good))
+    return VerdictRow(quantity, measured, expected, bool(good))
 
 
-def _told(quantity: str, measured: str, beside: str = "") -> Row:
+def _stated(quantity: str, measured: str, beside: str = "") -> VerdictRow:
     """A figure that is not judged, beside something to compare it with."""
-    return Row(quantity, measured, beside, None)
+    return VerdictRow(quantity, measured, beside, None)
 
 
 def _near(value: float, expected: float, *, within: float) -> bool:
     return abs(value / expected - 1.0) < within
 
 
-def _law_rows(figures: WhirlFigures) -> list[Row]:
+def _law_rows(figures: WhirlFigures) -> list[VerdictRow]:
     """The whirl against the law of rolling."""
     whirl_hz, disk_hz, law_hz = figures.frequency_hz, figures.disk_frequency_hz, figures.law_hz
     ring_hz = f"{whirl_hz:.3f} Hz, slip {figures.slip:.3%}"
@@ -112,27 +112,27 @@ def _law_rows(figures: WhirlFigures) -> list[Row]:
     disk_law = f"{law_hz:.3f} Hz, within 0.2 %"
     sense = "backward" if whirl_hz < 0 else "forward"
     return [
-        _asked("whirl frequency, ring probes", ring_hz, law, _near(whirl_hz, law_hz, within=2e-3)),
-        _asked("whirl frequency, disk probes", f"{disk_hz:.3f} Hz", disk_law, _near(disk_hz, law_hz, within=2e-3)),
-        _asked("sense of rotation", sense, "backward", whirl_hz < 0),
+        _judged("whirl frequency, ring probes", ring_hz, law, _near(whirl_hz, law_hz, within=2e-3)),
+        _judged("whirl frequency, disk probes", f"{disk_hz:.3f} Hz", disk_law, _near(disk_hz, law_hz, within=2e-3)),
+        _judged("sense of rotation", sense, "backward", whirl_hz < 0),
     ]
 
 
-def _orbit_row(recording: Recording, figures: WhirlFigures) -> Row:
+def _orbit_row(recording: Recording, figures: WhirlFigures) -> VerdictRow:
     """How far the shaft presses into the ring, against Hertz at the force that the transducers show."""
     delta_m = figures.radius_m - parameter_si(recording, "ring.clearance")
     force_n = (figures.reaction_x_n + figures.reaction_y_n) / 2
     hertz_m = (force_n / parameter_si(recording, "contact.stiffness")) ** (2 / 3)
     orbit = f"{figures.radius_m * 1e3:.4f} mm = r0 {delta_m * 1e6:+.1f} um"
     hertz = f"r0 {hertz_m * 1e6:+.1f} um, Hertz at {force_n:.0f} N, within 15 %"
-    return _asked("orbit in the ring", orbit, hertz, _near(delta_m, hertz_m, within=0.15))
+    return _judged("orbit in the ring", orbit, hertz, _near(delta_m, hertz_m, within=0.15))
 
 
-def _paper_rows(figures: WhirlFigures, *, before_hz: float) -> list[Row]:
+def _paper_rows(figures: WhirlFigures, *, before_hz: float) -> list[VerdictRow]:
     """The whirl against the paper's figures, which hold for its speed alone."""
     reaction = f"{figures.reaction_x_n:.0f} N"
     if not abs(before_hz - PAPER_SPIN_HZ) < 0.05:
-        return [_told("reaction E/W, whirl", reaction)]
+        return [_stated("reaction E/W, whirl", reaction)]
     whirl_hz, spin_hz = figures.frequency_hz, figures.spin_hz
     scaled_hz = whirl_hz / spin_hz * PAPER_SPIN_HZ
     paper_hz = -PAPER_WHIRL_HZ
@@ -142,28 +142,27 @@ def _paper_rows(figures: WhirlFigures, *, before_hz: float) -> list[Row]:
     at_its_spin = f"{paper_hz} Hz, within 1.5 % (delta lowers ours)"
     beside = "the paper: +-500 N measured, 0-900 N the axis of its simulation (Figs. 15, 16)"
     return [
-        _asked("against the paper's Fig. 14", whirl, as_is, _near(whirl_hz, paper_hz, within=0.03)),
-        _asked("  the same at 6.2 Hz spin", scaled, at_its_spin, _near(scaled_hz, paper_hz, within=0.015)),
-        _told("reaction E/W, whirl", reaction, beside),
+        _judged("against the paper's Fig. 14", whirl, as_is, _near(whirl_hz, paper_hz, within=0.03)),
+        _judged("  the same at 6.2 Hz spin", scaled, at_its_spin, _near(scaled_hz, paper_hz, within=0.015)),
+        _stated("reaction E/W, whirl", reaction, beside),
     ]
 
 
-def _impact_row(recording: Recording, blow_s: float) -> Row:
+def _impact_row(recording: Recording, hammer_s: float) -> VerdictRow:
     """The hardest impacts, in each direction."""
     forces = recording.samples("forces")
-    after = forces.times_s >= blow_s
-    pairs = [forces.column(a)[after] - forces.column(b)[after] for a, b in (("P_E", "P_W"), ("P_N", "P_S"))]
-    largest = " / ".join(f"{np.abs(pair).max():.0f} N" for pair in pairs)
-    return _told("largest reactions E/W / N/S", largest, "the paper: +-5000 N, the axes of its simulation (Fig. 15)")
+    after = forces.times_s >= hammer_s
+    largest = " / ".join(f"{np.abs(pair[after]).max():.0f} N" for pair in reactions(forces))
+    return _stated("largest reactions E/W / N/S", largest, "the paper: +-5000 N, the axes of its simulation (Fig. 15)")
 
 
-def _spin_row(figures: WhirlFigures, *, before_hz: float, lowest_hz: float) -> Row:
+def _spin_row(figures: WhirlFigures, *, before_hz: float, lowest_hz: float) -> VerdictRow:
     """The drive gives way to the impacts: the spin dips."""
     spin = f"{before_hz:.3f} / {lowest_hz:.3f} / {figures.spin_hz:.3f} Hz"
-    return _asked("spin: before, lowest, settled", spin, "dips, and recovers in part", lowest_hz < before_hz - 0.05)
+    return _judged("spin: before, lowest, settled", spin, "dips, and recovers in part", lowest_hz < before_hz - 0.05)
 
 
-def _status_rows(status: dict[str, Any]) -> list[Row]:
+def _status_rows(status: dict[str, Any]) -> list[VerdictRow]:
     """What the service said of itself, in its last status of the recording."""
     late, block_ms, factor = status["lateness_ms"], status["block_ms"], status["real_time_factor"]
     residual_j, dissipated_j = status["energy"]["residual_j"], status["energy"]["dissipated_j"]
@@ -171,7 +170,7 @@ def _status_rows(status: dict[str, Any]) -> list[Row]:
     ledger = f"{residual_j:.1e} J of {dissipated_j:.2f} J"
     closed = abs(residual_j) < ENERGY_ALARM * max(dissipated_j, 1e-6)
     return [
-        _asked("lateness p50 / p99 / max", lateness, f"p99 below a block of {block_ms:g} ms", late["p99"] < block_ms),
-        _asked("real-time factor", f"{factor:.4f}", "1.000", abs(factor - 1.0) < 2e-3),
-        _asked("energy residual", ledger, f"below {ENERGY_ALARM:g} of what was dissipated", closed),
+        _judged("lateness p50 / p99 / max", lateness, f"p99 below a block of {block_ms:g} ms", late["p99"] < block_ms),
+        _judged("real-time factor", f"{factor:.4f}", "1.000", abs(factor - 1.0) < 2e-3),
+        _judged("energy residual", ledger, f"below {ENERGY_ALARM:g} of what was dissipated", closed),
     ]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from recorder.reader import Recording
+from recorder.reader import Recording, Samples
 from rig.errors import InputError
+from rig.orbit import whirl_frequency
 
 
 @dataclass(frozen=True)
@@ -40,20 +40,6 @@ class WhirlFigures:
     reaction_y_n: float
 
 
-def whirl_frequency(times_s: np.ndarray, x: np.ndarray, y: np.ndarray) -> float:
-    """Slope of the phase of x + j y about the orbit's centre [Hz]; forward (with the spin, from x to y) is positive.
-
-    Unlike the bin of a spectrum this has no resolution limit; the orbit must go round its centre.
-
-    Args:
-        times_s: Times [s], shape (n,).
-        x: Horizontal, shape (n,).
-        y: Vertical, shape (n,).
-    """
-    orbit = (x - x.mean()) + 1j * (y - y.mean())
-    return float(np.polyfit(times_s - times_s[0], np.unwrap(np.angle(orbit)), 1)[0] / (2 * math.pi))
-
-
 def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigures:
     """Work out the figures of a stretch.
 
@@ -75,7 +61,7 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
     radius = float(np.hypot(ring_x, ring_y).mean())
     law = -spin * shaft_radius_m(recording) / radius
     held = (forces.times_s >= from_s) & (forces.times_s < to_s)
-    pairs = [forces.column(a)[held] - forces.column(b)[held] for a, b in (("P_E", "P_W"), ("P_N", "P_S"))]
+    pairs = [reaction[held] for reaction in reactions(forces)]
     return WhirlFigures(
         from_s=from_s,
         to_s=to_s,
@@ -88,6 +74,11 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
         reaction_x_n=float(np.ptp(pairs[0]) / 2),
         reaction_y_n=float(np.ptp(pairs[1]) / 2),
     )
+
+
+def reactions(forces: Samples) -> tuple[np.ndarray, np.ndarray]:
+    """What opposed transducers differ by: P_E - P_W and P_N - P_S [N], each shape (n,)."""
+    return forces.column("P_E") - forces.column("P_W"), forces.column("P_N") - forces.column("P_S")
 
 
 def parameter_si(recording: Recording, key: str) -> float:

@@ -64,7 +64,7 @@ class Picture:
     caption: str
 
 
-Part = Heading | Paragraph | Table | Picture
+ReportPart = Heading | Paragraph | Table | Picture
 
 
 class Report:
@@ -79,7 +79,7 @@ class Report:
     def __init__(self, title: str, lead: str = "") -> None:
         self.title = title
         self.lead = lead
-        self.parts: list[Part] = []
+        self.parts: list[ReportPart] = []
 
     def heading(self, text: str, *, level: int = 1) -> None:
         """Add a heading; level 1 or 2."""

@@ -8,7 +8,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from replays.report.document import Heading, Paragraph, Part, Picture, Report, Table
+from replays.report.document import Heading, Paragraph, Picture, Report, ReportPart, Table
 
 if TYPE_CHECKING:
     from fpdf import FPDF
@@ -71,7 +71,7 @@ def render(report: Report) -> bytes:
     return bytes(pdf.output())
 
 
-def _room(pdf: FPDF, parts: list[Part]) -> float:
+def _room(pdf: FPDF, parts: list[ReportPart]) -> float:
     """Height of headings with the start of what follows them [mm]: none stands alone at the foot of a page."""
     headings = list(takewhile(lambda part: isinstance(part, Heading), parts))
     following = parts[len(headings)] if len(headings) < len(parts) else None

@@ -29,7 +29,7 @@ _SMALL = {"sensors.truth_rate_hz": 100}
 
 
 @dataclass(frozen=True)
-class Session:
+class ReferenceSession:
     """One reference session: a scene, cut short and sampled slowly."""
 
     name: str
@@ -40,18 +40,22 @@ class Session:
 SESSIONS = {
     session.name: session
     for session in (
-        Session("drop", "drop", {"duration_s": 0.4, "sensors.rate_hz": 5000}),
-        Session("stable-run", "stable-run", {"duration_s": 0.6, "sensors.rate_hz": 2000}),
+        ReferenceSession("drop", "drop", {"duration_s": 0.4, "sensors.rate_hz": 5000}),
+        ReferenceSession("stable-run", "stable-run", {"duration_s": 0.6, "sensors.rate_hz": 2000}),
         *(
-            Session(f"hammer-{hz}", "hammer", {"duration_s": 0.6, "sensors.rate_hz": 5000, "drive.speed_hz": hz})
+            ReferenceSession(
+                f"hammer-{hz}", "hammer", {"duration_s": 0.6, "sensors.rate_hz": 5000, "drive.speed_hz": hz}
+            )
             for hz in (3.2, 4.2, 5.2, 6.2)
         ),
-        Session("partial-rub", "partial-rub", {"duration_s": 0.9, "sensors.rate_hz": 5000}),
+        ReferenceSession("partial-rub", "partial-rub", {"duration_s": 0.9, "sensors.rate_hz": 5000}),
     )
 }
 
 
-def make(session: Session, folder: Path, *, step: Callable[[str], None] = lambda _text: None) -> tuple[Path, Path]:
+def make(
+    session: ReferenceSession, folder: Path, *, step: Callable[[str], None] = lambda _text: None
+) -> tuple[Path, Path]:
     """Make one session: NAME.mcap and NAME.toml, each whole or not there; what stood there is replaced.
 
     Args:
@@ -68,14 +72,14 @@ def make(session: Session, folder: Path, *, step: Callable[[str], None] = lambda
     return recording, text
 
 
-def _record(session: Session, path: Path) -> None:
+def _record(session: ReferenceSession, path: Path) -> None:
     simulation = Simulation(load_scene(session.scene, {**_SMALL, **session.changes}))
     with McapRun(path, simulation, force=True, view_rate_hz=0.0, epoch_ns=_EPOCH_NS) as writer:
         for frame in frames(simulation):
             writer.write(frame)
 
 
-def quantities_text(session: Session, found: Validation) -> str:
+def quantities_text(session: ReferenceSession, found: Validation) -> str:
     """The quantities of a session as TOML, phase by phase, as its sensors show them (energies: the truth)."""
     lines = [
         f"# Quantities of {session.name}.mcap, read off the recording; made with it by `{COMMAND}`.",

@@ -129,7 +129,7 @@ def _truth(found: Validation) -> Table:
 
 
 def _statistics(found: Validation) -> Table:
-    table = new_table("Phases", "phase", "quantity", ">recorded", ">foretold", ">limit", "verdict")
+    table = new_table("Phases", "phase", "quantity", ">recorded", ">predicted", ">limit", "verdict")
     for one in found.statistics:
         limit = "" if one.limit is None else f"+- {one.limit:.2g}"
         table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])

@@ -22,9 +22,8 @@ import pytest
 
 import rig.cli
 from recorder.reader import Recording
-from replays.recordings.formats.conversion import convert
+from replays.recordings.formats.conversion import convert, write_recording
 from replays.recordings.formats.export import export
-from replays.recordings.formats.imported import write_recording
 from replays.recordings.formats.mapping import FileOptions, Mapping, load_mapping
 from replays.recordings.formats.selection import select
 from replays.recordings.formats.source import open_source

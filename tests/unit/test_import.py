@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import tomllib
 import wave
@@ -18,8 +19,7 @@ from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
 from replays.recordings.formats import clock, unit
 from replays.recordings.formats import mapping as mappings
-from replays.recordings.formats.conversion import Conversion, convert
-from replays.recordings.formats.imported import write_recording
+from replays.recordings.formats.conversion import Conversion, convert, write_recording
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import open_source
 from replays.recordings.formats.template import example, template
@@ -680,10 +680,10 @@ source = "speed"
 """
 
 
-def test_a_blow_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
+def test_a_hammer_pulse_is_found_and_becomes_a_scene(tmp_path: Path) -> None:
     path = hammer_log(tmp_path / "x.csv", at_s=0.73211, force_n=87.0, duration_s=6.5e-3)
     conversion, recording = imported(tmp_path, [path], HAMMER_MAPPING)
-    assert len(conversion.blows) == 1
+    assert len(conversion.pulses) == 1
     experiment = Experiment.of(recording)
     assert experiment.first_s == 5.0  # time zero lies before the first sample, so that the scene settles
     (timed,) = experiment.scene.commands
@@ -890,6 +890,14 @@ def test_damaged_files_are_one_line(
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["m.toml", name])
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+@pytest.mark.parametrize("name", ["log.csv", "log.wav"])
+def test_a_pipe_is_no_log_and_is_not_waited_for(name: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match=r"^file must be a file that can be read; instead received .*not a regular"):
+        open_source(tmp_path / name, FileOptions())
+
+
 # pyuff leaves the file that it writes to the garbage collector.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("suffix", [".tdms", ".uff"])
@@ -989,11 +997,11 @@ def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsy
 
 def test_a_comment_that_is_json_is_told_by_its_label(tmp_path: Path) -> None:
     from replays.recordings.formats.source import Entry
-    from replays.recordings.formats.template import _label
+    from replays.recordings.formats.template import label_of
 
-    assert _label(Entry("x", "", "mm", 1, None, label=json.dumps({"name": "x", "label": "Ring"}))) == "Ring"
-    assert _label(Entry("x", "", "mm", 1, None, label="{not json")) == "{not json"
-    assert _label(Entry("x", "", "mm", 1, None, label="long " * 20)).endswith("...")
+    assert label_of(Entry("x", "", "mm", 1, None, label=json.dumps({"name": "x", "label": "Ring"}))) == "Ring"
+    assert label_of(Entry("x", "", "mm", 1, None, label="{not json")) == "{not json"
+    assert label_of(Entry("x", "", "mm", 1, None, label="long " * 20)).endswith("...")
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import pytest
 
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
-from replays.recordings.formats.conversion import convert
-from replays.recordings.formats.imported import write_recording
+from replays.recordings.formats.conversion import convert, write_recording
 from replays.recordings.formats.mapping import load_mapping
 from replays.recordings.identification.nuisance import check_begin, is_imported, nuisances_of, tune
 from replays.recordings.sensitivity import ANGLE, value_of, with_values

@@ -15,7 +15,7 @@ from recorder.writer import RecordingWriter
 from replays.recordings.experiment import Experiment
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
 from replays.recordings.validation import load_criteria, outcome, validate
-from replays.recordings.validation.attribution import Explained, Explanation, _conclude, attribute
+from replays.recordings.validation.attribution import Explained, Explanation, attribute, conclude
 from replays.recordings.validation.criteria import DEFAULT
 from replays.recordings.validation.phases import View, find_phases, quantities, spectrum_distance
 from rig.errors import InputError
@@ -308,7 +308,7 @@ def test_two_that_explain_it_alike_are_both_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("left", "nearest"), [(1.0, False), (31.0, True)])
 def test_the_nearest_candidate_is_no_explanation_where_more_than_noise_is_left(left: float, nearest: bool) -> None:
     one = Explanation("model", "ring.clearance", "+2 %", 0.02, "", 0.97, left, 1e4 * left**2, 10_000, 0.3)
-    conclusion, names = _conclude([one], [], load_criteria().attribution, end_s=0.3)
+    conclusion, names = conclude([one], [], load_criteria().attribution, end_s=0.3)
     assert conclusion.startswith("nothing alone explains it") == nearest
     assert names == ("ring.clearance",)
 

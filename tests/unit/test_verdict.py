@@ -12,15 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from replays.recordings.export import writer_for
-from replays.recordings.picture import draw, full_spectrum
+from replays.recordings.picture import draw
 from replays.recordings.verdict import Verdict, hammer_time_s, judge
-from replays.recordings.whirl import parameter_si, whirl_figures, whirl_frequency
+from replays.recordings.whirl import parameter_si, whirl_figures
 from rig import wire
 from rig.errors import InputError
 from rig.offline import frames
@@ -202,10 +200,10 @@ def test_what_the_rig_said_of_itself_counts(
     assert len(verdict.rows) == len(judge(good).rows) + 3
 
 
-def test_a_recording_without_a_blow_is_refused(tmp_path: Path) -> None:
+def test_a_recording_without_a_hammer_pulse_is_refused(tmp_path: Path) -> None:
     quiet = simulated(tmp_path / "quiet.mcap", "stable-run", duration_s=0.2)
     for use in (hammer_time_s, judge, lambda recording: draw(recording, tmp_path / "quiet.png")):
-        with pytest.raises(InputError, match=r"^recording must be one with a hammer blow in it"):
+        with pytest.raises(InputError, match=r"^recording must be one with a hammer pulse in it"):
             use(quiet)
     assert not (tmp_path / "quiet.png").exists()
 
@@ -223,61 +221,10 @@ def test_a_recording_without_the_instruments_is_refused(tmp_path: Path, groups: 
         judge(simulated(tmp_path / "few.mcap", sensors__groups=groups, duration_s=0.1))
 
 
-def test_a_blow_that_dies_out_is_not_good(tmp_path: Path) -> None:
+def test_a_hammer_pulse_that_dies_out_is_not_good(tmp_path: Path) -> None:
     command = '[{ at_s = 0.02, command = "hammer", duration_ms = 2.0 }]'
     verdict = judge(simulated(tmp_path / "weak.mcap", commands=command))
     assert bad(verdict) >= {"whirl frequency, ring probes", "orbit in the ring"}
-
-
-def orbit(
-    hz: float, *, n: int = 4_000, rate: float = 4_000.0, noise: float = 0.0, centre: complex = 0.0
-) -> tuple[np.ndarray, ...]:
-    times = np.arange(n) / rate
-    rng = np.random.default_rng(1)
-    z = centre + np.exp(2j * math.pi * (hz * times + 0.1)) + noise * (rng.normal(size=n) + 1j * rng.normal(size=n))
-    return times, z.real, z.imag
-
-
-@given(
-    hz=st.floats(3.0, 500.0),
-    forward=st.booleans(),
-    x=st.floats(-3.0, 3.0),
-    y=st.floats(-3.0, 3.0),
-    start_s=st.floats(0.0, 1e5),
-)
-def test_whirl_frequency_knows_sense_and_needs_no_centre(
-    hz: float, forward: bool, x: float, y: float, start_s: float
-) -> None:
-    sign = 1.0 if forward else -1.0
-    times, ox, oy = orbit(sign * hz, centre=complex(x, y))
-    found = whirl_frequency(times + start_s, ox, oy)
-    # A part of a turn left over moves the mean, and with it the centre, by up to 1 part in 2 pi turns.
-    assert found == pytest.approx(sign * hz, abs=0.2 / hz + 1e-6)
-    assert whirl_frequency(times + start_s, ox, -oy) == pytest.approx(-found, rel=1e-9)
-    assert whirl_frequency(times + start_s, oy, ox) == pytest.approx(-found, rel=1e-6)
-
-
-@pytest.mark.parametrize("hz", [-83.7, -20.0, 6.2])
-def test_whirl_frequency_reads_through_noise(hz: float) -> None:
-    times, x, y = orbit(hz, noise=0.1)
-    # Phase noise of 0.1 rad over 4000 samples of 1 s: sqrt(12 / 4000) x 0.1 / (2 pi) = 0.9 mHz.
-    assert whirl_frequency(times, x, y) == pytest.approx(hz, abs=5e-3 + 0.2 / abs(hz) ** 2)
-
-
-def test_whirl_frequency_is_not_bound_to_the_bins_of_a_spectrum() -> None:
-    for hz in (-83.70, -83.75, -83.80):
-        times, x, y = orbit(hz)
-        assert whirl_frequency(times, x, y) == pytest.approx(hz, abs=0.005)
-
-
-@pytest.mark.parametrize("hz", [-80.0, 6.0])
-def test_full_spectrum_shows_sense_and_amplitude(hz: float) -> None:
-    _, x, y = orbit(hz, centre=3 + 2j)
-    frequency, amplitude = full_spectrum(0.7 * x, 0.7 * y, 4_000.0)
-    top = int(np.argmax(amplitude))
-    assert frequency[top] == pytest.approx(hz)
-    assert amplitude[top] == pytest.approx(0.7, rel=1e-3)
-    assert amplitude[np.argmin(np.abs(frequency + hz))] < 1e-5, "nothing on the other side"
 
 
 def test_picture_is_drawn(good: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,19 +6,20 @@ import json
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.recordings.formats import export
 from replays.recordings.formats.dialect import parse_heading, time_column
-from replays.recordings.formats.source import Entry, Signal, Source, even_rate_hz
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
-    from replays.recordings.formats.selection import Chunk, Column, Selection, Table
+    from replays.recordings.formats.selection import Column, ExportChunk, ExportTable, Selection
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a Parquet file.
 
     Raises:
@@ -52,8 +53,8 @@ def open_file(path: Path, options: FileOptions) -> Source:
                 Entry(name, "", unit or told.get("unit", ""), file.metadata.num_rows, rate, c, told.get("label", ""))
             )
 
-    def read(entry: Entry) -> Signal:
-        return Signal(values=column(entry.place), times_s=times_s)
+    def read(entry: Entry) -> FileSignal:
+        return FileSignal(values=column(entry.place), times_s=times_s)
 
     kept = {key.decode(): text.decode(errors="replace") for key, text in about.items() if key != b"ARROW:schema"}
     return Source(path=path, format="Parquet", entries=tuple(entries), read=read, about=kept, start=start)
@@ -102,19 +103,7 @@ def first_instant(column: Any) -> datetime | None:
     return None if told is None else told.replace(microsecond=0)
 
 
-class RowsFile(Protocol):
-    """A file that grows by rows."""
-
-    def write(self, columns: Sequence[np.ndarray]) -> None:
-        """Take rows, column by column, each shape (n,)."""
-        ...
-
-    def close(self) -> None:
-        """Write what is left."""
-        ...
-
-
-class Rows:
+class ParquetRows:
     """A Parquet file that grows by rows."""
 
     def __init__(self, path: Path, schema: Any) -> None:
@@ -157,13 +146,13 @@ def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
     return pyarrow.Table.from_arrays(arrays, schema=schema)
 
 
-class Writer:
+class ParquetWriter(export.FormatWriter):
     """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata."""
 
     merged = True
     sparse = True
-    rows: Callable[[Path, Any], RowsFile] = Rows
-    """What takes the rows."""
+    rows: Callable[[Path, Any], Any] = ParquetRows
+    """What takes the rows: has `write` and `close`."""
 
     def __init__(self, path: Path, selection: Selection) -> None:
         import pyarrow
@@ -175,20 +164,12 @@ class Writer:
             told = {key: str(value) for key, value in column.metadata.items()}
             fields.append(pyarrow.field(column.heading, _type(column, kind), metadata=told))
         whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz})}
-        self._rows = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
+        self._file = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
 
-    def write(self, table: Table, chunk: Chunk) -> None:
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows; those that no stream has are left out."""
         values = [table.exported(c, chunk)[chunk.present] for c in range(len(table.columns))]
-        self._rows.write([chunk.times_s[chunk.present], *values])
-
-    def close(self) -> None:
-        """Write what is left."""
-        self._rows.close()
-
-    def abandon(self) -> None:
-        """Let go of the file."""
-        self._rows.close()
+        self._file.write([chunk.times_s[chunk.present], *values])
 
 
 def _type(column: Column, kind: Any) -> Any:

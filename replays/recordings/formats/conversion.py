@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,25 +13,15 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.formats import clock, events
-from replays.recordings.formats.counts import ImportedChannel, quantise
-from replays.recordings.formats.mapped import (
-    MappedSignal,
-    Moves,
-    align,
-    axis_of,
-    check_rows,
-    engineering,
-    find_signal,
-    shifted,
-    take,
-)
+from replays.recordings.formats.group import ImportedChannel, PlacedGroup, place, quantise, rotate
+from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, engineering
 from replays.recordings.formats.mapping import Mapping
-from replays.recordings.formats.placement import PlacedGroup, place, rotate
-from replays.recordings.formats.source import Source, open_source
+from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
 
 TICK_RATE_HZ = 1_000_000
+_BLOCK_S = 0.05
 NO_SCENE = "none (imported)"
 _EPOCH_S = (946_684_800.0, 4_102_444_800.0)
 """Times from 2000 to 2100 in seconds since 1970: none that a measurement began at 0 would reach."""
@@ -47,13 +37,12 @@ class Conversion:
         present: Which rows there are, by group, shape (rows,).
         first_tick: Tick of the first row, by group.
         edges: Keyphasor edges [ticks], float64, shape (turns,).
-        blows: Hammer blows that were found.
+        pulses: Hammer pulses that were found.
         channels: What was done, channel by channel.
         remarks: What was done to the whole, and what was assumed.
         document: All of that, the mapping and the files, as JSON.
         start: Wall time of the recording's time zero.
         experiment: Scene, parameters and scene document, or None.
-        clock_known: The source told when it was.
     """
 
     table: ChannelTable
@@ -61,7 +50,7 @@ class Conversion:
     present: dict[str, np.ndarray]
     first_tick: dict[str, int]
     edges: np.ndarray
-    blows: tuple[events.Blow, ...]
+    pulses: tuple[events.HammerPulse, ...]
     channels: tuple[ImportedChannel, ...]
     remarks: tuple[str, ...]
     document: dict[str, Any]
@@ -88,31 +77,32 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     Raises:
         InputError: Something in the files is not as the mapping says, or would be lost silently.
     """
-    sources = _open(files, mapping)
-    remarks = [f"{source.path.name}: {remark}" for source in sources for remark in source.remarks]
+    log = Log(files, mapping)
+    remarks = log.remarks
     say("reading")
-    taken = [take(name, wanted, sources, mapping) for name, wanted in mapping.channels.items()]
+    taken = [log.take(name, wanted) for name, wanted in mapping.channels.items()]
     say("aligning")
-    moves = align(sources, mapping, remarks)
+    log.align()
     for entry in taken:
-        entry.axis = shifted(entry.axis, entry.source, entry.entry, moves).moved(-entry.mapping.delay_us * 1e-6)
+        axis = log.on_common_clock(entry.axis, entry.source, entry.entry)
+        entry.axis = axis.moved(-entry.mapping.delay_us * 1e-6)
     check_rows(taken)
     for entry in taken:
         engineering(entry, mapping)
-    blows, low_s, high_s = _range(taken, mapping, remarks)
+    pulses, low_s, high_s = _range(taken, log)
     say("placing samples")
     groups, zero_s = place(taken, mapping, low_s, high_s)
-    rotated = rotate(groups, mapping, remarks)
-    table, counts, present, channels = quantise(groups, rotated)
+    rotate(groups, mapping, remarks)
+    table, counts, present, channels = quantise(groups)
     lead_s = mapping.experiment.lead if mapping.experiment is not None else 0
     zero_s -= lead_s
     if lead_s:
         remarks.append(f"time zero lies {lead_s} s before the first sample: so long the scene runs, to have settled")
     first_tick = {name: round((group.start_s - zero_s) * TICK_RATE_HZ) for name, group in groups.items()}
-    edges = _edges(sources, mapping, moves, zero_s, groups, remarks)
-    since = tuple(replace(blow, at_s=blow.at_s - zero_s) for blow in blows)
-    kept = tuple(blow for blow in since if blow.at_s >= 0.0)
-    begin = _began(sources[0], mapping, zero_s, remarks)
+    edges = _edges(log, zero_s, groups)
+    since = tuple(replace(pulse, at_s=pulse.at_s - zero_s) for pulse in pulses)
+    kept = tuple(pulse for pulse in since if pulse.at_s >= 0.0)
+    begin = _began(log, zero_s)
     end_s = max(first_tick[name] / TICK_RATE_HZ + group.rows / group.rate_hz for name, group in groups.items())
     experiment = None
     if mapping.experiment is not None:
@@ -123,7 +113,7 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     document = {
         "files": [
             {"name": source.path.name, "format": source.format, "sha256": _digest(source.path), **source.about}
-            for source in sources
+            for source in log.sources
         ],
         "zero_s": zero_s,
         "start": begin.isoformat(),
@@ -132,20 +122,14 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
         "remarks": remarks,
     }
     return Conversion(
-        table=table, counts=counts, present=present, first_tick=first_tick, edges=edges, blows=kept,
+        table=table, counts=counts, present=present, first_tick=first_tick, edges=edges, pulses=kept,
         channels=tuple(channels), remarks=tuple(remarks), document=document, start=begin, experiment=experiment,
     )  # fmt: skip
 
 
-def _open(files: Sequence[Path], mapping: Mapping) -> list[Source]:
-    if len({path.name for path in files}) < len(files):
-        raise InputError("file", "files of different names", ", ".join(path.name for path in files))
-    return [open_source(path, mapping.file) for path in files]
-
-
-def _began(source: Source, mapping: Mapping, zero_s: float, remarks: list[str]) -> datetime:
+def _began(log: Log, zero_s: float) -> datetime:
     """Wall time of the recording's time zero."""
-    start = mapping.time.start or source.start
+    start, remarks = log.mapping.time.start or log.sources[0].start, log.remarks
     if start is not None:
         if start.tzinfo is None:
             remarks.append(f"{start.isoformat()} has no time zone: taken as UTC (time.start says otherwise)")
@@ -163,41 +147,35 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _range(
-    taken: Sequence[MappedSignal], mapping: Mapping, remarks: list[str]
-) -> tuple[tuple[events.Blow, ...], float, float]:
-    """Blows (in the time of the source), and from when to when is imported [s]."""
+def _range(taken: Sequence[MappedSignal], log: Log) -> tuple[tuple[events.HammerPulse, ...], float, float]:
+    """Hammer pulses (in the time of the source), and from when to when is imported [s]."""
+    mapping = log.mapping
     low = -math.inf if mapping.time.from_s is None else mapping.time.from_s
     high = math.inf if mapping.time.to_s is None else mapping.time.to_s
-    blows: tuple[events.Blow, ...] = ()
+    pulses: tuple[events.HammerPulse, ...] = ()
     if mapping.hammer is not None:
         hammer = next(entry for entry in taken if entry.name == "hammer")
-        found = events.find_blows(hammer.values, hammer.axis, mapping.hammer)
-        blows = tuple(blow for blow in found if low <= blow.at_s <= high)
-        if not blows:
+        found = events.find_pulses(hammer.values, hammer.axis, mapping.hammer)
+        pulses = tuple(pulse for pulse in found if low <= pulse.at_s <= high)
+        if not pulses:
             largest = float(np.nanmax(hammer.values))
             raise InputError("hammer.threshold_n", f"below the largest force, {largest:.3g} N, in what is imported",
                              mapping.hammer.threshold_n)  # fmt: skip
-        told = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in blows[:5])
-        remarks.append(f"{len(blows)} hammer blows found: {told}")
+        told = ", ".join(f"{b.force_n:.4g} N for {b.duration_ms:.3g} ms" for b in pulses[:5])
+        log.remarks.append(f"{len(pulses)} hammer pulses found: {told}")
         if mapping.hammer.pre_s is not None:
-            low = max(low, blows[0].at_s - mapping.hammer.pre_s)
-    return blows, low, high
+            low = max(low, pulses[0].at_s - mapping.hammer.pre_s)
+    return pulses, low, high
 
 
-def _edges(
-    sources: Sequence[Source], mapping: Mapping, moves: Moves, zero_s: float, groups: dict[str, PlacedGroup],
-    remarks: list[str],
-) -> np.ndarray:  # fmt: skip
+def _edges(log: Log, zero_s: float, groups: dict[str, PlacedGroup]) -> np.ndarray:
     """Keyphasor edges in ticks from time zero."""
-    wanted = mapping.keyphasor
+    wanted = log.mapping.keyphasor
     if wanted is None:
         return np.empty(0)
-    source, entry = find_signal(wanted, sources, "keyphasor")
-    signal = source.read(entry)
-    axis = axis_of(source, entry, signal, mapping)
-    values = axis.placed(signal.physical)
-    axis = shifted(axis, source, entry, moves)
+    source, entry = log.find(wanted, "keyphasor")
+    signal, axis = log.read(source, entry, "keyphasor")
+    values, axis = signal.physical, log.on_common_clock(axis, source, entry)
     found, level = clock.crossings(
         values, axis, threshold=wanted.threshold, hysteresis=wanted.hysteresis, falling=wanted.edge == "falling"
     )
@@ -207,7 +185,125 @@ def _edges(
     found = found[:: wanted.pulses_per_turn]
     end_s = max(group.start_s + group.rows / group.rate_hz for group in groups.values())
     kept = found[(found >= zero_s) & (found < end_s)]
-    remarks.append(
+    log.remarks.append(
         f"{len(kept)} keyphasor edges: {entry.name} {wanted.edge} through {level:.4g}, straight line between samples"
     )
     return (kept - zero_s) * TICK_RATE_HZ
+
+
+def write_recording(
+    conversion: Conversion, path: Path, *, force: bool = False, progress: Callable[[float], None] = lambda part: None
+) -> None:
+    """Write a recording; nothing is left behind on an error.
+
+    Args:
+        conversion: What to write.
+        path: File name, ends in .mcap.
+        force: Replace an existing file.
+        progress: Told the part done, 0 to 1.
+
+    Raises:
+        InputError: The destination cannot be used.
+    """
+    from recorder.writer import RecordingWriter
+
+    experiment = conversion.experiment
+    scene: dict[str, Any] = {"name": NO_SCENE, "seed": ""}
+    parameters: dict[str, Any] = {"set": "", "values": {}}
+    if experiment is not None:
+        scene, parameters = experiment.scene, experiment.parameters
+    writer = RecordingWriter(
+        path,
+        catalogue=_catalogue(conversion),
+        parameters=parameters,
+        scene={**scene, "import": conversion.document},
+        force=force,
+    )
+    start_ns = round(conversion.start.timestamp() * 1e9)
+    try:
+        for tick, key, payload in _payloads(conversion):
+            writer.write(key, payload, start_ns + tick * (1_000_000_000 // TICK_RATE_HZ))
+            progress(min(1.0, tick / conversion.end_tick))
+        writer.finish("completed", notes={"imported": ", ".join(f["name"] for f in conversion.document["files"])})
+    finally:
+        writer.abandon()
+
+
+def _catalogue(conversion: Conversion) -> dict[str, Any]:
+    texts = {"Imported": "no samples of this rig; what was done to them stands below and in scene.json under `import`"}
+    for channel in conversion.channels:
+        texts[channel.name] = f"{channel.source}; {channel.formula}; {channel.time}; counts: {channel.counts}"
+    texts |= {f"Remark {n + 1}": remark for n, remark in enumerate(conversion.remarks)}
+    return {
+        "root": wire.ROOT, "tick_rate_hz": TICK_RATE_HZ, "table": conversion.table.model_dump(mode="json"), "truth": {},
+        "reference": texts,
+    }  # fmt: skip
+
+
+def _payloads(conversion: Conversion) -> Iterator[tuple[int, str, bytes]]:
+    """Tick, key and bytes of everything, in order of time."""
+    yield 0, wire.EVENTS, _event(0, "import", files=", ".join(file["name"] for file in conversion.document["files"]))
+    due: list[tuple[int, str, bytes | wire.Block]] = sorted(
+        [
+            *((tick, wire.EVENTS, payload) for tick, payload in _happenings(conversion)),
+            *(block for name in conversion.counts for block in _blocks(conversion, name)),
+            *_edge_blocks(conversion),
+        ],
+        key=lambda item: item[0],
+    )
+    rows = wire.Continuity()
+    for tick, key, content in due:
+        if isinstance(content, wire.Block):
+            rows.follow(key, content.index, len(content.values))
+            content = wire.encode_block(content)
+        yield tick, key, content
+    yield conversion.end_tick, wire.EVENTS, _event(conversion.end_tick, "end", reason="completed", rows=rows.next)
+
+
+def _event(tick: int, event: str, **about: Any) -> bytes:
+    return wire.encode_document({"tick": tick, "time_s": tick / TICK_RATE_HZ, "event": event, **about})
+
+
+def _happenings(conversion: Conversion) -> Iterator[tuple[int, bytes]]:
+    """The commands of the scene, or the hammer pulses that were found where there is none."""
+    experiment = conversion.experiment
+    commands = [pulse.command() for pulse in conversion.pulses] if experiment is None else experiment.commands
+    for command in commands:
+        tick = round(command["at_s"] * TICK_RATE_HZ)
+        if tick < conversion.end_tick:
+            about = {key: value for key, value in command.items() if key not in ("at_s", "command")}
+            yield tick, _event(tick, command["command"], **about)
+
+
+def _blocks(conversion: Conversion, name: str) -> Iterator[tuple[int, str, wire.Block]]:
+    rate = conversion.table.groups[name].rate_hz
+    counts, present = conversion.counts[name], conversion.present[name]
+    first = conversion.first_tick[name]
+    # Blocks begin on whole ticks, so that the time of every row is exact at any rate.
+    unit = rate // math.gcd(rate, TICK_RATE_HZ)
+    rows = unit * max(1, round(_BLOCK_S * rate / unit))
+    base = round(first * rate / TICK_RATE_HZ)
+    for start in range(0, len(counts), rows):
+        stop = min(start + rows, len(counts))
+        for low, high in _runs(present[start:stop]):
+            at = start + low
+            tick = first + at * TICK_RATE_HZ / rate
+            values = np.ascontiguousarray(counts[at : start + high])
+            block = wire.Block(round(tick), base + at, float(rate), float(TICK_RATE_HZ), values)
+            yield block.tick, wire.sensor_key(name), block
+
+
+def _runs(present: np.ndarray) -> list[tuple[int, int]]:
+    """Starts and ends of the stretches that are there."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]]).astype(np.int8)))
+    return [(int(low), int(high)) for low, high in edges.reshape(-1, 2)]
+
+
+def _edge_blocks(conversion: Conversion) -> Iterator[tuple[int, str, wire.Block]]:
+    length = round(_BLOCK_S * TICK_RATE_HZ)
+    numbers = (conversion.edges // length).astype(np.int64)
+    for number in np.unique(numbers).tolist():
+        inside = np.flatnonzero(numbers == number)
+        values = (conversion.edges[inside] - number * length)[:, None]
+        block = wire.Block(number * length, int(inside[0]), 0.0, float(TICK_RATE_HZ), values)
+        yield block.tick, wire.EDGES, block

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import io
-from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.recordings.background import Background
 from replays.recordings.formats import columnar
 from replays.recordings.formats.dialect import MISSING, Layout, find_layout, instant, time_column
-from replays.recordings.formats.source import Entry, Signal, Source, damaged, even_rate_hz
+from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz
 from rig.errors import InputError
 from rig.text import printable
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a text file and read its columns.
 
     Raises:
@@ -47,9 +46,9 @@ def open_file(path: Path, options: FileOptions) -> Source:
         Entry(name, "", layout.units[c], len(columns[c]), rate, c) for c, name in enumerate(names) if c != stamps
     )
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         values = columns[entry.place]
-        return Signal(values=values, times_s=times_s, rate_hz=layout.rate_hz, first_s=layout.first_s)
+        return FileSignal(values=values, times_s=times_s, rate_hz=layout.rate_hz, first_s=layout.first_s)
 
     dialect = layout.dialect
     told: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
@@ -171,7 +170,7 @@ def _quoted(name: str) -> str:
     return printable(name).replace('"', '""')
 
 
-class Rows:
+class CsvRows:
     """A CSV file that grows by rows: numbers in the fewest digits that give them back, on two threads."""
 
     def __init__(self, path: Path, schema: Any) -> None:
@@ -182,14 +181,11 @@ class Rows:
         self._file = path.open("wb")
         self._file.write((",".join(f'"{_quoted(name)}"' for name in schema.names) + "\n").encode())
         # Formatting a number takes ten times as long as simulating it, and needs no lock.
-        self._pool = ThreadPoolExecutor(max_workers=2)
-        self._due: deque[Future[bytes]] = deque()
+        self._background = Background(self._file.write, threads=2)
 
     def write(self, columns: Sequence[np.ndarray]) -> None:
         """Take rows, column by column, each shape (n,)."""
-        self._due.append(self._pool.submit(self._format, columnar.arrow_table(columns, self._schema)))
-        while len(self._due) > 4:
-            self._file.write(self._due.popleft().result())
+        self._background.call(self._format, columnar.arrow_table(columns, self._schema))
 
     def _format(self, table: Any) -> bytes:
         buffer = io.BytesIO()
@@ -199,15 +195,13 @@ class Rows:
     def close(self) -> None:
         """Write what is left."""
         try:
-            while self._due:
-                self._file.write(self._due.popleft().result())
+            self._background.finish()
         finally:
-            self._pool.shutdown(cancel_futures=True)
             self._file.close()
 
 
-class Writer(columnar.Writer):
+class CsvWriter(columnar.ParquetWriter):
     """A CSV file: `time [s]` and a column a channel."""
 
     sidecar = True
-    rows = Rows
+    rows = CsvRows

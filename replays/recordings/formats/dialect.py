@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from replays.recordings.formats import unit as units
 from rig.errors import InputError
+from rig.outside import open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -179,7 +180,7 @@ def _layout(lines: list[str], dialect: Dialect, encoding: str, options: FileOpti
 
 
 def _head(path: Path, encoding: str | None) -> tuple[str, str, tuple[str, ...]]:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         raw = b"".join(file.readline(1 << 16) for _ in range(_HEAD_LINES))
     if encoding is None and raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         encoding = "utf-16"

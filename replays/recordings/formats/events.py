@@ -1,4 +1,4 @@
-"""What happened in an imported log: hammer blows found in it, and the experiment that a mapping tells of."""
+"""What happened in an imported log: hammer pulses found in it, and the experiment that a mapping tells of."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from rig.errors import InputError
 
 if TYPE_CHECKING:
     from replays.recordings.formats.clock import Axis
+    from replays.recordings.formats.group import PlacedGroup
     from replays.recordings.formats.mapping import ExperimentMapping, HammerMapping
-    from replays.recordings.formats.placement import PlacedGroup
 
 _FOOT = 0.05
 """A pulse is summed out to this part of its peak on either side."""
 
 
 @dataclass(frozen=True)
-class Blow:
-    """A blow as the half sine of the same peak and impulse, centred where it is: how a scene tells it.
+class HammerPulse:
+    """A hammer pulse as the half sine of the same peak and impulse, centred where it is: how a scene tells it.
 
     Attributes:
         at_s: Start [s].
@@ -46,8 +46,8 @@ class Blow:
         }  # fmt: skip
 
 
-def find_blows(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> list[Blow]:
-    """Blows in a force: stretches above the threshold, at least the dead time apart.
+def find_pulses(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> list[HammerPulse]:
+    """Hammer pulses in a force: stretches above the threshold, at least the dead time apart.
 
     Args:
         force_n: Force of the hammer [N], shape (n,).
@@ -58,7 +58,7 @@ def find_blows(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> list[B
     force = np.nan_to_num(force_n)
     above = force >= wanted.threshold_n
     starts = np.flatnonzero(above & ~np.concatenate([[False], above[:-1]]))
-    found: list[Blow] = []
+    found: list[HammerPulse] = []
     free_s = -math.inf
     for start in starts.tolist():
         if times_s[start] < free_s:
@@ -77,18 +77,21 @@ def find_blows(force_n: np.ndarray, axis: Axis, wanted: HammerMapping) -> list[B
         peak, impulse = float(pulse.max()), float(pulse.sum()) / axis.rate_hz
         duration = 0.5 * math.pi * impulse / peak
         centre = float(pulse @ when) / float(pulse.sum())
-        found.append(Blow(centre - 0.5 * duration - wanted.delay_us * 1e-6, peak, duration * 1e3, wanted.direction))
+        start_s = centre - 0.5 * duration - wanted.delay_us * 1e-6
+        found.append(HammerPulse(start_s, peak, duration * 1e3, wanted.direction))
     return found
 
 
 def speed_before(
-    groups: Mapped[str, PlacedGroup], edges: np.ndarray, blows: Sequence[Blow], *, zero_s: float
+    groups: Mapped[str, PlacedGroup], edges: np.ndarray, pulses: Sequence[HammerPulse], *, zero_s: float
 ) -> float | None:
-    """Mean speed before the first blow, or of the whole without one [Hz]: of the channel `speed`, else of the edges."""
+    """Mean speed before the first hammer pulse, else of the whole [Hz]: of the channel `speed`, else of the edges."""
     drive = groups.get("drive")
-    until_s = blows[0].at_s if blows else math.inf
-    if drive is not None and "speed" in drive.values:
-        values = drive.values["speed"][: max(1, round((min(until_s, 1e6) + zero_s - drive.start_s) * drive.rate_hz))]
+    until_s = pulses[0].at_s if pulses else math.inf
+    if drive is not None and "speed" in drive.channels:
+        values = drive.channels["speed"].values[
+            : max(1, round((min(until_s, 1e6) + zero_s - drive.start_s) * drive.rate_hz))
+        ]
         return float(np.nanmean(values))
     times = edges[edges < until_s * 1e6] if len(edges) else edges
     return (len(times) - 1) * 1e6 / float(times[-1] - times[0]) if len(times) > 1 else None
@@ -106,7 +109,7 @@ class ExperimentDocuments(NamedTuple):
 
 def build_experiment(
     wanted: ExperimentMapping,
-    blows: Sequence[Blow],
+    pulses: Sequence[HammerPulse],
     *,
     duration_s: float,
     speed_hz: float | None,
@@ -132,7 +135,7 @@ def build_experiment(
         data["drive"] = {**data["drive"], "speed_hz": max(0.0, speed), "profile": ()}
     if wanted.commands == "detected":
         others = [timed for timed in data["commands"] if timed["request"]["command"] != "hammer"]
-        data["commands"] = [*others, *(blow.command() for blow in blows)]
+        data["commands"] = [*others, *(pulse.command() for pulse in pulses)]
     elif wanted.commands != "scene":
         data["commands"] = list(wanted.commands)
     data |= {"duration_s": duration_s, "fidelity": "given"}

@@ -8,45 +8,54 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
 from replays.recordings.formats import clock
-from replays.recordings.formats.selection import ROWS, Chunk, Selection, Table
+from replays.recordings.formats.selection import ROWS, ExportChunk, ExportTable, Selection
 from rig.errors import InputError, check_new_file, check_not_among, whole_file
 
 _WRITERS = {
-    ".mf4": "mdf", ".tdms": "tdms", ".uff": "uff", ".csv": "delimited", ".parquet": "columnar", ".wav": "wav",
+    ".mf4": ("mdf", "MdfWriter"), ".tdms": ("tdms", "TdmsWriter"), ".uff": ("uff", "UffWriter"),
+    ".csv": ("delimited", "CsvWriter"), ".parquet": ("columnar", "ParquetWriter"), ".wav": ("wav", "WavWriter"),
 }  # fmt: skip
+"""Module and class of each format."""
 SUFFIXES = tuple(_WRITERS)
 Method = Literal["polyphase", "linear"]
-
-
 _MOST_MISSING = 1_000_000
 """Missing rows that a format with a start and a step fills in, besides as many as there are."""
 
 
-class Writer(Protocol):
-    """Writes the tables of a selection.
+class FormatWriter:
+    """Writes the tables of a selection; one of each format derives from it.
 
-    `merged` formats take one table, with all channels of one rate; `sparse` ones leave out the rows that no stream has.
+    Attributes:
+        merged: The format takes one table, with all channels of one rate.
+        sparse: Rows that no stream has are left out.
+        sidecar: It has no place for metadata: FILE.json stands beside it.
     """
 
-    merged: bool
-    sparse: bool
+    merged = False
+    sparse = False
+    sidecar = False
+    _file: Any
+    """What the values go to; has `close`."""
 
-    def write(self, table: Table, chunk: Chunk) -> None:
-        """Take rows."""
-        ...
+    def __init__(self, path: Path, selection: Selection) -> None:
+        raise NotImplementedError
+
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
+        """Take rows; a missing one is nan where the format has a start and a step and no times."""
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Finish the file."""
-        ...
+        """Write what is left, and close the file."""
+        self._file.close()
 
     def abandon(self) -> None:
         """Let go of the file, which will be removed."""
-        ...
+        self._file.close()
 
 
 @dataclass(frozen=True)
@@ -75,11 +84,12 @@ def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = SUFFIXE
 
 def merged(path: Path) -> bool:
     """Whether a format holds one table of one rate."""
-    return bool(_writer_class(path).merged)
+    return _writer_class(path).merged
 
 
-def _writer_class(path: Path) -> Any:
-    return importlib.import_module(f"replays.recordings.formats.{_WRITERS[path.suffix]}").Writer
+def _writer_class(path: Path) -> type[FormatWriter]:
+    module, name = _WRITERS[path.suffix]
+    return getattr(importlib.import_module(f"replays.recordings.formats.{module}"), name)
 
 
 def export(
@@ -116,7 +126,7 @@ def export(
         jobs = [(_rated(path, table, source), replace(source, tables=(table,))) for table in source.tables]
     total = sum(table.rows for table in source.tables)
     for target, part in jobs:
-        for made in [target, *([_beside(target)] if hasattr(kind, "sidecar") else [])]:
+        for made in [target, *([_beside(target)] if kind.sidecar else [])]:
             check_output(made, force=force, suffixes=(*SUFFIXES, ".json"))
             check_not_among([each.path for each in selection.recording.parts], made)
         for table in part.tables:
@@ -130,7 +140,7 @@ def export(
     written = []
     with ExitStack() as stack:
         for target, part in jobs:
-            writer: Writer = kind(stack.enter_context(whole_file(target)), part)
+            writer = kind(stack.enter_context(whole_file(target)), part)
             whole = False
             try:
                 for table in part.tables:
@@ -144,7 +154,7 @@ def export(
                 if not whole:
                     with suppress(Exception):
                         writer.abandon()
-            if hasattr(kind, "sidecar"):
+            if kind.sidecar:
                 text = json.dumps(part.sidecar(), indent=1, ensure_ascii=False)
                 stack.enter_context(whole_file(_beside(target))).write_text(text + "\n", encoding="utf-8")
             tables = tuple((t.name, t.rate_hz, t.rows, part.missing[t.name]) for t in part.tables)
@@ -156,7 +166,7 @@ def _beside(path: Path) -> Path:
     return path.with_name(path.name + ".json")
 
 
-def _rated(path: Path, table: Table, selection: Selection) -> Path:
+def _rated(path: Path, table: ExportTable, selection: Selection) -> Path:
     alike = [other for other in selection.tables if f"{other.rate_hz:g}" == f"{table.rate_hz:g}"]
     more = f"-{alike.index(table) + 1}" if len(alike) > 1 else ""
     return path.with_name(f"{path.stem}-{table.rate_hz:g}Hz{more}{path.suffix}")
@@ -164,26 +174,17 @@ def _rated(path: Path, table: Table, selection: Selection) -> Path:
 
 @dataclass(frozen=True)
 class _Resampled(Selection):
-    """A selection that was brought to one rate."""
+    """A selection that was brought to one rate: a table of no streams, which lacks no rows."""
 
     held: np.ndarray = None  # type: ignore[assignment]
     """Counts or values, float64, shape (rows, columns)."""
 
-    def whole(self, table: Table) -> bool:
-        """It has no gaps."""
-        return True
-
-    @property
-    def missing(self) -> dict[str, int]:  # type: ignore[override]
-        """None."""
-        return {table.name: 0 for table in self.tables}
-
-    def chunks(self, table: Table, rows: int = ROWS, *, sparse: bool = False) -> Iterator[Chunk]:
+    def chunks(self, table: ExportTable, rows: int = ROWS, *, sparse: bool = False) -> Iterator[ExportChunk]:
         """Rows, in order."""
         for start in range(0, table.rows, rows):
             values = self.held[start : start + rows]
             times_s = table.first_s + np.arange(start, start + len(values)) / table.rate_hz
-            yield Chunk(index=start, times_s=times_s, values=values, present=np.ones(len(values), dtype=bool))
+            yield ExportChunk(index=start, times_s=times_s, values=values, present=np.ones(len(values), dtype=bool))
 
 
 def resampled(selection: Selection, rate_hz: float, method: Method) -> Selection:
@@ -219,7 +220,7 @@ def resampled(selection: Selection, rate_hz: float, method: Method) -> Selection
             parts.append(values_c if linear is None else values_c * linear[0] + linear[1])
             columns.append(replace(column, linear=None, source=None))
     title = "; ".join(table.title for table in selection.tables)
-    table = Table("resampled", title, tuple(columns), (), rate_hz, first_s, rows, 0)
+    table = ExportTable("resampled", title, tuple(columns), (), rate_hz, first_s, rows, 0)
     how = clock.FILTER if method == "polyphase" else "straight lines between samples"
     rates = ", ".join(f"{other:g}" for other in sorted({table.rate_hz for table in selection.tables}))
     return _Resampled(

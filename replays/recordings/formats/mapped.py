@@ -7,13 +7,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 
 from replays.recordings.formats import clock
 from replays.recordings.formats import unit as units
 from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalName
-from replays.recordings.formats.source import Entry, Signal, Source, even_rate_hz
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
 from rig.channels import Channel, default_table
 from rig.errors import InputError
 
@@ -31,7 +32,7 @@ class MappedSignal:
     mapping: ChannelMapping
     source: Source
     entry: Entry
-    signal: Signal
+    signal: FileSignal
     axis: clock.Axis
     target: Channel
     gain: float
@@ -40,108 +41,193 @@ class MappedSignal:
     """Volts per source unit, where it is a voltage."""
     bias: float = 0.0
     values: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """Engineering values, shape (rows of the axis,)."""
+    """Engineering values, nan where missing, on its own axis, then on its group's, shape (rows,)."""
+    raw: np.ndarray | None = None
+    """Integers of the source where they are untouched, on the group's axis, shape (rows,)."""
+    mixed: bool = False
+    """It was worked out of two signals."""
     touched: list[str] = field(default_factory=list)
     """What was done that changes samples."""
     missing: int = 0
     overrange: int = 0
 
-
-def find_signal(wanted: SignalName, sources: Sequence[Source], field_name: str) -> tuple[Source, Entry]:
-    """The one signal that a name means."""
-    if wanted.file is not None and all(source.path.name != wanted.file for source in sources):
-        raise InputError(f"{field_name}.file", f"one of {', '.join(s.path.name for s in sources)}", wanted.file)
-    inside = [
-        (source, entry)
-        for source in sources
-        if wanted.file in (None, source.path.name)
-        for entry in source.entries
-        if wanted.group in (None, entry.group)
-    ]
-    found = [pair for pair in inside if pair[1].name == wanted.source]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in found)
-        raise InputError(f"{field_name}.group", f"given, as {wanted.source} stands in {places}", wanted.group or "none")
-    if not inside:
-        groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
-        raise InputError(f"{field_name}.group", f"one of {', '.join(groups)}", wanted.group)
-    names = list(dict.fromkeys(entry.name for _, entry in inside))
-    close = difflib.get_close_matches(wanted.source, names, n=3, cutoff=0.4) or names[:12]
-    more = f" ({len(names)} in all)" if len(names) > len(close) else ""
-    raise InputError(f"{field_name}.source", f"a signal of the file, such as {', '.join(close)}{more}", wanted.source)
+    def mix(self, values: np.ndarray) -> None:
+        """Take values that were worked out of two signals."""
+        self.values, self.raw, self.mixed = values, None, True
 
 
-def axis_of(source: Source, entry: Entry, signal: Signal, mapping: Mapping) -> clock.Axis:
-    """The time axis of a signal, as the file or the mapping tells it.
+class Log:
+    """The files of one log, and what a mapping says of them.
 
-    Raises:
-        InputError: Neither does, or the time stamps do not ascend.
+    Attributes:
+        mapping: What becomes what.
+        sources: The files; the first one's time is the time of all.
+        remarks: What was done to the whole, and what was assumed; grows on the way.
     """
-    rows, time = len(signal.values), mapping.time
-    what = f"{entry.name} in {source.path.name}"
-    if time.rate_hz is not None:
-        told = signal.rate_hz if signal.times_s is None else even_rate_hz(signal.times_s)
-        if told is not None and abs(told / time.rate_hz - 1.0) > _ROUNDING:
-            must = f'within {_ROUNDING:.0%} of the {told:.6g} Hz that {what} has (or file.time_column = "none")'
-            raise InputError("time.rate_hz", must, time.rate_hz)
-        first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
-        axis = clock.Axis(first_s, time.rate_hz, rows, note="rate from the mapping")
-    elif signal.times_s is not None:
-        axis = clock.axis_of_stamps(signal.times_s, line=time.stamps == "line", what=what)
-    elif signal.rate_hz is not None:
-        axis = clock.Axis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
-    else:
+
+    def __init__(self, files: Sequence[Path], mapping: Mapping) -> None:
+        if len({path.name for path in files}) < len(files):
+            raise InputError("file", "files of different names", ", ".join(path.name for path in files))
+        self.mapping = mapping
+        self.sources = [open_source(path, mapping.file) for path in files]
+        self.remarks = [f"{source.path.name}: {remark}" for source in self.sources for remark in source.remarks]
+        self._moves: list[tuple[str, str | None, clock.Shift]] = []  # of a file, or of a group in it
+
+    def find(self, wanted: SignalName, where: str) -> tuple[Source, Entry]:
+        """The one signal that a name means; `where` is the field that names it.
+
+        Raises:
+            InputError: There is none, or there are several.
+        """
+        sources = self.sources
+        if wanted.file is not None and all(source.path.name != wanted.file for source in sources):
+            raise InputError(f"{where}.file", f"one of {', '.join(s.path.name for s in sources)}", wanted.file)
+        inside = [
+            (source, entry)
+            for source in sources
+            if wanted.file in (None, source.path.name)
+            for entry in source.entries
+            if wanted.group in (None, entry.group)
+        ]
+        found = [pair for pair in inside if pair[1].name == wanted.source]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in found)
+            raise InputError(f"{where}.group", f"given, as {wanted.source} stands in {places}", wanted.group or "none")
+        if not inside:
+            groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
+            raise InputError(f"{where}.group", f"one of {', '.join(groups)}", wanted.group)
+        names = list(dict.fromkeys(entry.name for _, entry in inside))
+        close = difflib.get_close_matches(wanted.source, names, n=3, cutoff=0.4) or names[:12]
+        more = f" ({len(names)} in all)" if len(names) > len(close) else ""
+        raise InputError(f"{where}.source", f"a signal of the file, such as {', '.join(close)}{more}", wanted.source)
+
+    def read(self, source: Source, entry: Entry, where: str) -> tuple[FileSignal, clock.Axis]:
+        """A signal and its own time axis; nan where samples are missing from an even one.
+
+        Raises:
+            InputError: It is empty, nobody tells its rate, or its time stamps do not ascend.
+        """
+        signal = source.read(entry)
+        if not len(signal.values):
+            raise InputError(where, "a signal with values", f"{entry.name}, which is empty")
+        axis = self._axis(signal, f"{entry.name} in {source.path.name}")
+        if axis.numbers is not None:
+            signal = replace(signal, values=axis.placed(signal.values.astype(float)))
+        return signal, axis
+
+    def _axis(self, signal: FileSignal, what: str) -> clock.Axis:
+        """The time axis of a signal, as the file or the mapping tells it."""
+        rows, time = len(signal.values), self.mapping.time
+        if time.rate_hz is not None:
+            told = signal.rate_hz if signal.times_s is None else even_rate_hz(signal.times_s)
+            if told is not None and abs(told / time.rate_hz - 1.0) > _ROUNDING:
+                must = f'within {_ROUNDING:.0%} of the {told:.6g} Hz that {what} has (or file.time_column = "none")'
+                raise InputError("time.rate_hz", must, time.rate_hz)
+            first_s = signal.first_s if signal.times_s is None else float(signal.times_s[0])
+            return clock.Axis(first_s, time.rate_hz, rows, note="rate from the mapping")
+        if signal.times_s is not None:
+            return clock.axis_of_stamps(signal.times_s, line=time.stamps == "line", what=what)
+        if signal.rate_hz is not None:
+            return clock.Axis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
         raise InputError("time.rate_hz", f"given, as the file tells no rate of {what}", "none")
-    return axis
 
+    def take(self, name: str, wanted: ChannelMapping) -> MappedSignal:
+        """Find and read the signal of a channel.
 
-def take(name: str, wanted: ChannelMapping, sources: Sequence[Source], mapping: Mapping) -> MappedSignal:
-    """Find and read the signal of a channel.
+        Raises:
+            InputError: There is none, or its unit does not become the channel's.
+        """
+        where = f"channels.{name}"
+        source, entry = self.find(wanted, where)
+        target = default_table().channels.get(name)
+        if target is None:
+            if wanted.to is None or wanted.to_unit is None:
+                close = difflib.get_close_matches(name, list(default_table().channels), n=1)
+                hint = f" (such as {close[0]})" if close else ""
+                must = f"a channel of the rig{hint}, or given with `to` (a group) and `to_unit`"
+                raise InputError(where, must, name)
+            if "/" in wanted.to or "/" in name or not wanted.to:
+                raise InputError(f"{where}.to", "a plain name", wanted.to)
+            target = _foreign(name, wanted.to, units.canonical(wanted.to_unit))
+        elif wanted.to is not None or wanted.to_unit is not None:
+            raise InputError(
+                f"{where}.to", f"left out, as {name} is one of the rig's channels", wanted.to or wanted.to_unit
+            )
+        unit = entry.unit if wanted.unit is None else wanted.unit
+        volts = units.size_si(unit) if units.kind(unit) == "voltage" else None
+        if wanted.sensitivity is not None:
+            per_unit_v = units.sensitivity_v(wanted.sensitivity, target.unit, field=f"{where}.sensitivity")
+            if volts is None:
+                raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit or "none")
+            gain = volts / per_unit_v
+        else:
+            if wanted.unit is None and not entry.unit and target.unit != "1":
+                raise InputError(f"{where}.unit", f"given, as {source.path.name} tells none", "none")
+            # A pulse may stay in volts: only when it passes its level matters.
+            pulse = volts is not None and target.unit == "1"
+            gain = volts if pulse and volts is not None else units.factor(unit, target.unit, field=f"{where}.unit")
+        signal, axis = self.read(source, entry, where)
+        return MappedSignal(
+            name=name, mapping=wanted, source=source, entry=entry, signal=signal, axis=axis, target=target,
+            gain=gain * wanted.sign * wanted.factor, volts=volts,
+        )  # fmt: skip
 
-    Raises:
-        InputError: There is none, or its unit does not become the channel's.
-    """
-    where = f"channels.{name}"
-    source, entry = find_signal(wanted, sources, where)
-    target = default_table().channels.get(name)
-    if target is None:
-        if wanted.to is None or wanted.to_unit is None:
-            close = difflib.get_close_matches(name, list(default_table().channels), n=1)
-            hint = f" (such as {close[0]})" if close else ""
-            must = f"a channel of the rig{hint}, or given with `to` (a group) and `to_unit`"
-            raise InputError(where, must, name)
-        if "/" in wanted.to or "/" in name or not wanted.to:
-            raise InputError(f"{where}.to", "a plain name", wanted.to)
-        target = _foreign(name, wanted.to, units.canonical(wanted.to_unit))
-    elif wanted.to is not None or wanted.to_unit is not None:
-        raise InputError(
-            f"{where}.to", f"left out, as {name} is one of the rig's channels", wanted.to or wanted.to_unit
-        )
-    unit = entry.unit if wanted.unit is None else wanted.unit
-    volts = units.size_si(unit) if units.kind(unit) == "voltage" else None
-    if wanted.sensitivity is not None:
-        per_unit_v = units.sensitivity_v(wanted.sensitivity, target.unit, field=f"{where}.sensitivity")
-        if volts is None:
-            raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit or "none")
-        gain = volts / per_unit_v
-    else:
-        if wanted.unit is None and not entry.unit and target.unit != "1":
-            raise InputError(f"{where}.unit", f"given, as {source.path.name} tells none", "none")
-        # A pulse may stay in volts: only when it passes its level matters.
-        pulse = volts is not None and target.unit == "1"
-        gain = volts if pulse and volts is not None else units.factor(unit, target.unit, field=f"{where}.unit")
-    signal = source.read(entry)
-    if not len(signal.values):
-        raise InputError(where, "a signal with values", f"{entry.name}, which is empty")
-    axis = axis_of(source, entry, signal, mapping)
-    if axis.numbers is not None:
-        signal = replace(signal, values=axis.placed(signal.values.astype(float)))
-    return MappedSignal(
-        name=name, mapping=wanted, source=source, entry=entry, signal=signal, axis=axis, target=target,
-        gain=gain * wanted.sign * wanted.factor, volts=volts,
-    )  # fmt: skip
+    def align(self) -> None:
+        """Find how the clocks of files and groups move, in the order of the mapping.
+
+        Raises:
+            InputError: What they have in common is not to be found.
+        """
+        self._lay_by_start()
+        for number, wanted_align in enumerate(self.mapping.align):
+            where = f"align.{number}"
+            pairs, places = [], []
+            for wanted, side in ((wanted_align.reference, "reference"), (wanted_align.moved, "moved")):
+                source, entry = self.find(wanted, f"{where}.{side}")
+                signal, axis = self.read(source, entry, f"{where}.{side}")
+                pairs.append((signal.physical, self.on_common_clock(axis, source, entry)))
+                places.append((source, entry))
+            (source, entry), (base, base_entry) = places[1], places[0]
+            group = entry.group if wanted_align.scope == "group" else None
+            if source is base and (group is None or group == base_entry.group):
+                must = 'of another file than the reference (or of another group: scope "group")'
+                raise InputError(f"{where}.moved", must, wanted_align.moved.source)
+            if wanted_align.method == "edge":
+                shift = clock.shift_by_edges(
+                    pairs[0], pairs[1], threshold=wanted_align.threshold, within_s=wanted_align.within_s
+                )
+            else:
+                shift = clock.shift_by_correlation(pairs[0], pairs[1], within_s=wanted_align.within_s)
+            self._moves.append((source.path.name, group, shift))
+            what = source.path.name if group is None else f"{source.path.name}, group {group}"
+            self.remarks.append(
+                f"{what}: moved by {shift.offset_s * 1e3:+.4f} ms, {shift.note} of {wanted_align.moved.source}"
+            )
+
+    def on_common_clock(self, axis: clock.Axis, source: Source, entry: Entry) -> clock.Axis:
+        """The time axis of a signal on the clock of the first file."""
+        for file, group, shift in self._moves:
+            if file == source.path.name and group in (None, entry.group):
+                axis = axis.moved(shift.offset_s, shift.stretch)
+        return axis
+
+    def _lay_by_start(self) -> None:
+        """Lay the files by the wall clocks that started them."""
+        sources = self.sources
+        base = sources[0].start
+        for source in sources[1:]:
+            if base is None or source.start is None:
+                self.remarks.append(
+                    f"{source.path.name}: taken to start with {sources[0].path.name}, before any alignment"
+                )
+                continue
+            late_s = (_utc(source.start) - _utc(base)).total_seconds()
+            self._moves.append((source.path.name, None, clock.Shift(late_s, 1.0, "")))
+            zones = {source.start.tzinfo is None, base.tzinfo is None}
+            unsure = " (one of them without a time zone, taken as UTC)" if len(zones) > 1 else ""
+            self.remarks.append(f"{source.path.name}: {late_s:+.6f} s by the times of day in the files{unsure}")
 
 
 def _foreign(name: str, group: str, unit: str) -> Channel:
@@ -153,70 +239,8 @@ def _foreign(name: str, group: str, unit: str) -> Channel:
     )  # fmt: skip
 
 
-Moves = list[tuple[str, str | None, clock.Shift]]
-
-
-def align(sources: Sequence[Source], mapping: Mapping, remarks: list[str]) -> Moves:
-    """Find how the clocks of files and groups move, in the order of the mapping.
-
-    Raises:
-        InputError: What they have in common is not to be found.
-    """
-    moves = _starts(sources, remarks)
-    for number, wanted_align in enumerate(mapping.align):
-        where = f"align.{number}"
-        pairs, places = [], []
-        for wanted, side in ((wanted_align.reference, "reference"), (wanted_align.moved, "moved")):
-            source, entry = find_signal(wanted, sources, f"{where}.{side}")
-            signal = source.read(entry)
-            axis = axis_of(source, entry, signal, mapping)
-            if axis.numbers is not None:
-                signal = replace(signal, values=axis.placed(signal.values.astype(float)))
-            pairs.append((signal.physical, shifted(axis, source, entry, moves)))
-            places.append((source, entry))
-        (source, entry), (base, base_entry) = places[1], places[0]
-        group = entry.group if wanted_align.scope == "group" else None
-        if source is base and (group is None or group == base_entry.group):
-            must = 'of another file than the reference (or of another group: scope "group")'
-            raise InputError(f"{where}.moved", must, wanted_align.moved.source)
-        if wanted_align.method == "edge":
-            shift = clock.shift_by_edges(
-                pairs[0], pairs[1], threshold=wanted_align.threshold, within_s=wanted_align.within_s
-            )
-        else:
-            shift = clock.shift_by_correlation(pairs[0], pairs[1], within_s=wanted_align.within_s)
-        moves.append((source.path.name, group, shift))
-        what = source.path.name if group is None else f"{source.path.name}, group {group}"
-        remarks.append(f"{what}: moved by {shift.offset_s * 1e3:+.4f} ms, {shift.note} of {wanted_align.moved.source}")
-    return moves
-
-
-def _starts(sources: Sequence[Source], remarks: list[str]) -> Moves:
-    """How the files lie by the wall clocks that started them."""
-    moves: Moves = []
-    base = sources[0].start
-    for source in sources[1:]:
-        if base is None or source.start is None:
-            remarks.append(f"{source.path.name}: taken to start with {sources[0].path.name}, before any alignment")
-            continue
-        late_s = (_utc(source.start) - _utc(base)).total_seconds()
-        moves.append((source.path.name, None, clock.Shift(late_s, 1.0, "")))
-        zones = {source.start.tzinfo is None, base.tzinfo is None}
-        unsure = " (one of them without a time zone, taken as UTC)" if len(zones) > 1 else ""
-        remarks.append(f"{source.path.name}: {late_s:+.6f} s by the times of day in the files{unsure}")
-    return moves
-
-
 def _utc(moment: datetime) -> datetime:
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-
-
-def shifted(axis: clock.Axis, source: Source, entry: Entry, moves: Moves) -> clock.Axis:
-    """A time axis on the common clock."""
-    for file, group, shift in moves:
-        if file == source.path.name and group in (None, entry.group):
-            axis = axis.moved(shift.offset_s, shift.stretch)
-    return axis
 
 
 def check_rows(taken: Sequence[MappedSignal]) -> None:

@@ -15,11 +15,17 @@ from rig.outside import check, read_toml
 _TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "\u00b5s": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 
 
-class _Table(BaseModel):
+_ONLY_TEXT = (
+    "delimiter", "decimal", "thousands", "header_line", "units_line", "first_line", "encoding", "time_format",
+)  # fmt: skip
+"""Options that mean nothing for other files."""
+
+
+class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class FileOptions(_Table):
+class FileOptions(_Section):
     """How a file is read, where it does not say so itself."""
 
     delimiter: str | None = None
@@ -62,16 +68,7 @@ class FileOptions(_Table):
         Raises:
             InputError: The first such option.
         """
-        for name in (
-            "delimiter",
-            "decimal",
-            "thousands",
-            "header_line",
-            "units_line",
-            "first_line",
-            "encoding",
-            "time_format",
-        ):
+        for name in _ONLY_TEXT:
             if getattr(self, name) is not None:
                 raise InputError(f"file.{name}", f"left out with {path.suffix} files", getattr(self, name))
 
@@ -80,7 +77,7 @@ class FileOptions(_Table):
         return _TIME_UNITS.get(self.time_unit or told.strip(), 1.0)
 
 
-class TimeOptions(_Table):
+class TimeOptions(_Section):
     """The time axis of the source."""
 
     rate_hz: PositiveFloat | None = None
@@ -95,7 +92,7 @@ class TimeOptions(_Table):
     """When the source's time zero was."""
 
 
-class Resample(_Table):
+class Resample(_Section):
     """Another sample rate, or even samples out of uneven ones."""
 
     method: Literal["none", "polyphase", "linear"] = "none"
@@ -103,7 +100,7 @@ class Resample(_Table):
     """Rate of the recording [Hz]; left out: that of the source."""
 
 
-class SignalName(_Table):
+class SignalName(_Section):
     """A signal of the source."""
 
     source: str
@@ -150,7 +147,7 @@ class ChannelMapping(SignalName):
         return factor
 
 
-class Rotate(_Table):
+class Rotate(_Section):
     """Two probes at any two angles as horizontal and vertical."""
 
     channels: tuple[str, str]
@@ -159,7 +156,7 @@ class Rotate(_Table):
     """Where each probe sits: direction of its positive values, from x (EAST) toward y (up) [degrees]."""
 
 
-class Align(_Table):
+class Align(_Section):
     """Brings two clocks together by what both have recorded."""
 
     reference: SignalName
@@ -184,22 +181,22 @@ class KeyphasorMapping(SignalName):
     pulses_per_turn: Annotated[int, Field(ge=1)] = 1
 
 
-class HammerMapping(_Table):
-    """Blows of the hammer, found in the channel `hammer`."""
+class HammerMapping(_Section):
+    """Pulses of the hammer, found in the channel `hammer`."""
 
     threshold_n: PositiveFloat = 10.0
-    """Force from which on it is a blow [N]."""
+    """Force from which on it is a hammer pulse [N]."""
     dead_s: PositiveFloat = 0.1
-    """Time after a blow in which there is no other one [s]."""
+    """Time after a hammer pulse in which there is no other one [s]."""
     pre_s: Annotated[FiniteFloat, Field(ge=0.0)] | None = None
-    """The recording begins so long before the first blow [s]."""
+    """The recording begins so long before the first hammer pulse [s]."""
     delay_us: FiniteFloat = 0.0
-    """How late the channel shows it [us], as by a filter; only the blow's time changes, no sample moves."""
+    """How late the channel shows it [us], as by a filter; only the hammer pulse's time changes, no sample moves."""
     direction: str | float = "x"
     """Where it hits, as in a scene."""
 
 
-class ExperimentMapping(_Table):
+class ExperimentMapping(_Section):
     """What was done, as a scene, so that it can be simulated."""
 
     scene: str
@@ -209,10 +206,10 @@ class ExperimentMapping(_Table):
     speed_hz: FiniteFloat | Literal["measured"] | None = None
     """Speed of the drive [Hz]; measured: the mean of the channel `speed`, or of the edges, before the first command."""
     commands: tuple[dict[str, Any], ...] | Literal["scene", "detected"] = "scene"
-    """Commands with at_s in the recording's time; those of the scene; or the blows that were found."""
+    """Commands with at_s in the recording's time; those of the scene; or the hammer pulses that were found."""
     lead_s: Annotated[int, Field(ge=0, le=60)] | None = None
     """The recording's time zero lies so long before its first sample [s]: the scene runs from there, and what its own
-    start stirs up has died out. Left out: 5 where blows were found in a running rig, else 0."""
+    start stirs up has died out. Left out: 5 where hammer pulses were found in a running rig, else 0."""
 
     @property
     def lead(self) -> int:
@@ -222,7 +219,7 @@ class ExperimentMapping(_Table):
         return 5 if self.commands == "detected" else 0
 
 
-class Mapping(_Table):
+class Mapping(_Section):
     """A mapping file."""
 
     file: FileOptions = FileOptions()

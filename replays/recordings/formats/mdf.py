@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import gc
 import re
-import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from traceback import walk_tb
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.recordings.formats import export
 from replays.recordings.formats import unit as units
-from replays.recordings.formats.source import Entry, Signal, Source, damaged, even_rate_hz, library
+from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz, library
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
-    from replays.recordings.formats.selection import Chunk, Selection, Table
+    from replays.recordings.formats.selection import ExportChunk, ExportTable, Selection
 
 _TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
 """The text in a comment that is XML."""
@@ -37,7 +37,7 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into an MDF file (version 3 or 4).
 
     Raises:
@@ -47,7 +47,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
     with _quiet():
         entries, texts = _entries(mdf)
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         group, index = entry.place
         with _quiet():
             return _signal(mdf, group, index)
@@ -62,18 +62,16 @@ def open_file(path: Path, options: FileOptions) -> Source:
 
 def _open(path: Path) -> Any:
     asammdf = library("asammdf")
-    failure, hook = "", sys.unraisablehook
-    # Of a file that it cannot open, asammdf's half-made object complains on its own when it goes: let it go here.
-    sys.unraisablehook = lambda _: None
     try:
         with _quiet():
             return asammdf.MDF(path)
     except Exception as error:
-        failure = f"{type(error).__name__}: {error}"
-    finally:
-        gc.collect()
-        sys.unraisablehook = hook
-    raise damaged(path, "MDF", failure)
+        # The half-made object of a file that asammdf cannot open closes itself when it goes, and fails aloud: it has
+        # tried once here, and does not try again.
+        for frame, _ in walk_tb(error.__traceback__):
+            with suppress(Exception):
+                frame.f_locals["self"].close()
+        raise damaged(path, "MDF", error) from None
 
 
 def _entries(mdf: Any) -> tuple[list[Entry], int]:
@@ -122,7 +120,7 @@ def _numeric(mdf: Any, group: int, index: int) -> bool:
     return few.ndim == 1 and few.dtype.kind in "iufb"
 
 
-def _signal(mdf: Any, group: int, index: int) -> Signal:
+def _signal(mdf: Any, group: int, index: int) -> FileSignal:
     raw = mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
     kind = _IDENTITY if raw.conversion is None else raw.conversion.conversion_type
     scale, offset = 1.0, 0.0
@@ -138,13 +136,12 @@ def _signal(mdf: Any, group: int, index: int) -> Signal:
         values[np.asarray(invalid, dtype=bool)] = np.nan
     second = _second(mdf, group)
     times_s = None if second is None else np.asarray(raw.timestamps, dtype=float) * second
-    return Signal(values=values, scale=scale, offset=offset, times_s=times_s)
+    return FileSignal(values=values, scale=scale, offset=offset, times_s=times_s)
 
 
-class Writer:
+class MdfWriter(export.FormatWriter):
     """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion."""
 
-    merged = False
     sparse = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
@@ -154,12 +151,12 @@ class Writer:
         self._signal = asammdf.Signal
         self._groups: dict[str, int] = {}
         with _quiet():
-            self._mdf = asammdf.MDF(version="4.10")
-            self._mdf.header.start_time = selection.start
-            self._mdf.header.description = selection.summary()
+            self._file = asammdf.MDF(version="4.10")
+            self._file.header.start_time = selection.start
+            self._file.header.description = selection.summary()
 
-    def write(self, table: Table, chunk: Chunk) -> None:
-        """Take rows."""
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
+        """Take rows; those that no stream has are left out."""
         present = chunk.present
         times_s = chunk.times_s[present]
         if not len(times_s):
@@ -168,7 +165,7 @@ class Writer:
         with _quiet():
             if table.name in self._groups:
                 pairs = [(times_s, None), *((values, None) for values in columns)]
-                self._mdf.extend(self._groups[table.name], pairs)
+                self._file.extend(self._groups[table.name], pairs)
                 return
             signals = [
                 self._signal(
@@ -177,22 +174,17 @@ class Writer:
                 )
                 for column, values in zip(table.columns, columns, strict=True)
             ]  # fmt: skip
-            number = self._mdf.append(signals, acq_name=table.name, comment=table.title, common_timebase=True)
+            number = self._file.append(signals, acq_name=table.name, comment=table.title, common_timebase=True)
         self._groups[table.name] = number
 
     def close(self) -> None:
         """Write the file."""
-        # asammdf insists on its own suffix: what it wrote gets the name that was asked for.
-        own = self._path.with_name(self._path.name + ".mf4")
-        try:
-            with _quiet():
-                self._mdf.save(own, overwrite=True)
-                self._mdf.close()
-            own.replace(self._path)
-        finally:
-            own.unlink(missing_ok=True)
+        # Of a path, asammdf would change the suffix.
+        with _quiet(), self._path.open("wb+") as file:
+            self._file.save(file)
+            self._file.close()
 
     def abandon(self) -> None:
         """Let go of what it holds."""
         with _quiet():
-            self._mdf.close()
+            self._file.close()

@@ -78,7 +78,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Part:
+class ExportStream:
     """One stream of a recording, as columns of a table."""
 
     key: str
@@ -89,7 +89,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Chunk:
+class ExportChunk:
     """Consecutive rows of a table.
 
     Attributes:
@@ -106,7 +106,7 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class Table:
+class ExportTable:
     """Columns at one rate.
 
     Attributes:
@@ -123,19 +123,19 @@ class Table:
     name: str
     title: str
     columns: tuple[Column, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[ExportStream, ...]
     rate_hz: float
     first_s: float
     rows: int
     shift: int
 
-    def exported(self, c: int, chunk: Chunk) -> np.ndarray:
+    def exported(self, c: int, chunk: ExportChunk) -> np.ndarray:
         """Values of a column in the unit asked for, float64, shape (n,); nan where it has none."""
         linear = self.columns[c].linear
         values = chunk.values[:, c]
         return values.copy() if linear is None else values * linear[0] + linear[1]
 
-    def raw(self, c: int, chunk: Chunk) -> np.ndarray:
+    def raw(self, c: int, chunk: ExportChunk) -> np.ndarray:
         """What the recording holds: int32 counts where none is missing, else float64, shape (n,)."""
         values = chunk.values[:, c]
         present = values[chunk.present]
@@ -149,7 +149,7 @@ class Selection:
     """What is exported of a recording."""
 
     recording: Recording
-    tables: tuple[Table, ...]
+    tables: tuple[ExportTable, ...]
     unit: Unit
     notes: dict[str, str] = field(default_factory=dict)
 
@@ -200,11 +200,11 @@ class Selection:
             reached = max(reached, end)
         return held
 
-    def whole(self, table: Table) -> bool:
+    def whole(self, table: ExportTable) -> bool:
         """Whether every stream of a table has all its rows."""
         return not self.missing[table.name]
 
-    def chunks(self, table: Table, rows: int = ROWS, *, sparse: bool = False) -> Iterator[Chunk]:
+    def chunks(self, table: ExportTable, rows: int = ROWS, *, sparse: bool = False) -> Iterator[ExportChunk]:
         """Rows of a table, in order; blocks that came later than a chunk are in it all the same.
 
         Args:
@@ -224,7 +224,7 @@ class Selection:
                 present |= cursor.fill(start, values[:, first : first + width])
                 first += width
             times_s = table.first_s + np.arange(start, start + n) / table.rate_hz
-            yield Chunk(index=start, times_s=times_s, values=values, present=present)
+            yield ExportChunk(index=start, times_s=times_s, values=values, present=present)
             start += n
             if sparse:
                 start = max(start, min((cursor.next_row for cursor in cursors), default=start))
@@ -233,7 +233,7 @@ class Selection:
 class _Cursor:
     """Goes once through the blocks of a stream."""
 
-    def __init__(self, recording: Recording, part: Part, table: Table) -> None:
+    def __init__(self, recording: Recording, part: ExportStream, table: ExportTable) -> None:
         self.part = part
         self._shift = table.shift
         self._columns = list(part.columns)
@@ -302,7 +302,7 @@ def select(
         raise InputError("--to", f"after --from {from_s:g}", to_s)
     wanted = _wanted(recording, channels, truth=truth)
     streams = recording.streams
-    tables: dict[tuple[str, float, int], list[Table]] = {}
+    tables: dict[tuple[str, float, int], list[ExportTable]] = {}
     for key, numbers in wanted.items():
         stream = streams.get(key)
         if stream is None or stream.rows == 0:
@@ -378,12 +378,12 @@ def _table(
     unit: Unit,
     from_s: float | None,
     to_s: float | None,
-) -> Table | None:
+) -> ExportTable | None:
     block = next(block for block in recording.blocks(key) if len(block.values))
     rate = block.rate_hz
     zero_s = block.tick / block.tick_rate_hz - block.index / rate  # of the stream's row 0
     low, high = stream.first_time_s, stream.last_time_s
-    # A hair for the rounding of times.
+    # A little room for the rounding of times.
     first = math.ceil((max(low, -math.inf if from_s is None else from_s) - zero_s) * rate - 1e-6)
     last = math.floor((min(high, math.inf if to_s is None else to_s) - zero_s) * rate + 1e-6)
     if last < first:
@@ -400,8 +400,8 @@ def _table(
             for c in numbers
         )
         name, title, width = f"truth.{name}", f"True state of the model: {name}", len(about)
-    part = Part(key=key, columns=tuple(numbers), width=width)
-    return Table(
+    part = ExportStream(key=key, columns=tuple(numbers), width=width)
+    return ExportTable(
         name=name, title=title, columns=columns, parts=(part,), rate_hz=rate, first_s=zero_s + first / rate,
         rows=last - first + 1, shift=first,
     )  # fmt: skip
@@ -418,13 +418,13 @@ def sensor_column(channel: Channel, unit: Unit) -> Column:
     return Column(name=name, unit="V" if unit == "volts" else channel.unit, label=label, source=channel, linear=linear)
 
 
-def _merge(tables: list[Table]) -> Table:
+def _merge(tables: list[ExportTable]) -> ExportTable:
     if len(tables) == 1:
         return tables[0]
     first = min(table.shift for table in tables)
     last = max(table.shift + table.rows for table in tables)
     start = min(tables, key=lambda table: table.shift)
-    return Table(
+    return ExportTable(
         name="+".join(table.name for table in tables), title="; ".join(table.title for table in tables),
         columns=tuple(column for table in tables for column in table.columns),
         parts=tuple(part for table in tables for part in table.parts),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rig.errors import InputError
+from rig.outside import open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -58,7 +59,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Signal:
+class FileSignal:
     """The values of one signal.
 
     Attributes:
@@ -106,7 +107,7 @@ class Source:
     path: Path
     format: str
     entries: tuple[Entry, ...]
-    read: Callable[[Entry], Signal]
+    read: Callable[[Entry], FileSignal]
     start: datetime | None = None
     about: dict[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
@@ -123,7 +124,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
     if name is None:
         raise InputError("file", f"a file that ends in {', '.join(_READERS)}", str(path))
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             empty = not file.read(1)
     except OSError as error:
         raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
@@ -134,11 +135,11 @@ def open_source(path: Path, options: FileOptions) -> Source:
     what = _FORMATS[name]
     module = importlib.import_module(f"replays.recordings.formats.{name}")
     with _parsing(path, what):
-        source: Source = module.open_file(path, options)
+        source: Source = module.look_into(path, options)
     if not source.entries:
         raise InputError("file", "a file with signals in it", str(path))
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         where = f"{what} (signal {entry.name})"
         with _parsing(path, where):
             signal = source.read(entry)
@@ -169,7 +170,7 @@ def _parsing(path: Path, what: str) -> Iterator[None]:
         raise damaged(path, what, error) from None
 
 
-def _check(signal: Signal) -> None:
+def _check(signal: FileSignal) -> None:
     """See that the numbers of a signal are such that a measurement can have.
 
     Raises:

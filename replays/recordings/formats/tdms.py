@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from replays.recordings.formats import export
 from replays.recordings.formats.dialect import is_time
-from replays.recordings.formats.source import Entry, Signal, Source, damaged, even_rate_hz, library
+from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz, library
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
-    from replays.recordings.formats.selection import Chunk, Selection, Table
+    from replays.recordings.formats.selection import ExportChunk, ExportTable, Selection
 
 _RAW_INPUT = 0xFFFFFFFF
 """Input of the first scale: the raw values."""
@@ -36,7 +37,7 @@ def _quiet() -> Iterator[None]:
             one.setLevel(before)
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a TDMS file.
 
     Raises:
@@ -67,7 +68,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
             rate = 1.0 / step if step else None
             entries.append(Entry(channel.name, name, unit, len(channel), rate, (name, channel.name), label, number))
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         with nptdms.TdmsFile.open(path) as opened:
             return _signal(opened[entry.place[0]], entry.place[1], start)
 
@@ -80,7 +81,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
     )  # fmt: skip
 
 
-def _signal(group: Any, name: str, start: Any) -> Signal:
+def _signal(group: Any, name: str, start: Any) -> FileSignal:
     channel = group[name]
     properties = channel.properties
     scale, offset = 1.0, 0.0
@@ -101,33 +102,30 @@ def _signal(group: Any, name: str, start: Any) -> Signal:
         began = properties.get("wf_start_time", start)
         late_s = float((began - start) / np.timedelta64(1, "us")) * 1e-6 if start is not None else 0.0
         first_s = late_s + float(properties.get("wf_start_offset", 0.0))
-        return Signal(values=values, scale=scale, offset=offset, rate_hz=1.0 / step, first_s=first_s)
+        return FileSignal(values=values, scale=scale, offset=offset, rate_hz=1.0 / step, first_s=first_s)
     stamps = next((other for other in group.channels() if is_time(other.name) and other.name != name), None)
     if stamps is None or len(stamps) != len(values):
-        return Signal(values=values, scale=scale, offset=offset)
+        return FileSignal(values=values, scale=scale, offset=offset)
     times = np.asarray(stamps[:])
     if times.dtype.kind == "M":
         times = (times - (times[0] if start is None else start)) / np.timedelta64(1, "us") * 1e-6
     times_s = None if even_rate_hz(times) is None else times.astype(float)
-    return Signal(values=values, scale=scale, offset=offset, times_s=times_s)
+    return FileSignal(values=values, scale=scale, offset=offset, times_s=times_s)
 
 
-class Writer:
+class TdmsWriter(export.FormatWriter):
     """A TDMS file: a group a sensor group; counts with a linear scale, which LabVIEW applies on reading."""
-
-    merged = False
-    sparse = False
 
     def __init__(self, path: Path, selection: Selection) -> None:
         nptdms = library("npTDMS", "nptdms")
         self._api = nptdms
         self._selection = selection
-        self._writer = nptdms.TdmsWriter(path)
-        self._writer.open()
+        self._file = nptdms.TdmsWriter(path)
+        self._file.open()
         self._described: set[str] = set()
         self._start = np.datetime64(selection.start.astimezone(UTC).replace(tzinfo=None), "us")
 
-    def write(self, table: Table, chunk: Chunk) -> None:
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows; a missing one is nan, for the format has a start and a step and no times."""
         api, new = self._api, table.name not in self._described
         about = {key: value for key, value in self._selection.metadata.items() if value != ""}
@@ -140,9 +138,9 @@ class Writer:
             properties = self._properties(table, c, scaled=counts) if new else {}
             objects.append(api.ChannelObject(table.name, column.name, values, properties))
         self._described.add(table.name)
-        self._writer.write_segment(objects)
+        self._file.write_segment(objects)
 
-    def _properties(self, table: Table, c: int, *, scaled: bool) -> dict[str, Any]:
+    def _properties(self, table: ExportTable, c: int, *, scaled: bool) -> dict[str, Any]:
         column = table.columns[c]
         first = np.timedelta64(round(table.first_s * 1e6), "us")
         properties: dict[str, Any] = {
@@ -159,11 +157,3 @@ class Writer:
                 "NI_Scale[0]_Linear_Input_Source": np.uint32(_RAW_INPUT),
             }  # fmt: skip
         return properties
-
-    def close(self) -> None:
-        """Write what is left."""
-        self._writer.close()
-
-    def abandon(self) -> None:
-        """Let go of the file."""
-        self._writer.close()

@@ -110,7 +110,7 @@ def _channel(entry: Entry, source: Source, taken: set[str], *, rig: set[str], se
         name, number = f"{plain}_{number}", number + 1
     taken.add(name)
     rate = f"{entry.rate_hz:.9g} Hz" if entry.rate_hz else "no rate"
-    label = f"  {_label(entry)}".rstrip()
+    label = f"  {label_of(entry)}".rstrip()
     lines = [f"[channels.{_key(name)}]    # {entry.rows} values, {rate}{label}", f"source = {_quoted(entry.name)}"]
     if entry.group:
         lines.append(f"group = {_quoted(entry.group)}")
@@ -139,7 +139,7 @@ def _channel(entry: Entry, source: Source, taken: set[str], *, rig: set[str], se
     return lines
 
 
-def _label(entry: Entry) -> str:
+def label_of(entry: Entry) -> str:
     """What the file says of a signal, in a few words; of a comment that is JSON, its label."""
     text = entry.label
     if text.lstrip().startswith("{"):

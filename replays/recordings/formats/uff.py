@@ -13,14 +13,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from replays.recordings.formats import export
 from replays.recordings.formats import unit as units
-from replays.recordings.formats.source import Entry, Signal, Source, damaged, library
+from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, library
 from rig.errors import InputError
+from rig.outside import open_file
 from rig.text import printable
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
-    from replays.recordings.formats.selection import Chunk, Column, Selection, Table
+    from replays.recordings.formats.selection import Column, ExportChunk, ExportTable, Selection
 
 _TIME_RESPONSE = (0, 1)
 """Function types that are time histories: general, time response."""
@@ -42,7 +44,7 @@ _ORDINATE = {
 """Specific data type, and exponents of length and force, by what a unit measures (9: reaction force)."""
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a universal file.
 
     Raises:
@@ -67,14 +69,14 @@ def open_file(path: Path, options: FileOptions) -> Source:
     if not entries:
         raise InputError("file", "a universal file with time histories (dataset 58, real)", str(path))
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         data = file.read_sets(entry.place)
         values = np.array(data["data"], dtype=float)[: entry.rows]
         if len(values) < entry.rows:
             raise ValueError(f"{len(values)} of {entry.rows} values")
         if int(data["abscissa_spacing"]) == 0:
-            return Signal(values=values, times_s=np.array(data["x"], dtype=float)[: entry.rows])
-        return Signal(values=values, rate_hz=_rate_hz(data), first_s=float(data["abscissa_min"]))
+            return FileSignal(values=values, times_s=np.array(data["x"], dtype=float)[: entry.rows])
+        return FileSignal(values=values, rate_hz=_rate_hz(data), first_s=float(data["abscissa_min"]))
 
     others = len(kinds) - len(entries)
     remarks = (f"{others} datasets that are no time history are passed over",) if others else ()
@@ -84,7 +86,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
 
 def _ends(path: Path) -> bool:
     """Whether the file ends with the close of a dataset; pyuff passes over one that does not end."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         file.seek(max(0, path.stat().st_size - _TAIL))
         end = file.read().rstrip(_BLANK)
     # Binary numbers are followed by it without a new line; after one that closes, another opens the next dataset.
@@ -109,11 +111,8 @@ def _start(texts: list[str]) -> datetime | None:
     return None
 
 
-class Writer:
+class UffWriter(export.FormatWriter):
     """A universal file: a binary dataset 58 a channel, in float64."""
-
-    merged = False
-    sparse = False
 
     def __init__(self, path: Path, selection: Selection) -> None:
         self._file = path.open("wb")
@@ -125,22 +124,14 @@ class Writer:
                 self._file.seek(8 * table.rows, 1)
                 self._file.write(b"\n    -1\n")
 
-    def write(self, table: Table, chunk: Chunk) -> None:
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows; a missing one is nan, for the format has a start and a step and no times."""
         for c, at in enumerate(self._at[table.name]):
             self._file.seek(at + 8 * chunk.index)
             self._file.write(table.exported(c, chunk).astype("<f8").tobytes())
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
 
-    def abandon(self) -> None:
-        """Let go of the file."""
-        self._file.close()
-
-
-def _header(table: Table, column: Column, selection: Selection) -> bytes:
+def _header(table: ExportTable, column: Column, selection: Selection) -> bytes:
     kind, length, force = _ORDINATE.get(units.kind(column.unit), (_UNKNOWN, 0, 0))
     about = selection.metadata
     texts = (

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat
 
-from replays.recordings.formats.source import Entry, Signal, Source, library
+from replays.recordings.formats import export
+from replays.recordings.formats.source import Entry, FileSignal, Source, library
 from rig.errors import InputError
 from rig.outside import DOCUMENT_BYTES, check
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
-    from replays.recordings.formats.selection import Chunk, Selection, Table
+    from replays.recordings.formats.selection import ExportChunk, ExportTable, Selection
 
 _PCM = {"PCM_U8": 8, "PCM_16": 16, "PCM_24": 24, "PCM_32": 32}
 _FLOAT_BITS = 24
@@ -26,7 +27,7 @@ RULE = (
 )
 
 
-def open_file(path: Path, options: FileOptions) -> Source:
+def look_into(path: Path, options: FileOptions) -> Source:
     """Look into a WAV file; names, units and full scales come from FILE.wav.json if it stands beside it.
 
     Raises:
@@ -44,7 +45,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
         for c, column in enumerate(columns)
     )
 
-    def read(entry: Entry) -> Signal:
+    def read(entry: Entry) -> FileSignal:
         with soundfile.SoundFile(path) as file:
             parts = [
                 block[:, entry.place].copy()
@@ -59,7 +60,7 @@ def open_file(path: Path, options: FileOptions) -> Source:
             values = values.astype(np.int32) >> shift
             full /= 2.0 ** (bits - 1)
             rails = (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1.0)
-        return Signal(values=values, scale=full, offset=offset, rate_hz=float(rate), first_s=first_s, rails=rails)
+        return FileSignal(values=values, scale=full, offset=offset, rate_hz=float(rate), first_s=first_s, rails=rails)
 
     return Source(path=path, format=f"WAV {subtype}", entries=entries, read=read, about=about, start=start)
 
@@ -74,14 +75,14 @@ class _Column(BaseModel):
     offset_exported: FiniteFloat = 0.0
 
 
-class _Table(BaseModel):
+class _BesideTable(BaseModel):
     first_s: FiniteFloat
     columns: Annotated[tuple[_Column, ...], Field(min_length=1)]
 
 
 class _Beside(BaseModel):
     start: datetime
-    tables: Annotated[tuple[_Table, ...], Field(min_length=1, max_length=1)]
+    tables: Annotated[tuple[_BesideTable, ...], Field(min_length=1, max_length=1)]
 
 
 def _beside(path: Path, channels: int) -> tuple[tuple[_Column, ...], float, datetime | None]:
@@ -100,11 +101,10 @@ def _beside(path: Path, channels: int) -> tuple[tuple[_Column, ...], float, date
     return table.columns, table.first_s, found.start
 
 
-class Writer:
+class WavWriter(export.FormatWriter):
     """A WAV file. Counts as 32-bit integers, all else as floating point from -1 to 1."""
 
     merged = True
-    sparse = False
     sidecar = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
@@ -130,7 +130,7 @@ class Writer:
         self._file.date = selection.start.isoformat()
         self._file.comment = f"{RULE}. full_scale {scales}"[:2000]
 
-    def write(self, table: Table, chunk: Chunk) -> None:
+    def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows."""
         if self._integers:
             shifts = [32 - column.source.adc_bits for column in table.columns if column.source is not None]
@@ -140,11 +140,3 @@ class Writer:
             halves = [1.0 if column.source is None else 2.0 ** (column.source.adc_bits - 1) for column in table.columns]
             samples = chunk.values / np.array(halves)
         self._file.write(samples)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def abandon(self) -> None:
-        """Let go of the file."""
-        self._file.close()

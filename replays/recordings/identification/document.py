@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from replays.recordings.identification.fit import Identification
-from rig.errors import check_new_file
+from rig.errors import check_new_file, whole_file
 from rig.parameters import DEFAULT_SET, Parameter, load_parameters, set_names
 
 
@@ -62,13 +63,12 @@ def check_set(path: Path, *, force: bool) -> None:
 
 def write_set(text: str, path: Path) -> None:
     """Write a set to a file that is whole and can be loaded, or not there."""
-    part = path.with_name(f"{path.stem}.part.toml")
-    try:
-        part.write_text(text, encoding="utf-8")
-        load_parameters(str(part))
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with TemporaryDirectory() as folder:  # a draft has not the ending by which a set is known
+        named = Path(folder) / path.name
+        named.write_text(text, encoding="utf-8")
+        load_parameters(str(named))
+    with whole_file(path) as draft:
+        draft.write_text(text, encoding="utf-8")
 
 
 def identification_document(found: Identification, *, recording: str) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -185,7 +185,7 @@ def identify(
 
 @dataclass(frozen=True)
 class _State:
-    """What the search knows."""
+    """What the search knows, to come back to: values and their covariance, the window that it rests on, the stages."""
 
     z: np.ndarray
     covariance: np.ndarray
@@ -199,31 +199,19 @@ class _Search:
     def __init__(self, question: Question, *, spread: float) -> None:
         self.question = question
         self.scale = np.array([unknown.scale for unknown in question.unknowns])
-        self.z = np.zeros(len(self.scale))
         # The start is two standard deviations from the truth at most.
         self._loose = np.array([
             min(spread, unknown.reach / unknown.scale) / 2.0 for unknown in question.unknowns
         ])  # fmt: skip
-        self.covariance = np.diag(self._loose**2)
-        self.stages: tuple[Stage, ...] = ()
-        self.window: Window | None = None
+        self.state = _State(np.zeros(len(self.scale)), np.diag(self._loose**2), None, ())
         self.narrowed: dict[str, float] = {}
         self.jump = 0.0
         self.runs = 0
 
-    @property
-    def state(self) -> _State:
-        """What is known, to come back to."""
-        return _State(self.z.copy(), self.covariance.copy(), self.window, self.stages)
-
-    @state.setter
-    def state(self, state: _State) -> None:
-        self.z, self.covariance, self.window, self.stages = state.z, state.covariance, state.window, state.stages
-
     def horizon(self, end_s: float) -> Horizon:
         """Up to where the response to what is not known is linear, looking ahead to some time."""
         window = Window(self.question, end_s)
-        found = horizon(window, self.z, self.covariance)
+        found = horizon(window, self.state.z, self.state.covariance)
         self.runs += window.runs
         return found
 
@@ -234,7 +222,7 @@ class _Search:
             return False
         self._loose[place] *= _NARROWER
         self.narrowed[key] = 2.0 * self._loose[place]
-        self.covariance = np.diag(self._loose**2)
+        self.state = replace(self.state, covariance=np.diag(self._loose**2))
         return True
 
     def known(self, stage: Stage, part: float) -> bool:
@@ -245,53 +233,55 @@ class _Search:
     def known_of(self, part: float) -> str:
         """How many of the values asked for are known so far within a part of their scales."""
         asked = np.array([not unknown.along for unknown in self.question.unknowns])
-        last = self.stages[-1].half_widths if self.stages else np.full(len(self.scale), math.inf)
+        stages = self.state.stages
+        last = stages[-1].half_widths if stages else np.full(len(self.scale), math.inf)
         return f"{int(((last < part * self.scale) & asked).sum())} of {int(asked.sum())}"
 
     def extend(self, end_s: float, why: str) -> Stage:
         """Fit on a longer window, held loosely to the start."""
         window = Window(self.question, end_s)
-        z, covariance = self.z, self.covariance
+        before = self.state
         self._settle(window)
         chi2 = self._settle(window)  # again, by slopes along the directions that the first has given
-        squares = window.residuals(self.z) ** 2
-        rows = self.window.rows if self.window is not None else 0
+        squares = window.residuals(self.state.z) ** 2
+        rows = before.window.rows if before.window is not None else 0
         count = max(1, int(window.known[rows:].sum()))
-        fresh, usual = float(squares[rows:].sum()) / count, self.stages[-1].chi2 if self.stages else 1.0
+        fresh, usual = float(squares[rows:].sum()) / count, before.stages[-1].chi2 if before.stages else 1.0
         explained = fresh < usual * (1.0 + _CHANCE * math.sqrt(2.0 / count))
-        deviation = np.sqrt(np.diag(self.covariance))
-        moved = self.z - z
-        self.jump = math.sqrt(max(0.0, float(moved @ np.linalg.solve(covariance, moved))))
+        deviation = np.sqrt(np.diag(self.state.covariance))
+        moved = self.state.z - before.z
+        self.jump = math.sqrt(max(0.0, float(moved @ np.linalg.solve(before.covariance, moved))))
         self.runs += window.runs
-        self.window = window
-        stage = Stage(end_s, why, window.values(self.z), 1.96 * deviation * self.scale, chi2, fresh, explained)
-        self.stages = (*self.stages, stage)
+        stage = Stage(end_s, why, window.values(self.state.z), 1.96 * deviation * self.scale, chi2, fresh, explained)
+        self.state = replace(self.state, window=window, stages=(*before.stages, stage))
         return stage
 
     def _settle(self, window: Window) -> float:
         """Fit on a window, held loosely to the start; what is known then; chi2 a degree of freedom."""
-        self._solve(window, np.diag(0.5 / self._loose), np.zeros(len(self.z)))
-        squares = float((window.residuals(self.z) ** 2).sum())
-        chi2 = squares / max(1, int(window.known.sum()) - len(self.z))
+        self._solve(window, np.diag(0.5 / self._loose), np.zeros(len(self.state.z)))
+        squares = float((window.residuals(self.state.z) ** 2).sum())
+        chi2 = squares / max(1, int(window.known.sum()) - len(self.state.z))
         self._learn(window, chi2)
         return chi2
 
     def finish(self, why: str, *, robust: bool) -> Identification:
         """The last fit, without hold but where the samples tell nothing; and the judgement."""
-        window = self.window
-        assert window is not None
+        last = self.state.window
+        assert last is not None
         reach = np.array([unknown.reach / unknown.scale for unknown in self.question.unknowns])
-        window = Window(self.question, window.end_s)
-        blind = blind_directions(window.slopes(self.z, self.covariance), reach)
+        window = Window(self.question, last.end_s)
+        blind = blind_directions(window.slopes(self.state.z, self.state.covariance), reach)
         # Along what is not seen the values stay where they are.
-        self._solve(window, blind.T / reach, self.z, robust=robust)
-        judgement = judge(window, self.z, window.slopes(self.z, self.covariance), window.residuals(self.z))
+        self._solve(window, blind.T / reach, self.state.z, robust=robust)
+        judgement = judge(
+            window, self.state.z, window.slopes(self.state.z, self.state.covariance), window.residuals(self.state.z)
+        )
         return Identification(
             question=self.question,
             judgement=judgement,
             window=window,
-            z=self.z,
-            stages=self.stages,
+            z=self.state.z,
+            stages=self.state.stages,
             why=why,
             runs=self.runs + window.runs,
             narrowed=self.narrowed,
@@ -300,12 +290,12 @@ class _Search:
     def _learn(self, window: Window, chi2: float) -> None:
         """The covariance that the samples leave of z, starting from what was known before."""
         for _ in range(_PASSES):
-            slopes = window.slopes(self.z, self.covariance)
+            slopes = window.slopes(self.state.z, self.state.covariance)
             triangle = triangle_of(slopes) / math.sqrt(max(1.0, chi2))
             # By singular values: the information may span ten decades and more.
             _, singular, directions = np.linalg.svd(np.vstack([triangle, np.diag(1.0 / self._loose)]))
             root = directions.T / singular
-            self.covariance = root @ root.T
+            self.state = replace(self.state, covariance=root @ root.T)
 
     def _solve(self, window: Window, hold: np.ndarray, centre: np.ndarray, *, robust: bool = False) -> None:
         """Least squares over a window.
@@ -324,7 +314,7 @@ class _Search:
             (np.array(side) - start) / self.scale for side in zip(*((u.low, u.high) for u in unknowns), strict=True)
         )
         room = np.minimum(1e-9, (high - low) / 4.0)
-        begin = np.clip(self.z, low + room, high - room)
+        begin = np.clip(self.state.z, low + room, high - room)
         priors = [(place, unknown.prior) for place, unknown in enumerate(unknowns) if unknown.prior is not None]
         rows = np.zeros((len(priors), len(unknowns)))
         aims = np.zeros(len(priors))
@@ -333,20 +323,17 @@ class _Search:
             aims[row] = (mean - start[place]) / sigma
         held = np.vstack([hold, rows])
         aim = np.concatenate([hold @ centre, aims])
-        worst: list[np.ndarray] = []
+        if window.residuals_or_none(begin) is None:
+            raise InputError("start", "values that the model takes", window.values(begin).tolist())
 
         def residuals(z: np.ndarray) -> np.ndarray:
             found = window.residuals_or_none(z)
-            if found is None:  # the model does not take it: as bad as nothing seen so far
-                if not worst:
-                    raise InputError("start", "values that the model takes", window.values(z).tolist())
-                return np.concatenate([10.0 * worst[0], held @ z - aim])
-            if not worst or np.abs(found).max() > np.abs(worst[0]).max():
-                worst[:] = [found.ravel()]
-            return np.concatenate([found.ravel(), held @ z - aim])
+            # Of values that the model does not take, no number: the search takes a shorter step.
+            shown = np.full(window.known.size, np.inf) if found is None else found.ravel()
+            return np.concatenate([shown, held @ z - aim])
 
         def jacobian(z: np.ndarray) -> np.ndarray:
-            return np.vstack([-window.slopes(z, self.covariance).reshape(-1, len(z)), held])
+            return np.vstack([-window.slopes(z, self.state.covariance).reshape(-1, len(z)), held])
 
         solved = least_squares(
             residuals,
@@ -362,6 +349,6 @@ class _Search:
             gtol=None,  # pyright: ignore[reportArgumentType]
             max_nfev=25,
         )
-        self.z = solved.x
+        self.state = replace(self.state, z=solved.x)
         if not math.isfinite(solved.cost):
             raise InputError("fit", "of values that the model can run with", solved.x.tolist())

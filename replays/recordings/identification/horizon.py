@@ -53,10 +53,10 @@ def horizon(window: Window, z: np.ndarray, covariance: np.ndarray) -> Horizon:
     first, by = window.rows, ""
     sizes, directions = np.linalg.eigh(covariance)
     for size, direction in zip(sizes, directions.T, strict=True):
-        aside = SIGMAS * np.sqrt(max(size, 0.0)) * direction
+        change = SIGMAS * np.sqrt(max(size, 0.0)) * direction
         name = question.keys[int(np.argmax(np.abs(direction)))]
         try:
-            up, down = window.predicted(z + aside), window.predicted(z - aside)
+            up, down = window.predicted(z + change), window.predicted(z - change)
         except (InputError, SimulationError):
             continue  # at the edge of what the model takes, where there is only one side
         slope, bend = (up - down) / 2.0, (up + down) / 2.0 - base

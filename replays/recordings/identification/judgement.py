@@ -48,7 +48,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Channel:
+class ChannelFit:
     """How well one channel is explained: root mean square of the residuals over the noise, and their correlation."""
 
     name: str
@@ -81,7 +81,7 @@ class Judgement:
     freedom: int
     together: float
     inflation: float
-    channels: tuple[Channel, ...]
+    channels: tuple[ChannelFit, ...]
 
     @property
     def fits(self) -> bool:
@@ -307,17 +307,17 @@ def _wider(covariance: np.ndarray, other: np.ndarray) -> np.ndarray:
     return covariance * np.outer(np.maximum(stretch, 1.0), np.maximum(stretch, 1.0))
 
 
-def _channel(name: str, residuals: np.ndarray, known: np.ndarray) -> Channel:
+def _channel(name: str, residuals: np.ndarray, known: np.ndarray) -> ChannelFit:
     from scipy.stats import chi2
 
     held = residuals[known]
     if len(held) < 2 * _LAGS or not held.any():
-        return Channel(name, float(np.sqrt(np.mean(held**2))) if len(held) else 0.0, 0.0, white=True)
+        return ChannelFit(name, float(np.sqrt(np.mean(held**2))) if len(held) else 0.0, 0.0, white=True)
     centred = held - held.mean()
     power = float(centred @ centred)
     lags = np.arange(1, _LAGS + 1)
     correlations = np.array([float(centred[lag:] @ centred[:-lag]) / power for lag in lags]) if power else 0.0 * lags
     statistic = len(held) * (len(held) + 2.0) * float((correlations**2 / (len(held) - lags)).sum())
-    return Channel(
+    return ChannelFit(
         name, float(np.sqrt(np.mean(held**2))), float(correlations[0]), white=bool(statistic < chi2.ppf(0.999, _LAGS))
     )

@@ -1,4 +1,4 @@
-"""What a log of another system does not tell exactly: its clock, the shaft's angle, the speed, the force of the blow.
+"""What a log of another system does not tell exactly: its clock, the shaft's angle, the speed, the force of the pulse.
 
 A recording of this rig has all of that to the tick. Of an imported log it is fitted along with whatever is asked, so
 that it neither spoils other values nor passes for a fault of the model.
@@ -15,6 +15,7 @@ import numpy as np
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
 from replays.recordings.identification.question import first_command_s, observe
+from replays.recordings.least_squares import Fit, fit
 from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.sensitivity import ANGLE, Predictor, on_the_models_clock, value_of, with_values
 from rig.errors import InputError
@@ -27,8 +28,8 @@ NUISANCES = (
     "hammer.1.force_n",
     "hammer.1.duration_ms",
 )
-"""In place of the time of the first blow stand the clock and the angle: a simulation has blows only at its own rows."""
-_BLOW = "hammer.1.at_s"
+"""In place of the time of the first pulse stand clock and angle: a simulation has pulses only at its own rows."""
+_PULSE = "hammer.1.at_s"
 _DEVIATIONS = {"clock.rate_ppm": 50.0}
 """What is known before: the standard deviation of a crystal, in ppm; ..."""
 _RELATIVE = {"drive.speed_hz": 1e-4}
@@ -36,13 +37,13 @@ _RELATIVE = {"drive.speed_hz": 1e-4}
 _ANGLES = 8
 _ROUNDS = 2
 _LOOK_S = 0.5
-"""So much before the blow tells angle and speed [s] ..."""
+"""So much before the hammer pulse tells angle and speed [s] ..."""
 _MARGIN_S = 2e-3
-"""... up to here, as the time of the blow is not known better ..."""
+"""... up to here, as the time of the hammer pulse is not known better ..."""
 _BEFORE_S = 0.03
 """... and so much of it is in the fit of all [s]."""
 _WINDOWS_S = (6e-3, 9e-3, 13e-3, 20e-3, 30e-3)
-"""How far behind the begin of the blow the fits look [s]."""
+"""How far behind the begin of the hammer pulse the fits look [s]."""
 _WORSE = 1.5
 """A longer window is given up where it leaves more by this factor."""
 
@@ -61,9 +62,9 @@ class Fitted:
         """In words."""
         if self.key == "clock.offset_s":
             return f"time: shifted by {self.value * 1e6:+.1f} +-{1.0e6 * self.half_width:.2g} us, fitted"
-        if self.key == _BLOW:
+        if self.key == _PULSE:
             late = 1e6 * (self.value - self.start)
-            return f"time: blow shifted by {late:+.1f} +-{1e6 * self.half_width:.2g} us, fitted"
+            return f"time: hammer pulse shifted by {late:+.1f} +-{1e6 * self.half_width:.2g} us, fitted"
         if self.key == "clock.rate_ppm":
             return f"clock: {self.value:+.1f} +-{self.half_width:.2g} ppm fast, fitted"
         change = self.value - self.start
@@ -76,10 +77,10 @@ class Tuned:
 
     Attributes:
         begun: The experiment before the fit.
-        experiment: With the fitted numbers, those of a blow as its rows can have them.
+        experiment: With the fitted numbers, those of a hammer pulse as its rows can have them.
         fitted: What was fitted.
         values: The same, by key.
-        aside: Values as far off as the fit leaves open, drawn once from what it says.
+        perturbed: Values as far off as the fit leaves open, drawn once from what it says.
         about_s: Where the clocks differ by the offset alone [s].
         end_s: End of the samples that it rests on [s].
         chi2: Sum of squares of what is left over the noise, a sample.
@@ -89,7 +90,7 @@ class Tuned:
     experiment: Experiment
     fitted: tuple[Fitted, ...]
     values: dict[str, float]
-    aside: dict[str, float]
+    perturbed: dict[str, float]
     about_s: float
     end_s: float
     chi2: float
@@ -98,14 +99,14 @@ class Tuned:
         """Channels of the log on the model's clock."""
         return on_the_models_clock(parts, self.values, about_s=self.about_s)
 
-    def predict(self, parts: dict[str, Measured], *, aside: bool = False) -> Prediction:
-        """What is foretold for channels of the log, on its own clock; a blow may lie between two rows.
+    def predict(self, parts: dict[str, Measured], *, perturbed: bool = False) -> Prediction:
+        """What is predicted for channels of the log, on its own clock; a hammer pulse may lie between two rows.
 
         Args:
             parts: The channels.
-            aside: As far off as the fit leaves open.
+            perturbed: As far off as the fit leaves open.
         """
-        values = self.aside if aside else self.values
+        values = self.perturbed if perturbed else self.values
         predictor = Predictor(self.begun, tuple(values), parts, about_s=self.about_s)
         return predictor.predict(tuple(values.values()))
 
@@ -125,8 +126,8 @@ def nuisances_of(
         keys: The nuisances.
         besides: What is asked anyway.
     """
-    if experiment.first_s == 0.0:  # it has run from the scene's own start: the blow is late, and not the clock
-        keys = [_BLOW if key == "clock.offset_s" else key for key in keys]
+    if experiment.first_s == 0.0:  # it has run from the scene's own start: the pulse is late, and not the clock
+        keys = [_PULSE if key == "clock.offset_s" else key for key in keys]
     found: dict[str, tuple[float, float] | None] = {}
     for key in keys:
         if key in besides:
@@ -134,57 +135,44 @@ def nuisances_of(
         try:
             value = value_of(experiment, key)
         except InputError:
-            continue  # no blow
+            continue  # no hammer pulse
         deviation = _DEVIATIONS.get(key) or _RELATIVE.get(key, 0.0) * abs(value)
         found[key] = (value, deviation) if deviation else None
     return found
 
 
 def turned(recording: Recording, experiment: Experiment) -> Experiment:
-    """With the angle and the speed of the shaft that explain the motion before the first blow best.
+    """With the angle and the speed of the shaft that explain the motion before the first pulse best.
 
     The steady motion is a constant and a vector that turns along with the angle: a sum of squares over the angle is a
-    constant, a cosine and a sine. From its least place on, Gauss and Newton's method.
+    constant, a cosine and a sine. From its least place on, a fit.
     """
     first_s = first_command_s(experiment)
     try:
         window = (first_s - _LOOK_S, first_s - _MARGIN_S) if first_s > 0.0 else (None, None)
         parts = observe(recording, experiment, window=window).parts
     except InputError:
-        return experiment  # no samples before the blow
+        return experiment  # no samples before the hammer pulse
     predictor = Predictor(experiment, (ANGLE, "drive.speed_hz"), parts)
-
-    def off(prediction: Prediction) -> np.ndarray:
-        # What a probe's zero is, the angle does not tell.
-        z = [(part.values - prediction.values[name]) / part.floor for name, part in parts.items()]
-        return np.concatenate([(part - part.mean(axis=0)).ravel() for part in z])
-
+    speed_hz = float(predictor.start[1])
     angles = 2.0 * math.pi * np.arange(_ANGLES) / _ANGLES
-    squares = np.array([float(np.sum(off(predictor.predict((a, predictor.start[1]))) ** 2)) for a in angles])
-    values = np.array([math.atan2(-squares @ np.sin(angles), -squares @ np.cos(angles)), predictor.start[1]])
+    # What a probe's zero is, the angle does not tell: without each channel's mean.
+    squares = np.array([np.sum(_residuals(predictor, (angle, speed_hz), centred=True) ** 2) for angle in angles])
+    values = np.array([math.atan2(-squares @ np.sin(angles), -squares @ np.cos(angles)), speed_hz])
     for _ in range(_ROUNDS):
-        found = predictor.derivatives(values, check=False)
-        slopes = np.column_stack(
-            [
-                np.concatenate(
-                    [((s := slope[name] / part.floor) - s.mean(axis=0)).ravel() for name, part in parts.items()]
-                )
-                for slope in found.slopes
-            ]
-        )
-        z = off(found.base)
+        z = _residuals(predictor, values, centred=True)
         # Where the model is wrong, its errors do not outweigh the speed that the log tells.
-        held = math.sqrt(float(z @ z) / len(z)) / (_RELATIVE["drive.speed_hz"] * max(predictor.start[1], 1e-3))
-        slopes = np.vstack([slopes, [0.0, held]])
-        z = np.append(z, held * (predictor.start[1] - values[1]))
-        values = values + np.linalg.lstsq(slopes, z, rcond=None)[0]
+        weight = math.sqrt(float(z @ z) / len(z)) / (_RELATIVE["drive.speed_hz"] * max(speed_hz, 1e-3))
+        values = _fit(
+            predictor, values, predictor.start, weights=np.array([0.0, weight]), rounds=1, centred=True
+        ).values
     return with_values(experiment, dict(zip(predictor.keys, values.tolist(), strict=True)))
 
 
 def asked_along(experiment: Experiment, keys: Sequence[str]) -> dict[str, tuple[float, float] | None]:
     """Nuisances that are fitted along with what is asked of an imported log: those that a search can take.
 
-    The speed is known before the blow, and the length of a blow only in rows of the simulation.
+    The speed is known before the hammer pulse, and the length of a hammer pulse only in rows of the simulation.
     """
     few = tuple(key for key in NUISANCES if key not in ("drive.speed_hz", "hammer.1.duration_ms"))
     return nuisances_of(experiment, few, besides=keys)
@@ -201,12 +189,12 @@ def check_begin(experiment: Experiment, to_s: float | None) -> None:
         to_s: Where the samples end [s]; None for the log's end.
 
     Raises:
-        InputError: It is such a log, and the samples go beyond the first blow.
+        InputError: It is such a log, and the samples go beyond the first pulse.
     """
-    blow_s = first_command_s(experiment)
-    if experiment.first_s > 0.0 and blow_s > 0.0 and (to_s is None or to_s > blow_s):
+    hammer_s = first_command_s(experiment)
+    if experiment.first_s > 0.0 and hammer_s > 0.0 and (to_s is None or to_s > hammer_s):
         must = "a log that begins with the run, at rest (lead_s = 0 in its mapping), to be fitted through impacts; of "
-        must += f"one from the middle of a run, only what is before the blow: --to {blow_s - _MARGIN_S:.3f}"
+        must += f"one from the middle of a run, only what is before the hammer pulse: --to {hammer_s - _MARGIN_S:.3f}"
         raise InputError("file", must, f"{experiment.first_s:g} s of the run are before its first sample")
 
 
@@ -223,7 +211,7 @@ def tune(
     *,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Tuned:
-    """Fit what a log does not tell exactly, and nothing else: Gauss-Newton's method on windows that grow from the blow.
+    """Fit what a log does not tell exactly, and nothing else, on windows that grow from the pulse.
 
     Args:
         recording: The log.
@@ -234,21 +222,27 @@ def tune(
     Raises:
         InputError: There are no samples to do it by.
     """
-    progress("angle and speed of the shaft before the blow")
+    progress("angle and speed of the shaft before the hammer pulse")
     begun = turned(recording, experiment) if ANGLE in keys else experiment
     wanted = nuisances_of(begun, keys)
     first_s = first_command_s(begun)
     whole = observe(recording, begun, window=(max(0.0, first_s - _BEFORE_S), first_s + _WINDOWS_S[-1]))
-    start = np.array([value_of(begun, key) for key in wanted])
-    values, covariance, chi2, end_s = start, np.eye(len(start)), math.inf, first_s
+    values = np.array([value_of(begun, key) for key in wanted])
+    covariance, chi2, end_s = np.eye(len(values)), math.inf, first_s
     for length in _WINDOWS_S:
         progress(f"{', '.join(wanted)}: to {first_s + length:.3f} s")
-        line = _Line(begun, wanted, whole.parts_until(whole.until(first_s + length)))
-        found = line.fit(values)
-        if math.isfinite(chi2) and found[2] > max(_WORSE * chi2, _WORSE):
+        predictor = Predictor(begun, tuple(wanted), whole.parts_until(whole.until(first_s + length)))
+        # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
+        loose = zip(predictor.start, predictor.scales, strict=True)
+        known = [prior or held for prior, held in zip(wanted.values(), loose, strict=True)]
+        means, deviations = np.array(known).T
+        found = _fit(predictor, values, means, weights=1.0 / deviations, rounds=_ROUNDS)
+        left = found.squares / len(found.residuals)
+        if math.isfinite(chi2) and left > max(_WORSE * chi2, _WORSE):
             break  # the model no longer explains it: that is to be judged, and not to be fitted away
-        values, covariance, chi2 = found
-        end_s = first_s + length
+        assert found.slopes is not None
+        root = np.linalg.inv(np.linalg.qr(found.slopes, mode="r"))
+        values, covariance, chi2, end_s = found.values, root @ root.T, left, first_s + length
     half = 1.96 * math.sqrt(max(1.0, chi2)) * np.sqrt(np.diag(covariance))
     draw = values + np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(len(values))
     told = dict(zip(wanted, values.tolist(), strict=True))
@@ -260,58 +254,55 @@ def tune(
             for (key, value), width in zip(told.items(), half, strict=True)
         ),
         values=told,
-        aside=dict(zip(wanted, draw.tolist(), strict=True)),
+        perturbed=dict(zip(wanted, draw.tolist(), strict=True)),
         about_s=min(float(part.times_s[0]) for part in whole.parts.values()),
         end_s=end_s,
         chi2=chi2,
     )
 
 
-class _Line:
-    """Residuals over the noise as a function of the nuisances, with what is known of them before."""
+def _fit(
+    predictor: Predictor,
+    start: np.ndarray,
+    means: np.ndarray,
+    *,
+    weights: np.ndarray,
+    rounds: int,
+    centred: bool = False,
+) -> Fit:
+    """Values near a start that explain the channels best.
 
-    def __init__(
-        self, experiment: Experiment, wanted: dict[str, tuple[float, float] | None], parts: dict[str, Measured]
-    ) -> None:
-        self._predictor = Predictor(experiment, tuple(wanted), parts)
-        means = [prior[0] if prior is not None else 0.0 for prior in wanted.values()]
-        self._means = np.array(means)
-        # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
-        self._weights = np.array(
-            [
-                1.0 / (prior[1] if prior is not None else scale)
-                for prior, scale in zip(wanted.values(), self._predictor.scales, strict=True)
-            ]
-        )
-        self._means = np.where([prior is None for prior in wanted.values()], self._predictor.start, self._means)
+    Args:
+        predictor: Of the channels.
+        start: Where the search begins, shape (keys,).
+        means: What is known of the values before, shape (keys,) ...
+        weights: ... and how well: one over the standard deviation, 0 where nothing is, shape (keys,).
+        rounds: Largest number of steps.
+        centred: Without each channel's mean.
+    """
 
-    def fit(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """The values, their covariance by the noise, and the mean square of what is left."""
-        z = self._residuals(values)
-        slopes = self._slopes(values)
-        for number in range(_ROUNDS):
-            slopes = slopes if number == 0 else self._slopes(values)
-            step = np.linalg.lstsq(slopes, -z, rcond=None)[0]
-            for part in (1.0, 0.3, 0.1):
-                ahead = self._residuals(values + part * step)
-                if ahead @ ahead < z @ z:
-                    values, z = values + part * step, ahead
-                    break
-            else:
-                break
-        triangle = np.linalg.qr(slopes, mode="r")
-        root = np.linalg.inv(triangle)
-        return values, root @ root.T, float(z @ z) / len(z)
+    def residuals(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([_residuals(predictor, values, centred=centred), (values - means) * weights])
 
-    def _residuals(self, values: np.ndarray) -> np.ndarray:
-        found = self._predictor.predict(values).values
-        z = [((found[name] - part.values) / part.floor).ravel() for name, part in self._predictor.parts.items()]
-        return np.concatenate([*z, (values - self._means) * self._weights])
+    def slopes(values: np.ndarray, _z: np.ndarray) -> np.ndarray:
+        found = predictor.derivatives(values).slopes
+        columns = [_over_noise(predictor, slope, centred=centred) for slope in found]
+        return np.vstack([np.column_stack(columns), np.diag(weights)])
 
-    def _slopes(self, values: np.ndarray) -> np.ndarray:
-        found = self._predictor.derivatives(values, check=False)
-        parts = self._predictor.parts
-        columns = [
-            np.concatenate([(s[name] / part.floor).ravel() for name, part in parts.items()]) for s in found.slopes
-        ]
-        return np.vstack([np.column_stack(columns), np.diag(self._weights)])
+    found = fit(residuals, slopes, start, rounds=rounds)
+    assert found is not None
+    return found
+
+
+def _residuals(predictor: Predictor, values: Sequence[float] | np.ndarray, *, centred: bool) -> np.ndarray:
+    """Predicted less measured over the noise, of all channels, shape (n,)."""
+    found = predictor.predict(values).values
+    return _over_noise(
+        predictor, {name: found[name] - part.values for name, part in predictor.parts.items()}, centred=centred
+    )
+
+
+def _over_noise(predictor: Predictor, values: dict[str, np.ndarray], *, centred: bool) -> np.ndarray:
+    """Values of all channels, by group, in units of each one's noise, shape (n,)."""
+    found = [values[name] / part.floor for name, part in predictor.parts.items()]
+    return np.concatenate([(one - one.mean(axis=0) if centred else one).ravel() for one in found])

@@ -255,7 +255,7 @@ def observe(
         times_s=np.concatenate([part.times_s for part in parts.values()])[first],
         values=np.empty(0),
         noise=np.array([own[name][0].floor[own[name][1]] for name in wanted]),
-        noise_from=tuple("table" if _told(*own[name]) else "measured" for name in wanted),
+        noise_from=tuple("table" if _has_noise(*own[name]) else "measured" for name in wanted),
         parts=parts,
         rows={name: np.searchsorted(union, held) for name, held in stamps.items()},
         every=every,
@@ -264,7 +264,7 @@ def observe(
     return replace(observation, values=values)
 
 
-def _told(part: Measured, column: int) -> bool:
+def _has_noise(part: Measured, column: int) -> bool:
     return part.channels[column].noise_v > 0.0
 
 
@@ -272,7 +272,7 @@ def _with_noise(part: Measured) -> Measured:
     """With the noise of the table and its rounding as white noise; measured where the table tells none."""
     floor = np.array(
         [
-            channel_noise(channel) if _told(part, c) else measured_noise(part.values[:, c])
+            channel_noise(channel) if _has_noise(part, c) else measured_noise(part.values[:, c])
             for c, channel in enumerate(part.channels)
         ]
     )
@@ -292,7 +292,7 @@ def channel_noise(channel: Channel) -> float:
 
 
 def first_command_s(experiment: Experiment) -> float:
-    """When the first blow comes [s]; 0 without one."""
+    """When the first hammer pulse comes [s]; 0 without one."""
     times = [timed.at_s for timed in experiment.scene.commands if isinstance(timed.request, HammerCommand)]
     times += [command.tick / TICK_RATE_HZ for command in experiment.commands if command.name == "hammer"]
     return min(times, default=0.0)

@@ -80,17 +80,17 @@ class Window:
         sizes, directions = np.linalg.eigh(covariance)
         whitened = []
         for size, direction in zip(sizes, directions.T, strict=True):
-            aside = _STEP_SIGMAS * np.sqrt(max(size, _LEAST_VARIANCE)) * direction
-            (above, up), (below, down) = (self._side(z, sign * aside) for sign in (1.0, -1.0))
+            change = _STEP_SIGMAS * np.sqrt(max(size, _LEAST_VARIANCE)) * direction
+            (above, up), (below, down) = (self._side(z, sign * change) for sign in (1.0, -1.0))
             width = float((above - below) @ direction)
             if width == 0.0:
                 raise InputError("start", "values with room for a change", self.values(z).tolist())
             whitened.append(np.where(self.known, (up - down) / width, 0.0))
         return np.einsum("nck,pk->ncp", np.stack(whitened, axis=-1), directions)
 
-    def _side(self, z: np.ndarray, aside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _side(self, z: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A point beside z and what is predicted there; z itself where the model does not take it."""
         try:
-            return z + aside, self.predicted(z + aside)
+            return z + change, self.predicted(z + change)
         except (InputError, SimulationError):
             return z, self.predicted(z)

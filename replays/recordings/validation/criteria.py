@@ -19,12 +19,12 @@ NotNegative = Annotated[FiniteFloat, Field(ge=0.0)]
 Reason = Annotated[str, Field(min_length=1)]
 
 
-class _Part(BaseModel):
+class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Window(_Part):
-    """How long a trajectory can be foretold, and how much of a recording is compared at all."""
+class WindowRules(_Section):
+    """How long a trajectory can be predicted, and how much of a recording is compared at all."""
 
     reason: Reason
     perturbation: Positive
@@ -48,7 +48,7 @@ class Window(_Part):
         return keys
 
 
-class TrajectoryCriterion(_Part):
+class TrajectoryCriterion(_Section):
     """Limits of the residual over its noise floor, sample by sample inside the window."""
 
     channels: tuple[str, ...]
@@ -64,15 +64,15 @@ class TrajectoryCriterion(_Part):
     """Largest mean over a stretch [standard errors of such a mean]."""
 
 
-class StatisticCriterion(_Part):
-    """Limits of a quantity of a phase: recorded against foretold."""
+class StatisticCriterion(_Section):
+    """Limits of a quantity of a phase: recorded against predicted."""
 
     phases: tuple[str, ...]
     quantities: tuple[str, ...]
     """Patterns of names; of several criteria the first that fits phase and quantity holds."""
     reason: Reason
     relative: NotNegative = 0.0
-    """Part of the foretold value, ..."""
+    """Part of the predicted value, ..."""
     absolute: NotNegative = 0.0
     """... plus so much in the quantity's own unit, ..."""
     spread: NotNegative
@@ -89,8 +89,8 @@ class StatisticCriterion(_Part):
         return _known_names(names, tuple(QUANTITIES))
 
 
-class Ensemble(_Part):
-    """Re-simulations that show how far a quantity can be foretold: perturbed, each with noise of its own."""
+class Ensemble(_Section):
+    """Re-simulations that show how far a quantity can be predicted: perturbed, each with noise of its own."""
 
     reason: Reason
     members: Annotated[int, Field(ge=3, le=100)]
@@ -98,7 +98,7 @@ class Ensemble(_Part):
     """Relative, of the window's parameters."""
 
 
-class TruthCriterion(_Part):
+class TruthCriterion(_Section):
     """Limit for the truth, where it was recorded, inside the window."""
 
     reason: Reason
@@ -106,7 +106,7 @@ class TruthCriterion(_Part):
     """Largest difference as a part of each column's largest value, beyond that of the perturbed run."""
 
 
-class Imported(_Part):
+class Imported(_Section):
     """What is asked of logs of other systems, which tell less exactly what was done and how loud their sensors are."""
 
     reason: Reason
@@ -116,7 +116,7 @@ class Imported(_Part):
     """By this part the noise may be off that was read off the log."""
 
 
-class Candidate(_Part):
+class Candidate(_Section):
     """What may be off: numbers of the experiment that are changed together."""
 
     name: str
@@ -130,7 +130,7 @@ class Candidate(_Part):
     """Of the difference quotient, as `largest`."""
 
 
-class Attribution(_Part):
+class Attribution(_Section):
     """How a failure is explained."""
 
     reason: Reason
@@ -143,11 +143,11 @@ class Attribution(_Part):
     candidates: tuple[Candidate, ...]
 
 
-class Criteria(_Part):
+class Criteria(_Section):
     """All of it."""
 
     title: str
-    window: Window
+    window: WindowRules
     trajectory: tuple[TrajectoryCriterion, ...]
     truth: TruthCriterion
     ensemble: Ensemble

@@ -1,4 +1,4 @@
-"""Phases of a run, read off its recording, and the quantities of each; recorded and foretold are read alike."""
+"""Phases of a run, read off its recording, and the quantities of each; recorded and predicted are read alike."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from itertools import pairwise
 import numpy as np
 
 from replays.recordings.prediction import Measured
-from replays.recordings.whirl import whirl_frequency
+from rig.orbit import phase as phase_of
+from rig.orbit import whirl_frequency
 
 PHASES = ("free run", "impacts", "whirl", "rest", "decay")
 """Before the first contact; contact that comes and goes; lasting contact that goes round, or does not; after it."""
@@ -38,7 +39,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class View:
-    """A phase of one set of channels, recorded or foretold, without gaps.
+    """A phase of one set of channels, recorded or predicted, without gaps.
 
     Attributes:
         times_s: By channel [s], each shape (n,).
@@ -72,7 +73,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Reading:
     """One number of a phase."""
 
     unit: str
@@ -110,38 +111,38 @@ def _orbit(view: View) -> float:
 
 
 QUANTITIES = {
-    "whirl_frequency": Quantity("Hz", "phase slope of the shaft in the ring; negative is backward", _RING, _whirl,
+    "whirl_frequency": Reading("Hz", "phase slope of the shaft in the ring; negative is backward", _RING, _whirl,
                                 ("whirl",)),
-    "sense": Quantity("", "1 forward, -1 backward", _RING, lambda view: math.copysign(1.0, _whirl(view)), ("whirl",)),
-    "radius": Quantity("mm", "mean radius in the ring", _RING, lambda view: float(view.radius().mean()),
+    "sense": Reading("", "1 forward, -1 backward", _RING, lambda view: math.copysign(1.0, _whirl(view)), ("whirl",)),
+    "radius": Reading("mm", "mean radius in the ring", _RING, lambda view: float(view.radius().mean()),
                        ("whirl", "rest")),
-    "contact_fraction": Quantity("", "share of samples in contact", _RING,
+    "contact_fraction": Reading("", "share of samples in contact", _RING,
                                  lambda view: float(view.contact().mean()), ("impacts", "whirl", "rest")),
-    "impacts": Quantity("", "contacts that begin", _RING, _impacts, ("impacts",)),
-    "mean_force": Quantity("N", "mean size of the reaction, both axes", _FORCES,
+    "impacts": Reading("", "contacts that begin", _RING, _impacts, ("impacts",)),
+    "mean_force": Reading("N", "mean size of the reaction, both axes", _FORCES,
                            lambda view: float(np.abs(view.force()).mean()), ("impacts", "whirl", "rest")),
-    "peak_force": Quantity("N", "largest reaction", _FORCES, lambda view: float(np.abs(view.force()).max()),
+    "peak_force": Reading("N", "largest reaction", _FORCES, lambda view: float(np.abs(view.force()).max()),
                            ("impacts", "whirl", "rest")),
-    "impulse": Quantity("N s", "size of the reaction over time", _FORCES, _impulse, ("impacts",)),
-    "ripple_x": Quantity("N", "sqrt(2) RMS of P_E - P_W about its mean", _FORCES, _ripple("P_E", "P_W"),
+    "impulse": Reading("N s", "size of the reaction over time", _FORCES, _impulse, ("impacts",)),
+    "ripple_x": Reading("N", "sqrt(2) RMS of P_E - P_W about its mean", _FORCES, _ripple("P_E", "P_W"),
                          ("impacts", "whirl")),
-    "ripple_y": Quantity("N", "sqrt(2) RMS of P_N - P_S about its mean", _FORCES, _ripple("P_N", "P_S"),
+    "ripple_y": Reading("N", "sqrt(2) RMS of P_N - P_S about its mean", _FORCES, _ripple("P_N", "P_S"),
                          ("impacts", "whirl")),
-    "orbit": Quantity("mm", "RMS of the disk's orbit about its mean", _DISK, _orbit),
-    "mean_x": Quantity("mm", "mean of the disk, horizontal", _DISK, lambda view: float(view.values["disk_x"].mean()),
+    "orbit": Reading("mm", "RMS of the disk's orbit about its mean", _DISK, _orbit),
+    "mean_x": Reading("mm", "mean of the disk, horizontal", _DISK, lambda view: float(view.values["disk_x"].mean()),
                        ("rest", "decay")),
-    "mean_y": Quantity("mm", "mean of the disk, vertical", _DISK, lambda view: float(view.values["disk_y"].mean()),
+    "mean_y": Reading("mm", "mean of the disk, vertical", _DISK, lambda view: float(view.values["disk_y"].mean()),
                        ("rest", "decay")),
-    "spin": Quantity("Hz", "mean of the tachometer", ("speed",), lambda view: float(view.values["speed"].mean())),
-    "spin_lowest": Quantity("Hz", "lowest of the tachometer, means over 5 ms", ("speed",),
+    "spin": Reading("Hz", "mean of the tachometer", ("speed",), lambda view: float(view.values["speed"].mean())),
+    "spin_lowest": Reading("Hz", "lowest of the tachometer, means over 5 ms", ("speed",),
                             lambda view: _lowest(view), ("impacts",)),
     # Read off two views at once: see `spectrum_distance`.
-    "spectrum_ring": Quantity("", "distance of the full spectra of the shaft in the ring", _RING, lambda _: 0.0),
-    "spectrum_disk": Quantity("", "distance of the full spectra of the disk", _DISK, lambda _: 0.0),
-    "spectrum_force": Quantity("", "distance of the full spectra of the reaction", _FORCES, lambda _: 0.0),
+    "spectrum_ring": Reading("", "distance of the full spectra of the shaft in the ring", _RING, lambda _: 0.0),
+    "spectrum_disk": Reading("", "distance of the full spectra of the disk", _DISK, lambda _: 0.0),
+    "spectrum_force": Reading("", "distance of the full spectra of the reaction", _FORCES, lambda _: 0.0),
     # From the truth, where it was recorded.
-    "dissipated": Quantity("J", "dissipated within the phase (truth)", (), lambda _: math.nan),
-    "drive_work": Quantity("J", "work of the drive within the phase (truth)", (), lambda _: math.nan),
+    "dissipated": Reading("J", "dissipated within the phase (truth)", (), lambda _: math.nan),
+    "drive_work": Reading("J", "work of the drive within the phase (truth)", (), lambda _: math.nan),
 }  # fmt: skip
 SPECTRA = {"spectrum_ring": _RING, "spectrum_disk": _DISK, "spectrum_force": _FORCES}
 
@@ -239,7 +240,7 @@ def find_phases(view: View, *, floor_n: float) -> list[Phase]:
     """
     if view.has(*_RING) and math.isfinite(view.touches):
         times, contact = view.times_s["ring_x"], view.contact()
-        angle = np.unwrap(np.angle(view.values["ring_x"] + 1j * view.values["ring_y"])) / (2.0 * math.pi)
+        angle = phase_of(view.values["ring_x"], view.values["ring_y"]) / (2.0 * math.pi)
     elif view.has(*_FORCES):
         times, contact = view.times_s["P_E"], np.abs(view.force()) > _CLEAR * floor_n
         angle = np.zeros(len(times))

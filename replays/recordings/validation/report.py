@@ -1,4 +1,4 @@
-"""The report of a validation: tables, and pictures of what was recorded over what was foretold."""
+"""The report of a validation: tables, and pictures of what was recorded over what was predicted."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
 from replays.report import Mark, Report, Row
 from replays.report.canvas import BLUE, ORANGE, RED, draw_grid, new_figure
+from rig.orbit import full_spectrum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +54,7 @@ def _conclusion(report: Report, found: Validation) -> None:
     if found.failures and not found.good:
         report.heading("Criteria that fail")
         report.table(
-            ("criterion", "recorded", "foretold", "limit", "verdict"),
+            ("criterion", "recorded", "predicted", "limit", "verdict"),
             [Row((f.criterion, f.recorded, f.foretold, f.limit, "fails"), "bad") for f in found.failures],
             caption="Of a residual the first measure beyond its limit; +- is the largest difference.",
         )
@@ -116,20 +117,20 @@ def _trajectory(report: Report, found: Validation) -> None:
     zooms = _zooms(found)
     told = "".join(f" and from {begin:.3f} to {end:.3f} s ({why})" for why, begin, end in zooms)
     for part in found.parts.values():
-        caption = f"{part.group}: recorded over foretold as a whole{told}, and the residual over its noise."
+        caption = f"{part.group}: recorded over predicted as a whole{told}, and the residual over its noise."
         report.picture(_group(found, part, zooms), caption)
 
 
 def _phases(report: Report, found: Validation) -> None:
     report.heading("Phases")
     report.table(
-        ("phase", "quantity", "recorded", "foretold", "spread", "limit", "verdict"),
+        ("phase", "quantity", "recorded", "predicted", "spread", "limit", "verdict"),
         [
             Row((s.phase, s.title, f"{s.recorded:.6g}", f"{s.foretold:.6g}", f"{s.spread:.2g}",
                  "" if s.limit is None else f"+- {s.limit:.2g}", _WORDS[s.good]), _MARKS[s.good])
             for s in found.statistics
         ],
-        caption="Foretold is the median, spread the standard deviation over perturbed re-simulations with noise; "
+        caption="Predicted is the median, spread the standard deviation over perturbed re-simulations with noise; "
         f"phases are read off the recording ({', '.join(PHASES)}).",
     )  # fmt: skip
     names = {name for part in found.parts.values() for name in part.names}
@@ -219,7 +220,7 @@ def _overlay(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tup
     rows = _rows(part, window)
     times = part.times_s[rows]
     axes.plot(*_thin(times, part.values[rows, c]), color=BLUE, lw=1.0, label="recorded")
-    axes.plot(*_thin(times, values[rows, c]), color=ORANGE, lw=0.8, ls="--", label="foretold")
+    axes.plot(*_thin(times, values[rows, c]), color=ORANGE, lw=0.8, ls="--", label="predicted")
 
 
 def _residual(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tuple[str, float, float]) -> None:
@@ -251,15 +252,12 @@ def _orbits(found: Validation, pairs: list[tuple[str, str]]) -> Figure:
         ]
         rate = 1.0 / float(np.median(np.diff(part.times_s)))
         for signal, colour, label, style in zip(
-            signals, (BLUE, ORANGE), ("recorded", "foretold"), ("-", "--"), strict=True
+            signals, (BLUE, ORANGE), ("recorded", "predicted"), ("-", "--"), strict=True
         ):
             left.plot(signal.real, signal.imag, style, color=colour, lw=0.5, label=label, rasterized=True)
-            window = np.hanning(len(signal))
-            spectrum = np.abs(np.fft.fft((signal - signal.mean()) * window)) / window.sum()
-            frequency = np.fft.fftfreq(len(signal), 1.0 / rate)
-            shown = np.fft.fftshift(np.abs(frequency) < 250.0)
-            right.semilogy(np.fft.fftshift(frequency)[shown], np.fft.fftshift(spectrum)[shown] + 1e-12, style,
-                           color=colour, lw=0.8)  # fmt: skip
+            frequency, amplitude = full_spectrum(signal.real, signal.imag, rate)
+            shown = np.abs(frequency) < 250.0
+            right.semilogy(frequency[shown], amplitude[shown] + 1e-12, style, color=colour, lw=0.8)
         left.set_aspect("equal")
         left.set_xlabel(f"{pair[0]} [mm]")
         left.set_ylabel(f"{pair[1]} [mm]")

@@ -1,4 +1,4 @@
-"""Sample by sample, as long as the trajectory can be foretold: residuals over their noise floors."""
+"""Sample by sample, as long as the trajectory can be predicted: residuals over their noise floors."""
 
 from __future__ import annotations
 
@@ -83,11 +83,11 @@ def foreseeable_s(
 
 
 def scaled(part: Measured, values: np.ndarray, perturbed: np.ndarray | None = None) -> np.ndarray:
-    """Residuals of recorded against foretold over the floor, shape (n, channels).
+    """Residuals of recorded against predicted over the floor, shape (n, channels).
 
     Args:
         part: What was recorded.
-        values: What was foretold for its first rows.
+        values: What was predicted for its first rows.
         perturbed: The same of the perturbed run, which adds its distance to the floor.
     """
     floor = part.floor[None, :]
@@ -103,7 +103,7 @@ def residuals(
 
     Args:
         parts: What was recorded.
-        nominal: What was foretold.
+        nominal: What was predicted.
         perturbed: The same, perturbed.
         criteria: The limits.
         end_s: End of the window [s].

@@ -11,6 +11,7 @@ import numpy as np
 
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN
+from rig.orbit import phase, whirl_frequency
 from rig.simulation import DISSIPATED
 
 SETTLED = 0.25
@@ -97,9 +98,7 @@ def _whirl_frequency(trace: Trace) -> float:
     if _contact_fraction_settled(trace) < 0.5:
         return math.nan
     x, y = trace.settled("ring_x"), trace.settled("ring_y")
-    phase = np.unwrap(np.arctan2(y, x))
-    times = trace.times_s[-trace.settled_rows :]
-    return float(np.polyfit(times - times[0], phase, 1)[0] / (2.0 * math.pi))
+    return whirl_frequency(trace.times_s[-trace.settled_rows :], x, y, about=0.0)
 
 
 def _contact_fraction_settled(trace: Trace) -> float:
@@ -158,10 +157,10 @@ def _outcome(trace: Trace) -> str:
         return "no contact" if impulse[-1] == impulse[0] else "bouncing"
     if share < 0.95:
         return "bouncing"
-    turns = np.unwrap(np.arctan2(trace.settled("ring_y"), trace.settled("ring_x")))
-    if abs(turns[-1] - turns[0]) < 2.0 * math.pi:
+    angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
+    if abs(angle[-1] - angle[0]) < 2.0 * math.pi:
         return "resting"
-    return "forward whirl" if turns[-1] > turns[0] else "backward whirl"
+    return "forward whirl" if angle[-1] > angle[0] else "backward whirl"
 
 
 def _fraction(trace: Trace) -> float:

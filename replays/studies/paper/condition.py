@@ -21,6 +21,7 @@ from replays.studies.stability.boundary import NAMES, ROLLING, whirl_class
 from replays.studies.stability.motion import base_model, move, pivoted_mass, quiet_inputs, state
 from rig.kernels.constants import Constants
 from rig.levels import ModelLevels
+from rig.orbit import phase, whirl_frequency
 
 ENGINE = "split"
 FRICTIONS = (0.05, 0.08, 0.12, 0.18, 0.25, 0.35)
@@ -173,9 +174,9 @@ def gains_speed(constants: Constants, whirl: float) -> bool:
     )
     last = motion.times > 0.35
     touching = motion.column("penetration")[last] > 0.0
-    phase = np.unwrap(np.arctan2(motion.column("ring_y"), motion.column("ring_x"))[last])
+    angle = phase(motion.column("ring_x")[last], motion.column("ring_y")[last])
     passed_s = float(motion.times[last][-1] - motion.times[last][0])
-    return bool(touching.all()) and float(phase[0] - phase[-1]) > whirl * passed_s
+    return bool(touching.all()) and float(angle[0] - angle[-1]) > whirl * passed_s
 
 
 def keeps_whirling(constants: Constants, y0: np.ndarray, spin: float) -> bool:
@@ -187,13 +188,13 @@ def keeps_whirling(constants: Constants, y0: np.ndarray, spin: float) -> bool:
     motion = move(ENGINE, constants, inputs, y0, ticks=round(1.0 * _TICKS_S), every=500)
     if not (motion.column("penetration") > 0.0).all():
         return False
-    phase = np.unwrap(np.arctan2(motion.column("ring_y"), motion.column("ring_x")))
+    x, y = motion.column("ring_x"), motion.column("ring_y")
 
-    def rate(begin_s: float) -> float:
+    def whirl_hz(begin_s: float) -> float:
         part = (motion.times > begin_s) & (motion.times <= begin_s + 0.1)
-        return float(np.polyfit(motion.times[part], phase[part], 1)[0])
+        return whirl_frequency(motion.times[part], x[part], y[part], about=0.0)
 
-    return rate(0.9) < (1.0 - _SLOWER) * rate(0.4)  # both are negative
+    return whirl_hz(0.9) < (1.0 - _SLOWER) * whirl_hz(0.4)  # both are negative
 
 
 def bisect(holds: Callable[[float], bool], low: float, high: float, *, steps: int = 10) -> float:

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recorder.reader import Samples
-from replays.recordings.picture import full_spectrum, waterfall
-from replays.recordings.whirl import whirl_frequency
 from replays.studies.paper.blow import FORCE_N, SPEED_HZ, Blow, Outcome, blow_scene, outcomes, read
 from replays.studies.paper.spread import column, phases
 from replays.studies.paper.statement import statements
 from rig.magnets import map_force
 from rig.offline import Run, simulate
+from rig.orbit import full_spectrum, waterfall, whirl_frequency
 from rig.scenes import load_scene
 
 SPEEDS_HZ = (3.2, 4.2, 5.2, 6.2)
@@ -172,15 +170,5 @@ def _speed_numbers(found: dict[float, Outcome]) -> dict[str, float]:
 
 
 def spectra(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Full spectra of the disk's probes over time, as `replays.recordings.picture.waterfall` gives them."""
-    names = ("disk_x", "disk_y")
-    probes = Samples(
-        name="probes",
-        times_s=run.sample_times_s,
-        index=np.arange(len(run.sample_times_s)),
-        values=np.stack([run.samples[name] for name in names], axis=-1),
-        names=names,
-        units=("mm", "mm"),
-        rate_hz=float(_RATE_HZ),
-    )
-    return waterfall(probes, window_s=0.5, hop_s=0.1)
+    """Full spectra of the disk's probes over time, as `rig.orbit.waterfall` gives them [mm]."""
+    return waterfall(run.sample_times_s, run.samples["disk_x"], run.samples["disk_y"], float(_RATE_HZ))

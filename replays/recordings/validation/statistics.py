@@ -1,0 +1,133 @@
+"""Quantities of every phase of a recording, against how far perturbed runs spread them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from replays.recordings.experiment import Experiment
+from replays.recordings.prediction import Measured, Prediction, predict
+from replays.recordings.sensitivity import value_of, with_values
+from replays.recordings.validation.criteria import Criteria
+from replays.recordings.validation.outcome import StatisticResult
+from replays.recordings.validation.phases import (
+    QUANTITIES,
+    SPECTRA,
+    Phase,
+    View,
+    find_phases,
+    quantities,
+    spectra,
+    view_of,
+)
+from replays.recordings.validation.truth import TruthTables, energy_change
+from rig.kernels.signals import COLUMN
+from rig.model import build_model
+from rig.simulation import DISSIPATED
+
+_ENERGIES = {"dissipated": DISSIPATED, "drive_work": ("drive_work",)}
+"""Columns of the truth that sum up to a quantity."""
+
+
+def perturbed(experiment: Experiment, keys: tuple[str, ...], part: float) -> Experiment:
+    """The experiment with some of its values larger by a part."""
+    return with_values(experiment, {key: value_of(experiment, key) * (1.0 + part) for key in keys})
+
+
+def _whole(parts: dict[str, Measured]) -> Phase:
+    begin = min(float(part.times_s[0]) for part in parts.values())
+    return Phase("", begin, max(float(part.times_s[-1]) for part in parts.values()) + 1e-9)
+
+
+def statistics(
+    experiment: Experiment,
+    parts: dict[str, Measured],
+    nominal: Prediction,
+    tables: TruthTables,
+    criteria: Criteria,
+) -> tuple[list[Phase], list[StatisticResult]]:
+    """The phases of a recording, and every quantity of each against its spread over perturbed runs.
+
+    Args:
+        experiment: What was done, with cheap sensors.
+        parts: What was recorded.
+        nominal: What is predicted.
+        tables: The recorded truth.
+        criteria: What is asked.
+    """
+    look = _viewer(experiment, parts)
+    recorded = {name: part.values for name, part in parts.items()}
+    floors = {name: _floor(parts, names) for name, names in SPECTRA.items()}
+    phases = find_phases(look(recorded, _whole(parts)), floor_n=_floor(parts, ("P_N", "P_S", "P_E", "P_W")))
+    members = _ensemble(experiment, parts, criteria)
+    results = []
+    for number, phase in enumerate(phases):
+        seen, there = look(recorded, phase), look(nominal.values, phase)
+        others = [look(loud, phase) for loud, _ in members]
+        samples: dict[str, tuple[float, list[float]]] = {}  # recorded, and of every member
+        read = [quantities(other, phase.name) for other in others]
+        for name, value in quantities(seen, phase.name).items():
+            samples[name] = value, [one[name] for one in read]
+        distances = [spectra(other, there, floors) for other in others]
+        for name, value in spectra(seen, there, floors).items():
+            samples[name] = value, [one.get(name, 1.0) for one in distances]
+        for name, columns in _ENERGIES.items() if "energy" in tables else ():
+            ends = [energy_change(tables["energy"], columns, phase, prediction) for _, prediction in members]
+            samples[name] = (
+                energy_change(tables["energy"], columns, phase, nominal)[0],
+                [predicted for _, predicted in ends],
+            )
+        results += [_judge(number, phase, name, *sample, criteria) for name, sample in samples.items()]
+    return phases, results
+
+
+def _floor(parts: dict[str, Measured], names: tuple[str, ...]) -> float:
+    """Floor of the sum of those channels that are there."""
+    floors = [part.floor[c] for part in parts.values() for c, name in enumerate(part.names) if name in names]
+    return math.hypot(*floors)
+
+
+def _viewer(experiment: Experiment, parts: dict[str, Measured]) -> Callable[[dict[str, np.ndarray], Phase], View]:
+    """What shows a phase of values, with what the model tells of the transducers at rest and of the clearance."""
+    model = build_model(experiment.scene.load_parameters(), experiment.scene.model)
+    row = experiment.simulation().first_row
+    channels = {channel.name: channel for part in parts.values() for channel in part.channels}
+    base = {name: float(row[COLUMN[channel.signal]] / channel.si)
+            for name, channel in channels.items() if name.startswith("P_")}  # fmt: skip
+    touches = math.nan
+    if "ring_x" in channels:
+        touches = model.constants.contact.clearance * 1e3 + 6.0 * _floor(parts, ("ring_x",))
+    return lambda values, phase: view_of(parts, values, phase, base=base, touches=touches)
+
+
+def _ensemble(
+    experiment: Experiment, parts: dict[str, Measured], criteria: Criteria
+) -> list[tuple[dict[str, np.ndarray], Prediction]]:
+    """Perturbed runs: what the channels show with noise of their own, and what is predicted without."""
+    generator = np.random.default_rng(0)  # of the ensemble's noise and perturbations: the same in every validation
+    members = []
+    for _ in range(criteria.ensemble.members):
+        part = criteria.ensemble.perturbation * generator.uniform(-1.0, 1.0)
+        prediction = predict(perturbed(experiment, criteria.window.parameters, part), parts)
+        loud = {
+            name: values + parts[name].floor * parts[name].random * generator.standard_normal(values.shape)
+            for name, values in prediction.values.items()
+        }
+        members.append((loud, prediction))
+    return members
+
+
+def _judge(
+    number: int, phase: Phase, name: str, value: float, sample: list[float], criteria: Criteria
+) -> StatisticResult:
+    predicted, deviation = float(np.median(sample)), float(np.std(sample, ddof=1))
+    criterion = criteria.statistic_of(phase.name, name)
+    limit = None
+    if criterion is not None:
+        limit = criterion.relative * abs(predicted) + criterion.absolute + criterion.spread * deviation
+    return StatisticResult(
+        number=number, phase=phase.name, quantity=name, unit=QUANTITIES[name].unit, recorded=value, foretold=predicted,
+        spread=deviation, limit=limit, reason=criterion.reason if criterion else "",
+    )  # fmt: skip

@@ -1,0 +1,75 @@
+"""The model's truth in a recording: table by table against what is predicted, and the energies of a phase."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recorder.reader import Recording
+from replays.recordings.prediction import Prediction
+from replays.recordings.validation.criteria import Criteria
+from replays.recordings.validation.outcome import TruthResult
+from replays.recordings.validation.phases import Phase
+from rig.kernels.signals import TRUTH
+
+_CENTRE = 0.99
+"""Contact truth is compared where the gap is below this part of the clearance."""
+
+TruthTables = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Row numbers, shape (n,), and values [SI], shape (n, columns), by the table's name."""
+
+
+def recorded_truth(recording: Recording, *, longest_s: float) -> TruthTables:
+    """Row numbers and values of the truth tables that are as this version makes them."""
+    found = {}
+    for name, columns in TRUTH.items():
+        if name not in recording.catalogue.get("truth", {}):
+            continue
+        samples = recording.truth(name)
+        if samples.names == columns and len(samples.index):
+            kept = samples.times_s < longest_s
+            found[name] = (samples.index[kept], samples.values[kept])
+    return found
+
+
+def judge_truth(
+    tables: TruthTables,
+    nominal: Prediction,
+    perturbed: Prediction,
+    criteria: Criteria,
+    *,
+    end_s: float,
+) -> list[TruthResult]:
+    """Hold truth tables against what is predicted, to some time [s]; allowed is ten times what a perturbation does."""
+    found = []
+    for name, (index, values) in tables.items():
+        here, there = nominal.truth[name], perturbed.truth[name]
+        kept = (index < min(len(here), len(there))) & (index < end_s * nominal.truth_rate_hz)
+        if name == "contact":  # at the very centre it has no direction, nor a speed along it
+            kept &= np.append(here[:, 0], 0.0)[np.minimum(index, len(here))] > _CENTRE * here[:, 0].min()
+        rows, recorded = index[kept], values[kept]
+        if not len(rows):
+            continue
+        scale = np.abs(here).max(axis=0)
+        scale[scale == 0.0] = 1.0
+        off = np.abs(recorded - here[rows]).max(axis=0) / scale
+        allowed = criteria.truth.relative + 10.0 * np.abs(there[rows] - here[rows]).max(axis=0) / scale
+        worst = int(np.argmax(off / allowed))
+        found.append(TruthResult(name, TRUTH[name][worst], float(off[worst]), float(allowed[worst])))
+    return found
+
+
+def energy_change(
+    table: tuple[np.ndarray, np.ndarray], columns: tuple[str, ...], phase: Phase, prediction: Prediction
+) -> tuple[float, float]:
+    """Recorded and predicted change of a sum of integrals over a phase [J]."""
+    index, values = table
+    picked = [TRUTH["energy"].index(column) for column in columns]
+    rate = prediction.truth_rate_hz
+    rows = np.flatnonzero((index >= phase.from_s * rate) & (index < phase.to_s * rate))
+    rows = rows[index[rows] < len(prediction.truth["energy"])]
+    if len(rows) < 2:
+        return 0.0, 0.0
+    ends = [rows[0], rows[-1]]
+    recorded = values[np.ix_(ends, picked)].sum(axis=1)
+    predicted = prediction.truth["energy"][np.ix_(index[ends], picked)].sum(axis=1)
+    return float(recorded[1] - recorded[0]), float(predicted[1] - predicted[0])

@@ -1,0 +1,120 @@
+"""Figures of an orbit, read off samples of it: how often it goes round, in which sense, and its two-sided spectrum.
+
+One definition of each, for recordings and simulations, predictions and live views. An orbit is z = x + j y; forward is
+with the spin, from x to y, and positive; backward is negative. Lengths keep the unit of x and y.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+SPECTRUM_HZ = 200.0
+"""Spectra are shown up to this frequency, to both sides: the rig whirls below 130 Hz."""
+_LAG_S = 1e-3
+
+
+def phase(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Angle of x + j y about the origin, without jumps [rad], shape (n,)."""
+    return np.unwrap(np.arctan2(y, x))
+
+
+def whirl_frequency(times_s: np.ndarray, x: np.ndarray, y: np.ndarray, *, about: complex | None = None) -> float:
+    """Slope of the phase of x + j y about a centre [Hz]; forward is positive.
+
+    Unlike the bin of a spectrum this has no resolution limit; the orbit must go round the centre.
+
+    Args:
+        times_s: Times [s], shape (n,).
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+        about: The centre, in the unit of x; None: the orbit's own mean.
+    """
+    centre = complex(x.mean(), y.mean()) if about is None else about
+    angle = phase(x - centre.real, y - centre.imag)
+    return float(np.polyfit(times_s - times_s[0], angle, 1)[0] / (2.0 * math.pi))
+
+
+def mean_rotation(x: np.ndarray, y: np.ndarray, rate_hz: float) -> float:
+    """Mean rotation of x + j y about its mean [Hz], weighted by the square of the radius; 0 of less than 2 ms.
+
+    For an orbit that may be as small as the probes' noise, where a phase would jump. The phase is advanced over 1 ms:
+    short against any whirl of the rig (unambiguous to +-500 Hz), long against the correlation time of that noise, which
+    would otherwise pull the slope of a small orbit towards zero.
+
+    Args:
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+        rate_hz: Samples per second [Hz].
+    """
+    lag = max(1, round(_LAG_S * rate_hz))
+    if len(x) < 2 * lag:
+        return 0.0
+    turning = _centred(x, y)
+    advance = np.vdot(turning[:-lag], turning[lag:])
+    return math.atan2(advance.imag, advance.real) * rate_hz / (2.0 * math.pi * lag)
+
+
+def rms_radius(x: np.ndarray, y: np.ndarray) -> float:
+    """Root mean square distance of the orbit from its own mean, in the unit of x."""
+    return float(np.sqrt(np.mean(np.abs(_centred(x, y)) ** 2)))
+
+
+def full_spectrum(
+    x: np.ndarray, y: np.ndarray, rate_hz: float, *, lines: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two-sided spectrum: the amplitude of each circular component of x + j y about its centre.
+
+    Hann window over all samples, scaled so that a steady whirl of radius r has its peak at r.
+
+    Args:
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+        rate_hz: Sample rate [Hz].
+        lines: Number of lines, at least n: the samples are padded with zeros, so that lines stand closer. None: n.
+
+    Returns:
+        Frequencies [Hz], ascending, and amplitudes in the unit of x, each shape (lines,).
+    """
+    orbit = x + 1j * y
+    # Without its zeros at both ends, which would leave two samples out.
+    window = np.hanning(len(orbit) + 2)[1:-1]
+    total = window.sum()
+    # The plain mean of an unfinished revolution is not zero: taking it off would put a line at 0 Hz.
+    centre = np.dot(window, orbit) / total
+    count = len(orbit) if lines is None else lines
+    amplitude = np.abs(np.fft.fftshift(np.fft.fft((orbit - centre) * window, n=count))) / total
+    return np.fft.fftshift(np.fft.fftfreq(count, 1.0 / rate_hz)), amplitude
+
+
+def waterfall(
+    times_s: np.ndarray, x: np.ndarray, y: np.ndarray, rate_hz: float, *, window_s: float = 0.5, hop_s: float = 0.1
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Full spectra over time, up to `SPECTRUM_HZ`.
+
+    Args:
+        times_s: Times [s], shape (n,).
+        x: Horizontal, shape (n,).
+        y: Vertical, shape (n,).
+        rate_hz: Sample rate [Hz].
+        window_s: Length of a window [s].
+        hop_s: From one window to the next [s].
+
+    Returns:
+        Times of the windows' centres [s], shape (t,); frequencies [Hz], shape (f,); amplitudes in the unit of x, shape
+        (t, f).
+    """
+    size, hop = round(window_s * rate_hz), round(hop_s * rate_hz)
+    starts = range(0, max(1, len(x) - size), hop)
+    spectra = [full_spectrum(x[s : s + size], y[s : s + size], rate_hz) for s in starts]
+    frequency = spectra[0][0]
+    near = np.abs(frequency) <= SPECTRUM_HZ
+    centres = np.array([times_s[min(s + size // 2, len(x) - 1)] for s in starts])
+    return centres, frequency[near], np.array([amplitude[near] for _, amplitude in spectra])
+
+
+def _centred(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """X + j y about its mean, complex, shape (n,)."""
+    orbit = x + 1j * y
+    return orbit - orbit.mean()

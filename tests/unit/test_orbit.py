@@ -1,0 +1,104 @@
+"""Figures of an orbit from samples: whirl frequency and sense, full spectrum, waterfall."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rig.orbit import SPECTRUM_HZ, full_spectrum, mean_rotation, phase, rms_radius, waterfall, whirl_frequency
+
+
+def orbit(
+    hz: float, *, n: int = 4_000, rate: float = 4_000.0, noise: float = 0.0, centre: complex = 0.0
+) -> tuple[np.ndarray, ...]:
+    times = np.arange(n) / rate
+    rng = np.random.default_rng(1)
+    z = centre + np.exp(2j * math.pi * (hz * times + 0.1)) + noise * (rng.normal(size=n) + 1j * rng.normal(size=n))
+    return times, z.real, z.imag
+
+
+@given(
+    hz=st.floats(3.0, 500.0),
+    forward=st.booleans(),
+    x=st.floats(-3.0, 3.0),
+    y=st.floats(-3.0, 3.0),
+    start_s=st.floats(0.0, 1e5),
+)
+def test_whirl_frequency_knows_sense_and_needs_no_centre(
+    hz: float, forward: bool, x: float, y: float, start_s: float
+) -> None:
+    sign = 1.0 if forward else -1.0
+    times, ox, oy = orbit(sign * hz, centre=complex(x, y))
+    found = whirl_frequency(times + start_s, ox, oy)
+    # A part of a turn left over moves the mean, and with it the centre, by up to 1 part in 2 pi turns.
+    assert found == pytest.approx(sign * hz, abs=0.2 / hz + 1e-6)
+    assert whirl_frequency(times + start_s, ox, -oy) == pytest.approx(-found, rel=1e-9)
+    assert whirl_frequency(times + start_s, oy, ox) == pytest.approx(-found, rel=1e-6)
+
+
+@pytest.mark.parametrize("hz", [-83.7, -20.0, 6.2])
+def test_whirl_frequency_reads_through_noise(hz: float) -> None:
+    times, x, y = orbit(hz, noise=0.1)
+    # Phase noise of 0.1 rad over 4000 samples of 1 s: sqrt(12 / 4000) x 0.1 / (2 pi) = 0.9 mHz.
+    assert whirl_frequency(times, x, y) == pytest.approx(hz, abs=5e-3 + 0.2 / abs(hz) ** 2)
+
+
+def test_whirl_frequency_is_not_bound_to_the_bins_of_a_spectrum() -> None:
+    for hz in (-83.70, -83.75, -83.80):
+        times, x, y = orbit(hz)
+        assert whirl_frequency(times, x, y) == pytest.approx(hz, abs=0.005)
+
+
+@pytest.mark.parametrize("hz", [-80.0, 6.0])
+def test_full_spectrum_shows_sense_and_amplitude(hz: float) -> None:
+    _, x, y = orbit(hz, centre=3 + 2j)
+    frequency, amplitude = full_spectrum(0.7 * x, 0.7 * y, 4_000.0)
+    top = int(np.argmax(amplitude))
+    assert frequency[top] == pytest.approx(hz)
+    assert amplitude[top] == pytest.approx(0.7, rel=1e-3)
+    assert amplitude[np.argmin(np.abs(frequency + hz))] < 1e-5, "nothing on the other side"
+
+
+@pytest.mark.parametrize("hz", [-80.0, 6.0])
+def test_lines_of_a_padded_spectrum_stand_closer_and_a_shift_shows_none_at_zero(hz: float) -> None:
+    times, x, y = orbit(hz, n=2_000, centre=3 + 2j)
+    frequency, amplitude = full_spectrum(x, y, 4_000.0, lines=4_000)
+    assert len(times) == 2_000
+    assert np.allclose(np.diff(frequency), 1.0)
+    assert frequency[np.argmax(amplitude)] == hz
+    assert amplitude.max() == pytest.approx(1.0, rel=1e-2)
+    assert amplitude[frequency == 0.0].item() < 1e-9
+
+
+@pytest.mark.parametrize("hz", [-83.0, 40.5])
+def test_mean_rotation_is_not_pulled_to_zero_by_noise(hz: float) -> None:
+    _, x, y = orbit(hz, noise=0.5)
+    assert mean_rotation(x, y, 4_000.0) == pytest.approx(hz, rel=0.02)
+    assert mean_rotation(x[:5], y[:5], 4_000.0) == 0.0
+
+
+def test_radius_is_that_about_the_own_centre() -> None:
+    _, x, y = orbit(10.0, centre=5 - 1j)
+    assert rms_radius(0.3 * x, 0.3 * y) == pytest.approx(0.3)
+
+
+def test_phase_and_frequency_about_a_given_centre_tell_a_small_orbit_beside_it_from_one_around_it() -> None:
+    times, x, y = orbit(10.0, centre=5 + 0j)
+    assert abs(phase(x, y)[-1] - phase(x, y)[0]) < 1.0, "it never goes round the origin"
+    assert whirl_frequency(times, x, y, about=0.0) == pytest.approx(0.0, abs=0.1)
+    assert whirl_frequency(times, x, y) == pytest.approx(10.0, abs=0.02)
+
+
+def test_waterfall_shows_when_the_whirl_turns_over() -> None:
+    times, x, y = orbit(-80.0, n=8_000)
+    y = np.where(times < 1.0, y, -y)
+    centres, frequency, amplitude = waterfall(times, x, y, 4_000.0)
+    assert amplitude.shape == (len(centres), len(frequency))
+    assert np.abs(frequency).max() == SPECTRUM_HZ
+    assert np.allclose(np.diff(centres), 0.1)
+    assert (frequency[np.argmax(amplitude[centres < 0.7], axis=1)] == -80.0).all()
+    assert (frequency[np.argmax(amplitude[centres > 1.3], axis=1)] == 80.0).all()
