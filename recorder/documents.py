@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -11,7 +12,10 @@ from recorder import schemas
 from rig.channels import ChannelTable
 from rig.errors import InputError
 from rig.outside import Count, input_error, read_json
+from rig.wire import EVENTS, STATUS, schema_of
 
+_MOST_KEPT = 64 << 20
+"""Documents of one kind that are kept in memory [bytes]."""
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _Rate = Annotated[float, Field(gt=0.0, le=1e12, allow_inf_nan=False)]
 
@@ -190,8 +194,37 @@ class SeriesPart(_Text):
     number: Count
 
 
+class Kind(NamedTuple):
+    """The documents of a topic: what is read of them, and what the file says of their form."""
+
+    model: type[BaseModel]
+    definition: schemas.Definition
+
+
+KINDS = {
+    EVENTS: Kind(Event, schemas.document_definition("rig.Event", event="string")),
+    STATUS: Kind(Status, schemas.document_definition("rig.Status")),
+    schemas.GAPS: Kind(
+        Gap,
+        schemas.document_definition("recorder.Gap", kind="string", key="string", index="integer", size="integer"),
+    ),
+    schemas.CLOCK: Kind(
+        ClockPair, schemas.document_definition("recorder.Clock", tick="integer", time_s="number", wall_s="number")
+    ),
+}
+"""The documents of a recording, by topic."""
+_ANY = schemas.document_definition("rig.Document")
 METADATA: dict[str, type[BaseModel]] = {"rig": Rig, "end": End, "series": SeriesPart}
 ATTACHED: dict[str, type[BaseModel]] = {"catalogue": Catalogue, "parameters": Parameters, "scene": Scene}
+
+
+def definition_of(key: str) -> schemas.Definition:
+    """The form of the payloads of a key."""
+    schema = schema_of(key)
+    if schema is not None:
+        return schemas.BLOCKS[schema]
+    return KINDS[key].definition if key in KINDS else _ANY
+
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -209,7 +242,29 @@ def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, A
         raise input_error(error, field) from None
 
 
-def told(model: type[Model], entries: dict[str, str], *, field: str) -> Model:
+def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
+    """The document in a message of one of the topics `KINDS`; None where it is not what the topic promises."""
+    try:
+        document, found = read(KINDS[topic].model, payload, field=topic)
+        if isinstance(found, Event) and found.event == "command":
+            read(Command, payload, field=topic)
+    except InputError:
+        return None
+    return document
+
+
+def check_kept(kept_bytes: int, topic: str, path: Path) -> int:
+    """Refuse a recording with more documents of one kind than memory is to hold; gives their size [bytes].
+
+    Raises:
+        InputError: It has.
+    """
+    if kept_bytes > _MOST_KEPT:
+        raise InputError("file", f"a recording with at most {_MOST_KEPT} bytes of {topic}", str(path))
+    return kept_bytes
+
+
+def read_metadata(model: type[Model], entries: dict[str, str], *, field: str) -> Model:
     """Metadata as its model.
 
     Raises:

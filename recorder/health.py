@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from recorder.reader import Recording
+from recorder.samples import row_times_s
 from rig.channels import Channel, Group
-from rig.wire import EDGES, schema_of, sensor_key
+from rig.wire import EDGES, Block, sensor_key
 
 WINDOW_S = 2.0
 """Length of a window; its spectrum resolves 0.5 Hz."""
@@ -100,9 +101,8 @@ class Health:
 class _Watch:
     """Follows one group."""
 
-    def __init__(self, group: Group, spin_hz: float, *, noisy: bool) -> None:
+    def __init__(self, group: Group, *, noisy: bool) -> None:
         self._group = group
-        self._spin_hz = spin_hz
         self._noisy = noisy
         self._rows: list[np.ndarray] = []
         self._held = 0
@@ -173,7 +173,7 @@ class _Watch:
         self._longest[column] = max(self._longest[column], lengths.max())
         self._run[column] = lengths[-1]
 
-    def results(self) -> list[ChannelHealth]:
+    def results(self, spin_hz: float) -> list[ChannelHealth]:
         self.flush()
         levels = np.concatenate(self._levels) if self._levels else np.full((1, len(self._group.channels)), np.nan)
         quiet = np.percentile(levels, 10.0, axis=0)
@@ -193,11 +193,11 @@ class _Watch:
                 limited_rows=int(self._limited[column]),
                 stuck_s=float(self._longest[column] - 1) / self._group.rate_hz,
             )
-            self._judge(health, channel, column)
+            self._judge(health, channel, column, spin_hz)
             found.append(health)
         return found
 
-    def _judge(self, health: ChannelHealth, channel: Channel, column: int) -> None:
+    def _judge(self, health: ChannelHealth, channel: Channel, column: int, spin_hz: float) -> None:
         say = health.findings.append
         if not health.rows:
             say("no rows that fit the catalogue")
@@ -216,15 +216,15 @@ class _Watch:
             if abs(volts) > _DC * max(map(abs, channel.range_v)):
                 say(f"a mean of {volts:.3g} V though it is AC-coupled: a bias fault?")
         for mains_hz in _MAINS_HZ:
-            amplitude = self._line(mains_hz, column) * abs(channel.scale)
+            amplitude = self._line(mains_hz, column, spin_hz) * abs(channel.scale)
             if amplitude:
                 say(f"a line of {amplitude:.2g} {channel.unit} at {mains_hz:g} Hz: mains hum?")
 
-    def _line(self, mains_hz: float, column: int) -> float:
+    def _line(self, mains_hz: float, column: int, spin_hz: float) -> float:
         """Amplitude of a line that stands out [counts]; 0 if none does, or it may be a multiple of the spin."""
         if self._power is None:
             return 0.0
-        if self._spin_hz > 1.0 and abs(math.remainder(mains_hz, self._spin_hz)) < 1.0 / WINDOW_S:
+        if spin_hz > 1.0 and abs(math.remainder(mains_hz, spin_hz)) < 1.0 / WINDOW_S:
             return 0.0
         power = self._power[:, column] / self._windows
         middle, reach = round(mains_hz * WINDOW_S), round(10.0 * WINDOW_S)
@@ -254,34 +254,38 @@ def _limits(channel: Channel) -> tuple[float, float]:
 
 
 def examine(recording: Recording) -> Health:
-    """Look at everything that a recording tells about its own soundness."""
-    edges = np.unique(recording.edges())
-    spin_hz = 1.0 / float(np.median(np.diff(edges))) if len(edges) > 2 else 0.0
+    """Look at everything that a recording says of its own soundness, in one pass over its samples."""
     noisy = _has_noise(recording.scene)
     watches = {
-        sensor_key(name): _Watch(group, spin_hz, noisy=noisy)
+        sensor_key(name): _Watch(group, noisy=noisy)
         for name, group in recording.table.groups.items()
         if recording.messages.get(sensor_key(name))
     }
     misplaced: dict[str, int] = {}
     starts: dict[str, tuple[int, int]] = {}
-    keys = {key for key in recording.messages if schema_of(key) is not None and key != EDGES}
-    for key, block in recording.blocks_of(keys):
-        if block.rate_hz > 0.0:
-            tick, index = starts.setdefault(key, (block.tick, block.index))
-            if abs(block.tick - tick - (block.index - index) * block.tick_rate_hz / block.rate_hz) > 0.5:
-                misplaced[key] = misplaced.get(key, 0) + 1
-        watch = watches.get(key)
-        if watch is not None and block.values.shape[1] == len(watch._group.channels):
-            watch.add(block.index, block.values)
-    channels = [health for watch in watches.values() for health in watch.results()]
+    edges: list[np.ndarray] = []
+
+    def watch(key: str, block: Block) -> None:
+        if key == EDGES:
+            edges.append(row_times_s(key, block))
+            return
+        tick, index = starts.setdefault(key, (block.tick, block.index))
+        if abs(block.tick - tick - (block.index - index) * block.tick_rate_hz / block.rate_hz) > 0.5:
+            misplaced[key] = misplaced.get(key, 0) + 1
+        if key in watches:
+            watches[key].add(block.index, block.values)
+
+    recording.look_through(watch)
+    times_s = np.unique(np.concatenate(edges)) if edges else np.empty(0)
+    spin_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
+    channels = [health for one in watches.values() for health in one.results(spin_hz)]
     return _with_findings(recording, channels, misplaced)
 
 
 def _with_findings(recording: Recording, channels: list[ChannelHealth], misplaced: dict[str, int]) -> Health:
     clock = recording.clock if _has_clock(recording) else np.empty((0, 2))
     span_s = float(np.ptp(clock[:, 1])) if len(clock) else 0.0
-    pace, jitter_ms, jitter_max_ms, strays = _pace(clock)
+    pace, jitter_ms, jitter_max_ms, strays = pace_of(clock)
     last = recording.last_status or {}
     kept = ("pace", "real_time_factor", "lateness_ms", "overruns", "queue", "energy", "engine")
     warnings = dict.fromkeys(
@@ -324,7 +328,7 @@ def _has_clock(recording: Recording) -> bool:
     return not any((event.get("event"), event.get("pace")) in without for event in recording.events)
 
 
-def _pace(clock: np.ndarray) -> tuple[float, float, float, float]:
+def pace_of(clock: np.ndarray) -> tuple[float, float, float, float]:
     """Slope of simulated over wall time, deviations from the line (rms and largest [ms]), part of strays.
 
     The line is through medians: what a recorder fetched from the rig's cache arrived in one burst. A first one, through

@@ -1,4 +1,4 @@
-"""Payloads, taken for what they say only where a recording can hold it.
+"""Payloads, read once, and believed only where a recording can hold what they say.
 
 What comes off a wire or out of a damaged file may be of the right form and still name a time in the far future or a
 rate of zero. Such a payload is malformed like one that does not decode; it must not end a recording.
@@ -6,6 +6,7 @@ rate of zero. Such a payload is malformed like one that does not decode; it must
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,52 @@ from rig.wire import EDGES, EVENTS, Block, decode_block, decode_document, schema
 
 _MOST = 1 << 53
 """Ticks up to here are exact in every number that they become: 285 years of microseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """What came on a key, and what it says.
+
+    Attributes:
+        key: The key.
+        data: The bytes, as they came.
+        wall_ns: When they came [unix ns].
+        block: The block in them; None on a key of documents.
+        document: The document in them; None on a key of blocks.
+    """
+
+    key: str
+    data: bytes
+    wall_ns: int
+    block: Block | None = None
+    document: dict[str, Any] | None = None
+
+    @classmethod
+    def read(cls, key: str, data: bytes, wall_ns: int) -> Payload:
+        """Read a payload; one that is not what its key promises has neither block nor document."""
+        block = document = None
+        try:
+            if schema_of(key) is None:
+                document = event_in(data) if key == EVENTS else decode_document(data)
+            else:
+                block = block_in(key, data)
+        except ValueError:
+            pass
+        return cls(key, data, wall_ns, block, document)
+
+    @property
+    def malformed(self) -> bool:
+        """Whether it is not what its key promises."""
+        return self.block is None and self.document is None
+
+    @property
+    def tick(self) -> int | None:
+        """The tick that it names; None if it names none."""
+        return tick_in(self.document) if self.block is None else self.block.tick
+
+    def event(self, name: str) -> bool:
+        """Whether it is an event of that name."""
+        return self.key == EVENTS and self.document is not None and self.document.get("event") == name
 
 
 def block_in(key: str, payload: bytes) -> Block:
@@ -35,15 +82,6 @@ def block_in(key: str, payload: bytes) -> Block:
     if not sound:
         raise ValueError(f"payload must have rows at a rate, or edges at times; instead received {key}: {block}")
     return block
-
-
-def document_in(key: str, payload: bytes) -> dict[str, Any]:
-    """The document in a payload; one on the key of events is an event.
-
-    Raises:
-        ValueError: It is not what the key promises.
-    """
-    return event_in(payload) if key == EVENTS else decode_document(payload)
 
 
 def tick_in(document: dict[str, Any] | None) -> int | None:

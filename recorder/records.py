@@ -9,10 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from itertools import pairwise
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
-if TYPE_CHECKING:
-    from mcap.records import Channel
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, Channel, Metadata, MetadataIndex, Statistics
 
 MAGIC = b"\x89MCAP0\r\n"
 COPY = "metadata.json"
@@ -31,9 +34,9 @@ _MOST_PACKED = 1000
 """Chunks unpack to at most so many times the file, and to `MOST_CHUNK_BYTES` of a small one."""
 _LEAST_RECORD = 24
 """A file of records shorter than this, on the whole, is none of a recorder's [bytes]."""
-_RECORD = struct.Struct("<BQ")
+RECORD = struct.Struct("<BQ")
 MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQII")
+CHUNK = struct.Struct("<QQQII")
 _CHUNK_INDEX = struct.Struct("<QQQQI")
 _INDEXED = struct.Struct("<HQ")
 _FOOTER = struct.Struct("<BQQQI")
@@ -120,7 +123,7 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
     _take_data(file, found, indexed, data_end)
     file.seek(data_end)
     opcode, length, expected = _DATA_END.unpack(file.read(_DATA_END.size))
-    if (opcode, length) != (_op().DATA_END, 4):
+    if (opcode, length) != (Opcode.DATA_END, 4):
         raise DamagedError("no end of the data")
     if expected or COPY in found.attachments:
         if _sum(file, data_end) != expected:
@@ -133,26 +136,25 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
 
 def _take_data(file: BinaryIO, found: Contents, indexed: set[tuple[int, int]], data_end: int) -> None:
     """Hold the records of the data against their index, and take metadata and attachments."""
-    opcodes = _op()
     position, room, chunks = len(MAGIC), _Room(data_end), set()
     for chunk in found.chunks:
-        indexed.add((chunk.offset, chunk.length + _RECORD.size))
+        indexed.add((chunk.offset, chunk.length + RECORD.size))
     found.chunks = [chunk for chunk in found.chunks if chunk.channels]  # one without an index has no messages
     while position < data_end:
         file.seek(position)
         opcode, length = _head(file)
-        end = position + _RECORD.size + length
-        if end > data_end or opcode == opcodes.MESSAGE:
+        end = position + RECORD.size + length
+        if end > data_end or opcode == Opcode.MESSAGE:
             raise DamagedError("records that do not end with the data, or messages outside of chunks")
         room.take(opcode, file, length)
-        if opcode in (opcodes.CHUNK, opcodes.METADATA, opcodes.ATTACHMENT):
+        if opcode in (Opcode.CHUNK, Opcode.METADATA, Opcode.ATTACHMENT):
             chunks.add((position, end - position))
-            if opcode != opcodes.CHUNK:
+            if opcode != Opcode.CHUNK:
                 _take(found, opcode, file.read(length))
         position = end
     if chunks != indexed:
         raise DamagedError("an index that does not fit what is there")
-    if sum(found.counts.values()) > room.unpacked // (_RECORD.size + MESSAGE.size):
+    if sum(found.counts.values()) > room.unpacked // (RECORD.size + MESSAGE.size):
         raise DamagedError("more messages counted than there is room for")
     counted = {number for number, count in found.counts.items() if count}
     if counted != set().union(*(chunk.channels or () for chunk in found.chunks)):
@@ -166,7 +168,7 @@ class _Room:
         self.unpacked = 0
         self._most = _MOST_PACKED * size + MOST_CHUNK_BYTES
         self._records = size // _LEAST_RECORD + 10_000
-        self._kept = {_op().ATTACHMENT: _MOST_ATTACHED, _op().METADATA: _MOST_METADATA}
+        self._kept: dict[int, int] = {Opcode.ATTACHMENT: _MOST_ATTACHED, Opcode.METADATA: _MOST_METADATA}
 
     def take(self, opcode: int, file: BinaryIO, length: int) -> None:
         """Count a record; the file is where its body begins, and stays there.
@@ -175,11 +177,11 @@ class _Room:
             DamagedError: It is too large, or there are too many of them.
         """
         self._records -= 1
-        if opcode == _op().CHUNK:
+        if opcode == Opcode.CHUNK:
             start = file.tell()
-            head = file.read(_CHUNK.size)
+            head = file.read(CHUNK.size)
             file.seek(start)
-            unpacked = _CHUNK.unpack(head)[2] if len(head) == _CHUNK.size else 0
+            unpacked = CHUNK.unpack(head)[2] if len(head) == CHUNK.size else 0
             self.unpacked += unpacked if unpacked <= MOST_CHUNK_BYTES else 0  # a larger one is not unpacked
         elif opcode in self._kept:
             self._kept[opcode] -= length + _HEAD_BYTES
@@ -191,13 +193,7 @@ class _Room:
 
 def _head(file: BinaryIO) -> tuple[int, int]:
     """Opcode and length of the record that begins here."""
-    return _RECORD.unpack(file.read(_RECORD.size))
-
-
-def _op() -> type:
-    from mcap.opcode import Opcode
-
-    return Opcode
+    return RECORD.unpack(file.read(RECORD.size))
 
 
 def _sum(file: BinaryIO, end: int) -> int:
@@ -216,16 +212,12 @@ def _footer(file: BinaryIO, size: int) -> tuple[int, int] | None:
         return None
     file.seek(at)
     opcode, length, start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
-    whole = (opcode, length) == (_op().FOOTER, _FOOTER.size - _RECORD.size) and file.read(len(MAGIC)) == MAGIC
+    whole = (opcode, length) == (Opcode.FOOTER, _FOOTER.size - RECORD.size) and file.read(len(MAGIC)) == MAGIC
     return (start, checksum) if whole else None
 
 
 def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Contents, set[tuple[int, int]], int]:
     """Channels, counts and chunks by the summary; where metadata and attachments are; where the data end."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import AttachmentIndex, Channel, MetadataIndex, Statistics
-
-    opcodes = _op()
     start, expected = footer
     data_end, end = start - _DATA_END.size, size - len(MAGIC) - _FOOTER.size
     if data_end < len(MAGIC) or start > end:
@@ -240,17 +232,17 @@ def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Conten
     room = _Room(len(data))
     for opcode, at, stop in records(data[: end - start]):
         room.take(opcode, file, 0)
-        if opcode == opcodes.CHUNK_INDEX:
+        if opcode == Opcode.CHUNK_INDEX:
             found.chunks.append(_chunk_indexed(data[at:stop]))
             continue
         body = ReadDataStream(BytesIO(data[at:stop]))
-        if opcode == opcodes.CHANNEL:
+        if opcode == Opcode.CHANNEL:
             channel = Channel.read(body)
             _add_topic(found, channel)
-        elif opcode == opcodes.STATISTICS:
+        elif opcode == Opcode.STATISTICS:
             found.counts = dict(Statistics.read(body).channel_message_counts)
-        elif opcode in (opcodes.ATTACHMENT_INDEX, opcodes.METADATA_INDEX):
-            index = (AttachmentIndex if opcode == opcodes.ATTACHMENT_INDEX else MetadataIndex).read(body)
+        elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+            index = (AttachmentIndex if opcode == Opcode.ATTACHMENT_INDEX else MetadataIndex).read(body)
             places.add((index.offset, index.length))
     for earlier, later in pairwise(found.chunks):
         if later.offset < earlier.offset + earlier.length:
@@ -264,10 +256,10 @@ def _summary(file: BinaryIO, size: int, footer: tuple[int, int]) -> tuple[Conten
 def _chunk_indexed(body: bytes) -> Chunk:
     begin_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
     stop = _CHUNK_INDEX.size + indexed
-    if stop > len(body) or indexed % _INDEXED.size or length < _RECORD.size:
+    if stop > len(body) or indexed % _INDEXED.size or length < RECORD.size:
         raise DamagedError("an index of a chunk that is none")
     channels = frozenset(number for number, _ in _INDEXED.iter_unpack(body[_CHUNK_INDEX.size : stop]))
-    return Chunk(offset, length - _RECORD.size, begin_ns, end_ns, channels)
+    return Chunk(offset, length - RECORD.size, begin_ns, end_ns, channels)
 
 
 def _add_topic(found: Contents, channel: Channel) -> None:
@@ -281,14 +273,9 @@ def _take(found: Contents, opcode: int, body: bytes) -> None:
     Raises:
         DamagedError: It is not what was written, or its name comes twice.
     """
-    from mcap.data_stream import ReadDataStream
-    from mcap.exceptions import McapError
-    from mcap.records import Attachment, Metadata
-
-    opcodes = _op()
     stream = ReadDataStream(BytesIO(body))
     try:
-        if opcode == opcodes.ATTACHMENT:
+        if opcode == Opcode.ATTACHMENT:
             if len(body) < 4 or zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
                 raise DamagedError("an attachment whose checksum does not fit")
             attachment = Attachment.read(stream)
@@ -308,31 +295,30 @@ def _walked(file: BinaryIO, size: int) -> Contents:
 
     A record counts only if all of it lies in the file: a cut at any byte costs at most the chunk it went through.
     """
-    opcodes = _op()
     found = Contents()
     position, room = len(MAGIC), _Room(size)
-    while position + _RECORD.size <= size:
+    while position + RECORD.size <= size:
         file.seek(position)
         opcode, length = _head(file)
-        end = position + _RECORD.size + length
+        end = position + RECORD.size + length
         if opcode == 0 or end > size:
             # Cut off, or zeros where a power cut left unwritten pages; else its length is not what was written.
-            if opcode == opcodes.CHUNK and _says(file, length):
-                found.chunks.append(Chunk(position, size - position - _RECORD.size, cut=True))
+            if opcode == Opcode.CHUNK and _says(file, length):
+                found.chunks.append(Chunk(position, size - position - RECORD.size, cut=True))
             elif not (length == 0 and _zeros(file) if opcode == 0 else _says_index(file, opcode, length)):
                 found.damaged += 1
             break
-        if opcode == opcodes.DATA_END and length == 4:
+        if opcode == Opcode.DATA_END and length == 4:
             break
         room.take(opcode, file, length)
-        if opcode == opcodes.CHUNK:
+        if opcode == Opcode.CHUNK:
             found.chunks.append(Chunk(position, length))
-        elif opcode in (opcodes.METADATA, opcodes.ATTACHMENT):
+        elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             try:
                 _take(found, opcode, file.read(length))
             except DamagedError:
                 found.damaged += 1
-        elif opcode not in (opcodes.HEADER, opcodes.MESSAGE_INDEX):
+        elif opcode not in (Opcode.HEADER, Opcode.MESSAGE_INDEX):
             found.damaged += 1
         position = end
     return found
@@ -340,21 +326,20 @@ def _walked(file: BinaryIO, size: int) -> Contents:
 
 def _says(file: BinaryIO, length: int) -> bool:
     """Whether a chunk that was cut is as long as it says in two places, as far as the file goes."""
-    head = file.read(_CHUNK.size + _LONGEST_NAME + 8)
-    if len(head) < _CHUNK.size:
+    head = file.read(CHUNK.size + _LONGEST_NAME + 8)
+    if len(head) < CHUNK.size:
         return True
-    name = _CHUNK.unpack_from(head)[-1]
-    packed = head[_CHUNK.size + name : _CHUNK.size + name + 8]
-    return len(packed) < 8 or _CHUNK.size + name + 8 + int.from_bytes(packed, "little") == length
+    name = CHUNK.unpack_from(head)[-1]
+    packed = head[CHUNK.size + name : CHUNK.size + name + 8]
+    return len(packed) < 8 or CHUNK.size + name + 8 + int.from_bytes(packed, "little") == length
 
 
 def _says_index(file: BinaryIO, opcode: int, length: int) -> bool:
     """The same of another record that was cut: an index behind a chunk, or the metadata at the end."""
-    opcodes = _op()
-    if opcode == opcodes.MESSAGE_INDEX:
+    if opcode == Opcode.MESSAGE_INDEX:
         head = file.read(6)
         return len(head) < 6 or 6 + int.from_bytes(head[2:], "little") == length
-    return opcode in (opcodes.METADATA, opcodes.ATTACHMENT, opcodes.DATA_END)
+    return opcode in (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.DATA_END)
 
 
 def _zeros(file: BinaryIO) -> bool:
@@ -366,11 +351,6 @@ def _zeros(file: BinaryIO) -> bool:
 
 def _counted(file: BinaryIO, found: Contents) -> Contents:
     """Find channels, counts and times of a cut file in its chunks; one that does not unpack is passed over."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.exceptions import McapError
-    from mcap.records import Channel
-
-    opcodes = _op()
     good, counts, unchecked = [], [], 0
     for chunk in found.chunks:
         times_ns: list[int] = []
@@ -378,11 +358,11 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
         try:
             data = unpack(file, chunk)
             for opcode, start, end in records(data, cut=chunk.cut):
-                if opcode == opcodes.MESSAGE:
-                    number, time_ns = _stamp(data, start, end)
+                if opcode == Opcode.MESSAGE:
+                    number, _, time_ns, _ = _stamp(data, start, end)
                     inside[number] = inside.get(number, 0) + 1
                     times_ns.append(time_ns)
-                elif opcode == opcodes.CHANNEL:
+                elif opcode == Opcode.CHANNEL:
                     _add_topic(found, Channel.read(ReadDataStream(BytesIO(data[start:end]))))
         except (McapError, struct.error, ValueError):
             found.damaged += 1
@@ -404,12 +384,11 @@ def _counted(file: BinaryIO, found: Contents) -> Contents:
     return found
 
 
-def _stamp(data: bytes, start: int, end: int) -> tuple[int, int]:
-    """Channel and time of a message [ns]."""
+def _stamp(data: bytes, start: int, end: int) -> tuple[int, int, int, int]:
+    """Channel, number, simulated time [ns] and wall time of arrival [unix ns] of a message."""
     if end - start < MESSAGE.size:
         raise DamagedError("a message without a head")
-    number, _, time_ns, _ = MESSAGE.unpack_from(data, start)
-    return number, time_ns
+    return MESSAGE.unpack_from(data, start)
 
 
 def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]:
@@ -423,11 +402,11 @@ def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]
         DamagedError: They do not end with the data.
     """
     position = 0
-    while position + _RECORD.size <= len(data):
-        opcode, length = _RECORD.unpack_from(data, position)
+    while position + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, position)
         if opcode == 0:  # no record: zeros
             break
-        start = position + _RECORD.size
+        start = position + RECORD.size
         position = start + length
         if position <= len(data):
             yield opcode, start, position
@@ -437,11 +416,9 @@ def records(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int]]
 
 def messages(data: bytes, *, cut: bool = False) -> Iterator[tuple[int, int, int, bytes]]:
     """Channel, simulated time [ns], wall time of arrival [unix ns] and payload of each message of a chunk."""
-    opcode_of_message = _op().MESSAGE
     for opcode, start, end in records(data, cut=cut):
-        if opcode == opcode_of_message:
-            _stamp(data, start, end)
-            number, _, log_time, publish_time = MESSAGE.unpack_from(data, start)
+        if opcode == Opcode.MESSAGE:
+            number, _, log_time, publish_time = _stamp(data, start, end)
             yield number, log_time, publish_time, data[start + MESSAGE.size : end]
 
 
@@ -451,24 +428,22 @@ def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
     Raises:
         DamagedError: It is not what was written, or larger than a recorder makes one.
     """
-    import zstandard
-
     if chunk.length > MOST_CHUNK_BYTES + _PIECE:
         raise DamagedError(f"a chunk of {chunk.length} bytes")
-    file.seek(chunk.offset + _RECORD.size)
+    file.seek(chunk.offset + RECORD.size)
     body = file.read(chunk.length)
-    if len(body) < _CHUNK.size + 8:
+    if len(body) < CHUNK.size + 8:
         if chunk.cut:
             return b""
         raise DamagedError("a chunk without a head")
-    *_, size, checksum, name_length = _CHUNK.unpack_from(body)
-    name, packed = body[_CHUNK.size : _CHUNK.size + name_length], body[_CHUNK.size + name_length + 8 :]
+    *_, size, checksum, name_length = CHUNK.unpack_from(body)
+    name, packed = body[CHUNK.size : CHUNK.size + name_length], body[CHUNK.size + name_length + 8 :]
     if size > MOST_CHUNK_BYTES or name not in (b"", b"zstd"):
         raise DamagedError(f"a chunk of {size} bytes, packed by {name[:_LONGEST_NAME]!r}")
     if chunk.cut:
         return _unpack_cut(packed, size) if name else packed
-    told = int.from_bytes(body[_CHUNK.size + name_length : _CHUNK.size + name_length + 8], "little")
-    if told != len(packed):
+    stated = int.from_bytes(body[CHUNK.size + name_length : CHUNK.size + name_length + 8], "little")
+    if stated != len(packed):
         raise DamagedError("a chunk that does not end where it should")
     data = packed
     if name:
@@ -486,8 +461,6 @@ def unpack(file: BinaryIO, chunk: Chunk) -> bytes:
 
 def _unpack_cut(packed: bytes, size: int) -> bytes:
     """What can be unpacked of a chunk that the file ends in; the last record in it may be cut."""
-    import zstandard
-
     found, length = [], 0
     # In small pieces: where it ends in zeros or in nothing, the blocks before that are good.
     with (

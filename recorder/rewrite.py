@@ -10,21 +10,24 @@ import contextlib
 import json
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from recorder import documents, schemas
-from recorder.payload import block_in, tick_in
+from recorder.counts import Counts
+from recorder.draft import check_destination
+from recorder.head import Beginning, Commands
+from recorder.payload import Payload, tick_in
 from recorder.reader import Recording
 from recorder.records import COPY
-from recorder.series import Commands
-from recorder.writer import Counts, RecordingWriter, check_destination
+from recorder.writer import RecordingWriter
 from rig.errors import PART_SUFFIX, InputError, check_not_among
 from rig.outside import open_file
-from rig.wire import EDGES, EVENTS, SENSORS, TRUTH, Block, decode_document, encode_block, schema_of
+from rig.wire import EDGES, SENSORS, TRUTH, Block, encode_block, schema_of
 
 _TELL_EVERY = 5000
 """Messages between two reports of progress."""
@@ -51,7 +54,7 @@ class Rewritten:
 
 
 def recovered_path(source: Path) -> Path:
-    """Where `recover` writes to unless told otherwise: beside NAME.mcap.part or NAME.mcap, to NAME.recovered.mcap."""
+    """Where `recover` writes to by default: beside NAME.mcap.part or NAME.mcap, to NAME.recovered.mcap."""
     name = source.name.removesuffix(PART_SUFFIX).removesuffix(".mcap")
     return source.with_name(f"{name}.recovered.mcap")
 
@@ -71,11 +74,11 @@ def is_whole(source: Path, *, on_progress: Callable[[float], None] | None = None
     with _unlocked(source):
         try:
             recording = Recording.open(source)
-            total = max(1, sum(recording.messages.values()))
-            for number, _ in enumerate(recording.everything() if recording.complete else ()):
-                if on_progress is not None and number % _TELL_EVERY == 0:
-                    on_progress(number / total)
-            return recording.complete and not recording.short
+            if not recording.complete:
+                return False
+            step = _progress(recording, on_progress)
+            recording.look_through(lambda key, block: step())
+            return not recording.short
         except InputError:
             return False
 
@@ -103,7 +106,7 @@ def recover(
     output = output or recovered_path(source)
     check_not_among([source], output)
     with _unlocked(source):
-        recording = Recording(source, salvage=True)
+        recording = Recording.open(source, salvage=True)
         about = {
             "source": source.name,
             "source_bytes": str(source.stat().st_size),
@@ -114,12 +117,9 @@ def recover(
         counts = _write(
             recording,
             output,
-            scene=recording.scene,
-            catalogue=recording.catalogue,
             metadata={"recovered": about},
             reason="recovered",
             force=force,
-            change=lambda _, payload: payload,
             on_progress=on_progress,
         )
     return Rewritten(output, counts, recording.damaged, recording.unchecked, recording.short)
@@ -162,25 +162,25 @@ def cut(
     check_not_among([part.path for part in recording.parts], output)
     catalogue, columns = _narrowed(recording, channels, only)
     tick_rate_hz = recording.catalogue["tick_rate_hz"]
-    from_tick, to_tick = (_tick(at_s, tick_rate_hz) for at_s in (from_s, to_s))
+    from_tick, to_tick = (at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz)) for at_s in (from_s, to_s))
     commands = Commands(recording.scene)
     for event in recording.events:
         tick = tick_in(event)
         if tick is not None and tick < from_tick:
-            commands.follow(EVENTS, event)
+            commands.follow(event)
 
-    def change(key: str, payload: bytes) -> bytes | None:
+    def change(payload: Payload) -> Payload | None:
+        key, tick, block = payload.key, payload.tick, payload.block
         if schema_of(key) is None:
-            tick = _tick_of(payload)
             return payload if tick is None or from_tick <= tick < to_tick else None
         if key not in columns:
             return None
-        try:
-            block = block_in(key, payload)
-        except ValueError:
+        if block is None:
             return payload
         kept = _trimmed(key, block, from_tick, to_tick, columns[key])
-        return payload if kept is block else None if kept is None else encode_block(kept)
+        if kept is None or kept is block:
+            return payload if kept else None
+        return replace(payload, data=encode_block(kept), block=kept)
 
     about = {
         "sources": json.dumps([part.path.name for part in recording.parts]),
@@ -190,7 +190,8 @@ def cut(
         "only": only or "",
         "channels": json.dumps(channels),
     }
-    if not any(_overlaps(recording, key, from_s, to_s) for key in columns):
+    streams = [stream for key, stream in recording.streams.items() if key in columns and stream.rows]
+    if not any(stream.first_time_s < to_s and stream.last_time_s >= from_s for stream in streams):
         raise InputError("from and to", "times that the recording holds", f"{from_s:g} to {to_s:g} s")
     counts = _write(
         recording,
@@ -210,12 +211,12 @@ def _write(
     recording: Recording,
     output: Path,
     *,
-    scene: dict[str, Any],
-    catalogue: dict[str, Any],
     metadata: dict[str, dict[str, str]],
     reason: str,
     force: bool,
-    change: Callable[[str, bytes], bytes | None],
+    scene: dict[str, Any] | None = None,
+    catalogue: dict[str, Any] | None = None,
+    change: Callable[[Payload], Payload | None] = lambda payload: payload,
     on_progress: Callable[[float], None] | None,
 ) -> Counts:
     """Copy what was recorded, changed or left out (None), and derive the rest anew."""
@@ -224,36 +225,47 @@ def _write(
     left_out = {"rig", "end"} if "recovered" in metadata else {"rig", "end", "series"}  # a cut is no part of a series
     kept = {name: entries for name, entries in recording.metadata.items() if name not in left_out}
     metadata = {**kept, "rig": {"created": about["created"]}, **metadata}
+    attachments = {name: data for name, data in recording.attachments.items() if name not in _HEAD}
     with contextlib.ExitStack() as stack:
         writer = RecordingWriter(
             output,
-            catalogue=catalogue,
+            catalogue=catalogue or recording.catalogue,
             parameters=recording.parameters,
-            scene=scene,
+            scene=scene or recording.scene,
             view_rate_hz=float(about.get("view_rate_hz", 0.0)),
             force=force,
-            metadata=metadata,
-            attachments={name: data for name, data in recording.attachments.items() if name not in _HEAD},
+            beginning=Beginning(metadata=metadata, attachments=attachments),
             sync_every_s=2.0,
         )
         stack.callback(writer.abandon)  # nothing half-written stays; does nothing once it is finished
-        total = max(1, sum(recording.messages.values()))
-        for number, (key, _, wall_ns, payload) in enumerate(recording.everything()):
-            if on_progress is not None and number % _TELL_EVERY == 0:
-                on_progress(number / total)
+        step = _progress(recording, on_progress)
+        for key, _, wall_ns, data in recording.everything():
+            step()
             if key.startswith(schemas.VIEW + "/") or key == schemas.CLOCK:
                 continue
             if key == schemas.GAPS:
                 with contextlib.suppress(InputError):
-                    gap, _ = documents.read(documents.Gap, payload, field=key)
+                    gap, _ = documents.read(documents.Gap, data, field=key)
                     if gap.get("kind") == "messages":
                         writer.write_missed(gap["key"], gap["size"], wall_ns)
                 continue
-            changed = change(key, payload)
+            changed = change(Payload.read(key, data, wall_ns))
             if changed is not None:
-                writer.write(key, changed, wall_ns)
+                writer.take(changed)
         writer.finish(reason)
     return writer.counts()
+
+
+def _progress(recording: Recording, on_progress: Callable[[float], None] | None) -> Callable[[], None]:
+    """Something to call for each message, which reports the part of them that is done now and then."""
+    total, numbers = max(1, sum(recording.messages.values())), count()
+
+    def step() -> None:
+        number = next(numbers)
+        if on_progress is not None and number % _TELL_EVERY == 0:
+            on_progress(number / total)
+
+    return step
 
 
 @contextlib.contextmanager
@@ -276,22 +288,6 @@ def _unlocked(path: Path) -> Iterator[None]:
         if error.filename != str(path):
             raise
         raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
-
-
-def _tick(at_s: float, tick_rate_hz: float) -> float:
-    return at_s if math.isinf(at_s) else float(round(at_s * tick_rate_hz))
-
-
-def _tick_of(payload: bytes) -> int | None:
-    try:
-        return tick_in(decode_document(payload))
-    except ValueError:
-        return None
-
-
-def _overlaps(recording: Recording, key: str, from_s: float, to_s: float) -> bool:
-    stream = recording.streams.get(key)
-    return stream is not None and stream.rows > 0 and stream.first_time_s < to_s and stream.last_time_s >= from_s
 
 
 def _narrowed(

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from rig.wire import EVENTS, STATUS
+from rig.wire import SCHEMAS
 
 FORMAT = "rig-recording"
 VERSION = "1"
@@ -21,39 +22,50 @@ VIEW = "view"
 VIEW_EVENTS = f"{VIEW}/events"
 
 
+@dataclass(frozen=True)
+class Definition:
+    """The form of a topic's messages, as it stands in the file.
+
+    Attributes:
+        name: Name of the form.
+        encoding: How its messages are encoded.
+        language: What it is written in.
+        text: What it says.
+    """
+
+    name: str
+    encoding: str
+    language: str
+    text: bytes
+
+
+def _ros2(name: str, text: str) -> Definition:
+    return Definition(name, "cdr", "ros2msg", text.encode())
+
+
+def document_definition(name: str, **properties: str) -> Definition:
+    """The form of a JSON document with properties of some types, all of them required."""
+    body = {property_: {"type": kind} for property_, kind in properties.items()}
+    schema = {"title": name, "type": "object", "properties": body, "required": list(body)}
+    return Definition(name, "json", "jsonschema", json.dumps(schema).encode())
+
+
 _SEPARATOR = "=" * 80 + "\n"
 _TIME = _SEPARATOR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-JOINT_STATE_SCHEMA = "sensor_msgs/msg/JointState"
-JOINT_STATE_DEFINITION = (
+BLOCKS = {name: _ros2(name, text) for name, text in SCHEMAS.items()}
+JOINT_STATE = _ros2(
+    "sensor_msgs/msg/JointState",
     "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
     + _SEPARATOR
     + "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-    + _TIME
+    + _TIME,
 )
-LOG_SCHEMA = "rcl_interfaces/msg/Log"
-LOG_DEFINITION = (
+LOG = _ros2(
+    "rcl_interfaces/msg/Log",
     "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n"
-    + _TIME
+    + _TIME,
 )
 LOG_INFO, LOG_WARN, LOG_ERROR = 20, 30, 40
-
-
-def _document_schema(title: str, **properties: str) -> bytes:
-    body = {name: {"type": kind} for name, kind in properties.items()}
-    return json.dumps({"title": title, "type": "object", "properties": body, "required": list(body)}).encode()
-
-
-DOCUMENT_SCHEMAS = {
-    EVENTS: ("rig.Event", _document_schema("rig.Event", event="string")),
-    STATUS: ("rig.Status", _document_schema("rig.Status")),
-    GAPS: (
-        "recorder.Gap",
-        _document_schema("recorder.Gap", kind="string", key="string", index="integer", size="integer"),
-    ),
-    CLOCK: ("recorder.Clock", _document_schema("recorder.Clock", tick="integer", time_s="number", wall_s="number")),
-}
-"""JSON schema of each document topic: name and definition."""
-ANY_DOCUMENT = ("rig.Document", _document_schema("rig.Document"))
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 

@@ -7,37 +7,28 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from recorder.payload import block_in
-from recorder.series import Limits, Series, check_room, check_series
-from recorder.trigger import Capture, Captures, check_captures
-from recorder.writer import NS, Counts, RecordingError, RecordingWriter, check_view_rate
+from recorder.captures import Captures, check_captures
+from recorder.counts import NS, Counts
+from recorder.head import Beginning
+from recorder.payload import Payload
+from recorder.room import Limits
+from recorder.series import Series, check_series
+from recorder.sink import Needs, Sink
+from recorder.summary import Progress, Summary
+from recorder.trigger import Capture
+from recorder.writer import RecordingError, RecordingWriter, check_view_rate
+from rig import wire
 from rig.bounded_queue import BoundedQueue
-from rig.channels import ChannelTable
 from rig.errors import InputError
 from rig.intake import Catalogue, Intake
 from rig.text import printable
 from rig.transport import Client, NoReplyError
 from rig.transport.clients import Reporter
-from rig.wire import (
-    ALIVE,
-    CATALOGUE,
-    EDGES,
-    EVENTS,
-    PARAMETERS,
-    SCENE,
-    SENSORS,
-    STATUS,
-    TRUTH,
-    decode_document,
-    schema_of,
-    sensor_key,
-    truth_key,
-)
 
+Document = dict[str, Any]
 RIG_LOST = "rig lost"
 """End reason of a session whose rig vanished without an end event."""
 INBOX_BYTES = 256 << 20
@@ -55,156 +46,44 @@ up [s]."""
 PATIENCE_S = 30.0
 """After the end of the stream: longest wait [s]."""
 RETURN_S = 10.0
-"""Unless told otherwise, how long a rig that is lost may take to be there again with the same run [s]: a recorder that
+"""How long, by default, a rig that is lost may take to be there again with the same run [s]: a recorder that
 was stopped for a minute loses its links, and is linked again in a second or two."""
 _DOCUMENTS_BYTES = 64 << 20
 """What documents may take of memory when blocks find no more room."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """State of a session, for display.
+class _Extent:
+    """The simulated time to record, from the first block of each stream on."""
 
-    Attributes:
-        time_s: Simulated time recorded since its first row [s].
-        rows: Rows of sensor blocks received.
-        lost: Rows of all block streams that never arrived.
-        size_bytes: Size of the file.
-        waiting: Payloads in the inbox.
-        backlog_bytes: Bytes in the inbox.
-        dropped: Payloads that found the inbox full.
-        files: Finished files.
-        remarks: What the user should know at once, a line each; more come behind these.
-    """
+    def __init__(self, duration_s: float | None, promised: Catalogue, monotonic_s: Callable[[], float]) -> None:
+        self._duration_ns = math.inf if duration_s is None else duration_s * NS
+        self._tick_rate_hz = round(promised.tick_rate_hz)
+        self._streams = {*map(wire.sensor_key, promised.table.groups), *map(wire.truth_key, promised.truth)}
+        self._monotonic_s = monotonic_s
+        self._begin_ns: dict[str, int] = {}
+        self._within_s = 0.0
+        self._beyond: set[str] = set()
+        """Streams that have come to the end of the time to record."""
 
-    time_s: float
-    rows: int
-    lost: int
-    size_bytes: int
-    waiting: int
-    backlog_bytes: int = 0
-    dropped: int = 0
-    files: int = 0
-    remarks: tuple[str, ...] = ()
+    def takes(self, payload: Payload) -> bool:
+        """Whether a payload is of the time to record; only what is a block can be of a later one."""
+        key, block = payload.key, payload.block
+        if math.isinf(self._duration_ns) or block is None:
+            return True
+        start_ns = block.tick * NS // self._tick_rate_hz
+        begin_ns = self._begin_ns.setdefault(key, start_ns)
+        first_ns = min(self._begin_ns.values())
+        if key == wire.EDGES or begin_ns - first_ns > _ROUND_NS:
+            begin_ns = first_ns
+        if start_ns < begin_ns + self._duration_ns:
+            self._within_s = self._monotonic_s()
+            return True
+        self._beyond.add(key)
+        return False
 
-
-@dataclass(frozen=True)
-class Summary:
-    """Outcome of a session.
-
-    Attributes:
-        path: The last file; the .part file if it could not be finished.
-        reason: Why the session ended.
-        error: What went wrong at the disk or in the recorder, or that there was no more room; empty if nothing did.
-        first_time_s: Simulated time of the first row in the files [s].
-        duration_s: Simulated time from the first to the last row; of all captures in sum [s].
-        rows: Rows in the files by key.
-        lost: Rows that were lost, by key, only keys that lost some; of captures also those lost between them.
-        gaps: Number of gaps that they are in.
-        missed: Messages that the transport gave up, by key.
-        dropped: Payloads that found the inbox full; they are among the lost.
-        malformed: Payloads that were not what their key promises; they are in the file as they came.
-        size_bytes: Size of the files.
-        files: All files that are there, in order; among them a .part file that could not be finished.
-        removed: Files that were removed for want of room.
-        high_water_bytes: Most that ever waited in the inbox.
-        received_s: Simulated time from the first to the last row received, kept or not [s].
-        fired: Triggers that came; None where it was not recorded around triggers.
-        remarks: What the user should know, a line each.
-        refused: Blocks that cannot be of the rig, and were left out.
-        ended_early: Up to which time it is recorded, where that is not all that was asked for; empty else.
-    """
-
-    path: Path
-    reason: str
-    error: str
-    first_time_s: float
-    duration_s: float
-    rows: dict[str, int]
-    lost: dict[str, int]
-    gaps: int
-    missed: dict[str, int]
-    dropped: int
-    malformed: int
-    size_bytes: int
-    files: tuple[Path, ...] = ()
-    removed: int = 0
-    high_water_bytes: int = 0
-    received_s: float = 0.0
-    fired: int | None = None
-    remarks: tuple[str, ...] = ()
-    refused: int = 0
-    ended_early: str = ""
-
-    @property
-    def losses(self) -> tuple[str, ...]:
-        """What is missing, a line each."""
-        lines = [f"{lost} rows of {key}" for key, lost in self.lost.items()]
-        lines += [f"{missed} messages of {key}, says the transport" for key, missed in self.missed.items()]
-        return (*lines, self.ended_early) if self.ended_early else tuple(lines)
-
-    @property
-    def good(self) -> bool:
-        """Whether the run did not fail, and all of it was recorded that was to be."""
-        return not (self.error or self.losses or self.reason.startswith("failed"))
-
-
-class Sink(Protocol):
-    """Where payloads go: a `Series`, or `Captures`."""
-
-    path: Path
-    files: list[Path]
-    removed: int
-    ended: str
-    out_of_room: bool
-    remarks: tuple[str, ...]
-
-    @property
-    def part(self) -> Path:
-        """Name of the file that is being written."""
-        ...
-
-    @property
-    def table(self) -> ChannelTable:
-        """The channel table."""
-        ...
-
-    @property
-    def next_index(self) -> dict[str, int]:
-        """Number of the row that is due next, by key."""
-        ...
-
-    def counts(self) -> Counts:
-        """What was received so far."""
-        ...
-
-    def kept(self) -> list[Counts]:
-        """What stands in the files, for each stretch of time that is recorded without a pause."""
-        ...
-
-    def write(self, key: str, payload: bytes, wall_ns: int) -> dict[str, Any] | None:
-        """Take one payload."""
-        ...
-
-    def write_missed(self, key: str, messages: int, wall_ns: int) -> None:
-        """Record that the transport lost messages for good."""
-        ...
-
-    def short_of(self, rows: dict[str, int]) -> dict[str, int]:
-        """Streams that have not come to the end of what was published."""
-        ...
-
-    def note_short(self, rows: dict[str, int], wall_ns: int) -> None:
-        """Record what is missing at the end of streams."""
-        ...
-
-    def sync_if_due(self) -> None:
-        """Flush to the disk if the last flush was long enough ago."""
-        ...
-
-    def finish(self, reason: str, *, notes: dict[str, str] | None = None) -> None:
-        """Close the last file."""
-        ...
+    def over(self, now_s: float) -> bool:
+        """Whether all streams have come to its end, or those that have not are not heard of any more."""
+        return bool(self._beyond) and (self._beyond >= self._streams or now_s - self._within_s > RECOVERY_S)
 
 
 class RecordingSession:
@@ -271,12 +150,11 @@ class RecordingSession:
             for field in ("rotate_mb", "rotate_s"):
                 if (given := getattr(self._limits, field)) is not None:
                     raise InputError(field, "left out where it is recorded around triggers", given)
-            check_captures(path, capture, force=force)
-            check_room(path, self._limits)
+            check_captures(path, capture, self._limits, force=force)
         self.path = path
         self._client = client
         self._reporter = Reporter(client, name)
-        self._duration_ns = math.inf if duration_s is None else duration_s * NS
+        self._duration_s = duration_s
         self._view_rate_hz = view_rate_hz
         self._history = history
         self._wait_s = wait_s
@@ -294,25 +172,25 @@ class RecordingSession:
         self._stop_reason = ""
         self._end_reason = ""
         self._end_rows: dict[str, int] | None = None
-        """Number of the row after the last one published, by key, as the end event tells it."""
+        """Number of the row after the last one published, by key, as the end event states it."""
         self._rig: str | None = None
-        """Who the rig is, as the transport tells."""
+        """Who the rig is, by its transport."""
         self._rig_lost = False
         self._lost_s = 0.0
         self._replaced = False
         self._remarks: list[str] = []
         self._heard_s = 0.0
-        self._streams: set[str] = set()
-        self._beyond: set[str] = set()
-        """Streams that have come to the end of the time to record."""
-        self._begin_ns: dict[str, int] = {}
-        self._within_s = 0.0
         self._failure: BaseException | None = None
 
     def stop(self, reason: str = "stopped") -> None:
         """End the session from another thread or a signal handler; what was received is still written."""
         # Only a flag: a signal handler that took the lock of an event could wait for its own thread.
         self._stop_reason = self._stop_reason or reason
+
+    @property
+    def waiting(self) -> int:
+        """Payloads that wait to be written."""
+        return len(self._inbox)
 
     def run(self, on_progress: Callable[[Progress], None] | None = None) -> Summary:
         """Record until the end.
@@ -327,19 +205,20 @@ class RecordingSession:
             NoReplyError: No rig answers.
             InputError: The file cannot be created.
         """
-        catalogue, parameters, scene = (decode_document(self._ask(key)) for key in (CATALOGUE, PARAMETERS, SCENE))
+        asked = (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE)
+        catalogue, parameters, scene = (wire.decode_document(self._ask(key)) for key in asked)
         promised = Catalogue.read(catalogue)
         self._rig = self._client.rig
-        writer = self._open_sink(catalogue, parameters, scene)
+        writer = self._open_sink(promised, catalogue, parameters, scene)
         self._intake = Intake(promised)
-        self._tick_rate_hz = round(promised.tick_rate_hz)
-        self._streams = {*map(sensor_key, promised.table.groups), *map(truth_key, promised.truth)}
+        self._extent = _Extent(self._duration_s, promised, self._monotonic_s)
+        self._table = promised.table
         thread = threading.Thread(target=self._write_all, args=(writer,), name="recorder-writer", daemon=True)
         thread.start()
         reason = "failed"
         try:
-            self._client.watch(ALIVE, self._on_alive)
-            for key in (f"{SENSORS}/**", f"{TRUTH}/**", EVENTS, STATUS):
+            self._client.watch(wire.ALIVE, self._on_alive)
+            for key in (f"{wire.SENSORS}/**", f"{wire.TRUTH}/**", wire.EVENTS, wire.STATUS):
                 self._client.subscribe(key, self._on_message, on_miss=self._on_miss, history=self._history)
             reason = self._wait_for_end(writer, on_progress)
         except BaseException as error:
@@ -364,46 +243,31 @@ class RecordingSession:
                     raise
                 time.sleep(0.05)
 
-    def _open_sink(self, catalogue: dict[str, Any], parameters: dict[str, Any], scene: dict[str, Any]) -> Sink:
-        def open_writer(path: Path, *, from_start: bool, **options: Any) -> RecordingWriter:
+    def _open_sink(self, promised: Catalogue, catalogue: Document, parameters: Document, scene: Document) -> Sink:
+        def open_file(path: Path, scene: Document, beginning: Beginning) -> RecordingWriter:
             return RecordingWriter(
                 path,
                 catalogue=catalogue,
                 parameters=parameters,
+                scene=scene,
                 view_rate_hz=self._view_rate_hz,
-                from_start=from_start and self._history,
+                beginning=beginning,
                 force=self._force,
                 wall_ns=self._wall_ns,
                 monotonic_s=self._monotonic_s,
-                **options,
             )
 
+        tick_rate_hz = round(promised.tick_rate_hz)
+        needs = Needs(promised.table, tick_rate_hz, scene, open_file, self._limits, self._force, self._monotonic_s)
         if self._capture is None:
-            return Series(
-                self.path,
-                scene=scene,
-                limits=self._limits,
-                open_writer=open_writer,
-                force=self._force,
-                monotonic_s=self._monotonic_s,
-            )
-        return Captures(
-            self.path,
-            self._capture,
-            table=Catalogue.read(catalogue).table,
-            tick_rate_hz=round(catalogue["tick_rate_hz"]),
-            scene=scene,
-            open_writer=open_writer,
-            limits=self._limits,
-            force=self._force,
-            monotonic_s=self._monotonic_s,
-        )
+            return Series(self.path, needs, from_start=self._history)
+        return Captures(self.path, self._capture, needs)
 
     # On the transport's threads.
 
     def _on_message(self, key: str, payload: bytes) -> None:
         wall_ns = self._wall_ns()
-        if schema_of(key) is None:
+        if wire.schema_of(key) is None:
             if not self._replaced:
                 self._inbox.offer((key, payload, wall_ns), room=self._inbox.room + _DOCUMENTS_BYTES)
             return
@@ -440,12 +304,12 @@ class RecordingSession:
     def _write_all(self, writer: Sink) -> None:
         try:
             while not self._inbox.ended:
-                for key, payload, wall_ns in self._inbox.take_many(_PORTION, 0.1):
-                    if not self._is_in_time(key, payload):
+                for item in self._inbox.take_many(_PORTION, 0.1):
+                    payload = Payload.read(*item)
+                    if not self._extent.takes(payload):
                         continue
-                    document = writer.write(key, payload, wall_ns)
-                    if document is not None:
-                        self._follow(key, document)
+                    writer.take(payload)
+                    self._follow(payload)
                     if writer.ended:
                         self._inbox.close()
                         self._wake.set()
@@ -458,30 +322,13 @@ class RecordingSession:
             self._inbox.close()
             self._wake.set()
 
-    def _is_in_time(self, key: str, payload: bytes) -> bool:
-        """Whether a payload is of the time to record; only what is a block can be of a later one."""
-        if math.isinf(self._duration_ns) or schema_of(key) is None:
-            return True
-        try:
-            start_ns = block_in(key, payload).tick * NS // self._tick_rate_hz
-        except ValueError:
-            return True
-        begin_ns = self._begin_ns.setdefault(key, start_ns)
-        first_ns = min(self._begin_ns.values())
-        if key == EDGES or begin_ns - first_ns > _ROUND_NS:
-            begin_ns = first_ns
-        if start_ns < begin_ns + self._duration_ns:
-            self._within_s = self._monotonic_s()
-            return True
-        self._beyond.add(key)
-        return False
-
-    def _follow(self, key: str, document: dict) -> None:
-        if key == EVENTS and document.get("event") == "end":
+    def _follow(self, payload: Payload) -> None:
+        document = payload.document or {}
+        if payload.event("end"):
             self._end_rows = document.get("rows")
             self._end_reason = printable(document.get("reason") or "ended", 500)
             self._wake.set()
-        elif key == STATUS and document.get("state") == "ended" and not self._end_reason:
+        elif payload.key == wire.STATUS and document.get("state") == "ended" and not self._end_reason:
             self._end_reason = "ended before the recording began"
             self._wake.set()
 
@@ -499,7 +346,7 @@ class RecordingSession:
                 return self._stop_reason
             if writer.ended:
                 return writer.ended
-            if self._beyond and (self._beyond >= self._streams or now_s - self._within_s > RECOVERY_S):
+            if self._extent.over(now_s):
                 return "duration reached"
             gone = self._replaced or (self._rig_lost and now_s - self._lost_s > self._patience_s)
             if ended_s is None and (self._end_reason or gone):
@@ -532,24 +379,24 @@ class RecordingSession:
         if now_s - ended_s > PATIENCE_S or self._replaced:
             return True
         # The `end` event can overtake blocks that are being recovered: while a stream is short of it, wait longer.
-        whole = self._end_rows is not None and not len(self._inbox) and not writer.short_of(self._end_rows)
+        whole = self._end_rows is not None and not self.waiting and not writer.tally.short_of(self._end_rows)
         quiet_s = now_s - max(ended_s, self._heard_s)
         return quiet_s > (QUIET_S if whole or self._rig_lost else RECOVERY_S)
 
     def _report(self, writer: Sink, *, done: bool = False) -> None:
-        groups = list(writer.table.groups)
-        first = sensor_key("probes" if "probes" in groups or not groups else groups[0])
+        groups = list(self._table.groups)
+        first = wire.sensor_key("probes" if "probes" in groups or not groups else groups[0])
         lost = sum(writer.counts().lost.values())
-        self._reporter.tell(writer.next_index.get(first, 0), lost=lost, done=done)
+        self._reporter.tell(writer.tally.next.get(first, 0), lost=lost, done=done)
 
     def _progress(self, writer: Sink) -> Progress:
         counts = writer.counts()
         return Progress(
             time_s=0.0 if counts.first_time_ns is None else (counts.last_time_ns - counts.first_time_ns) / NS,
-            rows=sum(rows for key, rows in counts.rows.items() if key.startswith(SENSORS + "/")),
+            rows=sum(rows for key, rows in counts.rows.items() if key.startswith(wire.SENSORS + "/")),
             lost=sum(counts.lost.values()),
             size_bytes=counts.size_bytes,
-            waiting=len(self._inbox),
+            waiting=self.waiting,
             backlog_bytes=self._inbox.used,
             dropped=self._inbox.dropped,
             files=len(writer.files),
@@ -564,8 +411,9 @@ class RecordingSession:
             while self._misses:
                 writer.write_missed(*self._misses.popleft())
             for each in self._intake.rest(self._end_rows) if not self._replaced and self._failure is None else ():
-                if self._is_in_time(each.key, each.payload):
-                    writer.write(each.key, each.payload, each.wall_ns)
+                payload = Payload.read(each.key, each.payload, each.wall_ns)
+                if self._extent.takes(payload):
+                    writer.take(payload)
             if reason == self._end_reason and self._end_rows:
                 writer.note_short(self._end_rows, self._wall_ns())
             notes = {
@@ -583,7 +431,7 @@ class RecordingSession:
 
     def _summary(self, writer: Sink, reason: str, trouble: str) -> Summary:
         files = tuple(writer.files)
-        if trouble and writer.part.exists():
+        if trouble and writer.part is not None and writer.part.exists():
             files = (*files, writer.part)
         counts = writer.counts()
         kept = writer.kept()

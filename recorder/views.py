@@ -33,23 +33,9 @@ def slot_of(channel: Channel) -> str:
     return "effort" if channel.unit in _FORCES else "velocity"
 
 
-@dataclass(frozen=True)
-class Messages:
-    """Messages of one topic, oldest first.
-
-    Attributes:
-        times_ns: Simulated time of each [ns], int64, shape (n,).
-        data: Their CDR bytes, uint8, shape (n, bytes).
-    """
-
-    times_ns: np.ndarray
-    data: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.times_ns)
-
-
-_NONE = Messages(np.empty(0, np.int64), np.empty((0, 0), np.uint8))
+Messages = tuple[np.ndarray, np.ndarray]
+"""Messages of one topic, oldest first: simulated times [ns], int64, shape (n,), and CDR, uint8, shape (n, bytes)."""
+_NONE: Messages = (np.empty(0, np.int64), np.empty((0, 0), np.uint8))
 
 
 @dataclass
@@ -108,7 +94,6 @@ class View:
             tick: Tick of the block that the rows are from.
             times_ns: Simulated time of each row [ns], shape (n,).
             values: Engineering values, shape (n, channels of the group).
-
         """
         self._waiting.setdefault(tick, {})[group.name] = (times_ns, values)
         if len(self._waiting[tick]) == len(self.groups):
@@ -151,7 +136,7 @@ class View:
             rows = slice(None) if len(times_ns) == len(instants) else np.searchsorted(instants, times_ns)
             for slot, place, columns in self._places[name]:
                 filled[slot][rows, place] = values[:, columns]
-        return Messages(instants, self._rows.encode(instants, filled))
+        return instants, self._rows.encode(instants, filled)
 
 
 class Views:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+
+import rerun as rr
+import rerun.blueprint as rrb
 
 from recorder.viewer import canvas, contact, orbit, painter, scene3d, series, spectrum
 from recorder.viewer.geometry import Geometry
 from rig.channels import ChannelTable
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
 
 LIVE_S = 10.0
 """Time series of a live view show this much of the past [s]."""
@@ -21,8 +20,6 @@ _SMALL = ("Spin speed [Hz]", "Hammer [N]")
 
 def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Blueprint:
     """The blueprint of a file's or a live view."""
-    import rerun.blueprint as rrb
-
     curves = _curve_views(table, geometry, live=live)
     small = [curves.pop(name) for name in _SMALL if name in curves]
     planes = [plane for plane in orbit.PLANES if plane in painter.planes_in(table)]
@@ -61,8 +58,6 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Bluepr
 
 
 def _spectrum_view() -> rrb.BarChartView:
-    import rerun.blueprint as rrb
-
     return rrb.BarChartView(
         origin=f"{spectrum.ROOT}/now",
         name="Full spectrum of x + jy at the ring [mm] over [Hz]: backward < 0 < forward",
@@ -71,8 +66,6 @@ def _spectrum_view() -> rrb.BarChartView:
 
 
 def _waterfall_view() -> rrb.Spatial2DView:
-    import rerun.blueprint as rrb
-
     return rrb.Spatial2DView(
         origin=spectrum.WATERFALL,
         name="Waterfall of the full spectrum [dB re 1 um]",
@@ -82,8 +75,6 @@ def _waterfall_view() -> rrb.Spatial2DView:
 
 
 def _events_view() -> rrb.TextLogView:
-    import rerun.blueprint as rrb
-
     return rrb.TextLogView(
         origin=painter.EVENTS,
         name="Events",
@@ -92,8 +83,6 @@ def _events_view() -> rrb.TextLogView:
 
 
 def _orbit_view(plane: str, geometry: Geometry) -> rrb.Spatial2DView:
-    import rerun.blueprint as rrb
-
     reach = 1.9 * geometry.clearance_mm(plane)
     return rrb.Spatial2DView(
         origin=f"{orbit.ROOT}/{plane}",
@@ -104,8 +93,6 @@ def _orbit_view(plane: str, geometry: Geometry) -> rrb.Spatial2DView:
 
 
 def _scene_view() -> rrb.Spatial3DView:
-    import rerun.blueprint as rrb
-
     return rrb.Spatial3DView(
         origin=scene3d.ROOT,
         name=f"Rig, displacements x {scene3d.EXAGGERATION:g}",
@@ -148,8 +135,6 @@ def _curve_views(table: ChannelTable, geometry: Geometry, *, live: bool) -> dict
 
 
 def _curve_view(title: str, paths: Sequence[str], *, reach: float | None, live: bool) -> rrb.TimeSeriesView:
-    import rerun.blueprint as rrb
-
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"+ {path}" for path in paths],
@@ -161,8 +146,6 @@ def _curve_view(title: str, paths: Sequence[str], *, reach: float | None, live: 
 
 
 def _contact_view(*, live: bool) -> rrb.StateTimelineView:
-    import rerun.blueprint as rrb
-
     return rrb.StateTimelineView(
         origin="/contact",
         contents=[f"+ {contact.SENSED}", f"+ {contact.TRUTH}"],
@@ -172,9 +155,6 @@ def _contact_view(*, live: bool) -> rrb.StateTimelineView:
 
 
 def _time_axis(*, live: bool) -> rrb.TimeAxis:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     if not live:
         return rrb.TimeAxis(link="LinkToGlobal")
     past = rr.TimeRange(

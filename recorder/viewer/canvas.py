@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.clock import WallClock
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 APPLICATION = "rig"
 SIMULATED = "simulated_time"
 WALL = "wall_time"
+Place = tuple[float, float]
+RGB = tuple[int, int, int]
 
 
 def new_stream(name: str) -> rr.RecordingStream:
     """A recording stream named `name` that is connected to nothing yet."""
-    import rerun as rr
-
     stream = rr.RecordingStream(APPLICATION)
     # rerun's own time of logging would stand as a third time line that means nothing to the reader.
     stream.set_log_time_enabled(False)
@@ -38,7 +36,7 @@ class Canvas:
 
     def __init__(self, stream: rr.RecordingStream, clock: WallClock | None = None) -> None:
         self.stream = stream
-        self.clock = clock or WallClock()
+        self.clock = WallClock() if clock is None else clock
 
     def fix(self, path: str, *what: Any) -> None:
         """Draw something that holds for all times."""
@@ -52,6 +50,14 @@ class Canvas:
             self.stream.set_time(WALL, timestamp=float(wall[0]))
         self.stream.log(path, what[0], *what[1:])
 
+    def write(self, path: str, words: dict[Place, str], colors: Sequence[RGB], *, time_s: float | None = None) -> None:
+        """Write words at places of a 2-D view; without a time [s] they hold for all times."""
+        text = rr.Points2D(list(words), radii=pixels(0.0), colors=colors, labels=list(words.values()), show_labels=True)
+        if time_s is None:
+            self.fix(path, text)
+        else:
+            self.draw(path, time_s, text)
+
     def keeps_up(self, *, timeout_s: float) -> bool:
         """Whether all that was drawn so far leaves for the viewer within that time; what does not, piles up here."""
         try:
@@ -62,8 +68,6 @@ class Canvas:
 
     def plot(self, path: str, times_s: np.ndarray, columns: Iterable[Any]) -> None:
         """Draw many instants at once; `columns` comes from an archetype's `columns`."""
-        import rerun as rr
-
         indexes = [rr.TimeColumn(SIMULATED, duration=np.round(times_s * 1e9).astype("timedelta64[ns]"))]
         wall = self.clock.at(times_s)
         if wall is not None:

@@ -14,6 +14,9 @@ class WallClock:
         self._simulated: list[float] = []
         self._wall: list[float] = []
 
+    def __len__(self) -> int:
+        return len(self._wall)
+
     def mark(self, simulated_s: float, wall_s: float) -> None:
         """Say that a simulated instant [s] was seen at a wall time [s since 1970]; marks that go back are ignored."""
         if self._simulated and (simulated_s <= self._simulated[-1] or wall_s < self._wall[-1]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.canvas import Canvas
 from rig.channels import Channel
@@ -15,7 +16,7 @@ TOUCH, FREE = "contact", "free"
 
 
 def resolution_mm(channel: Channel) -> float:
-    """What a probe can tell apart [mm]: three standard deviations of its noise and converter step."""
+    """Resolution of a probe [mm]: three standard deviations of its noise and converter step."""
     step = channel.lsb_v / math.sqrt(12.0)
     return 3.0 * math.hypot(channel.noise_v, step) / abs(channel.sensitivity_v) * channel.si * 1e3
 
@@ -46,8 +47,6 @@ class ContactPlot:
     """One lane of the contact view."""
 
     def __init__(self, canvas: Canvas, *, path: str, touch: Touch) -> None:
-        import rerun as rr
-
         self._canvas = canvas
         self._path = path
         self._touch = touch
@@ -66,8 +65,6 @@ class ContactPlot:
 
     def add(self, times_s: np.ndarray, quantity: np.ndarray) -> None:
         """Take the rows of the deciding quantity, shape (n,), and draw the changes."""
-        import rerun as rr
-
         times, states = self._touch.changes(times_s, quantity)
         if len(times_s) and self.touching:
             self.last_contact_s = float(times_s[-1])

@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from recorder.reader import Recording
+from recorder.samples import Samples
 from recorder.viewer.canvas import Canvas
 from recorder.viewer.geometry import Geometry
 from recorder.viewer.painter import FRAME_S, Painter
 
-if TYPE_CHECKING:
-    from recorder.reader import Recording, Samples
-
 MOST_ROWS_PER_S = 2000.0
 MOST_ROWS = 60_000
-"""Points of one curve, whatever the length of the file; full rate around hammer blows comes on top."""
+"""Points of one curve, whatever the length of the file; full rate around hammer pulses comes on top."""
 MOST_FRAMES = 6_000
 """Orbits and places of the rotor; 25 Hz up to four minutes, fewer in longer files."""
 _FLUSH_EVERY = 100
@@ -55,7 +53,7 @@ def paint(recording: Recording, canvas: Canvas) -> Painted:
     """Draw a whole recording."""
     for simulated_s, wall_s in recording.clock:
         canvas.clock.mark(float(simulated_s), float(wall_s))
-    # The hammer comes first: its blows decide where the other curves keep their full rate.
+    # The hammer comes first: its pulses decide where the other curves keep their full rate.
     names = sorted(recording.table.groups, key=lambda name: name != "hammer")
     painter: Painter | None = None
     start_s, end_s = np.inf, -np.inf

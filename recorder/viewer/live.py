@@ -22,7 +22,7 @@ from rig.transport.clients import Reporter
 
 NAME = "viewer"
 ROWS_PER_S = 500.0
-"""Points of each curve per simulated second [Hz]; full rate around hammer blows."""
+"""Points of each curve per simulated second [Hz]; full rate around hammer pulses."""
 _TICK_S = 0.04
 _FLUSH_EVERY = 4
 _HEARTBEAT_S = 0.5
@@ -107,7 +107,8 @@ class LiveView:
         self._received_index = 0
         self._there: bool | None = None
         self._gone_at_s = 0.0
-        self._end: str | None = None
+        self.ended: str | None = None
+        """Why the run ended, as the rig states it; None before."""
         self._stalled = False
         self.failed = False
         """Whether the run failed, or the rig went without an end."""
@@ -136,16 +137,16 @@ class LiveView:
         Returns:
             Why it ended, in one line.
         """
-        self._client.subscribe(f"{wire.SENSORS}/*", self._take, lossless=False)
+        self._client.subscribe(f"{wire.SENSORS}/*", self.take, lossless=False)
         if self._force_column is not None:
-            self._client.subscribe(_CONTACT, self._take, lossless=False)
+            self._client.subscribe(_CONTACT, self.take, lossless=False)
         # Events are few: those from before we came are fetched.
-        self._client.subscribe(wire.EVENTS, self._take, history=True)
+        self._client.subscribe(wire.EVENTS, self.take, history=True)
         self._client.watch(wire.ALIVE, self._watch)
         count, heard_s, beat_s, check_s = 0, time.monotonic(), 0.0, 0.0
         while True:
             now_s = time.monotonic()
-            if self._draw():
+            if self.draw():
                 heard_s = now_s
             count += 1
             if count % _FLUSH_EVERY == 0:
@@ -158,7 +159,7 @@ class LiveView:
                 beat_s = now_s
             reason = self._reason(now_s, heard_s) or ("the viewer was closed" if stop() else None)
             if reason is not None:
-                if self._end is None:
+                if self.ended is None:
                     self._painter.note(self._painter.now_s, reason, level="WARN")
                 self._painter.close()
                 self._report(done=True)
@@ -169,15 +170,16 @@ class LiveView:
     def _reason(self, now_s: float, heard_s: float) -> str | None:
         if now_s - heard_s < _QUIET_S:
             return None
-        if self._end is not None:
-            self.failed = self._end.startswith("failed")
-            return f"the rig ended: {self._end}"
+        if self.ended is not None:
+            self.failed = self.ended.startswith("failed")
+            return f"the rig ended: {self.ended}"
         if self._there is False and now_s - self._gone_at_s > _GONE_S:
             self.failed = True
             return "the rig is gone without ending its stream (killed, or the connection broke)"
         return None
 
-    def _take(self, key: str, payload: bytes) -> None:
+    def take(self, key: str, payload: bytes) -> None:
+        """Take a payload, from any thread."""
         self._inbox.append((key, payload))
 
     def _watch(self, there: bool) -> None:
@@ -195,12 +197,12 @@ class LiveView:
             self._painter.note(self._painter.now_s, text, level="WARN")
         self._stalled = stalled
 
-    def _draw(self) -> bool:
+    def draw(self) -> bool:
         """Draw all that has arrived; whether anything had."""
         arrived = []
         while self._inbox:
             arrived.append(self._inbox.popleft())
-        # Stable: each key stays in order, and its blocks come together. Events first: they tell of the hammer.
+        # Stable: each key stays in order, and its blocks come together. Events first: they announce hammer pulses.
         arrived.sort(key=lambda item: (item[0] != wire.EVENTS, item[0]))
         for key, items in groupby(arrived, key=lambda item: item[0]):
             payloads = [payload for _, payload in items]
@@ -219,7 +221,7 @@ class LiveView:
                 continue
             self._painter.add_event(event)
             if event["event"] == "end":
-                self._end = printable(event.get("reason") or "no reason given", 500)
+                self.ended = printable(event.get("reason") or "no reason given", 500)
 
     def _draw_blocks(self, key: str, payloads: list[bytes]) -> None:
         taken = []

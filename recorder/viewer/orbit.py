@@ -10,8 +10,9 @@ import itertools
 import math
 
 import numpy as np
+import rerun as rr
 
-from recorder.viewer.canvas import Canvas, pixels
+from recorder.viewer.canvas import Canvas, Place, pixels
 from recorder.viewer.history import History
 from recorder.viewer.whirl import Whirl, whirl_of
 
@@ -37,6 +38,10 @@ def screen(z: np.ndarray) -> np.ndarray:
     return np.stack((np.real(z), -np.imag(z)), axis=-1)
 
 
+def _placed(words: dict[complex, str]) -> dict[Place, str]:
+    return {(float(np.real(z)), float(-np.imag(z))): text for z, text in words.items()}
+
+
 def shown_s(whirl: Whirl) -> float:
     """How much of the past an orbit shows [s]: a few revolutions of the whirl."""
     if whirl.sense == "none":
@@ -56,8 +61,6 @@ class OrbitPlot:
         self._draw_frame(plane)
 
     def _draw_frame(self, plane: str) -> None:
-        import rerun as rr
-
         radius = self._clearance_mm
         circle = radius * np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 181))
         reach = 1.15 * radius
@@ -70,28 +73,12 @@ class OrbitPlot:
             rr.LineStrips2D([screen(circle)], colors=[_CLEARANCE_RGB], radii=pixels(3.5), draw_order=2.0),
         )
         at_ring = " (ring at rest)" if plane == "disk" else ""
-        self._write(
-            "words",
-            {1.30 * radius: "EAST +x", 1.22j * radius: "UP +y", 1.58j * radius: f"clearance {radius:.3f} mm{at_ring}"},
-            [_WORDS_RGB, _WORDS_RGB, _CLEARANCE_RGB],
-        )
-
-    def _write(
-        self, name: str, words: dict[complex, str], colors: list[tuple[int, int, int]], time_s: float | None = None
-    ) -> None:
-        import rerun as rr
-
-        text = rr.Points2D(
-            screen(np.array(list(words))),
-            radii=pixels(0.0),
-            colors=colors,
-            labels=list(words.values()),
-            show_labels=True,
-        )
-        if time_s is None:
-            self._canvas.fix(f"{self._path}/{name}", text)
-        else:
-            self._canvas.draw(f"{self._path}/{name}", time_s, text)
+        words = {
+            1.30 * radius: "EAST +x",
+            1.22j * radius: "UP +y",
+            1.58j * radius: f"clearance {radius:.3f} mm{at_ring}",
+        }
+        self._canvas.write(f"{self._path}/words", _placed(words), [_WORDS_RGB, _WORDS_RGB, _CLEARANCE_RGB])
 
     def add(self, z: np.ndarray) -> None:
         """Take rows of x + j y [mm], shape (n,)."""
@@ -103,8 +90,6 @@ class OrbitPlot:
 
     def draw(self, time_s: float) -> None:
         """Draw the orbit that ends at `time_s`, with an arrow in its direction and a line that names its sense."""
-        import rerun as rr
-
         whirl = whirl_of(self._history.last(math.ceil(_JUDGED_S * self._rate_hz)), self._rate_hz)
         z = self._history.last(math.ceil(shown_s(whirl) * self._rate_hz))
         if len(z) < 2:
@@ -126,12 +111,11 @@ class OrbitPlot:
         self._draw_turn(time_s, complex(points[-1] - z.mean()), whirl)
         first, second = reading_of(whirl)
         at = -1.32j * self._clearance_mm
-        self._write("reading", {at: first, 1.27 * at: second}, [whirl.color], time_s)
+        words = _placed({at: first, 1.27 * at: second})
+        self._canvas.write(f"{self._path}/reading", words, [whirl.color], time_s=time_s)
 
     def _draw_turn(self, time_s: float, position: complex, whirl: Whirl) -> None:
         """Draw a round arrow in the middle that turns as the shaft whirls; it leads up to the shaft's direction."""
-        import rerun as rr
-
         path = f"{self._path}/turn"
         if whirl.sense == "none" or position == 0.0:
             self._canvas.draw(path, time_s, rr.LineStrips2D([]))

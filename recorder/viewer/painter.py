@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import rerun as rr
 
 from recorder import schemas
 from recorder.viewer import contact, orbit
@@ -15,7 +16,7 @@ from recorder.viewer.contact import ContactPlot, Touch
 from recorder.viewer.geometry import Geometry
 from recorder.viewer.orbit import OrbitPlot
 from recorder.viewer.scene3d import Scene3D
-from recorder.viewer.series import REACTIONS, SeriesPlot, Window, reaction_of
+from recorder.viewer.series import REACTIONS, SeriesPlot, Span, reaction_of
 from recorder.viewer.spectrum import SpectrumPlot
 from rig.channels import ChannelTable, Group
 
@@ -26,7 +27,7 @@ SPECTRUM_EVERY = 5
 """Frames per spectrum: 5 Hz."""
 AROUND_HAMMER_S = 0.05
 HELD_S = AROUND_HAMMER_S + 0.02
-"""Live curves lag by this much, so that a hammer blow still finds the rows before it at full rate."""
+"""Live curves lag by this much, so that a hammer pulse still finds the rows before it at full rate."""
 
 _LEVELS = {schemas.LOG_INFO: "INFO", schemas.LOG_WARN: "WARN", schemas.LOG_ERROR: "ERROR"}
 _SLOW_ROWS_PER_S = 200.0
@@ -101,15 +102,15 @@ class Painter:
             canvas: Where to draw.
             table: The channels that will be fed.
             geometry: Lengths of the rig.
-            rows_per_s: Points of each curve per simulated second [Hz]; full rate around hammer blows.
+            rows_per_s: Points of each curve per simulated second [Hz]; full rate around hammer pulses.
             whole: A file, drawn from its start to its end, in contrast to a stream.
-            held_s: How long curves wait for a hammer blow that is not known yet [s].
+            held_s: How long curves wait for a hammer pulse that is not known yet [s].
         """
         self._canvas = canvas
         self._held_s = held_s
         self._whole = whole
         self._last_s: dict[str, float] = {}
-        self._windows: list[Window] = []
+        self._windows: list[Span] = []
         self._curves = {
             name: SeriesPlot(
                 canvas, group, rows_per_s=rows_per_s if _is_fast(group) else min(rows_per_s, _SLOW_ROWS_PER_S)
@@ -180,8 +181,6 @@ class Painter:
 
     def note(self, time_s: float, text: str, *, level: str = "INFO") -> None:
         """Write a line into the log of events."""
-        import rerun as rr
-
         self._canvas.draw(EVENTS, time_s, rr.TextLog(text, level=level))
 
     def frame(self, name: str) -> None:
@@ -234,7 +233,7 @@ class _Part:
         """Rows are missing before the next ones."""
 
     def close(self) -> None:
-        """Draw what only the end tells."""
+        """Draw what is known at the end only."""
 
 
 class _Probes(_Part):
@@ -251,7 +250,7 @@ class _Probes(_Part):
             )
             for plane in planes
         }
-        # The ring's plane tells most; a rig with probes at the disk only shows the same whirl there.
+        # The ring's plane shows most; a rig with probes at the disk only shows the same whirl there.
         self._main = planes[0]
         self._spectrum = SpectrumPlot(canvas, rate_hz=group.rate_hz, interval_s=FRAME_S * SPECTRUM_EVERY, whole=whole)
         self._frames = 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.canvas import Canvas
 from recorder.viewer.geometry import Geometry
@@ -39,8 +40,6 @@ class Scene3D:
         self._draw_rotor()
 
     def _draw_stator(self) -> None:
-        import rerun as rr
-
         g = self._geometry
         self._canvas.fix(ROOT, rr.ViewCoordinates.RIGHT_HAND_Y_UP)
         bore = g.shaft_radius_m + EXAGGERATION * g.ring_clearance_m
@@ -105,8 +104,6 @@ class Scene3D:
         )
 
     def _draw_rotor(self) -> None:
-        import rerun as rr
-
         g = self._geometry
         rotor = f"{ROOT}/rotor"
         length = g.magnet_arm_m + 0.01
@@ -141,8 +138,6 @@ class Scene3D:
 
     def draw_tilt(self, time_s: float, disk_m: complex) -> None:
         """Tilt the rotor so that its disk is at x + j y [m]."""
-        import rerun as rr
-
         tilt = EXAGGERATION * abs(disk_m) / self._geometry.disk_arm_m
         half = 0.5 * math.atan(tilt)
         direction = disk_m / abs(disk_m) if abs(disk_m) > 0.0 else 1.0 + 0.0j
@@ -154,16 +149,12 @@ class Scene3D:
 
     def draw_spin(self, time_s: float, turned_rad: float) -> None:
         """Show the rotor turned by an angle [rad] since the start, where its angle is not known."""
-        import rerun as rr
-
         half = 0.5 * math.remainder(turned_rad, 4.0 * math.pi)
         turned = rr.Quaternion(xyzw=(0.0, 0.0, math.sin(half), math.cos(half)))
         self._canvas.draw(f"{ROOT}/rotor/spin", time_s, rr.Transform3D(quaternion=turned))
 
     def draw_contact(self, time_s: float, ring_m: complex, *, touching: bool) -> None:
         """Mark the point of the ring nearest to the shaft at x + j y [m], or nothing."""
-        import rerun as rr
-
         g = self._geometry
         path = f"{ROOT}/contact"
         if not touching or ring_m == 0.0:
@@ -178,8 +169,6 @@ class Scene3D:
 
     def draw_reaction(self, time_s: float, reaction_n: complex) -> None:
         """Draw the force of the shaft on the houses, x + j y [N], at the ring."""
-        import rerun as rr
-
         g = self._geometry
         bore = g.shaft_radius_m + EXAGGERATION * g.ring_clearance_m
         size = abs(reaction_n)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.canvas import Canvas
 from rig.channels import ChannelTable, Group
@@ -29,11 +30,11 @@ _PLAIN = (200, 205, 215)
 _SHADES = {"outer": 0.6}
 """Curves of the outer house stand in the plot of the inner one."""
 
-Window = tuple[float, float]
+Span = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class Curves:
     """Curves that share a plot: one entity with a value per curve.
 
     Attributes:
@@ -49,24 +50,24 @@ class Series:
     select: Callable[[np.ndarray], np.ndarray]
 
 
-def series_of(group: Group) -> list[Series]:
+def series_of(group: Group) -> list[Curves]:
     """The curves of one sensor group: channels with a common first part of the name stand together."""
     planes: dict[str, list[int]] = {}
     for column, channel in enumerate(group.channels):
         if channel.name not in _NOT_DRAWN:
             planes.setdefault(channel.name.split("_")[0], []).append(column)
     found = [
-        Series(
+        Curves(
             path=f"{ROOT}/{group.name}/{plane}",
             labels=tuple(f"{group.channels[column].name} [{group.channels[column].unit}]" for column in columns),
             colors=tuple(_color_of(group.channels[column].name) for column in columns),
-            select=_take(columns),
+            select=lambda values, columns=columns: values[:, columns],
         )
         for plane, columns in planes.items()
     ]
     if set(group.names) >= REACTIONS:
         found.append(
-            Series(
+            Curves(
                 path=REACTION,
                 labels=("x: P_E - P_W [N]", "y: P_N - P_S [N]"),
                 colors=(_color_of("x"), _color_of("y")),
@@ -94,10 +95,6 @@ def reaction_of(group: Group) -> Callable[[np.ndarray], np.ndarray]:
     return lambda values: np.stack((values[:, east] - values[:, west], values[:, north] - values[:, south]), axis=1)
 
 
-def _take(columns: list[int]) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda values: values[:, columns]
-
-
 class Envelope:
     """Keeps the extremes of each bucket of rows, and every row inside the given windows.
 
@@ -115,7 +112,7 @@ class Envelope:
         self._times.append(times_s)
         self._values.append(values)
 
-    def take(self, *, until_s: float, windows: list[Window], rest: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    def take(self, *, until_s: float, windows: list[Span], rest: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Give the points of the buckets that end before `until_s`; with `rest`, also of the unfinished one."""
         if not self._times:
             return np.empty(0), np.empty((0, 0))
@@ -155,8 +152,6 @@ class SeriesPlot:
     """The curves of one sensor group on a canvas."""
 
     def __init__(self, canvas: Canvas, group: Group, *, rows_per_s: float) -> None:
-        import rerun as rr
-
         self._canvas = canvas
         self._rate_hz = group.rate_hz
         self._series = series_of(group)
@@ -179,20 +174,16 @@ class SeriesPlot:
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             envelope.add(times_s, series.select(values))
 
-    def flush(self, *, until_s: float, windows: list[Window], rest: bool = False) -> None:
+    def flush(self, *, until_s: float, windows: list[Span], rest: bool = False) -> None:
         """Draw what is complete before `until_s`."""
-        import rerun as rr
-
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             times, values = envelope.take(until_s=until_s, windows=windows, rest=rest)
             if len(times):
                 self._canvas.plot(series.path, times, rr.Scalars.columns(scalars=values))
                 self.points += values.size
 
-    def lift(self, *, at_s: float, windows: list[Window]) -> None:
+    def lift(self, *, at_s: float, windows: list[Span]) -> None:
         """Draw what is held, then interrupt the curves at `at_s`: rows are missing from here on."""
-        import rerun as rr
-
         self.flush(until_s=np.inf, windows=windows, rest=True)
         for series in self._series:
             hole = np.full((1, len(series.labels)), np.nan)

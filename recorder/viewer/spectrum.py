@@ -6,17 +6,19 @@ import math
 from collections import deque
 
 import numpy as np
+import rerun as rr
 
 from recorder.viewer.canvas import Canvas, pixels
 from recorder.viewer.history import History
 from recorder.viewer.whirl import BACKWARD_RGB, FORWARD_RGB
+from rig.orbit import SPECTRUM_HZ, full_spectrum
 
 ROOT = "/spectrum"
 BACKWARD = f"{ROOT}/now/backward"
 FORWARD = f"{ROOT}/now/forward"
 WATERFALL = f"{ROOT}/waterfall"
 
-LIMIT_HZ = 200
+LIMIT_HZ = round(SPECTRUM_HZ)
 WINDOW_S = 0.5
 COLUMN_HZ = 2
 """Width of a waterfall column [Hz]: the window of half a second resolves no more."""
@@ -24,27 +26,22 @@ HEIGHT = 120
 """Rows of the waterfall's image."""
 FLOOR_DB, CEILING_DB = 0.0, 62.0
 """Colour range [dB re 1 um]: 1 um to 1.26 mm."""
+_MARKS_RGB = (150, 155, 165)
 
 
-def full_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitude of each circular component of z about its centre.
-
-    Hann window over all of z, padded to one second, so that bins stand at whole hertz; scaled so that a steady whirl of
-    radius r has its peak at r.
+def shown_spectrum(z: np.ndarray, rate_hz: int) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitude of each circular component of z about its centre, at whole hertz (`rig.orbit.full_spectrum`).
 
     Args:
         z: x + j y, shape (n,), n at most `rate_hz`.
         rate_hz: Samples per second [Hz].
 
     Returns:
-        Frequencies -200 .. 200 [Hz] and amplitudes in the unit of z, both of shape (401,).
+        Frequencies -200 .. 200 [Hz] and amplitudes in the unit of z, both of shape (401,); 0 beyond half the rate.
     """
     frequencies = np.arange(-LIMIT_HZ, LIMIT_HZ + 1)
-    window = np.hanning(len(z) + 2)[1:-1]
-    # The plain mean of an unfinished revolution is not zero: taking it off would put a line at 0 Hz.
-    centre = np.dot(window, z) / window.sum()
-    lines = np.fft.fft((z - centre) * window, n=rate_hz) / window.sum()
-    amplitude = np.abs(lines[frequencies % rate_hz])
+    _, lines = full_spectrum(np.real(z), np.imag(z), rate_hz, lines=rate_hz)
+    amplitude = lines[(frequencies + rate_hz // 2) % rate_hz]
     amplitude[np.abs(frequencies) >= rate_hz / 2] = 0.0
     return frequencies, amplitude
 
@@ -53,8 +50,6 @@ class SpectrumPlot:
     """The spectrum of the last half second as bars, backward and forward in their own colours, and the waterfall."""
 
     def __init__(self, canvas: Canvas, *, rate_hz: int, interval_s: float, whole: bool) -> None:
-        import rerun as rr
-
         self._canvas = canvas
         self._rate_hz = rate_hz
         self._history = History(capacity=math.ceil(WINDOW_S * rate_hz), dtype=complex)
@@ -80,19 +75,17 @@ class SpectrumPlot:
 
     def draw(self, time_s: float) -> None:
         """Draw the spectrum of the half second that ends at `time_s`; nothing before there is that much."""
-        import rerun as rr
-
         z = self._history.last(math.ceil(WINDOW_S * self._rate_hz))
         if len(z) < math.ceil(WINDOW_S * self._rate_hz):
             return
-        _, amplitude = full_spectrum(z, self._rate_hz)
+        _, amplitude = shown_spectrum(z, self._rate_hz)
         bars = amplitude.astype(np.float32)
         self._canvas.draw(BACKWARD, time_s, rr.BarChart(bars[:LIMIT_HZ]))
         self._canvas.draw(FORWARD, time_s, rr.BarChart(bars[LIMIT_HZ + 1 :]))
         self._waterfall.add(time_s, amplitude)
 
     def close(self) -> None:
-        """Draw what only the end tells."""
+        """Draw what is known at the end only."""
         self._waterfall.finish()
 
 
@@ -112,35 +105,14 @@ class Waterfall:
         self._draw_axes()
 
     def _draw_axes(self) -> None:
-        import rerun as rr
-
         marks = range(-LIMIT_HZ, LIMIT_HZ + 1, 50)
         ticks = [[(self.x_of(hz), HEIGHT), (self.x_of(hz), HEIGHT + (5 if hz == 0 else 3))] for hz in marks]
         faint = pixels(0.6)
-        self._canvas.fix(
-            f"{WATERFALL}/ticks", rr.LineStrips2D(ticks, colors=[(150, 155, 165)], radii=faint, draw_order=2.0)
-        )
-        named = [hz for hz in marks if hz % 100 == 0]
-        self._canvas.fix(
-            f"{WATERFALL}/frequencies",
-            rr.Points2D(
-                [(self.x_of(hz), HEIGHT + 10) for hz in named],
-                radii=pixels(0.0),
-                colors=[(150, 155, 165)],
-                labels=[f"{hz:+d} Hz" if hz else "0" for hz in named],
-                show_labels=True,
-            ),
-        )
-        self._canvas.fix(
-            f"{WATERFALL}/senses",
-            rr.Points2D(
-                [(self.x_of(-150), -8), (self.x_of(150), -8)],
-                radii=pixels(0.0),
-                colors=[BACKWARD_RGB, FORWARD_RGB],
-                labels=["BACKWARD", "FORWARD"],
-                show_labels=True,
-            ),
-        )
+        self._canvas.fix(f"{WATERFALL}/ticks", rr.LineStrips2D(ticks, colors=[_MARKS_RGB], radii=faint, draw_order=2.0))
+        named = {(self.x_of(hz), HEIGHT + 10.0): f"{hz:+d} Hz" if hz else "0" for hz in marks if hz % 100 == 0}
+        self._canvas.write(f"{WATERFALL}/frequencies", named, [_MARKS_RGB])
+        senses = {(self.x_of(-150), -8.0): "BACKWARD", (self.x_of(150), -8.0): "FORWARD"}
+        self._canvas.write(f"{WATERFALL}/senses", senses, [BACKWARD_RGB, FORWARD_RGB])
 
     def x_of(self, frequency_hz: float) -> float:
         """Place of a frequency in the image [pixels]."""
@@ -171,13 +143,11 @@ class Waterfall:
 
     def finish(self) -> None:
         """For a whole file: draw the image, its times, and the line that marks the present."""
-        import rerun as rr
-
         if not self._whole or not self._times:
             return
         self._draw_image(None, self.image())
         start, end = self._times[0], self._times[-1]
-        self._draw_times([(0.5, f"{end:.1f} s"), (HEIGHT - 0.5, f"{start:.1f} s")])
+        self._draw_times(f"{end:.1f} s", f"{start:.1f} s")
         for time in self._times:
             y = HEIGHT * (end - time) / (end - start) if end > start else 0.5
             line = [[(0.0, y), (float(self.columns), y)]]
@@ -188,8 +158,6 @@ class Waterfall:
             )
 
     def _draw_image(self, time_s: float | None, image: np.ndarray) -> None:
-        import rerun as rr
-
         picture = rr.DepthImage(
             image, meter=1.0, colormap="inferno", depth_range=[FLOOR_DB, CEILING_DB], draw_order=0.0
         )
@@ -198,18 +166,7 @@ class Waterfall:
             return
         self._canvas.draw(f"{WATERFALL}/level", time_s, picture)
         if len(self._times) == 1:
-            self._draw_times([(0.5, "now"), (HEIGHT - 0.5, f"-{HEIGHT * self._interval_s:.0f} s")])
+            self._draw_times("now", f"-{HEIGHT * self._interval_s:.0f} s")
 
-    def _draw_times(self, marks: list[tuple[float, str]]) -> None:
-        import rerun as rr
-
-        self._canvas.fix(
-            f"{WATERFALL}/times",
-            rr.Points2D(
-                [(-9.0, y) for y, _ in marks],
-                radii=pixels(0.0),
-                colors=[(150, 155, 165)],
-                labels=[text for _, text in marks],
-                show_labels=True,
-            ),
-        )
+    def _draw_times(self, newest: str, oldest: str) -> None:
+        self._canvas.write(f"{WATERFALL}/times", {(-9.0, 0.5): newest, (-9.0, HEIGHT - 0.5): oldest}, [_MARKS_RGB])

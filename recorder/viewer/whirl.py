@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from rig.orbit import mean_rotation, rms_radius
 
 BACKWARD_RGB = (240, 100, 75)
 FORWARD_RGB = (95, 205, 150)
 STILL_RGB = (150, 155, 165)
 
-_LAG_S = 1e-3
 _LEAST_RADIUS_MM = 5e-3
 _LEAST_FREQUENCY_HZ = 0.5
 
@@ -42,20 +42,13 @@ class Whirl:
 
 
 def whirl_of(z: np.ndarray, rate_hz: float) -> Whirl:
-    """Radius-weighted mean rotation of z about its mean.
-
-    The phase is advanced over 1 ms: short against any whirl of the rig (unambiguous to +-500 Hz), long against the
-    correlation time of the probes' noise, which would otherwise pull the slope of a small orbit towards zero.
+    """How z turns about its mean.
 
     Args:
         z: x + j y [mm], shape (n,).
         rate_hz: Samples per second [Hz].
     """
-    lag = max(1, round(_LAG_S * rate_hz))
-    if len(z) < 2 * lag:
+    if not len(z):
         return Whirl(frequency_hz=0.0, radius_mm=0.0)
-    turning = z - z.mean()
-    radius = float(np.sqrt(np.mean(np.abs(turning) ** 2)))
-    advance = np.vdot(turning[:-lag], turning[lag:])
-    angle = math.atan2(advance.imag, advance.real)
-    return Whirl(frequency_hz=angle * rate_hz / (2.0 * math.pi * lag), radius_mm=radius)
+    x, y = np.real(z), np.imag(z)
+    return Whirl(frequency_hz=mean_rotation(x, y, rate_hz), radius_mm=rms_radius(x, y))

@@ -14,15 +14,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
+
+from rerun.experimental import ViewerClient, ViewerState
 
 from recorder.viewer.canvas import SIMULATED
 from rig.errors import InputError
-
-if TYPE_CHECKING:
-    from rerun.experimental import ViewerClient, ViewerState
 
 Kind = Literal["native", "web", "headless"]
 
@@ -151,17 +150,11 @@ class Window:
 
     def _ask(self, satisfied: Callable[[ViewerClient], bool]) -> ViewerClient:
         """Wait until the viewer answers as wanted."""
-        from rerun.experimental import ViewerClient
-
-        deadline = time.monotonic() + _LOADED_S
-        while time.monotonic() < deadline:
-            if not self.open:
-                raise WindowError(f"the viewer could not start: {self.last_words()}")
+        for _ in self._while_it_runs(_LOADED_S, 0.1):
             with contextlib.suppress(ConnectionError, RuntimeError):
                 viewer = ViewerClient.connect(self.url)
                 if satisfied(viewer):
                     return viewer
-            time.sleep(0.1)
         raise WindowError(f"the viewer does not answer, or did not load the recording: {self.last_words()}")
 
     def last_words(self) -> str:
@@ -189,14 +182,19 @@ class Window:
         self.close()
 
     def _wait_for(self, port: int) -> None:
-        deadline = time.monotonic() + _READY_S
+        for _ in self._while_it_runs(_READY_S, 0.05):
+            with contextlib.suppress(OSError), socket.create_connection((_HOST, port), timeout=1.0):
+                return
+        raise WindowError(f"the viewer does not listen on port {port} after {_READY_S:g} s: {self.last_words()}")
+
+    def _while_it_runs(self, timeout_s: float, pause_s: float) -> Iterator[None]:
+        """Again and again for a time, with a pause after each turn."""
+        deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             if not self.open:
                 raise WindowError(f"the viewer could not start: {self.last_words()}")
-            with contextlib.suppress(OSError), socket.create_connection((_HOST, port), timeout=1.0):
-                return
-            time.sleep(0.05)
-        raise WindowError(f"the viewer does not listen on port {port} after {_READY_S:g} s: {self.last_words()}")
+            yield
+            time.sleep(pause_s)
 
 
 def _reaches(state: ViewerState, end_s: float) -> bool:

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from recorder.reader import Chunk, join
+from recorder.reader import join
+from recorder.records import Chunk
 from rig import wire
 from rig.errors import InputError
 

@@ -136,6 +136,7 @@ class McapRun:
         self._background = Background()
 
     def __enter__(self) -> Self:
+        from recorder.head import Beginning
         from recorder.writer import RecordingWriter
 
         epoch_ns = self._epoch_ns
@@ -147,7 +148,7 @@ class McapRun:
             parameters=simulation.parameters_document(),
             scene=simulation.scene_document(),
             view_rate_hz=self._view_rate_hz,
-            from_start=True,
+            beginning=Beginning(from_start=True),
             force=self._force,
             wall_ns=time.time_ns if epoch_ns is None else lambda: epoch_ns,
             monotonic_s=time.monotonic if epoch_ns is None else lambda: 0.0,

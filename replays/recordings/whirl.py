@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recorder.reader import Recording, Samples
+from recorder.reader import Recording
+from recorder.samples import Samples
 from rig.errors import InputError
 from rig.orbit import whirl_frequency
 

@@ -32,9 +32,9 @@ def cut(
     force: Force = False,
 ) -> None:
     """Cut a recording, or join several files of one run; what is kept is kept byte for byte, trimmed at the edges."""
+    from recorder.draft import check_destination
     from recorder.reader import join
     from recorder.rewrite import cut as cut_recording
-    from recorder.writer import check_destination
 
     check_destination(output, force=force)
     with reporting() as report:

@@ -54,7 +54,7 @@ def import_(
         raise InputError("FILE", "given: the logs to import", "none")
     if output is None or mapping is None:
         raise InputError("--output", "given: a recording to write, such as -o log.mcap", "none")
-    from recorder.writer import check_destination
+    from recorder.draft import check_destination
     from replays.recordings.formats.conversion import convert, write_recording
     from replays.recordings.formats.mapping import Mapping, load_mapping
     from rig.cli.progress import reporting

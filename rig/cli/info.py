@@ -70,8 +70,9 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
         "events": recording.events,
     }
     if not quick:
+        health = asdict(examine(recording))  # the one pass in which the streams are counted, too
         document["streams"] = {key: asdict(stream) for key, stream in recording.streams.items()}
-        document["health"] = asdict(examine(recording))
+        document["health"] = health
     return _without_nan(document)
 
 

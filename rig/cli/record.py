@@ -17,8 +17,9 @@ from rig.cli.tables import echo, plain, table_console
 from rig.errors import InputError
 
 if TYPE_CHECKING:
-    from recorder.series import Limits
-    from recorder.session import Progress, RecordingSession, Summary
+    from recorder.room import Limits
+    from recorder.session import RecordingSession
+    from recorder.summary import Progress, Summary
     from recorder.trigger import Capture
     from rig.transport.zenoh import ZenohClient
 
@@ -122,7 +123,7 @@ class Disk:
         Raises:
             InputError: There cannot be so much memory.
         """
-        from recorder.series import Limits
+        from recorder.room import Limits
 
         if not 1.0 <= self.backlog_mb <= 1e5:
             raise InputError("backlog_mb", "from 1 to 1e5", self.backlog_mb)
@@ -171,7 +172,7 @@ def record(
     """
     import os
 
-    from recorder.series import MB
+    from recorder.room import MB
     from recorder.session import RecordingSession
 
     limits, capture = disk.limits(rotation), triggers.capture()

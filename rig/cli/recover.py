@@ -26,8 +26,8 @@ def recover(
 
     Of a file that is whole nothing is made, unless with --force.
     """
+    from recorder.draft import check_destination
     from recorder.rewrite import recovered_path
-    from recorder.writer import check_destination
 
     if output is not None and len(files) > 1:
         raise InputError("--output", "used with one FILE", f"{len(files)} files")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 import replays
+from recorder.head import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from rig.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, encode_document, sensor_key
@@ -33,7 +34,7 @@ def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -
     file = RecordingWriter(
         path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE], view_rate_hz=100.0,
         sync_every_s=0.0, wall_ns=lambda: 1_700_000_000_000_000_000,
-        metadata={"series": {"id": "a1", "number": "0", "previous": "", "due": "{}"}}, **changes,
+        beginning=Beginning(metadata={"series": {"id": "a1", "number": "0", "previous": "", "due": "{}"}}), **changes,
     )  # fmt: skip
     for number, (key, payload) in enumerate(stream(blocks, block_ms=1)):
         file.write(key, payload, number)
@@ -43,7 +44,7 @@ def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -
         file.write("rig/events", encode_document(event), 0)
     file.write_missed(PROBES, 2, 0)
     if leave:
-        file._sync()
+        file.sync()
         kept = path.with_name(path.name + ".part")
         kept.write_bytes(file.part.read_bytes())
         data = kept.read_bytes()

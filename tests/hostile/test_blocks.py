@@ -21,8 +21,9 @@ import recorder.session
 from drivers.daq import Daq
 from drivers.sources.rig import RigSource
 from recorder.reader import Recording, join
-from recorder.series import Limits
-from recorder.session import RecordingSession, Summary
+from recorder.room import Limits
+from recorder.session import RecordingSession
+from recorder.summary import Summary
 from recorder.trigger import Capture, Trigger
 from recorder.viewer import live
 from rig import wire
@@ -178,7 +179,7 @@ def fed(
         while wire.STATUS not in client.subscribed:
             time.sleep(0.002)
         for key, payload, is_true in mixed(count, seed):
-            while len(session._inbox) > 2000:
+            while session.waiting > 2000:
                 time.sleep(0.001)
             client.publish(key, payload)
             if is_true and key in true:
@@ -303,17 +304,16 @@ def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> N
         view = live.LiveView(
             client, type("Canvas", (), {"clock": type("Clock", (), {"mark": lambda *_: None})()})(), described
         )
-    view._painter = still  # type: ignore[assignment]
     rows = 0
     for number, (key, payload, is_true) in enumerate(mixed(inputs(3000), seed=4)):
-        view._take(key, payload)
+        view.take(key, payload)
         if is_true and key.startswith(wire.SENSORS):
             rows += len(wire.decode_block(payload, wire.SAMPLE_SCHEMA).values)
         if number % 500 == 0:
-            view._draw()
-    view._draw()
+            view.draw()
+    view.draw()
     assert (view.received, view.lost, still.rows) == (rows, 0, rows)
-    assert view._end == "completed"
+    assert view.ended == "completed"
     assert view.malformed > inputs(3000) / 3
 
 

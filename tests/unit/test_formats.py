@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recorder.head import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from replays.recordings.export import writer_for
@@ -344,7 +345,7 @@ def test_parts_of_a_rotation_are_exported_as_one(recording: Recording, tmp_path:
     for number, path in enumerate(parts):
         with RecordingWriter(
             path, catalogue=recording.catalogue, parameters=recording.parameters, scene=recording.scene,
-            metadata={"series": {"id": "one", "number": str(number)}},
+            beginning=Beginning(metadata={"series": {"id": "one", "number": str(number)}}),
         ) as writer:  # fmt: skip
             for name in recording.table.groups:
                 for time_ns, payload in recording.payloads(sensor_key(name)):

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from recorder.reader import Recording
-from recorder.session import Progress, Summary
+from recorder.summary import Progress, Summary
 from recorder.writer import RecordingWriter
 from rig.cli.main import main
 from rig.cli.record import run_session, tell
@@ -74,6 +74,7 @@ def test_quick_info_reads_no_samples(path, capsys, monkeypatch):
         raise AssertionError("samples were read")
 
     monkeypatch.setattr(Recording, "blocks_of", fail)
+    monkeypatch.setattr(Recording, "look_through", fail)
     monkeypatch.setattr(Recording, "streams", property(fail))
     assert run("info", "--quick", path) == 0
     assert "rig/sensors/probes 60" in " ".join(capsys.readouterr().out.split())

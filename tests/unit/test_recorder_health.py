@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import recorder.health
-from recorder.health import ChannelHealth, Health, examine
+from recorder.health import ChannelHealth, Health, examine, pace_of
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from rig.channels import Channel, default_table
@@ -140,7 +139,7 @@ def test_the_clock_is_measured(tmp_path, ppm):
 def test_history_that_arrived_at_once_does_not_bend_the_clock():
     wall_s = np.arange(20) * 0.5
     simulated_s = np.where(wall_s < 2.0, wall_s * 10.0, 16.5 + wall_s * (1.0 + 50e-6))
-    slope, jitter_ms, _, strays = recorder.health._pace(np.column_stack((simulated_s, wall_s)))
+    slope, jitter_ms, _, strays = pace_of(np.column_stack((simulated_s, wall_s)))
     assert slope == pytest.approx(1.0 + 50e-6, abs=1e-6)
     assert jitter_ms < 0.1
     assert strays == pytest.approx(0.2, abs=0.01)

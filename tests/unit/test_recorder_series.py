@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections import defaultdict
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,40 +16,49 @@ import numpy as np
 import pytest
 
 import recorder.series
+from recorder.head import Beginning
+from recorder.payload import Payload
 from recorder.reader import Recording, join
 from recorder.rewrite import cut, recover
-from recorder.series import Limits, Series, part_path
+from recorder.room import Limits
+from recorder.series import Series, part_path
+from recorder.sink import Needs
 from recorder.writer import RecordingError, RecordingWriter
+from rig.channels import default_table
 from rig.errors import InputError
 from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, Gap, encode_block, encode_document, schema_of, sensor_key
 
-from .recorder_stream import block_of, documents, stream
+from .recorder_stream import TICK_RATE_HZ, block_of, documents, stream
 
 PROBES = sensor_key("probes")
 
 
-def series(path: Path, *, force: bool = False, **limits: Any) -> Series:
+def series(
+    path: Path, *, force: bool = False, monotonic_s: Callable[[], float] = time.monotonic, **limits: Any
+) -> Series:
     about = documents()
     calls = count()
 
-    def open_writer(name: Path, *, from_start: bool, **options: Any) -> RecordingWriter:
+    def open_file(name: Path, scene: dict[str, Any], beginning: Beginning) -> RecordingWriter:
         return RecordingWriter(
             name,
             catalogue=about[CATALOGUE],
             parameters=about[PARAMETERS],
+            scene=scene,
+            beginning=beginning,
             force=force,
             monotonic_s=lambda: 0.01 * next(calls),  # a flush each 25 payloads
-            **options,
         )
 
-    return Series(path, scene=about[SCENE], limits=Limits(**limits), open_writer=open_writer, force=force)
+    needs = Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, Limits(**limits), force, monotonic_s)
+    return Series(path, needs)
 
 
 def write(file: Series, items: list[tuple[str, bytes]]) -> None:
     for number, (key, payload) in enumerate(items):
         if file.ended:
             break
-        file.write(key, payload, 1_700_000_000_000_000_000 + number)
+        file.take(Payload.read(key, payload, 1_700_000_000_000_000_000 + number))
     file.finish("completed")
 
 
@@ -210,14 +221,15 @@ def test_the_oldest_files_make_room_on_a_disk_of_which_nothing_is_to_be_left(tmp
 def test_room_is_left_on_the_disk(tmp_path, monkeypatch):
     free = [100]
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=free[0], f_frsize=1_000_000))
-    file = series(tmp_path / "run.mcap", keep_free_mb=50.0)
+    now_s = [0.0]
+    file = series(tmp_path / "run.mcap", monotonic_s=lambda: now_s[0], keep_free_mb=50.0)
     items = list(stream(40))
     for key, payload in items[:160]:
-        file.write(key, payload, 0)
+        file.take(Payload.read(key, payload, 0))
     assert file.ended == ""
     free[0] = 51
-    file._room._checked_s = -1e9
-    file.write(*items[160], 0)
+    now_s[0] = 1.0
+    file.take(Payload.read(*items[160], 0))
     assert file.ended == "less than 50 MB are free on the disk"
     file.finish(file.ended)
     assert Recording.open(tmp_path / "run.mcap").end_reason == file.ended
@@ -262,7 +274,7 @@ def test_force_removes_no_file_of_a_recording_in_the_making(tmp_path, items):
     path = tmp_path / "run.mcap"
     first = series(path, rotate_s=0.1)
     for number, (key, payload) in enumerate(items[:300]):
-        first.write(key, payload, number)
+        first.take(Payload.read(key, payload, number))
     there = sorted(tmp_path.iterdir())
     assert len(there) > 2
     with pytest.raises(InputError, match="no other recording is writing to"):
@@ -290,7 +302,7 @@ def test_a_removed_folder_leaves_a_copy_in_the_nearest_one(tmp_path, items):
     folder.mkdir()
     file = series(folder / "run.mcap")
     for key, payload in items[:200]:
-        file.write(key, payload, 0)
+        file.take(Payload.read(key, payload, 0))
     for each in folder.iterdir():
         each.unlink()
     folder.rmdir()
@@ -326,7 +338,7 @@ def test_files_of_different_runs_are_not_joined(tmp_path, items):
             scene={**about[SCENE], "seed": seed},
         ) as file:
             for key, payload in items[:50]:
-                file.write(key, payload, 0)
+                file.take(Payload.read(key, payload, 0))
     with pytest.raises(InputError, match="recordings of one run"):
         join([tmp_path / "a.mcap", tmp_path / "b.mcap"])
 

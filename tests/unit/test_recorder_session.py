@@ -10,10 +10,13 @@ from pathlib import Path
 import pytest
 
 import recorder.session
+from recorder.payload import Payload
 from recorder.reader import Recording
-from recorder.series import Limits
-from recorder.session import RIG_LOST, Progress, RecordingSession, Summary
+from recorder.room import Limits
+from recorder.session import RIG_LOST, RecordingSession
+from recorder.summary import Progress, Summary
 from recorder.trigger import Capture, Trigger
+from recorder.writer import RecordingWriter
 from rig.channels import default_table
 from rig.errors import InputError
 from rig.transport import NoReplyError
@@ -240,16 +243,16 @@ def test_a_rig_that_is_started_again_is_not_mixed_into_the_recording(path):
 def test_a_fault_of_the_recorder_itself_is_told_and_the_file_is_finished(path, monkeypatch):
     client = ScriptedClient()
     blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(20)]
-    real = recorder.session.RecordingWriter.write
+    real = RecordingWriter.take
     calls = [0]
 
-    def breaks(self, key: str, payload: bytes, wall_ns: int):
+    def breaks(self, payload: Payload) -> None:
         calls[0] += 1
         if calls[0] > 10:
             raise TypeError("a mistake")
-        return real(self, key, payload, wall_ns)
+        real(self, payload)
 
-    monkeypatch.setattr(recorder.session.RecordingWriter, "write", breaks)
+    monkeypatch.setattr(RecordingWriter, "take", breaks)
     summary = record(RecordingSession(client, path), client, play(client, blocks))
     assert "TypeError: a mistake" in summary.error
     assert summary.rows[PROBES] == 2000
@@ -380,13 +383,13 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
     client = ScriptedClient()
     session = RecordingSession(client, path, inbox_bytes=20_000)
     gate = threading.Event()
-    real = recorder.session.RecordingWriter.write
+    real = RecordingWriter.take
 
-    def slow(self, key: str, payload: bytes, wall_ns: int):
+    def slow(self, payload: Payload) -> None:
         gate.wait(10.0)
-        return real(self, key, payload, wall_ns)
+        real(self, payload)
 
-    monkeypatch.setattr(recorder.session.RecordingWriter, "write", slow)
+    monkeypatch.setattr(RecordingWriter, "take", slow)
     blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(50)]
 
     def act() -> None:
@@ -394,7 +397,7 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
             client.publish(*block)
         gate.set()
         deadline = time.monotonic() + 10.0
-        while len(session._inbox) and time.monotonic() < deadline:
+        while session.waiting and time.monotonic() < deadline:
             time.sleep(0.002)
         client.publish(*blocks[-1])
         client.publish(EVENTS, encode_document({"event": "end", "tick": 0, "time_s": 0.0, "reason": "completed"}))

@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recorder.captures import Captures
+from recorder.head import Beginning
+from recorder.payload import Payload
 from recorder.reader import Recording
-from recorder.series import Limits
-from recorder.trigger import Capture, Captures, Trigger
+from recorder.room import Limits
+from recorder.sink import Needs
+from recorder.trigger import Capture, Trigger
 from recorder.writer import RecordingWriter
 from rig.channels import default_table
 from rig.errors import InputError
@@ -26,21 +30,20 @@ PROBES, FORCES = sensor_key("probes"), sensor_key("forces")
 def captures(path: Path, *triggers: str, force: bool = False, limits: Limits | None = None, **options: Any) -> Captures:
     about = documents()
 
-    def open_writer(name: Path, *, from_start: bool, **more: Any) -> RecordingWriter:
+    def open_file(name: Path, scene: dict[str, Any], beginning: Beginning) -> RecordingWriter:
         return RecordingWriter(
-            name, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], view_rate_hz=0.0, force=force, **more
+            name,
+            catalogue=about[CATALOGUE],
+            parameters=about[PARAMETERS],
+            scene=scene,
+            view_rate_hz=0.0,
+            beginning=beginning,
+            force=force,
         )
 
-    return Captures(
-        path,
-        Capture(tuple(Trigger.parse(text) for text in triggers), **options),
-        table=default_table(),
-        tick_rate_hz=TICK_RATE_HZ,
-        scene=about[SCENE],
-        open_writer=open_writer,
-        limits=limits,
-        force=force,
-    )
+    capture = Capture(tuple(Trigger.parse(text) for text in triggers), **options)
+    limits = limits or Limits(keep_free_mb=0.0)
+    return Captures(path, capture, Needs(default_table(), TICK_RATE_HZ, about[SCENE], open_file, limits, force))
 
 
 def event(name: str, time_s: float, **fields: Any) -> tuple[str, bytes]:
@@ -51,9 +54,9 @@ def feed(file: Captures, blocks: range, events: dict[int, list[tuple[str, bytes]
     """Blocks of 10 ms of probes and forces; events behind the block that they are in, as the rig sends them."""
     for number in blocks:
         for key in (PROBES, FORCES):
-            file.write(key, encode_block(block_of(key, number)), number)
+            file.take(Payload.read(key, encode_block(block_of(key, number)), number))
         for item in (events or {}).get(number, []):
-            file.write(*item, number)
+            file.take(Payload.read(*item, number))
 
 
 def extent(path: Path, key: str = PROBES) -> tuple[float, float]:
@@ -105,7 +108,7 @@ def test_a_level_fires_where_it_is_crossed_and_once(tmp_path, trigger, sign):
         time_s = (np.arange(200) + 200 * number) / 20_000
         # Above from the start, then below, then above from 1.2345 s on until the end.
         values = np.where((time_s < 0.3) | (time_s >= 1.2345), 600.0, 400.0)
-        file.write(*_level_block(number, sign * values), number)
+        file.take(Payload.read(*_level_block(number, sign * values), number))
     file.finish("completed")
     assert file.fired == 1
     assert [path.name for path in file.files] == ["run.P_E-001.mcap"]
@@ -143,7 +146,8 @@ def pulses(file: Captures, rows: list[int], blocks: range) -> None:
         counts[:, 0] = round(-channel.offset / channel.scale)
         counts[[row for row in rows if 0 <= row < 200], 0] = round((0.3 - channel.offset) / channel.scale)
         rows = [row - 200 for row in rows]
-        file.write(PROBES, encode_block(Block(number * 10_000, number * 200, 20e3, TICK_RATE_HZ, counts)), number)
+        block = Block(number * 10_000, number * 200, 20e3, TICK_RATE_HZ, counts)
+        file.take(Payload.read(PROBES, encode_block(block), number))
 
 
 def test_the_time_after_counts_from_the_last_crossing_even_in_one_block(tmp_path):
@@ -159,7 +163,7 @@ def test_the_time_after_counts_from_the_last_crossing_even_in_one_block(tmp_path
 def _forces(file: Captures, values_of: Callable[[np.ndarray], np.ndarray], blocks: range) -> None:
     for number in blocks:
         if not file.ended:
-            file.write(*_level_block(number, values_of((np.arange(200) + 200 * number) / 20_000)), number)
+            file.take(Payload.read(*_level_block(number, values_of((np.arange(200) + 200 * number) / 20_000)), number))
 
 
 def test_a_level_that_is_passed_already_is_told_once(tmp_path):
@@ -203,7 +207,7 @@ def test_a_capture_that_is_made_longer_has_a_longest_length(tmp_path):
 def test_a_blow_during_a_capture_makes_it_longer_and_a_level_does_not(tmp_path):
     file = captures(tmp_path / "run.mcap", "|P_E|>500", "hammer", pre_s=0.0, post_s=0.5)
     _forces(file, _whirl, range(130))
-    file.write(*event("hammer", 1.3), 0)
+    file.take(Payload.read(*event("hammer", 1.3), 0))
     _forces(file, _whirl, range(130, 300))
     (path,) = file.files
     assert extent(path, FORCES)[1] == pytest.approx(1.8, abs=0.011)
@@ -238,29 +242,29 @@ def test_triggers_without_end_take_no_memory_without_end(tmp_path):
     file = captures(tmp_path / "run.mcap", "note", pre_s=0.0, post_s=1.0)
     feed(file, range(5))
     for number in range(3000):
-        file.write(*event("note", 0.04, text=str(number)), number)
+        file.take(Payload.read(*event("note", 0.04, text=str(number)), number))
     feed(file, range(5, 300))
-    assert len(file._ring) < 300
+    assert file.held < 300
     end = Recording.open(file.files[0]).metadata["end"]
     assert (end["trigger_count"], len(json.loads(end["triggers"]))) == ("3000", 1000)
 
 
 def test_an_event_of_a_far_time_does_not_hold_up_the_ring(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.1)
-    file.write(*event("command", 1e6, id=1, command="speed", request={}), 0)
+    file.take(Payload.read(*event("command", 1e6, id=1, command="speed", request={}), 0))
     feed(file, range(500))
-    assert len(file._ring) < 200
+    assert file.held < 200
 
 
 def test_streams_that_are_behind_are_waited_for(tmp_path):
     file = captures(tmp_path / "run.mcap", "hammer", pre_s=0.1, post_s=0.2)
-    file.write(FORCES, encode_block(block_of(FORCES, 0)), 0)
+    file.take(Payload.read(FORCES, encode_block(block_of(FORCES, 0)), 0))
     for number in range(100, 140):
-        file.write(PROBES, encode_block(block_of(PROBES, number)), number)
+        file.take(Payload.read(PROBES, encode_block(block_of(PROBES, number)), number))
         if number == 110:
-            file.write(*event("hammer", 1.1), number)
+            file.take(Payload.read(*event("hammer", 1.1), number))
     for number in range(100, 140):
-        file.write(FORCES, encode_block(block_of(FORCES, number)), number)
+        file.take(Payload.read(FORCES, encode_block(block_of(FORCES, number)), number))
     file.finish("completed")
     assert extent(file.files[0], FORCES) == extent(file.files[0], PROBES)
 

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recorder.draft import check_destination
+from recorder.head import Beginning
 from recorder.reader import Recording
 from recorder.views import Views
-from recorder.writer import RecordingError, RecordingWriter, check_destination
+from recorder.writer import RecordingError, RecordingWriter
 from rig.channels import default_table
 from rig.errors import InputError
 from rig.wire import (
@@ -186,7 +188,7 @@ def test_groups_that_never_come_do_not_hold_up_the_others_for_ever(monkeypatch):
     for number in range(6):
         shown = views.add(table.groups["probes"], block_of(PROBES, number), number * 10_000_000)
         assert shown is not None
-        counts.append(len(shown[1]))
+        counts.append(len(shown[1][0]))
     assert counts == [0, 0, 0, 5, 5, 5]
 
 
@@ -253,7 +255,7 @@ def test_gaps_are_recorded_where_they_are(tmp_path, items):
     file = write(path, kept)
     recording = Recording.open(path)
     assert recording.gaps == [Gap(PROBES, 1400, 400), Gap(PROBES, 4000, 200)]
-    assert file.gaps == 2
+    assert file.tally.gaps == 2
     assert json.loads(recording.metadata["end"]["lost_rows"]) == {PROBES: 600}
     assert recording.streams[PROBES].lost == 600
     index = recording.samples("probes").index
@@ -264,7 +266,8 @@ def test_gaps_are_recorded_where_they_are(tmp_path, items):
 @pytest.mark.parametrize(("from_start", "gaps"), [(True, [Gap(PROBES, 0, 600)]), (False, [])])
 def test_a_late_start_is_a_gap_only_where_the_whole_run_was_asked_for(tmp_path, from_start, gaps):
     path = tmp_path / "run.mcap"
-    write(path, [(PROBES, encode_block(block_of(PROBES, number))) for number in (3, 4)], from_start=from_start)
+    late = [(PROBES, encode_block(block_of(PROBES, number))) for number in (3, 4)]
+    write(path, late, beginning=Beginning(from_start=from_start))
     assert Recording.open(path).gaps == gaps
 
 
@@ -292,8 +295,8 @@ def test_rows_missing_at_the_end_are_a_gap(tmp_path):
     path = tmp_path / "run.mcap"
     with writer(path) as file:
         file.write(PROBES, encode_block(block_of(PROBES, 0)), 0)
-        assert file.short_of({PROBES: 200}) == {}
-        assert file.short_of({PROBES: 300, truth_key("state"): 9}) == {PROBES: 300}
+        assert file.tally.short_of({PROBES: 200}) == {}
+        assert file.tally.short_of({PROBES: 300, truth_key("state"): 9}) == {PROBES: 300}
         file.note_short({PROBES: 300}, 0)
         file.finish("completed")
     assert Recording.open(path).gaps == [Gap(PROBES, 200, 100)]
@@ -303,7 +306,7 @@ def test_payloads_that_are_not_what_their_key_promises_are_kept(tmp_path, items)
     path = tmp_path / "run.mcap"
     odd = [(PROBES, b"\x00\x01\x00\x00short"), (EVENTS, b"not json"), ("rig/sensors/unknown", b""), (EVENTS, b"[1]")]
     file = write(path, [items[0], *odd, *items[1:]])
-    assert file.malformed == 4
+    assert file.tally.malformed == 4
     recording = Recording.open(path)
     for key, payload in odd:
         assert payload in [found for _, found in recording.payloads(key)]
@@ -427,7 +430,7 @@ def test_the_size_of_the_index_is_known_beforehand(tmp_path, items):
     with writer(tmp_path / "run.mcap", sync_every_s=0.0) as file:
         for number, (key, payload) in enumerate(items):
             file.write(key, payload, number)
-        before, promised = file.part.stat().st_size, file.index_bytes
+        before, promised = file.part.stat().st_size, file.file.index_bytes
         begun = writer(tmp_path / "empty.mcap")
         head = begun.part.stat().st_size
         begun.finish("completed")

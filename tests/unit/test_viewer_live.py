@@ -200,7 +200,7 @@ def test_a_window_that_takes_nothing_is_not_drawn_for(
     def publish_later() -> bool:
         if next(ticks) == 3:
             for key, payload in late:
-                view._take(key, payload)
+                view.take(key, payload)
         return False
 
     assert view.run(stop=publish_later) == "the rig ended: completed"

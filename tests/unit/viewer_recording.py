@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from recorder.reader import Samples
+from recorder.samples import Samples
 from rig import wire
 from rig.channels import Group, default_table
 

@@ -13,7 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from recorder.reader import Recording, Stream
+from recorder.reader import Recording
+from recorder.survey import Stream
 from rig.channels import Channel
 from rig.errors import InputError
 from rig.wire import Block, sensor_key, truth_key

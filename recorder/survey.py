@@ -1,0 +1,170 @@
+"""What a file of a recording holds, counted from what is there, and what in it does not fit the rest of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from recorder import documents, schemas
+from recorder.recording_file import RecordingFile
+from recorder.samples import row_times_s
+from rig.wire import EDGES, EVENTS, Block, Continuity, schema_of
+
+_LEAST_SPAN_S = 0.5
+"""A stream without rows raises doubt in a recording of this length; in a shorter one it may not have begun."""
+_OFF_RATE = 1e-3
+"""Part by which the rate of a block may be off that of its stream: an import's is a whole number."""
+OnBlock = Callable[[str, Block], None]
+"""Is shown each block, with its key."""
+
+
+@dataclass
+class Stream:
+    """What a recording holds of one block stream.
+
+    Attributes:
+        messages: Number of blocks.
+        rows: Number of rows in them.
+        lost: Number of rows missing between them, counted anew from the row numbers.
+        first_time_s: Simulated time of the first row [s].
+        last_time_s: Simulated time of the last row [s].
+        first: Number of the first row.
+        due: Number of the row after the last one.
+        odd: Number of payloads that are no blocks, or do not fit the catalogue.
+        back: Number of blocks that begin before the row that was due.
+        off: Number of blocks at another rate than the catalogue says.
+        missing: Rows that the file says it has, or the rig that it made, and that are not there.
+    """
+
+    messages: int = 0
+    rows: int = 0
+    lost: int = 0
+    first_time_s: float = 0.0
+    last_time_s: float = 0.0
+    first: int = 0
+    due: int = 0
+    odd: int = 0
+    back: int = 0
+    off: int = 0
+    missing: int = 0
+
+    def then(self, later: Stream) -> Stream:
+        """The same stream with what it goes on with in another file."""
+        sums = {
+            name: getattr(self, name) + getattr(later, name)
+            for name in ("messages", "rows", "lost", "odd", "back", "off", "missing")
+        }
+        if not (self.rows and later.rows):
+            return replace(self if self.rows else later, **sums)
+        sums["lost"] += max(0, later.first - self.due)
+        return replace(self, **sums, last_time_s=later.last_time_s, due=later.due)
+
+
+class Survey:
+    """Counts what one file holds.
+
+    Attributes:
+        file: The file.
+        streams: Extent of every block stream by key.
+    """
+
+    def __init__(self, file: RecordingFile, on_block: OnBlock | None = None) -> None:
+        """Read the whole file.
+
+        Args:
+            file: The file.
+            on_block: Is shown each block that fits the catalogue.
+
+        Raises:
+            InputError: The file is damaged.
+        """
+        self.file = file
+        self._continuity = Continuity()
+        self.streams: dict[str, Stream] = {}
+        self._counted: dict[str, int] = {}
+        self._published: dict[str, int] = {}
+        self._noted: set[tuple[str, int]] = set()
+        self._noted_bytes = 0
+        for key, _, _, payload in file.stamped(None):
+            self._counted[key] = self._counted.get(key, 0) + 1
+            if schema_of(key) is None:
+                self._take_document(key, payload)
+            elif (block := self._take_block(key, payload)) is not None and on_block is not None:
+                on_block(key, block)
+        self._end()
+
+    @cached_property
+    def short(self) -> tuple[str, ...]:
+        """Rows that the file says it has, and that are not there though all of it is as it was written."""
+        return tuple(f"{one.missing} rows of {key} are missing" for key, one in self.streams.items() if one.missing)
+
+    @cached_property
+    def doubts(self) -> tuple[str, ...]:
+        """What in the file does not fit the rest of it though every checksum holds, in a line each."""
+        promises, messages = self.file.promises, self.file.messages
+        found = list(self.short)
+        for key, stream in self.streams.items():
+            if stream.odd:
+                found.append(f"payloads of {key} that are no blocks, or do not fit the catalogue: {stream.odd}")
+            if stream.back:
+                found.append(f"blocks of {key} that repeat row numbers, or go back: {stream.back}")
+            if stream.off:
+                found.append(f"blocks of {key} at another rate than the catalogue says: {stream.off}")
+            if stream.rows > (stated := self.file.stated_rows.get(key, stream.rows)):
+                found.append(f"{key} has {stream.rows} rows where the file says {stated}")
+            if stream.rows and key not in promises:
+                found.append(f"{key} is not in the catalogue")
+        for topic in sorted(set(messages) | set(self._counted)):
+            if (is_there := self._counted.get(topic, 0)) != (stated := messages.get(topic, 0)):
+                found.append(f"{is_there} messages of {topic} where the file says {stated}")
+        filled = {key: one for key, one in self.streams.items() if one.rows}
+        span_s = max((one.last_time_s for one in filled.values()), default=0.0)
+        span_s -= min((one.first_time_s for one in filled.values()), default=0.0)
+        for key in sorted(set(promises) - {EDGES} - set(filled)):
+            if span_s > max(_LEAST_SPAN_S, 2.0 / promises[key].rate_hz):
+                found.append(f"no rows of {key}, which the catalogue promises")
+        return tuple(found)
+
+    def _take_block(self, key: str, payload: bytes) -> Block | None:
+        stream = self.streams.setdefault(key, Stream())
+        block, promise = self.file.block(key, payload), self.file.promises.get(key)
+        if block is None:
+            stream.odd += 1
+            return None
+        gap = self._continuity.follow(key, block.index, len(block.values))
+        stream.first = stream.first if stream.messages else block.index
+        stream.messages += 1
+        stream.back += gap is not None and gap.size < 0
+        if promise is not None and promise.rate_hz:
+            stream.off += abs(block.rate_hz / promise.rate_hz - 1.0) > _OFF_RATE
+        if len(block.values):
+            first_s, stream.last_time_s = row_times_s(key, block)[[0, -1]].tolist()
+            stream.first_time_s = stream.first_time_s if stream.rows else first_s
+            stream.rows += len(block.values)
+        return block
+
+    def _take_document(self, key: str, payload: bytes) -> None:
+        """Follow what the rig says of the rows that it published, and the recorder of those that never arrived."""
+        if key not in (EVENTS, schemas.GAPS) or (document := documents.document_in(key, payload)) is None:
+            return
+        if key == schemas.GAPS:
+            self._noted_bytes = documents.check_kept(self._noted_bytes + len(payload), key, self.file.path)
+            if document["index"] >= 0:
+                self._noted.add((document["key"], document["index"] + document["size"]))
+        elif document["event"] in ("start", "end"):
+            self._published = (document.get("rows") or {}) if document["event"] == "end" else {}
+
+    def _end(self) -> None:
+        """Hold what was counted against what the file says of itself, and the rig of what it published."""
+        stated, continuity = self.file.stated_rows, self._continuity
+        # A file that does not go to the end of a run ends where it was to end.
+        whole = not {"trigger", "cut"} & set(self.file.metadata)
+        for key in set(self.streams) | {key for key, rows in stated.items() if rows}:
+            stream = self.streams.setdefault(key, Stream())
+            stream.rows, stream.lost = continuity.received.get(key, 0), continuity.lost.get(key, 0)
+            stream.due = continuity.next.get(key, 0)
+            end = self._published.get(key, stream.due)
+            short = end - stream.due if whole and key in continuity.next and (key, end) not in self._noted else 0
+            stream.missing = max(0, stated.get(key, stream.rows) - stream.rows, short)
+        self.streams = dict(sorted(self.streams.items()))
