@@ -20,11 +20,10 @@ from typing import Self
 import numpy as np
 
 from drivers.link import LinkTimeoutError
-from drivers.samples import Pile, Samples, StreamEndedError
-from drivers.samples import Sequence as RowSequence
+from drivers.samples import Pile, Samples, StreamEndedError, follow
 from drivers.sources import Source, open_source
 from rig.errors import InputError
-from rig.wire import Gap
+from rig.wire import Continuity, Gap
 
 _GAPS = 1000
 """Gaps that are remembered; all are counted."""
@@ -43,9 +42,9 @@ class Aligner:
         self._columns = {name: list(chosen) for name, chosen in columns.items()}
         self._order = np.argsort(order)
         self._room = room
-        self._sequences = {name: RowSequence() for name in columns}
+        self._rows = Continuity()
         self._waiting: dict[str, deque[Samples]] = {name: deque() for name in columns}
-        self._joint = RowSequence()
+        self._joint = Continuity()
         self.gaps: deque[Gap] = deque(maxlen=_GAPS)
         self.unmatched = 0
         """Rows that were dropped because those of another stream were not there."""
@@ -53,19 +52,18 @@ class Aligner:
     @property
     def lost(self) -> dict[str, int]:
         """Rows of each stream that never came."""
-        return {name: sequence.lost for name, sequence in self._sequences.items()}
+        return {name: self._rows.lost.get(name, 0) for name in self._columns}
 
     def feed(self, stream: str, samples: Samples) -> list[Samples]:
         """Take rows of one stream; returns the rows that are complete now."""
-        sequence = self._sequences[stream]
-        runs = sequence.runs
-        new = sequence.follow(samples)
+        runs = self._runs(stream)
+        new = follow(self._rows, samples, stream)
         if new is None:
             return []
         if new.gap:
             self.gaps.append(Gap(stream, new.index - new.gap, new.gap))
         waiting = self._waiting[stream]
-        if sequence.runs != runs:
+        if self._runs(stream) != runs:
             waiting.clear()
         waiting.append(new)
         surplus = sum(map(len, waiting)) - self._room
@@ -74,13 +72,16 @@ class Aligner:
             self.unmatched += len(waiting.popleft())
         return self._complete()
 
+    def _runs(self, stream: str) -> int:
+        return self._rows.runs.get(stream, 0)
+
     def _complete(self) -> list[Samples]:
         made = []
         # Numbers of different runs do not belong together: the streams that are behind must first have begun anew.
-        newest = max(sequence.runs for sequence in self._sequences.values())
-        for name, sequence in self._sequences.items():
-            if sequence.runs < newest:
-                self._waiting[name].clear()
+        newest = max(map(self._runs, self._columns))
+        for name, waiting in self._waiting.items():
+            if self._runs(name) < newest:
+                waiting.clear()
         while all(self._waiting.values()):
             start = max(waiting[0].index for waiting in self._waiting.values())
             for waiting in self._waiting.values():
@@ -116,7 +117,7 @@ class Aligner:
             values=np.concatenate(chosen, axis=1)[:, self._order],
             gap=0,
         )
-        followed = self._joint.follow(joint)
+        followed = follow(self._joint, joint)
         assert followed is not None
         return followed
 

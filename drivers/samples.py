@@ -65,35 +65,23 @@ RESTART_S = 5.0
 """Rows that are further behind than this belong to another run, not to a block that came twice or late."""
 
 
-class Sequence:
-    """Follows the rows of one stream that may come late or twice, and gives what is new of them."""
+def follow(rows: Continuity, samples: Samples, key: str = "") -> Samples | None:
+    """Follow one stream of rows that may come late or twice.
 
-    def __init__(self) -> None:
-        self._rows = Continuity()
+    Args:
+        rows: What has come; gets the new rows.
+        samples: The next ones.
+        key: The stream.
 
-    @property
-    def lost(self) -> int:
-        """Rows that never came."""
-        return self._rows.lost.get("", 0)
-
-    @property
-    def stale(self) -> int:
-        """Rows that came twice, or after later ones."""
-        return self._rows.stale
-
-    @property
-    def runs(self) -> int:
-        """How often the numbers began anew."""
-        return self._rows.runs.get("", 0)
-
-    def follow(self, samples: Samples) -> Samples | None:
-        """The same rows without those that came before, with the gap before them; None where nothing is new."""
-        stale, lost = self.stale, self.lost
-        self._rows.follow("", samples.index, len(samples), late_rows=RESTART_S * samples.rate_hz)
-        stale = self.stale - stale
-        if stale == len(samples):
-            return None
-        return replace(samples.rows(stale, len(samples)), gap=self.lost - lost)
+    Returns:
+        The same rows without those that came before, with the gap before them; None where nothing is new.
+    """
+    stale, lost = rows.stale, rows.lost.get(key, 0)
+    rows.follow(key, samples.index, len(samples), late_rows=RESTART_S * samples.rate_hz)
+    stale = rows.stale - stale
+    if stale == len(samples):
+        return None
+    return replace(samples.rows(stale, len(samples)), gap=rows.lost[key] - lost)
 
 
 class Pile:
@@ -118,9 +106,9 @@ class Pile:
             oldest = self._parts.popleft()
             self.rows -= len(oldest)
             self.dropped += len(oldest)
-            heir = self._parts[0]
-            if heir.index > oldest.index:
-                self._parts[0] = replace(heir, gap=heir.gap + len(oldest) + oldest.gap)
+            following = self._parts[0]
+            if following.index > oldest.index:
+                self._parts[0] = replace(following, gap=following.gap + len(oldest) + oldest.gap)
 
     def take(self, rows: int | None, *, ended: bool) -> Samples | None:
         """The lowest rows, if there are as many as asked for, or all that there will be before a gap or the end.

@@ -72,13 +72,13 @@ class Twins:
         Raises:
             InputError: There is no such bus.
         """
-        from drivers.link.can import TO_INSTRUMENT, CanLink, CanMedium
+        from drivers.link.can import TO_INSTRUMENT, CanLink, CanNode
         from drivers.link.port import MessagePort
 
-        medium = CanMedium(spec, [TO_INSTRUMENT + kind.CODEC.address.number for kind in kinds])
-        self._closing.callback(medium.close)
+        node = CanNode(spec, [TO_INSTRUMENT + kind.CODEC.address.number for kind in kinds])
+        self._closing.callback(node.close)
         for kind in kinds:
-            link = CanLink(spec, kind.CODEC.address, medium=medium, instrument=True)
+            link = CanLink(spec, kind.CODEC.address, node=node, instrument=True)
             self.serve(kind, MessagePort(link, f"can:{spec}"))
 
     def close(self) -> None:

@@ -225,8 +225,8 @@ def _ports() -> list[str]:
         "`rig twins` listens on 127.0.0.1:7462: requests to an instrument are queries, its data is published, under "
         "`rig/instruments/NAME/`. A CAN bus (`rig run --can zenoh:CHANNEL`, `rig can hub`) listens on 127.0.0.1:7461; "
         "its frames travel under `rig/can/CHANNEL/`. Both are for their drivers and python-can's interface `zenoh`: "
-        "what they carry is described in drivers/instrument/protocol.py and drivers/can/medium.py, the CAN frames in "
-        "drivers/can/rig.dbc.",
+        "what they carry is described in drivers/instrument/protocol.py and drivers/can/bus/codec.py, the CAN "
+        "frames in drivers/can/rig.dbc.",
         "",
         "On a bus a name belongs to whoever has joined under it for as long as it is there: `join` hands out a secret, "
         "and offers, `set`, `flush` and another `join` are taken with it only; what is tried without is counted and "

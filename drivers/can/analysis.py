@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from drivers.can import frame as frames
+from drivers.can.bus import frame as frames
 from drivers.can.timing import Speed, speed
 from rig.errors import InputError
 
@@ -46,7 +46,7 @@ class Message(NamedTuple):
         fd: Whether it is a CAN FD frame.
         brs: Whether its data phase has the higher bit rate.
         bits: Nominal and fast bits with the intermission where the content is known, as
-            `drivers.can.frame.frame_bits` counts them; none: the most that any content can make.
+            `drivers.can.bus.frame.frame_bits` counts them; none: the most that any content can make.
     """
 
     identifier: int
@@ -162,7 +162,7 @@ def worst_case(
     Returns:
         One for each message, the highest priority first.
     """
-    from drivers.can import kernels
+    from drivers.can.bus import kernels
 
     timing = speed(rate)
     order = sorted(messages, key=lambda message: kernels.priority(_word(message), 0))
@@ -258,7 +258,7 @@ def _worst_bits(shape: frames.Frame) -> tuple[int, int]:
         g = 54 if shape.extended else 34
         n = len(shape.data)
         return g + 8 * n + 13 + (g + 8 * n - 1) // 4, 0
-    from drivers.can import kernels
+    from drivers.can.bus import kernels
 
     record = frames.records([shape])[0]
     raw = np.zeros(kernels.LONGEST, np.uint8)

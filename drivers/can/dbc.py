@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.can.signals import CONTROLLER, RIG, Message, MessageTable, Signal, default_messages
+from drivers.can.message import Message, MessageTable, Signal
+from drivers.can.signals import CONTROLLER, RIG, default_messages
 
 if TYPE_CHECKING:
     from cantools.database.can import Database

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drivers.can import analysis
-from drivers.can.signals import CLASSIC_HZ, FD_HZ, Message, MessageTable, default_messages
+from drivers.can.message import Message, MessageTable
+from drivers.can.signals import CLASSIC_HZ, CLASSIC_SHARE, FD_HZ, default_messages
 from drivers.can.timing import Speed
 from rig.errors import InputError
 
@@ -40,8 +41,7 @@ class Schedule:
         Raises:
             InputError: FD frames on a bus for classic CAN only.
         """
-        if self.fd_hz is not None and not speed.fd:
-            raise InputError("--can-bitrate", "two rates for CAN FD, such as 1M/8M", str(speed))
+        self._check_fd(speed)
         table = {message.identifier: message for message in self.messages()}
         return [(table[row.message.identifier], row) for row in analysis.worst_case(self._shapes(), speed)]
 
@@ -55,13 +55,25 @@ class Schedule:
         Raises:
             InputError: It cannot; the message has the load.
         """
-        if self.fd_hz is not None and not speed.fd:
-            raise InputError("--can-bitrate", "two rates for CAN FD, such as 1M/8M", str(speed))
+        self._check_fd(speed)
         share = self.load(speed)
         if share > 1.0:
             must = "a schedule of at most 100 % of the bus in the worst case (or add --can-overload)"
             raise InputError("CAN load", must, f"{100 * share:.1f} % of {speed}")
         return share
+
+    def warnings(self, speed: Speed) -> list[str]:
+        """What a person should know of a bus that is fuller than the classic layout was made for, in one line."""
+        share = self.load(speed)
+        if self.classic_hz is None or self.fd_hz is not None or share <= CLASSIC_SHARE:
+            return []
+        must = f"at most {100 * CLASSIC_SHARE:g} % of {speed} with classic frames, so that others find room beside them"
+        received = f"{100 * share:.1f} % with {len(default_messages().classic)} frames an instant"
+        return [f"{InputError('CAN load', must, received)} (a lower --can-rate or --can-fd helps)"]
+
+    def _check_fd(self, speed: Speed) -> None:
+        if self.fd_hz is not None and not speed.fd:
+            raise InputError("--can-bitrate", "two rates for CAN FD, such as 1M/8M", str(speed))
 
     def _shapes(self) -> list[analysis.Message]:
         return [

@@ -12,37 +12,32 @@ folds back, which is the receiver's to know.
 
 A command must not arise from noise. It has a kind (4 of 256 values), a counter that goes on by 1 to 15 from that of
 the last command that reached the rig, a constant key, reserved bits at zero, and a CRC-8 over identifier and data; a
-blow is also limited in force and duration. Of random frames of 8 bytes on the very identifier of commands, one of
-`ODDS` passes all that.
+hammer pulse is also limited in force and duration. Of random frames of 8 bytes on the very identifier of commands, one
+of `ODDS` passes all that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 
-import numpy as np
-
-from drivers.can.frame import FD_LENGTHS
+from drivers.can.bus.frame import FD_LENGTHS
+from drivers.can.message import ABSENT, Message, MessageTable, Samples, Signal
 from rig.channels import Channel, ChannelTable, default_table
 
 CLASSIC_HZ = 1_000
 FD_HZ = 10_000
 """Usual rates of the two layouts [Hz]."""
 CLASSIC_SHARE = 0.7
-"""Most that the classic layout may take of a bus of 1 Mbit/s, with everything that goes with it."""
-
-ABSENT = -32768
-"""Value of a channel that a run does not have, in a classic frame; counts stop one above it."""
+"""Most that the classic layout is to take of its bus, with everything that goes with it; beyond, a start warns."""
 
 KEY = 0x9D
 """What every command carries."""
 AHEAD = 15
 """How far the counter of a command may be ahead of that of the last one that reached the rig."""
 ODDS = 2.7e9
-"""Random frames of 8 bytes on the identifier of commands for one that is taken: a blow of the hammer by nearly all of
+"""Random frames of 8 bytes on the identifier of commands for one that is taken: a hammer pulse by nearly all of
 it, 256 kinds x 256 / 15 counters x 256 keys x 256 checksums x 1 / (0.15 forces x 0.78 durations x 0.94 directions)."""
 
 RIG = "Rig"
@@ -105,223 +100,6 @@ class EventKind(IntEnum):
     OTHER = 15
 
 
-@dataclass(frozen=True, slots=True)
-class Signal:
-    """A number in a message.
-
-    Attributes:
-        name: Unique in its message.
-        start: Position of its lowest bit in the little-endian message.
-        bits: Width.
-        signed: Two's complement.
-        scale: Unit per step.
-        offset: Value at 0.
-        unit: Engineering unit.
-        label: What it is.
-        choices: Names of values.
-        selects: It tells which of the signals with `selected_by` are there.
-        selected_by: Value of the selecting signal with which this one is there.
-        channel: Channel that it carries a sample of, or None.
-    """
-
-    name: str
-    start: int
-    bits: int
-    signed: bool = False
-    scale: float = 1.0
-    offset: float = 0.0
-    unit: str = ""
-    label: str = ""
-    choices: Mapping[int, str] | None = None
-    selects: bool = False
-    selected_by: tuple[int, ...] = ()
-    channel: Channel | None = None
-
-    @property
-    def raw_range(self) -> tuple[int, int]:
-        """Least and largest value that the bits can hold."""
-        return (-(1 << self.bits - 1), (1 << self.bits - 1) - 1) if self.signed else (0, (1 << self.bits) - 1)
-
-
-@dataclass(frozen=True, slots=True)
-class Samples:
-    """How samples lie in a message: a running number, then instant after instant, channel after channel.
-
-    Attributes:
-        channels: What is in it, in order.
-        rows: Instants a frame.
-        width: Bytes a value.
-        index_width: Bytes of the running number.
-    """
-
-    channels: tuple[Channel, ...]
-    rows: int
-    width: int
-    index_width: int
-
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """Sensor groups that the channels come from."""
-        return tuple(dict.fromkeys(channel.group for channel in self.channels))
-
-    @property
-    def shifts(self) -> np.ndarray:
-        """Lower bits of the recorded counts that are left out, shape (channels,)."""
-        return np.array([max(0, channel.adc_bits - 8 * self.width) for channel in self.channels])
-
-    def pack(self, numbers: np.ndarray, counts: np.ndarray, length: int) -> np.ndarray:
-        """Data of frames.
-
-        Args:
-            numbers: Running number of each frame's first instant; what does not fit is cut off, shape (frames,).
-            counts: Recorded counts, int32, shape (frames * rows, channels).
-            length: Bytes of a frame.
-
-        Returns:
-            uint8, shape (frames, length).
-        """
-        frames = len(numbers)
-        values = counts >> self.shifts
-        if self.width == 2:
-            values = np.maximum(values, ABSENT + 1)
-        out = np.zeros((frames, length), np.uint8)
-        head = np.ascontiguousarray(numbers, "<i8").view(np.uint8).reshape(frames, 8)
-        out[:, : self.index_width] = head[:, : self.index_width]
-        body = np.ascontiguousarray(values, "<i4").view(np.uint8).reshape(frames, -1, 4)[:, :, : self.width]
-        out[:, self.index_width : self.index_width + body.shape[1] * self.width] = body.reshape(frames, -1)
-        return out
-
-    def unpack(self, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Running numbers and values of frames.
-
-        Args:
-            data: uint8, shape (frames, length).
-
-        Returns:
-            Number of each frame's first instant, int64, shape (frames,), and the values as they are in the frames,
-            int32, shape (frames * rows, channels).
-        """
-        frames, size = len(data), self.rows * len(self.channels)
-        head = np.zeros((frames, 8), np.uint8)
-        head[:, : self.index_width] = data[:, : self.index_width]
-        body = np.zeros((frames, size, 4), np.uint8)
-        end = self.index_width + size * self.width
-        body[:, :, 4 - self.width :] = data[:, self.index_width : end].reshape(frames, size, self.width)
-        values = body.view("<i4").reshape(-1, len(self.channels)) >> (32 - 8 * self.width)
-        return head.view("<i8").reshape(frames), values
-
-    def engineering(self, values: np.ndarray) -> np.ndarray:
-        """Values of `unpack` in each channel's unit, float64, shape (instants, channels); nan where it is absent."""
-        scale = np.array([channel.scale for channel in self.channels]) * 2.0**self.shifts
-        out = values * scale + np.array([channel.offset for channel in self.channels])
-        if self.width == 2:
-            out[values == ABSENT] = np.nan
-        return out
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Message:
-    """A kind of frame.
-
-    Attributes:
-        name: Unique.
-        identifier: 11 bits.
-        length: Bytes.
-        fd: A CAN FD frame with bit rate switch.
-        period_s: How often it is sent, or at most sent where nothing but events sends it [s].
-        periodic: Whether it is sent by the clock.
-        sender: Node.
-        label: What it is.
-        signals: What is in it.
-        samples: Where it carries samples, how.
-    """
-
-    name: str
-    identifier: int
-    length: int
-    fd: bool
-    period_s: float
-    periodic: bool
-    sender: str
-    label: str
-    signals: tuple[Signal, ...]
-    samples: Samples | None = None
-
-    def encode(self, **raw: int) -> bytes:
-        """Data with these raw values; signals that are not named are 0.
-
-        Raises:
-            ValueError: A value does not fit its bits.
-        """
-        total = 0
-        known = {signal.name: signal for signal in self.signals}
-        for name, value in raw.items():
-            signal = known[name]
-            low, high = signal.raw_range
-            if not low <= value <= high:
-                raise ValueError(f"{self.name}.{name} must be between {low} and {high}; instead received {value}")
-            total |= (value & (1 << signal.bits) - 1) << signal.start
-        return total.to_bytes(self.length, "little")
-
-    def decode(self, data: bytes) -> dict[str, int]:
-        """Raw values by name; of signals that take turns, those that are there."""
-        total = int.from_bytes(data, "little")
-        values: dict[str, int] = {}
-        selected = None
-        for signal in self.signals:
-            value = total >> signal.start & (1 << signal.bits) - 1
-            if signal.signed and value >> signal.bits - 1:
-                value -= 1 << signal.bits
-            if signal.selects:
-                selected = value
-            if not signal.selected_by or selected in signal.selected_by:
-                values[signal.name] = value
-        return values
-
-
-@dataclass(frozen=True, slots=True)
-class MessageTable:
-    """All messages of a rig."""
-
-    messages: tuple[Message, ...]
-    by_name: dict[str, Message] = field(init=False)
-    by_identifier: dict[int, Message] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "by_name", {message.name: message for message in self.messages})
-        object.__setattr__(self, "by_identifier", {message.identifier: message for message in self.messages})
-        if not len(self.by_name) == len(self.by_identifier) == len(self.messages):
-            raise ValueError("names and identifiers of CAN messages must be unique")
-
-    @property
-    def classic(self) -> tuple[Message, ...]:
-        """Messages of the classic sample layout."""
-        return tuple(row for row in self.messages if row.samples is not None and not row.fd)
-
-    @property
-    def fd(self) -> tuple[Message, ...]:
-        """Messages of the FD sample layout."""
-        return tuple(row for row in self.messages if row.samples is not None and row.fd)
-
-    @property
-    def others(self) -> tuple[Message, ...]:
-        """Messages without samples."""
-        return tuple(row for row in self.messages if row.samples is None)
-
-    def schedule(self, *, classic_hz: float | None = None, fd_hz: float | None = None) -> dict[Message, float]:
-        """What is on the bus, and how often [s].
-
-        Args:
-            classic_hz: Rate of the classic layout [Hz], or None where it is not sent.
-            fd_hz: Rate of the FD layout [Hz], or None where it is not sent.
-        """
-        rows = {row: row.period_s for row in self.others}
-        for messages, rate in ((self.classic, classic_hz), (self.fd, fd_hz)):
-            if rate is not None:
-                rows |= {row: row.samples.rows / rate for row in messages if row.samples is not None}
-        return rows
-
-
 def _choices(names: type[IntEnum]) -> dict[int, str]:
     return {member.value: member.name.lower() for member in names}
 
@@ -338,14 +116,24 @@ _STOP_SIGNALS = (
     Signal("reserved", 16, 32, label="Always 0"),
     *_HEAD,
 )
+LIMITS = {"force_n": (1.0, 1000.0), "duration_ms": (0.5, 50.0)}
+"""Least and largest value of a command's field that the rig takes [N], [ms]; the drive's top speed is its parameter."""
 _HAMMER, _SPEED, _RELEASE = (int(Kind.HAMMER),), (int(Kind.SPEED),), (int(Kind.RELEASE),)
+
+
+def _within(label: str, name: str) -> str:
+    return "{}, {:g} to {:g}".format(label, *LIMITS[name])
+
+
 _COMMAND_SIGNALS = (
     Signal(
         "kind", 0, 8, label="What to do", selects=True,
         choices={value: name for value, name in _choices(Kind).items() if value != Kind.STOP},
     ),
-    Signal("force", 16, 16, scale=0.1, unit="N", label="Peak force, 1 to 1000", selected_by=_HAMMER),
-    Signal("duration", 32, 8, scale=0.25, unit="ms", label="Of the half sine, 0.5 to 50", selected_by=_HAMMER),
+    Signal("force", 16, 16, scale=0.1, unit="N", label=_within("Peak force", "force_n"), selected_by=_HAMMER),
+    Signal(
+        "duration", 32, 8, scale=0.25, unit="ms", label=_within("Of the half sine", "duration_ms"), selected_by=_HAMMER
+    ),
     Signal("direction", 40, 8, scale=1.5, unit="deg", label="From x (EAST) toward y (up)", selected_by=_HAMMER),
     Signal("speed", 16, 24, scale=0.001, unit="Hz", label="Speed that the drive holds", selected_by=_SPEED),
     Signal("reserved_speed", 40, 8, label="Always 0", selected_by=_SPEED),
@@ -384,7 +172,7 @@ def _other_messages() -> list[Message]:
                 Signal("event", 0, 8, label="What", choices=_choices(EventKind)),
                 Signal("number", 8, 8, label="Running number, modulo 256"),
                 Signal("time", 16, 32, unit="us", label=_TIME),
-                Signal("value", 48, 16, scale=0.1, label="Force of a blow, N, or speed, Hz; else 0"),
+                Signal("value", 48, 16, scale=0.1, label="Peak force of a hammer pulse, N, or speed, Hz; else 0"),
             ),
         ),
         Message(
@@ -490,7 +278,7 @@ def _classic_messages(table: ChannelTable) -> list[Message]:
         samples = Samples(channels[first : first + 3], 1, 2, 2)
         step = samples.channels[0].rate_hz // CLASSIC_HZ
         label = (
-            f"{', '.join(channel.name for channel in samples.channels)}: upper 16 bits of counts; -32768: not there. "
+            f"{', '.join(channel.name for channel in samples.channels)}: upper 16 bits of counts; {ABSENT}: not there. "
             f"Every n-th sample of the stream (n = {step} at {CLASSIC_HZ} Hz; Rates.classic_step), not filtered again: "
             "what lies above half the slower rate folds back"
         )
@@ -504,20 +292,16 @@ def _classic_messages(table: ChannelTable) -> list[Message]:
     return found
 
 
-@cache
-def _default_messages() -> MessageTable:
-    return make_table(default_table())
-
-
 def make_table(channels: ChannelTable) -> MessageTable:
     """All messages for a channel table."""
     rows = [*_other_messages(), *_fd_messages(channels), *_classic_messages(channels)]
     return MessageTable(tuple(sorted(rows, key=lambda row: row.identifier)))
 
 
+@cache
 def default_messages() -> MessageTable:
     """The messages of the rig's own channel table."""
-    return _default_messages()
+    return make_table(default_table())
 
 
 def _crc_table() -> bytes:
@@ -590,16 +374,12 @@ def command_frame(
         speed_hz: Speed that the drive holds [Hz], to 0.001.
     """
     message = default_messages().by_name["Stop" if kind is Kind.STOP else "Command"]
-    raw = {"kind": int(kind), "counter": counter & 0xFF, "key": KEY}
-    if kind is Kind.HAMMER:
-        raw |= {
-            "force": round(force_n / 0.1),
-            "duration": round(duration_ms / 0.25),
-            "direction": round(direction / 1.5) % _DIRECTIONS,
-        }
-    elif kind is Kind.SPEED:
-        raw["speed"] = round(speed_hz / 0.001)
-    data = message.encode(**raw)
+    values = {"force_n": force_n, "duration_ms": duration_ms, "direction": direction, "speed_hz": speed_hz}
+    scales = {signal.name: signal.scale for signal in message.signals}
+    raw = {key: round(values[name] / scales[key]) for key, name in _REQUEST_FIELDS[kind].items()}
+    if "direction" in raw:
+        raw["direction"] %= _DIRECTIONS
+    data = message.encode(kind=int(kind), counter=counter & 0xFF, key=KEY, **raw)
     return message.identifier, data[:7] + bytes([checksum(message.identifier, data)])
 
 

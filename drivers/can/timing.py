@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from drivers.can import frame as frames
+from drivers.can.bus import frame as frames
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Speed(NamedTuple):
         return self.duration_ns(*frames.frame_bits(frame)) * 1e-9
 
     def durations(self, array: np.ndarray) -> np.ndarray:
-        """`duration` for an array of `drivers.can.frame.RECORD` [s], shape (frames,)."""
+        """`duration` for an array of `drivers.can.bus.frame.RECORD` [s], shape (frames,)."""
         nominal, fast = frames.bits_of(array)
         return (nominal * self.nominal_ps + fast * self.data_ps) * 1e-12
 

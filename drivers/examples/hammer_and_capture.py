@@ -1,4 +1,4 @@
-"""Hit the shaft and capture from 50 ms before to 200 ms after the blow."""
+"""Hit the shaft and capture from 50 ms before to 200 ms after the impact."""
 
 import sys
 
@@ -17,7 +17,7 @@ def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.0.0.1:
         while captured[-1].times_s[-1] < done.time_s + 0.2:
             captured.append(daq.read())
     peak = np.concatenate([samples["hammer"] for samples in captured]).max()
-    print(f"blow {done.id} at {done.time_s:.4f} s, {peak:.1f} N, {sum(map(len, captured))} rows captured")
+    print(f"impact {done.id} at {done.time_s:.4f} s, {peak:.1f} N, {sum(map(len, captured))} rows captured")
     return captured
 
 

@@ -15,12 +15,13 @@ from dataclasses import dataclass
 from typing import ClassVar, Self, TypeVar
 
 from drivers.instrument import protocol
+from drivers.instrument.datasheet import Datasheet, parse_datasheet
 from drivers.instrument.protocol import Codec, Message, ProtocolError
-from drivers.instrument.sheet import Sheet, parse_sheet
 from drivers.link import ROOM, Link, LinkError, LinkTimeoutError, open_link
-from drivers.samples import Pile, Samples, Sequence, StreamEndedError
+from drivers.samples import Pile, Samples, StreamEndedError, follow
 from rig.channels import Group
 from rig.errors import InputError, RefusedError
+from rig.wire import Continuity
 
 M = TypeVar("M", bound=Message)
 _SLICE_S = 1.0
@@ -63,12 +64,12 @@ class Instrument:
     CODEC: ClassVar[Codec]
 
     def __init__(self, link: Link, *, timeout_s: float = 3.0) -> None:
-        self._link = link
+        self.link = link
         self._timeout_s = timeout_s
         # From anywhere, so that a late reply to whoever had the line before is not taken for ours.
         self._sequence = random.getrandbits(32)
         self._data: deque[Message] = deque()
-        self._sheet: Sheet | None = None
+        self._datasheet: Datasheet | None = None
         self.malformed = 0
         """Messages that were none of this protocol."""
         self.dropped = 0
@@ -90,24 +91,24 @@ class Instrument:
             raise
         return instrument
 
-    def identify(self) -> Sheet:
+    def identify(self) -> Datasheet:
         """Identification and calibration, as the instrument tells them now."""
-        self._sheet = parse_sheet(self._ask(protocol.Identify(), protocol.Identity).sheet)
-        return self._sheet
+        self._datasheet = parse_datasheet(self.ask(protocol.Identify(), protocol.Identity).datasheet)
+        return self._datasheet
 
     @property
-    def sheet(self) -> Sheet:
+    def datasheet(self) -> Datasheet:
         """Identification and calibration, as the instrument told them last."""
-        return self._sheet or self.identify()
+        return self._datasheet or self.identify()
 
     @property
     def lost(self) -> int:
         """Messages that were dropped or spoilt at this end of the link; lost rows show as gaps as well."""
-        return self._link.lost + self.dropped + self.malformed
+        return self.link.lost + self.dropped + self.malformed
 
     def close(self) -> None:
         """Close the link; may be called again."""
-        self._link.close()
+        self.link.close()
 
     def __enter__(self) -> Self:
         return self
@@ -122,13 +123,19 @@ class Instrument:
             RefusedError: It refuses, for the reason in the message.
             LinkError: No reply came; whether it was done is not known.
         """
-        done = self._ask(act, protocol.Done)
+        done = self.ask(act, protocol.Done)
         return Done(id=done.id, tick=done.tick, time_s=done.time_s)
 
-    def _ask(self, request: Message, expected: type[M]) -> M:
+    def ask(self, request: Message, expected: type[M]) -> M:
+        """Send a request of the protocol; returns the reply, which must be of that kind.
+
+        Raises:
+            RefusedError: The instrument refuses, for the reason in the message.
+            LinkError: It could not answer, or did not in time.
+        """
         self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         deadline = time.monotonic() + self._timeout_s
-        self._link.send(self.CODEC.encode(request, self._sequence), timeout_s=self._timeout_s)
+        self.link.send(self.CODEC.encode(request, self._sequence), timeout_s=self._timeout_s)
         while (left := deadline - time.monotonic()) > 0:
             received = self._receive(left)
             if received is None:
@@ -147,7 +154,7 @@ class Instrument:
         )
 
     def _receive(self, timeout_s: float) -> tuple[int, Message] | None:
-        data = self._link.receive(timeout_s=timeout_s)
+        data = self.link.receive(timeout_s=timeout_s)
         if data is None:
             return None
         try:
@@ -170,7 +177,7 @@ class Sampler(Instrument):
         super().__init__(link, timeout_s=timeout_s)
         self._group: Group | None = None
         self._stream: int | None = None
-        self._rows = Sequence()
+        self._rows = Continuity()
         self._pile = Pile()
         self._ended: str | None = None
 
@@ -178,20 +185,20 @@ class Sampler(Instrument):
         """Choose what to measure; a stream that runs ends.
 
         Args:
-            channels: Names from the sheet; all of them where none are given. They come in the sheet's order.
-            rate_hz: Rows per second [Hz], a whole fraction of the sheet's rate; every n-th row is taken, with the
-                conditioner's own low-pass and no further filter. 0 is the sheet's rate.
+            channels: Names from the datasheet; all of them where none are given. They come in the datasheet's order.
+            rate_hz: Rows per second [Hz], a whole fraction of the datasheet's rate; every n-th row is taken, with the
+                conditioner's own low-pass and no further filter. 0 is the datasheet's rate.
 
         Raises:
             InputError: There is no such channel.
             RefusedError: There is no such rate.
         """
-        sheet = self.identify()
-        wanted = sheet.group(tuple(channels)).names if channels else tuple(row.name for row in sheet.channels)
-        mask = sum(1 << n for n, row in enumerate(sheet.channels) if row.name in wanted)
-        reply = self._ask(protocol.Configure(rate_hz=float(rate_hz), channels=mask), protocol.Configured)
-        names = tuple(row.name for n, row in enumerate(sheet.channels) if reply.channels >> n & 1)
-        self._group = group = sheet.group(names)
+        datasheet = self.identify()
+        wanted = datasheet.group(tuple(channels)).names if channels else tuple(row.name for row in datasheet.channels)
+        mask = sum(1 << n for n, row in enumerate(datasheet.channels) if row.name in wanted)
+        reply = self.ask(protocol.Configure(rate_hz=float(rate_hz), channels=mask), protocol.Configured)
+        names = tuple(row.name for n, row in enumerate(datasheet.channels) if reply.channels >> n & 1)
+        self._group = group = datasheet.group(names)
         self._stream = None
         return Configuration(names, tuple(row.unit for row in group.channels), reply.rate_hz)
 
@@ -204,9 +211,9 @@ class Sampler(Instrument):
         if self._group is None:
             self.configure()
         self._pile.clear()
-        self._rows = Sequence()
+        self._rows = Continuity()
         self._ended = None
-        self._stream = self._ask(protocol.Start(), protocol.Started).stream
+        self._stream = self.ask(protocol.Start(), protocol.Started).stream
 
     def stop(self) -> None:
         """End the stream; what came before can still be read."""
@@ -222,7 +229,7 @@ class Sampler(Instrument):
         super().close()
 
     def _stop(self, *, discard: bool) -> None:
-        self._ask(protocol.Stop(self._stream or 0, int(discard)), protocol.Stopped)
+        self.ask(protocol.Stop(self._stream or 0, int(discard)), protocol.Stopped)
 
     def read(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Samples:
         """The next rows of the stream.
@@ -291,5 +298,5 @@ class Sampler(Instrument):
             units=tuple(channel.unit for channel in group.channels),
             values=group.engineering(rows.counts),
         )
-        if (new := self._rows.follow(came)) is not None:
+        if (new := follow(self._rows, came)) is not None:
             self._pile.add(new)

@@ -79,7 +79,7 @@ class Configure(Message):
 
     Attributes:
         rate_hz: Rows per second [Hz]; 0 is the instrument's own rate.
-        channels: Bit n is channel n of the sheet; 0 is all.
+        channels: Bit n is channel n of the datasheet; 0 is all.
     """
 
     KIND = 0x02
@@ -120,11 +120,11 @@ class Act(Message):
 
 @dataclass(frozen=True, slots=True)
 class Identity(Message):
-    """The sheet (`drivers.instrument.sheet`) as JSON."""
+    """The datasheet (`drivers.instrument.datasheet`) as JSON."""
 
     KIND = 0x81
     TAIL = Tail.TEXT
-    sheet: str
+    datasheet: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,11 +239,11 @@ class Codec:
     def __init__(self, address: Address, acts: tuple[type[Act], ...] = ()) -> None:
         self.address = address
         self.acts = acts
-        self._kinds = {each.KIND: (each, struct.Struct(each.LAYOUT)) for each in (*COMMON, *acts)}
+        self.kinds = {each.KIND: (each, struct.Struct(each.LAYOUT)) for each in (*COMMON, *acts)}
 
     def encode(self, message: Message, sequence: int) -> bytes:
         """One message as bytes."""
-        kind, layout = self._kinds[message.KIND]
+        kind, layout = self.kinds[message.KIND]
         values = [getattr(message, each.name) for each in dataclasses.fields(kind)]
         tail = b""
         if kind.TAIL == Tail.TEXT:
@@ -271,9 +271,9 @@ class Codec:
         if number != self.address.number:
             text = f"instrument must be {self.address.number} ({self.address.name}); instead received {number}"
             raise wrong(Reason.INSTRUMENT, text)
-        if code not in self._kinds:
+        if code not in self.kinds:
             raise wrong(Reason.KIND, f"kind must be one that the {self.address.name} has; instead received {code:#04x}")
-        kind, layout = self._kinds[code]
+        kind, layout = self.kinds[code]
         start = HEAD.size + layout.size
         if len(data) < start or (kind.TAIL is None and len(data) != start):
             raise wrong(Reason.LENGTH, f"{kind.__name__} must be of {start} bytes; instead received {len(data)}")

@@ -14,12 +14,13 @@ import numpy as np
 
 from drivers.console import Accepted, Console
 from drivers.instrument import protocol
+from drivers.instrument.datasheet import Datasheet
 from drivers.instrument.protocol import Codec, Message, ProtocolError, Reason
-from drivers.instrument.sheet import Sheet
 from drivers.link import Port
 from drivers.stream import RigStream, thin, whole_step
 from rig import wire
 from rig.channels import Group
+from rig.desk import one_line
 from rig.errors import InputError
 from rig.transport import NoReplyError
 
@@ -74,6 +75,11 @@ class Twin:
         port.serve(self.answer, self._on_idle)
 
     @property
+    def running(self) -> bool:
+        """Whether a stream is on its way to the host."""
+        return self._running is not None
+
+    @property
     def url(self) -> str:
         """What a host opens."""
         return self._port.url
@@ -86,11 +92,11 @@ class Twin:
             reply = self._carry_out(request)
         except ProtocolError as error:
             sequence = error.sequence
-            reply = protocol.Refused(error.reason, _one_line(error))
+            reply = protocol.Refused(error.reason, one_line(error))
         except InputError as error:
-            reply = protocol.Refused(Reason.REFUSED, _one_line(error))
+            reply = protocol.Refused(Reason.REFUSED, one_line(error))
         except NoReplyError as error:
-            reply = protocol.Refused(Reason.UNAVAILABLE, _one_line(error))
+            reply = protocol.Refused(Reason.UNAVAILABLE, one_line(error))
         self.refused += isinstance(reply, protocol.Refused)
         return self.CODEC.encode(reply, sequence)
 
@@ -105,7 +111,7 @@ class Twin:
 
     def _carry_out(self, request: Message) -> Message:
         if isinstance(request, protocol.Identify):
-            return protocol.Identity(self._sheet().model_dump_json())
+            return protocol.Identity(self._datasheet().model_dump_json())
         if isinstance(request, protocol.Act):
             accepted = self.act(request)
             return protocol.Done(id=accepted.id, tick=accepted.tick, time_s=accepted.time_s)
@@ -117,10 +123,10 @@ class Twin:
             return self._stop(request)
         raise ProtocolError(Reason.KIND, f"kind must be a request; instead received {type(request).__name__}")
 
-    def _sheet(self) -> Sheet:
+    def _datasheet(self) -> Datasheet:
         name = self.CODEC.address.name
         group = self._measured() if self.GROUP else None
-        return Sheet(
+        return Datasheet(
             manufacturer=MANUFACTURER,
             model=f"{name} (virtual)",
             serial=f"VIRTUAL-{self.CODEC.address.number:03d}",
@@ -267,7 +273,3 @@ class Twin:
         if self._leave is not None:
             self._leave()
         self._port.close()
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.link import FORMS, ROOM, Address, LinkClosedError, LinkTimeoutError
 from rig.bounded_queue import BoundedQueue
+from rig.desk import one_line
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ _LOGGER = "drivers.link.can"
 logging.getLogger(_LOGGER).addHandler(logging.NullHandler())
 
 
-class CanMedium:
+class CanNode:
     """One node of a bus, for any number of links.
 
     Args:
@@ -51,10 +52,7 @@ class CanMedium:
 
         interface, channel, settings = parse_spec(spec)
         filters = [{"can_id": each, "can_mask": 0x7FF, "extended": False} for each in receive]
-        try:
-            self.bus: can.BusABC = can.Bus(channel, interface, can_filters=filters, **settings)  # pyright: ignore
-        except (can.CanError, OSError, ValueError, TypeError) as error:
-            raise InputError("can", f"a bus that can be opened ({' '.join(str(error).split())})", spec) from None
+        self.bus = open_bus(spec, interface, channel, can_filters=filters, **settings)
         self._receivers: dict[int, Callable[[can.Message], None]] = {}
         self.fd = settings.get("fd") is True or self.bus.protocol is can.CanProtocol.CAN_FD
         self._notifier = can.Notifier(self.bus, [self._take], timeout=0.1)
@@ -78,6 +76,20 @@ class CanMedium:
         self.bus.shutdown()
 
 
+def open_bus(spec: str, interface: str, channel: str, **settings: Any) -> can.BusABC:
+    """One of python-can's buses; the specification is what an error names.
+
+    Raises:
+        InputError: There is no such bus, or it cannot be opened.
+    """
+    import can
+
+    try:
+        return can.Bus(channel, interface, **settings)
+    except (can.CanError, OSError, ValueError, TypeError) as error:
+        raise InputError("can", f"a bus that can be opened ({one_line(error)})", spec) from None
+
+
 def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:
     """Split INTERFACE:CHANNEL?NAME=VALUE&...; values as python-can reads them.
 
@@ -98,25 +110,23 @@ class CanLink:
     """One end of the way between a host and an instrument.
 
     Args:
-        spec: The bus, as `CanMedium` takes it.
+        spec: The bus, as `CanNode` takes it.
         address: The instrument.
-        medium: A node to share instead of one of its own.
+        node: A node to share instead of one of its own.
         instrument: Whether this is the instrument's end.
 
     Raises:
         InputError: There is no such bus.
     """
 
-    def __init__(
-        self, spec: str, address: Address, *, medium: CanMedium | None = None, instrument: bool = False
-    ) -> None:
+    def __init__(self, spec: str, address: Address, *, node: CanNode | None = None, instrument: bool = False) -> None:
         import isotp
 
         down, up = TO_INSTRUMENT + address.number, FROM_INSTRUMENT + address.number
         send, receive = (up, down) if instrument else (down, up)
-        self._own = medium is None
-        self._medium = CanMedium(spec, [receive]) if medium is None else medium
-        fd = self._medium.fd
+        self._own = node is None
+        self._node = CanNode(spec, [receive]) if node is None else node
+        fd = self._node.fd
         self._name = address.name
         self._receive_identifier = receive
         self._frames: queue.SimpleQueue[can.Message | None] = queue.SimpleQueue()
@@ -144,7 +154,7 @@ class CanLink:
         self._spoilt = 0
         self.max_bytes = _MAX_BYTES
         self._stack.start()
-        self._medium.listen(receive, self._frames.put)
+        self._node.listen(receive, self._frames.put)
         self._reader = threading.Thread(target=self._read, name=f"can {address.name} reads", daemon=True)
         self._reader.start()
 
@@ -177,7 +187,7 @@ class CanLink:
             bitrate_switch=message.bitrate_switch,
         )
         try:
-            self._medium.bus.send(frame, timeout=_SEND_S)
+            self._node.bus.send(frame, timeout=_SEND_S)
         except can.CanError:
             self._spoilt += 1
 
@@ -220,11 +230,11 @@ class CanLink:
                 return
             self._closed = True
         self._messages.close()
-        self._medium.leave(self._receive_identifier)
+        self._node.leave(self._receive_identifier)
         # Both wake their readers.
         self._frames.put(None)
         self._stack.rx_queue.put(bytearray())
         self._reader.join(timeout=2.0)
         self._stack.stop()
         if self._own:
-            self._medium.close()
+            self._node.close()

@@ -72,6 +72,10 @@ class Deframer:
         self.spoilt = 0
         """Frames that were cut, too long, or had a wrong CRC."""
 
+    def __len__(self) -> int:
+        """Bytes that wait for the rest of their frame."""
+        return len(self._part)
+
     def feed(self, data: bytes) -> list[bytes]:
         """The messages that these bytes complete."""
         messages = []

@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivers.can.signals import Message, MessageTable, State, default_messages
+from drivers.can.message import Message, MessageTable
+from drivers.can.signals import State, default_messages
 from drivers.samples import Samples
 from drivers.stream import RIG_GONE, whole_step
 from rig.errors import InputError
 
 if TYPE_CHECKING:
-    import can
+    pass
 
 _PATIENCE_S = 3.0
 """A bus that is silent for so long has no rig any more, whose heart beats once a second."""
@@ -112,9 +113,7 @@ class CanSource:
     """
 
     def __init__(self, spec: str, *, wait_s: float = 3.0, table: MessageTable | None = None) -> None:
-        import can
-
-        from drivers.link.can import parse_spec
+        from drivers.link.can import open_bus, parse_spec
 
         interface, channel, settings = parse_spec(spec)
         self._wish = settings.pop("layout", None)
@@ -122,12 +121,10 @@ class CanSource:
             raise InputError("layout", "fd or classic", self._wish)
         self._table = table or default_messages()
         self._wait_s = wait_s
-        try:
-            self._bus: can.BusABC = can.Bus(channel, interface, **settings)  # pyright: ignore[reportArgumentType]
-        except (can.CanError, OSError, ValueError, TypeError) as error:
-            raise InputError("can", f"a bus that can be opened ({' '.join(str(error).split())})", spec) from None
-        self._lock = threading.Lock()
-        self._rates: dict[str, int] | None = None
+        self._bus = open_bus(spec, interface, channel, **settings)
+        self._lock = threading.RLock()
+        self.rates: dict[str, int] | None = None
+        """How samples are picked, as the rig tells it last."""
         self._started = (0, 0)
         self._sync: int | None = None
         self._known = threading.Event()
@@ -150,11 +147,11 @@ class CanSource:
         Raises:
             InputError: No rig is on that bus.
         """
-        if not self._known.wait(self._wait_s) or self._rates is None:
+        if not self._known.wait(self._wait_s) or self.rates is None:
             must = f"a bus with a rig on it (no Rates and Sync in {self._wait_s:g} s)"
             raise InputError("can", must, self._bus.channel_info)
-        layout = self._wish or ("fd" if self._rates["fd_step"] else "classic")
-        if not self._rates[f"{layout}_step"]:
+        layout = self._wish or ("fd" if self.rates["fd_step"] else "classic")
+        if not self.rates[f"{layout}_step"]:
             raise InputError("layout", "one that the rig sends", layout)
         self._wish = layout
         rows = self._table.fd if layout == "fd" else self._table.classic
@@ -178,7 +175,7 @@ class CanSource:
         on_end: Callable[[str, str], None],
     ) -> float:
         """Begin with what has come since the source was opened."""
-        rates = self._rates
+        rates = self.rates
         assert rates is not None
         self._started = (rates["rate"], rates[f"{self._wish}_step"])
         native = rates["rate"] / rates[f"{self._wish}_step"]
@@ -191,7 +188,7 @@ class CanSource:
             for identifier, data in early:
                 if identifier in self._wanted:
                     self._portion.setdefault(identifier, []).append(data)
-            self._hand_on()
+            self.hand_on()
         return native / thinned
 
     def _read(self) -> None:
@@ -208,21 +205,20 @@ class CanSource:
             if message is not None:
                 if not (message.is_error_frame or message.is_remote_frame or message.is_extended_id):
                     heard = now
-                    state = self._take(message.arbitration_id, bytes(message.data))
+                    state = self.take(message.arbitration_id, bytes(message.data))
                     beat = beat if state is None else state
             elif self._on_samples is not None and now - heard > _PATIENCE_S:
                 break
             if now - handed > _PORTION_S:
                 handed = now
-                with self._lock:
-                    self._hand_on()
+                self.hand_on()
             if beat == State.ENDED and message is None:
                 # The bus is silent, so nothing of the run is still to come.
                 self._finish("the rig's run has ended")
                 return
         self._finish(RIG_GONE)
 
-    def _take(self, identifier: int, data: bytes) -> int | None:
+    def take(self, identifier: int, data: bytes) -> int | None:
         """A frame; returns the state in a heartbeat."""
         if identifier in self._sampled:
             with self._lock:
@@ -238,31 +234,32 @@ class CanSource:
         if row.name == "Sync":
             self._sync = row.decode(data)["index"]
         elif row.name == "Rates":
-            self._rates = row.decode(data)
+            self.rates = row.decode(data)
         elif row.name == "Heartbeat":
             return row.decode(data)["state"]
-        if self._sync is not None and self._rates is not None and self._rates["rate"]:
+        if self._sync is not None and self.rates is not None and self.rates["rate"]:
             self._known.set()
         return None
 
-    def _hand_on(self) -> None:
-        """Give what has come to whoever takes it; the lock is held."""
-        rates, layout, take = self._rates, self._layout, self._on_samples
-        if layout is None or take is None or rates is None or self._sync is None:
-            return
-        portion, self._portion = self._portion, {}
-        step = rates[f"{self._wish}_step"]
-        if (rates["rate"], step) != self._started:
-            # Another run, of which the numbers mean something else.
-            return
-        for identifier, frames in portion.items():
-            name = self._wanted[identifier]
-            for samples in layout.decode(name, frames, rates["rate"], step, self._sync):
-                take(name, samples)
+    def hand_on(self) -> None:
+        """Give what has come to whoever takes it."""
+        with self._lock:
+            rates, layout, take = self.rates, self._layout, self._on_samples
+            if layout is None or take is None or rates is None or self._sync is None:
+                return
+            portion, self._portion = self._portion, {}
+            step = rates[f"{self._wish}_step"]
+            if (rates["rate"], step) != self._started:
+                # Another run, of which the numbers mean something else.
+                return
+            for identifier, frames in portion.items():
+                name = self._wanted[identifier]
+                for samples in layout.decode(name, frames, rates["rate"], step, self._sync):
+                    take(name, samples)
 
     def _finish(self, reason: str) -> None:
         with self._lock:
-            self._hand_on()
+            self.hand_on()
             end, names = self._on_end, list(self._wanted.values())
         for name in names:
             if end is not None:

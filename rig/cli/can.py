@@ -51,8 +51,8 @@ def hub(
 
     Programs reach one by python-can: can.Bus(interface="zenoh", channel="can0"), or can_logger -i zenoh -c can0.
     """
-    from drivers.can.bus import BusModel
-    from drivers.can.hub import Hub
+    from drivers.can.bus.hub import Hub
+    from drivers.can.bus.model import BusModel
     from drivers.can.interface import HubBus
     from drivers.can.timing import speed as parse_speed
     from rig.cli.can_outlets import CanOutlets

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.can_output import CanMessages
 from rig.cli.tables import echo
 from rig.errors import whole_file
+
+if TYPE_CHECKING:
+    from drivers.can.schedule import Schedule
+    from drivers.can.timing import Speed
 
 
 def dbc(
@@ -21,6 +25,8 @@ def dbc(
     from rig.scenes import rig_table
 
     rig_table()
+    schedule, speed = plan(classic=True, fd=False, rate_hz=None, bitrate=None)
+    _warn(schedule, speed)
     if out is None:
         echo(text(), nl=False)
         return
@@ -53,3 +59,9 @@ def load(*, messages: CanMessages) -> None:
     console = table_console(width=120)
     console.print(table)
     console.print(f"load: at most {100 * schedule.load(speed):.1f} % of the bus")
+    _warn(schedule, speed)
+
+
+def _warn(schedule: Schedule, speed: Speed) -> None:
+    for warning in schedule.warnings(speed):
+        echo(f"rig: warning: {warning}", err=True)

@@ -7,9 +7,9 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drivers.can.outlet import OpenBus
-    from drivers.can.slcan_port import SlcanPort
-    from drivers.can.socketcand import SocketcandServer
+    from drivers.can.bus.outlet import OpenBus
+    from drivers.can.bus.slcan import SlcanPort
+    from drivers.can.bus.socketcand import SocketcandServer
     from drivers.can.timing import Speed
 
 
@@ -39,13 +39,13 @@ class CanOutlets:
         self._stack = ExitStack()
         with ExitStack() as stack:
             if socketcand is not None:
-                from drivers.can.socketcand import SocketcandServer
+                from drivers.can.bus.socketcand import SocketcandServer
                 from rig.transport.endpoint import parse_loopback
 
                 host, port = parse_loopback(socketcand, field="socketcand")
                 self._server = stack.enter_context(SocketcandServer(buses, host=host, port=port))
             if slcan:
-                from drivers.can.slcan_port import SlcanPort
+                from drivers.can.bus.slcan import SlcanPort
 
                 for name, open_bus in buses.items():
                     self._ports[name] = stack.enter_context(SlcanPort(open_bus, speed=speed))

@@ -14,9 +14,9 @@ from rig.errors import InputError
 if TYPE_CHECKING:
     import can
 
+    from drivers.can.bus.hub import Hub
+    from drivers.can.bus.outlet import OpenBus
     from drivers.can.gateway import Gateway
-    from drivers.can.hub import Hub
-    from drivers.can.outlet import OpenBus
     from drivers.can.schedule import Schedule
     from drivers.can.timing import Speed
     from rig.cli.can_outlets import CanOutlets
@@ -190,7 +190,13 @@ class CanOutput:
         return (
             f"CAN {self.interface}:{self.channel} at {self.speed}, all channels at {sent}; "
             f"load at most {100 * self.load:.1f} %"
-        ) + "".join(f"\nrig: {line}" for line in (self._outlets.lines() if self._outlets is not None else []))
+        ) + "".join(
+            f"\nrig: {line}"
+            for line in (
+                *(f"warning: {warning}" for warning in self.schedule.warnings(self.speed)),
+                *(self._outlets.lines() if self._outlets is not None else []),
+            )
+        )
 
     def _figures(self) -> dict[str, float]:
         if self._gateway is None:
@@ -228,14 +234,14 @@ class CanOutput:
     @contextmanager
     def _with_hub(self) -> Iterator[can.BusABC]:
         """The hub of a virtual bus in this process, and a node on it."""
-        from drivers.can import medium
-        from drivers.can.bus import BusModel
-        from drivers.can.hub import Hub
+        from drivers.can.bus import codec
+        from drivers.can.bus.hub import Hub
+        from drivers.can.bus.model import BusModel
         from drivers.can.interface import HubBus
         from rig.transport.zenoh import ZenohServer
 
         settings = dict(self._settings)
-        endpoint = str(settings.pop("endpoint", medium.DEFAULT_ENDPOINT))
+        endpoint = str(settings.pop("endpoint", codec.DEFAULT_ENDPOINT))
         if settings:
             raise InputError("--can", "zenoh:CHANNEL, or zenoh:CHANNEL?endpoint=HOST:PORT", "&".join(settings))
         with (

@@ -13,7 +13,7 @@ _MOST = 64
 _TOGETHER = 4
 
 
-class _Bucket:
+class Bucket:
     """Room for so many at once, refilled steadily."""
 
     def __init__(self, rate_hz: float, burst: float, now_s: float) -> None:
@@ -21,11 +21,13 @@ class _Bucket:
         self._left, self._at_s = burst, now_s
 
     def left(self, now_s: float) -> float:
+        """How many there is room for now."""
         self._left = min(self._burst, self._left + self._rate_hz * (now_s - self._at_s))
         self._at_s = now_s
         return self._left
 
     def take(self) -> None:
+        """One of them comes."""
         self._left -= 1.0
 
 
@@ -43,8 +45,8 @@ class CommandLimit:
     ) -> None:
         self._rate_hz, self._burst, self._now_s = rate_hz, burst, now_s
         self._lock = threading.Lock()
-        self._all = _Bucket(_TOGETHER * rate_hz, _TOGETHER * burst, now_s())
-        self.senders: dict[str, _Bucket] = {}
+        self._all = Bucket(_TOGETHER * rate_hz, _TOGETHER * burst, now_s())
+        self.senders: dict[str, Bucket] = {}
         """Those that are told apart, the one heard longest ago first."""
         self.refused = 0
         """Commands that were not let through."""
@@ -57,7 +59,7 @@ class CommandLimit:
         """
         now_s = self._now_s()
         with self._lock:
-            bucket = self.senders.pop(sender, None) or _Bucket(self._rate_hz, self._burst, now_s)
+            bucket = self.senders.pop(sender, None) or Bucket(self._rate_hz, self._burst, now_s)
             if len(self.senders) >= _MOST:
                 del self.senders[next(iter(self.senders))]  # the one that was heard longest ago
             self.senders[sender] = bucket

@@ -13,6 +13,7 @@ import re
 import select
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -21,20 +22,18 @@ import can  # noqa: TID253 - the subject
 import numpy as np
 import pytest
 
-from drivers.can import hub as hubs
-from drivers.can import medium, slcan_port, socketcand
-from drivers.can.bus import BusModel
-from drivers.can.frame import fault_of
+from drivers.can.bus import codec, endpoints, slcan, socketcand
+from drivers.can.bus.frame import fault_of, packed
+from drivers.can.bus.hub import Hub
+from drivers.can.bus.model import BusModel
+from drivers.can.bus.slcan import SlcanPort
+from drivers.can.bus.socketcand import SocketcandServer
 from drivers.can.gateway import Gateway
-from drivers.can.hub import Hub
 from drivers.can.interface import HubBus
 from drivers.can.schedule import Schedule
 from drivers.can.signals import AHEAD, KEY, Kind, checksum, command_frame, default_messages
-from drivers.can.slcan_port import SlcanPort
-from drivers.can.socketcand import SocketcandServer
 from drivers.instrument.protocol import Codec, ProtocolError
-from drivers.link import memory
-from drivers.link.can import TO_INSTRUMENT, CanLink, CanMedium
+from drivers.link.can import TO_INSTRUMENT, CanLink, CanNode
 from drivers.link.frames import Deframer, frame, unstuff
 from drivers.link.port import MessagePort
 from drivers.sources.can import CanSource
@@ -44,9 +43,11 @@ from rig.channels import default_table
 from rig.transport.memory import MemoryClient, MemoryServer
 from tests.hostile import inputs
 from tests.hostile.documents import documents
+from tests.unit import link_memory as memory
 from tests.unit.instruments_fake import FakeRig
 from tests.unit.test_transport_zenoh import until
 
+THREADS = {"can gateway sends", "can gateway receives", "can gateway asks"}
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(3600)]
 _channels = itertools.count()
 
@@ -161,30 +162,30 @@ def test_a_command_is_carried_out_only_where_its_frame_is_exactly_valid() -> Non
     ):
         valid = 0
         for number in range(inputs(3000)):
-            message = a_frame(random, gateway._counter)
-            good = is_command(message, gateway._counter)
+            message = a_frame(random, gateway.commands.counter)
+            good = is_command(message, gateway.commands.counter)
             before = len(rig.taken)
-            gateway._take_message(message)
+            gateway.commands.take_message(message)
             if good:
                 valid += 1
-                until(lambda: len(rig.taken) > before and not gateway._asked)  # noqa: B023
+                until(lambda: len(rig.taken) > before and not gateway.commands.waiting)  # noqa: B023
             assert len(rig.taken) == before + good, message
             if number % 100 == 0:
                 while other.recv(0) is not None:
                     pass
         assert valid > number // 10
-        assert gateway.counts.accepted > 0
-        assert gateway.counts.refused.total() > number // 10
-        assert all(thread.is_alive() for thread in gateway._threads)
+        assert gateway.commands.accepted > 0
+        assert gateway.commands.refused.total() > number // 10
+        assert {thread.name for thread in threading.enumerate()} >= THREADS
         assert gateway.warnings() == []
         # The bus itself, and what the gateway's own thread makes of it.
         for _ in range(2000):
             with contextlib.suppress(can.CanError, ValueError):
-                other.send(a_frame(random, gateway._counter))
+                other.send(a_frame(random, gateway.commands.counter))
         before = len(rig.taken)
         time.sleep(0.3)
-        until(lambda: not gateway._asked)
-        identifier, data = command_frame(Kind.SPEED, gateway._counter + 1, speed_hz=5.0)
+        until(lambda: not gateway.commands.waiting)
+        identifier, data = command_frame(Kind.SPEED, gateway.commands.counter + 1, speed_hz=5.0)
         other.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
         until(lambda: rig.taken[-1][1].get("speed_hz") == 5.0)
 
@@ -208,14 +209,14 @@ def test_blocks_events_and_states_that_lie_do_not_stop_a_gateway() -> None:
         Gateway(MemoryClient(rig.server), own, Schedule(1000, 10_000)) as gateway,
     ):
         for number, document in enumerate(documents(random, inputs(1000), events)):
-            gateway._guard(gateway._unpack, keys[random.integers(len(keys))], document)
-            gateway._guard(gateway._unpack, keys[random.integers(len(keys))], mutated(random, block))
+            gateway.guard(gateway.unpack, keys[random.integers(len(keys))], document)
+            gateway.guard(gateway.unpack, keys[random.integers(len(keys))], mutated(random, block))
             if number % 100 == 0:
                 while other.recv(0) is not None:
                     pass
-        gateway._slots.clear()
-        assert all(thread.is_alive() for thread in gateway._threads)
-        assert gateway._waiting_frames <= gateway._room + 512
+        assert {thread.name for thread in threading.enumerate()} >= THREADS
+        # A quarter of a second of what is sent.
+        assert gateway.outbox.waiting <= 0.25 * 13_000 + 512
         identifier = default_messages().by_name["Heartbeat"].identifier
         while (found := other.recv(5.0)) is not None and found.arbitration_id != identifier:
             pass
@@ -225,17 +226,17 @@ def test_blocks_events_and_states_that_lie_do_not_stop_a_gateway() -> None:
 # Messages and requests to the hub.
 
 
-def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[medium.Record]]:
+def an_offer(random: np.random.Generator, secret: bytes) -> tuple[bytes, list[codec.Record]]:
     """What comes as an offer, and the frames in it, if it is one."""
     rows = []
     for _ in range(random.integers(1, 20)):
         word = int(random.choice((0x10, 0x7FF, 0x800, 0x1FFFFFFF))) | int(
-            random.choice((0, 0, 0, medium.EXTENDED, medium.REMOTE, medium.ERROR, medium.EXTENDED | medium.REMOTE))
+            random.choice((0, 0, 0, codec.EXTENDED, codec.REMOTE, codec.ERROR, codec.EXTENDED | codec.REMOTE))
         )
         length = int(random.choice((0, 1, 7, 8, 9, 12, 48, 63, 64, 200)))
         flags = int(random.choice((0, 0, 0, 1, 3, 7, 2, 16, 255)))
-        rows.append(medium.Record(0, word, length, flags, int(random.integers(1 << 16)), random.bytes(min(length, 64))))
-    message = medium.encode(rows)
+        rows.append(codec.Record(0, word, length, flags, int(random.integers(1 << 16)), random.bytes(min(length, 64))))
+    message = codec.encode(packed(rows))
     kind = random.integers(8)
     if kind == 0:
         return mutated(random, secret + message), []
@@ -260,10 +261,10 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
         HubBus(hub, rx_queue_size=10_000) as receiver,
         HubBus(hub) as villain,
     ):
-        names = [sender._name, receiver._name, villain._name, "ghost", "", "x" * 100, "a/b"]
+        names = [sender.name, receiver.name, villain.name, "ghost", "", "x" * 100, "a/b"]
         for example in examples[1:3]:
-            example["endpoint"] = sender._name
-        secret = bytes.fromhex(villain._secret or "")
+            example["endpoint"] = sender.name
+        secret = bytes.fromhex(villain.secret or "")
         requests = documents(random, inputs(1500), examples)
         got: list[int] = []
         strangers = sent = 0
@@ -277,22 +278,21 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
                     got.append(int.from_bytes(item.data, "big"))
                 else:
                     strangers += 1
-                    assert fault_of(medium.record_of(item)) is None
+                    assert fault_of(codec.record_of(item)) is None
 
         for number, request in enumerate(requests):
             payload, _ = an_offer(random, secret)
             victim = names[random.integers(len(names))]
             # Under another's name always with a wrong secret; under its own no more than leaves the bus some room.
-            if victim == villain._name and hub._waiting > 5:
+            if victim == villain.name and hub.endpoints.waiting > 5:
                 payload = payload[1:]
             hub.offer(victim, payload)
             if number % 3 == 0:
-                hub._reply("join", b'{"endpoint": "ghost%d"}' % number)
-            hub._reply(("join", "set", "flush", "status")[random.integers(4)], request)
-            hub._watch(
-                f"rig/can/can0/node/{names[random.integers(3, 7)]}{random.integers(3000)}", random.random() < 0.7
-            )
-            villain._take(payload[16:])
+                hub.reply("join", b'{"endpoint": "ghost%d"}' % number)
+            hub.reply(("join", "set", "flush", "status")[random.integers(4)], request)
+            hub.watch(f"rig/can/can0/node/{names[random.integers(3, 7)]}{random.integers(3000)}", random.random() < 0.7)
+            with contextlib.suppress(codec.CodecError):
+                villain.hear(codec.decode(payload[16:]))
             if number % 20 == 0:
                 sender.send(
                     can.Message(arbitration_id=1, data=sent.to_bytes(4, "big"), is_extended_id=False), timeout=5.0
@@ -306,13 +306,13 @@ def test_messages_and_requests_to_the_hub_stop_nobody_and_forge_nothing() -> Non
         assert strangers > 10
         for name in ("malformed", "invalid", "refused", "forged", "strange", "evicted"):
             assert counts[name] > 3, name
-        assert hub._guard.failures == 0
-        assert sum(row["name"] not in names[:3] for row in status["nodes"]) <= hubs.MAX_ENDPOINTS
-        assert len(hub._tokens) <= 16 * hubs.MAX_ENDPOINTS
+        assert not any("failed" in text for text in hub.warnings())
+        assert sum(row["name"] not in names[:3] for row in status["nodes"]) <= endpoints.MAX_ENDPOINTS
+        assert len(hub.endpoints.tokens) <= 16 * endpoints.MAX_ENDPOINTS
         rows = {row["name"]: row for row in status["nodes"]}
-        assert rows[sender._name]["listen_only"] is False
-        assert rows[sender._name]["dropped"] == 0
-        assert hub._thread.is_alive()
+        assert rows[sender.name]["listen_only"] is False
+        assert rows[sender.name]["dropped"] == 0
+        assert any(thread.name == "can hub can0" for thread in threading.enumerate())
 
 
 # Text.
@@ -378,7 +378,7 @@ def test_text_to_socketcand_makes_a_frame_only_where_it_stands_for_one() -> None
         words = (found[0] or "").split()
         frame_ = None
         if words and words[0] in ("send", "sendrtr"):
-            with contextlib.suppress(socketcand.CommandError):
+            with contextlib.suppress(codec.CodecError):
                 frame_ = fields_of(socketcand.parse_frame(words[1:], remote=words[0] == "sendrtr"))
         assert frame_ == expected, command
         made += expected is not None
@@ -388,7 +388,7 @@ def test_text_to_socketcand_makes_a_frame_only_where_it_stands_for_one() -> None
             random.choice((b"<", b">", b" ", b"x" * 600, b"\xff\0", b"send 1 0", random.bytes(9)))
         ):
             assert each is None or len(each) < 512
-        assert len(splitter._text) <= 1024
+        assert len(splitter) <= 1024
 
 
 class Flood:
@@ -430,7 +430,7 @@ def test_text_to_a_socketcand_server_stops_nobody() -> None:
                         texts = [b"<" + a_command(random) + b">" for _ in range(10)]
                         flood.write(mutated(random, b"".join(texts)) if random.random() < 0.3 else b"".join(texts))
                         while (item := other.recv(0)) is not None:
-                            assert item.is_error_frame or fault_of(medium.record_of(item)) is None
+                            assert item.is_error_frame or fault_of(codec.record_of(item)) is None
                     flood.quiet()
                     flood.write(b">< statistics 0 ><>< echo >")
                     assert flood.quiet().endswith(b"< echo >")
@@ -468,15 +468,15 @@ def a_line(random: np.random.Generator) -> bytes:
 
 def test_lines_to_an_slcan_port_make_a_frame_only_where_they_stand_for_one() -> None:
     random = np.random.default_rng(6)
-    lines = slcan_port.Lines()
+    lines = slcan.Lines()
     made = 0
     for _ in range(inputs(3000)):
         line = a_line(random).replace(b"\r", b"").replace(b"\n", b"")
         (text,) = lines.feed(line + b"\r")
         found = None
         if text:
-            with contextlib.suppress(slcan_port.FrameError):
-                message = slcan_port.parse(text)
+            with contextlib.suppress(codec.CodecError):
+                message = slcan.parse(text)
                 found = (
                     *fields_of(message)[:3], message.is_fd, message.bitrate_switch, fields_of(message)[3]
                 )  # fmt: skip
@@ -490,7 +490,7 @@ def test_lines_to_an_slcan_port_make_a_frame_only_where_they_stand_for_one() -> 
             for _ in range(inputs(1500) // 10):
                 flood.write(b"\r".join(a_line(random) for _ in range(10)) + b"\r")
                 while (item := other.recv(0)) is not None:
-                    assert item.is_error_frame or fault_of(medium.record_of(item)) is None
+                    assert item.is_error_frame or fault_of(codec.record_of(item)) is None
             flood.write(b"\r\rC\r")
             flood.quiet()
             flood.write(b"V\r")
@@ -505,10 +505,10 @@ def test_lines_to_an_slcan_port_make_a_frame_only_where_they_stand_for_one() -> 
 
 def a_request(random: np.random.Generator, codec: Codec) -> bytes:
     """A request that is right but for its values, or nearly one."""
-    kinds = list(codec._kinds)
+    kinds = list(codec.kinds)
     code = kinds[random.integers(len(kinds))] if random.random() < 0.9 else int(random.integers(256))
     head = struct.pack("<BBBI", 1, codec.address.number, code, int(random.integers(1 << 32)))
-    kind, layout = codec._kinds.get(code, (None, struct.Struct("<")))
+    kind, layout = codec.kinds.get(code, (None, struct.Struct("<")))
     doubles = (0.0, 1.0, 100.0, 1e300, -1.0, float("nan"), float("inf"), 5e-324, 20_000.0, 1000.0)
     body = b""
     for each in layout.format.strip("<"):
@@ -569,7 +569,7 @@ def test_frames_of_a_serial_line_are_whole_or_dropped() -> None:
         found = [*deframer.feed(b"\0" + line[:cut]), *deframer.feed(line[cut:] + b"\0")]
         assert found == good
         taken += len(found)
-        assert len(deframer._part) <= 1100
+        assert len(deframer) <= 1100
     assert taken > 500
 
 
@@ -612,7 +612,7 @@ def test_transport_frames_of_instruments_on_a_bus_leave_them_answering() -> None
 
             def identified() -> bool:
                 with contextlib.suppress(ConnectionError):
-                    link.send(codec.encode(codec._kinds[1][0](), 77), timeout_s=1.0)
+                    link.send(codec.encode(codec.kinds[1][0](), 77), timeout_s=1.0)
                     while (reply := link.receive(timeout_s=1.0)) is not None:
                         if codec.decode(reply)[0] == 77:
                             return True
@@ -649,35 +649,35 @@ def test_frames_that_lie_to_a_daq_stop_nothing_and_are_counted() -> None:
             for number in range(inputs(3000)):
                 row = rows[random.integers(len(rows))]
                 size = row.length if random.random() < 0.7 else int(random.integers(9))
-                source._take(row.identifier, random.bytes(size))
+                source.take(row.identifier, random.bytes(size))
                 if number % 50 == 0:
                     say("Sync", index=0, time=0)  # else it takes the rig for gone
-                    source._take(int(random.integers(1 << 11)), random.bytes(8))
-                    with source._lock:
-                        source._hand_on()
+                    source.take(int(random.integers(1 << 11)), random.bytes(8))
+                    source.hand_on()
                     taken.clear()
             for _ in range(200):
-                source._take(table.by_name["Rates"].identifier, random.bytes(8))
-                source._take(table.by_name["Samples_1"].identifier, random.bytes(table.by_name["Samples_1"].length))
-                with source._lock:
-                    source._hand_on()
+                source.take(table.by_name["Rates"].identifier, random.bytes(8))
+                source.take(table.by_name["Samples_1"].identifier, random.bytes(table.by_name["Samples_1"].length))
+                source.hand_on()
             assert source.statistics["malformed"] > 10
             say("Rates", rate=20_000, fd_step=0, classic_step=20, latency=0)
-            until(lambda: source._rates is not None and source._rates["rate"] == 20_000)
+            until(lambda: source.rates is not None and source.rates["rate"] == 20_000)
             before = len(taken)
             say("Samples_1", index=500)
             until(lambda: len(taken) > before)
             assert not ended
-            assert source._thread.is_alive()
+            assert any(
+                thread.name.startswith("can ") and thread.name.endswith(" reads") for thread in threading.enumerate()
+            )
     finally:
         source.close()
 
 
-def test_a_medium_for_links_outlives_frames_of_all_kinds() -> None:
+def test_a_node_for_links_outlives_frames_of_all_kinds() -> None:
     random = np.random.default_rng(11)
     channel = f"hostile-{next(_channels)}"
     heard: list[can.Message] = []
-    node = CanMedium(f"virtual:{channel}", [0x601])
+    node = CanNode(f"virtual:{channel}", [0x601])
     try:
         node.listen(0x601, heard.append)
         with can.Bus(channel, interface="virtual", ignore_config=True) as villain:

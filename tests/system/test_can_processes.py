@@ -16,7 +16,7 @@ from typing import Any
 import can  # noqa: TID253 - the subject
 import pytest
 
-from drivers.can import medium
+from drivers.can.bus import codec
 from drivers.can.interface import ZenohBus
 from rig.transport.zenoh import ZenohClient
 from tests.unit.test_transport_zenoh import free_endpoint, until
@@ -62,7 +62,7 @@ class Bench:
         self.nodes(0, "can1")
 
     def status(self, channel: str = "can0") -> dict[str, Any]:
-        return json.loads(self._client.request(medium.request_key(channel, "status"), timeout_s=10.0))
+        return json.loads(self._client.request(codec.request_key(channel, "status"), timeout_s=10.0))
 
     def nodes(self, count: int, channel: str = "can0") -> None:
         until(lambda: len(self.status(channel)["nodes"]) == count, timeout_s=PATIENCE_S)
@@ -253,7 +253,7 @@ def test_an_endpoint_that_stalls_or_dies_slows_nobody(hub: Bench, how: signal.Si
                 )
                 for number in range(first, first + 100)
             ]
-            sender.send_records(medium.records_of(rows), timeout=10.0)
+            sender.send_records(codec.records_of(rows), timeout=10.0)
             while (item := receiver.recv(0)) is not None:
                 found.append(item)
         found += take(receiver, count - len(found))

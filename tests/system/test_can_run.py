@@ -121,7 +121,7 @@ class InProcess:
         return self.decoded("Acknowledge")[-1]
 
 
-def test_a_blow_from_the_bus_causes_the_whirl_and_wrong_ones_do_nothing(tmp_path: Path) -> None:
+def test_a_hammer_pulse_from_the_bus_causes_the_whirl_and_wrong_ones_do_nothing(tmp_path: Path) -> None:
     with InProcess(tmp_path / "run.mcap", Schedule(1000, 10_000), "stable-run") as rig:
         rig.console.step(200_000)
         identifier, good = command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0)
@@ -131,13 +131,13 @@ def test_a_blow_from_the_bus_causes_the_whirl_and_wrong_ones_do_nothing(tmp_path
         assert (strong["result"], strong["field"], strong["limit"]) == (Result.OUT_OF_RANGE, 1, 10_000)
         assert rig.ask(identifier, good)["result"] == Result.STALE_COUNTER
         rig.console.step(200_000)
-        blow = command_frame(Kind.HAMMER, 2, force_n=100.0, duration_ms=5.0)
-        reply = rig.ask(*blow)
+        pulse = command_frame(Kind.HAMMER, 2, force_n=100.0, duration_ms=5.0)
+        reply = rig.ask(*pulse)
         assert (reply["result"], reply["counter"]) == (Result.ACCEPTED, 2)
-        assert rig.ask(*blow)["result"] == Result.STALE_COUNTER
+        assert rig.ask(*pulse)["result"] == Result.STALE_COUNTER
         rig.console.step(1_600_000)
-        assert rig.gateway.counts.accepted == 1
-        assert dict(rig.gateway.counts.refused) == {"bad_checksum": 1, "out_of_range": 1, "stale_counter": 2}
+        assert rig.gateway.commands.accepted == 1
+        assert dict(rig.gateway.commands.refused) == {"bad_checksum": 1, "out_of_range": 1, "stale_counter": 2}
         rig.read()
     compared = check_against_recording(rig.frames, rig.path, rates={True: 10_000, False: 1000})
     assert compared == 15 * 20_000 + 15 * 2000

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from drivers.can.analysis import Errors, Message, check_load, load, worst_bits, worst_case
-from drivers.can.bus import BusModel
-from drivers.can.frame import FD_LENGTHS, Frame, frame_bits
+from drivers.can.bus.frame import FD_LENGTHS, Frame, frame_bits
+from drivers.can.bus.model import BusModel
 from drivers.can.timing import speed
 from rig.errors import InputError
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can import frame as frames
-from drivers.can import kernels
-from drivers.can.bus import OUTCOMES, BusModel, Delivery, warm_up
-from drivers.can.frame import Frame, encode, frame_bits, records
+from drivers.can.bus import frame as frames
+from drivers.can.bus import kernels
+from drivers.can.bus.frame import Frame, encode, frame_bits, records
+from drivers.can.bus.model import OUTCOMES, BusModel, Delivery, warm_up
 from rig.errors import InputError
 
 US = 1_000

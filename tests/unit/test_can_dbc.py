@@ -10,10 +10,22 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drivers.can import dbc
-from drivers.can.signals import CLASSIC_HZ, FD_HZ, Command, Kind, command_frame, default_messages, parse_command
+from drivers.can import dbc, schedule
+from drivers.can.signals import (
+    CLASSIC_HZ,
+    FD_HZ,
+    Command,
+    Kind,
+    command_frame,
+    default_messages,
+    make_table,
+    parse_command,
+)
+from drivers.can.timing import speed
 from rig.channels import default_table
 from rig.cli.app import app
+from rig.cli.can_output import CanOutput
+from rig.errors import InputError
 
 TABLE = default_messages()
 DATABASE = dbc.database()
@@ -38,6 +50,31 @@ def test_the_load_command_shows_every_message() -> None:
     assert "load: at most 69.0 % of the bus" in result.output
     result = CliRunner().invoke(app, ["can", "load", "--can-fd", "--can-bitrate", "1M/5M"], catch_exceptions=False)
     assert "load: at most 125.9 % of the bus" in result.output
+
+
+def test_a_bus_that_gets_too_full_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    groups = default_table().groups
+    forces = groups["forces"]
+    more = [row.model_copy(update={"name": f"{row.name}_{side}"}) for row in forces.channels[:1] for side in "ab"]
+    fuller = {**groups, "forces": forces.model_copy(update={"channels": (*forces.channels, *more)})}
+    table = make_table(default_table().model_copy(update={"groups": fuller}))
+    monkeypatch.setattr(schedule, "default_messages", lambda: table)
+    warning = (
+        "rig: warning: CAN load must be at most 70 % of 1M with classic frames, so that others find room beside them; "
+        "instead received '80.5 % with 6 frames an instant' (a lower --can-rate or --can-fd helps)\n"
+    )
+    for command in (["can", "load"], ["can", "dbc"]):
+        assert CliRunner().invoke(app, command, catch_exceptions=False).stderr == warning
+    assert warning in f"{CanOutput('virtual:full')}\n"
+    # What is still carried is only told; what is not is refused.
+    assert CanOutput("virtual:full", rate_hz=500).schedule.warnings(speed("1M")) == []
+    with pytest.raises(InputError, match="CAN load must be a schedule of at most 100 % of the bus"):
+        CanOutput("virtual:full", bitrate="500k")
+
+
+def test_the_usual_bus_is_not_too_full() -> None:
+    for command in (["can", "load"], ["can", "dbc"], ["can", "load", "--can-fd"]):
+        assert CliRunner().invoke(app, command, catch_exceptions=False).stderr == ""
 
 
 def test_cantools_sees_the_messages_of_the_table() -> None:

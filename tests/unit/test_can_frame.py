@@ -21,9 +21,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.can import frame as frames
 from drivers.can.analysis import Message, best_bits, worst_bits
-from drivers.can.frame import FD_LENGTHS, RECORD, Frame, bits_of, encode, frame_bits, pad, record_of, records
+from drivers.can.bus import frame as frames
+from drivers.can.bus.frame import FD_LENGTHS, RECORD, Frame, bits_of, encode, frame_bits, pad, record_of, records
 from drivers.can.timing import speed
 from rig.errors import InputError
 
@@ -397,8 +397,8 @@ def test_nonsense_bit_rates(text: object):
 
 _PARITY = """
 import json, random
-from drivers.can.bus import BusModel
-from drivers.can.frame import FD_LENGTHS, Frame, encode, frame_bits
+from drivers.can.bus.model import BusModel
+from drivers.can.bus.frame import FD_LENGTHS, Frame, encode, frame_bits
 
 random.seed(3)
 rows = []

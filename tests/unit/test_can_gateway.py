@@ -18,13 +18,14 @@ import pytest
 
 from drivers.can import dbc
 from drivers.can.gateway import Gateway
-from drivers.can.health import Rising
 from drivers.can.schedule import Schedule
-from drivers.can.signals import ABSENT, Kind, Result, State, command_frame, default_messages
+from drivers.can.signals import ABSENT, LIMITS, Field, Kind, Result, State, command_frame, default_messages
+from drivers.health import Rising
 from rig import wire
 from rig.channels import default_table
 from rig.errors import InputError
 from rig.pacing import FreeRun, RealTime
+from rig.scenes import HammerCommand, SpeedCommand, parse_command
 from rig.service import Service
 from rig.transport.fanout import Fanout
 from rig.transport.memory import MemoryClient, MemoryServer
@@ -108,19 +109,20 @@ class Setup:
         self.service = Service(simulation, everywhere, clock, block_ticks=block_ticks)
         self.client = MemoryClient(self.server)
         self.service.prepare()
+        self.bus = bus
         self.gateway = Gateway(self.client, bus, schedule, **options)
         self.summary: dict[str, Any] = {}
-        self._thread = threading.Thread(target=self._run)
+        self.thread = threading.Thread(target=self._run)
 
     def _run(self) -> None:
         self.summary = self.service.run()
 
     def start(self) -> None:
-        self._thread.start()
+        self.thread.start()
 
     def join(self) -> None:
-        self._thread.join(timeout=30.0)
-        assert not self._thread.is_alive()
+        self.thread.join(timeout=30.0)
+        assert not self.thread.is_alive()
 
 
 @contextmanager
@@ -145,7 +147,7 @@ def rig(
                 yield setup
             finally:
                 setup.service.stop()
-                if setup._thread.ident is not None:
+                if setup.thread.ident is not None:
                     setup.join()
     finally:
         tap.close()
@@ -207,8 +209,8 @@ def test_slow_messages_say_how_it_goes_and_how_samples_were_picked() -> None:
 def test_edges_keep_the_fraction_of_their_microsecond() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         block = wire.Block(1000, 7, 1e6, 1e6, np.array([[12.25], [2_000_000.5]]))
-        setup.gateway._on_edges(block)
-        setup.gateway._send_due(time.monotonic())
+        setup.gateway.unpack(wire.EDGES, wire.encode_block(block))
+        setup.gateway.outbox.send_due()
         until(lambda: len(setup.tap.of("Keyphasor")) == 2)
     found = setup.tap.decoded("Keyphasor")
     assert [row["number"] for row in found] == [7, 8]
@@ -235,8 +237,8 @@ def test_a_gap_of_the_stream_loses_whole_frames_and_is_counted() -> None:
         for index in (0, 200, 430):
             values = np.repeat(np.arange(index, index + 200, dtype=np.int32)[:, None], 4, axis=1)
             block = wire.Block(50 * index, index, 20_000.0, 1e6, values)
-            setup.gateway._on_samples("probes", block)
-        setup.gateway._send_due(time.monotonic())
+            setup.gateway.unpack(wire.sensor_key("probes"), wire.encode_block(block))
+        setup.gateway.outbox.send_due()
         until(lambda: len(setup.tap.of("Probes")) == 60)
         assert setup.gateway.figures()["can_dropped"] == 3
     numbers, values = samples_of(setup.tap, "Probes")
@@ -272,7 +274,7 @@ def test_a_stalled_bus_loses_the_oldest_blocks_and_does_not_slow_the_rig() -> No
         assert setup.summary["queue"]["dropped"] == 0
         # A block that waits for no bus is over in 10 ms; a frame takes this one 50 ms.
         assert setup.summary["real_time_factor"] > 0.9
-        assert setup.gateway.counts.blocks_dropped > 50
+        assert setup.gateway.blocks_dropped > 50
         bus.seconds = 0.0
         setup.gateway.close()
 
@@ -281,20 +283,19 @@ def test_what_the_bus_refuses_is_counted() -> None:
     with rig(Fake(duration_s=0.6), paced=True, bus=Stubborn(refuse=True)) as setup:
         setup.start()
         setup.join()
-    counts = setup.gateway.counts
-    assert counts.frames == 0
+    assert setup.gateway.outbox.sent == 0
     # Samples of 0.6 s, sync and events; status and the like.
-    assert 12_500 * 0.6 + 6 + 2 <= counts.dropped <= 12_500 * 0.6 + 30
+    assert 12_500 * 0.6 + 6 + 2 <= setup.gateway.dropped <= 12_500 * 0.6 + 30
 
 
 def test_what_finds_no_room_for_a_moment_is_sent_afterwards_in_its_order() -> None:
     bus = Stubborn(refuse=True)
     with rig(Fake(duration_s=0.5), paced=True, bus=bus, schedule=Schedule(None, 10_000)) as setup:
         setup.start()
-        until(lambda: setup.gateway._waiting_frames > 1000)
+        until(lambda: setup.gateway.outbox.waiting > 1000)
         bus.refuse = False
         setup.join()
-    assert setup.gateway.counts.dropped == 0
+    assert setup.gateway.dropped == 0
     probes = TABLE.by_name["Probes"]
     numbers = [probes.decode(data)["index"] for identifier, data in bus.taken if identifier == probes.identifier]
     assert numbers == list(range(0, 10_000, 10))
@@ -306,7 +307,7 @@ def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_ha
     bus = Stubborn()
     now = 0.0
     with rig(Fake(duration_s=None), paced=True, bus=bus) as setup:
-        setup.gateway._dropping = Rising("CAN: {} frames were dropped", clock=lambda: now)
+        setup.gateway.dropping = Rising("CAN: {} frames were dropped", clock=lambda: now)
         told = []
         setup.client.subscribe(wire.EVENTS, lambda _, payload: told.append(wire.decode_document(payload)))
         setup.start()
@@ -319,10 +320,10 @@ def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_ha
             assert warned() == []
             bus.refuse = True
             until(lambda: bool(warned()))
-            before = setup.gateway.counts.dropped
+            before = setup.gateway.dropped
             until(lambda: setup.service.status()["congestion"].get("can_dropped", 0) > before)  # noqa: B023
             bus.refuse = False
-            until(lambda: setup.gateway._waiting_frames == 0)
+            until(lambda: setup.gateway.outbox.waiting == 0)
             warned()
             now += 10.0
             until(lambda: not warned())
@@ -337,19 +338,19 @@ def test_a_run_without_the_clock_waits_for_the_bus() -> None:
         expected = 7500 + 5000 + 10
         until(lambda: len(bus.taken) >= expected)
         assert setup.gateway.figures()["can_dropped"] == 0
-        assert setup.gateway.counts.blocks_dropped == 0
+        assert setup.gateway.blocks_dropped == 0
 
 
-def test_a_hammer_blow_is_acknowledged_with_its_time() -> None:
+def test_a_hammer_pulse_is_acknowledged_with_its_time() -> None:
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
         reply = setup.tap.ask(*command_frame(Kind.HAMMER, 1, force_n=100.0, duration_ms=5.0))
         assert (reply["counter"], reply["result"]) == (1, Result.ACCEPTED)
         until(lambda: any(row["event"] == 3 for row in setup.tap.decoded("Event")))
-        blow = next(row for row in setup.tap.decoded("Event") if row["event"] == 3)
+        pulse = next(row for row in setup.tap.decoded("Event") if row["event"] == 3)
         # The fake carries it out at the start of the next block.
-        assert blow["time"] == reply["time"]
+        assert pulse["time"] == reply["time"]
         assert reply["time"] % BLOCK == 0
         until(lambda: any(row["counter"] == 1 for row in setup.tap.decoded("Heartbeat")))
 
@@ -377,11 +378,46 @@ def test_refusals_name_their_reason_and_are_counted() -> None:
         assert (reply["result"], reply["field"], reply["limit"]) == (Result.OUT_OF_RANGE, 1, 10_000)
         # Used up by the refusal.
         assert setup.tap.ask(*command_frame(Kind.HAMMER, 2, force_n=50.0))["result"] == Result.STALE_COUNTER
-        assert dict(setup.gateway.counts.refused) == {
+        assert dict(setup.gateway.commands.refused) == {
             "bad_checksum": 1, "bad_length": 1, "stale_counter": 2, "out_of_range": 1,
         }  # fmt: skip
-        assert setup.gateway.counts.accepted == 1
+        assert setup.gateway.commands.accepted == 1
         until(lambda: any(row["refused"] == 5 for row in setup.tap.decoded("Status")))
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "field", "limit"),
+    [
+        (Kind.HAMMER, {"force_n": 0.5, "duration_ms": 5.0}, Field.FORCE, 1.0),
+        (Kind.HAMMER, {"force_n": 1000.1, "duration_ms": 5.0}, Field.FORCE, 1000.0),
+        (Kind.HAMMER, {"force_n": 10.0, "duration_ms": 0.25}, Field.DURATION, 0.5),
+        (Kind.HAMMER, {"force_n": 10.0, "duration_ms": 60.0}, Field.DURATION, 50.0),
+        (Kind.SPEED, {"speed_hz": 5000.0}, Field.SPEED, 61.5),
+    ],
+)
+def test_a_refusal_says_which_limit_was_passed(kind: Kind, values: Any, field: Field, limit: float) -> None:
+    class Checked(Fake):
+        """Refuses as the rig's own simulation does."""
+
+        def parameters_document(self) -> dict[str, Any]:
+            return {"set": "fake", "title": "", "values": {"drive.top_speed": {"value": 61.5, "unit": "Hz"}}}
+
+        def submit(self, name: str, request: Any) -> int:
+            command = parse_command(name, request)
+            if isinstance(command, SpeedCommand) and command.speed_hz > 61.5:
+                raise InputError("speed.speed_hz", "at most the top speed", command.speed_hz)
+            return super().submit(name, request)
+
+    with rig(Checked(duration_s=None), paced=True) as setup:
+        setup.start()
+        reply = setup.tap.ask(*command_frame(kind, 1, **values))
+        assert (reply["result"], reply["field"], reply["limit"]) == (Result.OUT_OF_RANGE, field, round(10 * limit))
+
+
+def test_limits_of_commands_are_those_of_the_rig() -> None:
+    for name, (low, high) in LIMITS.items():
+        bounds = {type(bound).__name__: bound for bound in HammerCommand.model_fields[name].metadata}
+        assert (bounds["Ge"].ge, bounds["Le"].le) == (low, high)
 
 
 def test_other_frames_on_the_identifier_of_commands_are_ignored() -> None:
@@ -393,7 +429,7 @@ def test_other_frames_on_the_identifier_of_commands_are_ignored() -> None:
         setup.tap.bus.send(can.Message(arbitration_id=identifier, is_error_frame=True, data=data))
         setup.tap.send(0x011, data)
         assert setup.tap.ask(*command_frame(Kind.SPEED, 1, speed_hz=5.0))["result"] == Result.ACCEPTED
-        assert setup.gateway.counts.refused.total() == 0
+        assert setup.gateway.commands.refused.total() == 0
 
 
 def test_a_stop_ends_the_run() -> None:
@@ -403,7 +439,7 @@ def test_a_stop_ends_the_run() -> None:
         assert setup.tap.ask(*command_frame(Kind.STOP, 1))["result"] == Result.ACCEPTED
         setup.join()
         assert setup.summary["reason"] == "stopped"
-        until(lambda: setup.gateway._state == State.ENDED)
+        until(lambda: setup.gateway.state == State.ENDED)
 
 
 class Silent(MemoryClient):
@@ -434,7 +470,7 @@ def test_a_command_that_the_rig_does_not_answer_times_out_and_too_many_are_refus
             results = [(row["counter"], Result(row["result"])) for row in tap.decoded("Acknowledge")]
             assert results[0] == (17, Result.BUSY)
             assert sorted(results[1:]) == [(counter, Result.TIMED_OUT) for counter in range(1, 17)]
-            assert gateway.counts.refused == {"busy": 1, "timed_out": 16}
+            assert gateway.commands.refused == {"busy": 1, "timed_out": 16}
             client.go.set()
     finally:
         tap.close()
@@ -447,20 +483,21 @@ def test_threads_of_a_gateway_outlive_what_fails_in_them_and_a_command_is_asked_
     with rig(Fake(duration_s=None), paced=True) as setup:
         setup.start()
         until(lambda: bool(setup.tap.of("Probes")))
-        good, asked = setup.gateway._client.request, []
+        good, asked = setup.client.request, []
 
         def bad(key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
             asked.append((key, good(key, payload, timeout_s=timeout_s)))
             raise ZeroDivisionError("spoilt")
 
-        monkeypatch.setattr(setup.gateway._client, "request", bad)
+        monkeypatch.setattr(setup.client, "request", bad)
         assert setup.tap.ask(*command_frame(Kind.SPEED, 1, speed_hz=5.0))["result"] == Result.TIMED_OUT
         assert len(asked) == 1
-        for name in ("_unpack", "_take_message", "_send_due"):
-            monkeypatch.setattr(setup.gateway, name, lambda *_: 1 / 0)
-        monkeypatch.setattr(setup.gateway._bus, "recv", lambda _: {}[1])
-        before = setup.gateway._guard.failures
-        until(lambda: setup.gateway._guard.failures > before + 10)
+        gateway = setup.gateway
+        for owner, name in ((gateway, "unpack"), (gateway.commands, "take_message"), (gateway.outbox, "send_due")):
+            monkeypatch.setattr(owner, name, lambda *_: 1 / 0)
+        monkeypatch.setattr(setup.bus, "recv", lambda _: {}[1])
+        before = setup.gateway.guard.failures
+        until(lambda: setup.gateway.guard.failures > before + 10)
         assert any("the CAN gateway failed" in text for text in setup.service.status()["warnings"])
         monkeypatch.undo()
         count = len(setup.tap.of("Probes"))
@@ -474,10 +511,9 @@ def test_100_000_random_frames_are_no_command_and_few_are_answered() -> None:
         data = random.integers(0, 256, (100_000, 8), dtype=np.uint8).tobytes()
         start = time.monotonic()
         for number in range(100_000):
-            setup.gateway._on_command((0x010, 0x020)[number & 1], data[8 * number : 8 * number + 8])
-        counts = setup.gateway.counts
-        assert counts.accepted == 0
-        assert counts.refused.total() == 100_000
+            setup.gateway.commands.take((0x010, 0x020)[number & 1], data[8 * number : 8 * number + 8])
+        assert setup.gateway.commands.accepted == 0
+        assert setup.gateway.commands.refused.total() == 100_000
         answered = 20 + 50 * (time.monotonic() - start) + 1
         time.sleep(0.05)
         assert len(setup.tap.of("Acknowledge")) <= answered

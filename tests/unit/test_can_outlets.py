@@ -22,13 +22,14 @@ from can.bus import BusState  # noqa: TID253
 from can.interfaces.slcan import slcanBus  # noqa: TID253
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus  # noqa: TID253
 
-from drivers.can import medium, slcan_port, socketcand
-from drivers.can.bus import BusModel
-from drivers.can.hub import Hub
+from drivers.can.bus import codec, slcan, socketcand
+from drivers.can.bus.codec import CodecError
+from drivers.can.bus.hub import Hub
+from drivers.can.bus.model import BusModel
+from drivers.can.bus.outlet import Outlet
+from drivers.can.bus.slcan import Lines, SlcanPort
+from drivers.can.bus.socketcand import SocketcandServer, Splitter
 from drivers.can.interface import HubBus
-from drivers.can.outlet import Outlet
-from drivers.can.slcan_port import Lines, SlcanPort
-from drivers.can.socketcand import CommandError, SocketcandServer, Splitter
 from drivers.can.timing import speed
 from drivers.twins import Twins
 from rig.cli.can_outlets import CanOutlets
@@ -228,7 +229,7 @@ def test_the_words_of_the_protocol(bench: Bench) -> None:
     assert client.ask("< echo >") == "< echo >"
     assert client.ask("< open can0 >") == "< ok >"
     other.send(message(0x7))
-    until(lambda: server._clients[0]._traffic[1] == 1)
+    until(lambda: server.clients[0].traffic[1] == 1)
     assert client.ask("<echo>") == "< echo >"  # Frames come in raw mode, or when subscribed to.
     assert client.ask("< controlmode >< rawmode >") == "< ok >"
     assert client.next() == "< ok >"
@@ -335,12 +336,12 @@ def test_fd_frames_are_left_out_and_counted(bench: Bench) -> None:
 def test_error_frames_reach_the_client(hub_bench: Bench) -> None:
     other, server = hub_bench.bus(), hub_bench.serve()
     client = hub_bench.socketcand(server)
-    (outlet,) = server._clients
-    outlet._put(outlet._show(medium.message_of(medium.error_record(10**9, medium.BUS_OFF))) or b"")
+    (outlet,) = server.clients
+    outlet.put(outlet.show_frame(codec.message_of(codec.error_record(10**9, codec.BUS_OFF))) or b"")
     other.send(CLASSIC[0])
     first, second = read(client, 2)
     assert first.is_error_frame
-    assert first.arbitration_id == medium.BUS_OFF
+    assert first.arbitration_id == codec.BUS_OFF
     assert first.timestamp == 1.0
     assert same(second, CLASSIC[0])
 
@@ -461,7 +462,7 @@ def test_what_a_frame_is_in_text() -> None:
         digits = 8 if each.is_extended_id else 3
         words = [f"{each.arbitration_id:0{digits}X}", f"{len(each.data)}", *(f"{byte:x}" for byte in each.data)]
         assert same(socketcand.parse_frame(words), each)
-    with pytest.raises(CommandError):
+    with pytest.raises(CodecError):
         socketcand.parse_frame([])
     assert socketcand.show(FD[0]) is None
 
@@ -575,8 +576,8 @@ def test_listening_only_sends_nothing(bench: Bench) -> None:
     with Terminal(port) as terminal:
         assert [terminal.ask("L"), terminal.ask("t1230")] == [b"\r", b"\a"]
         if hasattr(bench, "hub"):
-            assert port._bus is not None
-            assert port._bus.state is BusState.PASSIVE
+            assert port.bus is not None
+            assert port.bus.state is BusState.PASSIVE
         other.send(CLASSIC[0])
         assert terminal.next() == b"t1233616263\r"
         assert other.recv(0.05) is None
@@ -587,12 +588,12 @@ def test_status_flags_tell_what_error_frames_say(bench: Bench) -> None:
     with Terminal(port) as terminal:
         terminal.ask("O")
         for record, flags in [
-            (medium.overflow(0), 0x09),
-            (medium.error_record(0, medium.CONTROLLER, data=bytes((0, 0x20, 0, 0, 0, 0, 0, 0))), 0x20),
-            (medium.error_record(0, medium.BUS_ERROR | medium.PROTOCOL), 0x80),
-            (medium.error_record(0, medium.BUS_OFF), 0xA0),
+            (codec.overflow(0), 0x09),
+            (codec.error_record(0, codec.CONTROLLER, data=bytes((0, 0x20, 0, 0, 0, 0, 0, 0))), 0x20),
+            (codec.error_record(0, codec.BUS_ERROR | codec.PROTOCOL), 0x80),
+            (codec.error_record(0, codec.BUS_OFF), 0xA0),
         ]:
-            assert port._show(medium.message_of(record)) is None
+            assert port.show_frame(codec.message_of(record)) is None
             assert terminal.ask("F") == b"F%02X\r" % flags
             assert terminal.ask("F") == b"F00\r"
 
@@ -663,9 +664,9 @@ def test_lines_come_in_any_portions() -> None:
 
 def test_lines_and_frames_are_each_others_inverse() -> None:
     for each in CLASSIC + REMOTE + FD:
-        line = slcan_port.show(each)
+        line = slcan.show(each)
         assert line is not None
-        assert same(slcan_port.parse(line.decode().rstrip("\r")), each)
+        assert same(slcan.parse(line.decode().rstrip("\r")), each)
 
 
 # What they share.
@@ -738,7 +739,7 @@ def test_messages_are_bounded_and_never_torn_however_little_is_taken_at_once() -
         thread.start()
         kept, seen, turn = [], b"", random.Random(3)
         for each in messages:
-            if outlet._put(each):
+            if outlet.put(each):
                 kept.append(each)
             if turn.random() < 0.3:
                 with contextlib.suppress(BlockingIOError):
@@ -763,7 +764,7 @@ def test_each_write_holds_whole_messages() -> None:
         outlet = Echo(ours.fileno(), name="echo")
         messages = [b"< frame %03X 1.000000 %s >" % (number, b"AB" * (number % 9)) for number in range(1000)]
         for each in messages:
-            assert outlet._put(each)
+            assert outlet.put(each)
         thread = threading.Thread(target=outlet.serve)
         thread.start()
         seen: list[bytes] = []

@@ -23,8 +23,7 @@ from drivers.can.schedule import Schedule
 from drivers.can.signals import default_messages
 from drivers.daq import Aligner, Daq
 from drivers.link import LinkTimeoutError
-from drivers.samples import Pile, Samples, StreamEndedError
-from drivers.samples import Sequence as RowSequence
+from drivers.samples import Pile, Samples, StreamEndedError, follow
 from drivers.sources.can import CanSource, Layout
 from drivers.sources.rig import RigSource
 from drivers.twins import Twins
@@ -33,6 +32,7 @@ from rig.channels import default_table
 from rig.errors import InputError
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient, ZenohServer
+from rig.wire import Continuity
 from tests.unit.instruments_fake import BLOCK, FakeRig, counts_of, values_of
 from tests.unit.test_transport_zenoh import free_endpoint
 
@@ -51,15 +51,15 @@ def part(index: int, rows: int, *, name: str = "a", columns: int = 1, rate_hz: f
 
 
 def test_rows_that_are_missing_late_or_twice_are_counted() -> None:
-    sequence = RowSequence()
-    kept = [sequence.follow(part(*each)) for each in [(100, 10), (110, 10), (115, 10), (105, 5), (135, 5), (125, 10)]]
+    rows = Continuity()
+    kept = [follow(rows, part(*each)) for each in [(100, 10), (110, 10), (115, 10), (105, 5), (135, 5), (125, 10)]]
     assert [(new.index, len(new), new.gap) if new else None for new in kept] == [
         (100, 10, 0), (110, 10, 0), (120, 5, 0), None, (135, 5, 10), None,
     ]  # fmt: skip
-    assert (sequence.lost, sequence.stale, sequence.runs) == (10, 5 + 5 + 10, 0)
-    again = sequence.follow(part(0, 10))
+    assert (rows.lost, rows.stale, rows.runs) == ({"": 10}, 5 + 5 + 10, {"": 0})
+    again = follow(rows, part(0, 10))
     assert again is not None
-    assert (again.gap, sequence.runs) == (0, 1)
+    assert (again.gap, rows.runs) == (0, {"": 1})
 
 
 def test_a_pile_gives_what_was_asked_for_and_never_over_a_gap() -> None:
@@ -354,9 +354,9 @@ def test_frames_give_back_the_counts_of_the_recording(layout: str, step: int) ->
         decoder = Layout({message.name: message})
         found = decoder.decode(message.name, sent[:20], 20_000, step, index + 3000)
         found += decoder.decode(message.name, sent[20:], 20_000, step, index + 3000)
-        sequence = RowSequence()
-        followed = [each for each in map(sequence.follow, found) if each is not None]
-        assert sequence.lost == 2 * form.rows
+        rows = Continuity()
+        followed = [each for each in (follow(rows, one) for one in found) if each is not None]
+        assert rows.lost == {"": 2 * form.rows}
         assert decoder.malformed == 1
         for samples in followed:
             first = samples.index - index // step

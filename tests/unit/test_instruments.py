@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from drivers.accelerometer.driver import Accelerometer, AsyncAccelerometer
-from drivers.can.bus import BusModel
-from drivers.can.hub import Hub
+from drivers.can.bus.hub import Hub
+from drivers.can.bus.model import BusModel
 from drivers.daq import Daq
 from drivers.drive.driver import AsyncDrive, Drive
 from drivers.force.driver import AsyncForce, Force
@@ -28,7 +28,7 @@ from drivers.instrument.aio import AsyncInstrument, AsyncSampler
 from drivers.instrument.driver import Instrument, Sampler
 from drivers.instrument.protocol import ProtocolError
 from drivers.instrument.twin import Twin
-from drivers.link import Address, Link, LinkClosedError, LinkError, LinkTimeoutError, frames, memory, open_link
+from drivers.link import Address, Link, LinkClosedError, LinkError, LinkTimeoutError, frames, open_link
 from drivers.link.port import MessagePort
 from drivers.link.serial import open_pty, open_serial
 from drivers.magnet.driver import AsyncMagnet, Magnet
@@ -40,6 +40,7 @@ from rig.channels import default_table
 from rig.errors import InputError, RefusedError
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.unit import link_memory as memory
 from tests.unit.instruments_fake import BLOCK, FakeRig, values_of
 from tests.unit.test_transport_zenoh import free_endpoint, until
 
@@ -255,14 +256,20 @@ def test_a_command_goes_through_while_data_stream(bench: Bench) -> None:
     np.testing.assert_allclose(hammer.read(10 * BLOCK).values, values_of("hammer", 0, 10 * BLOCK), rtol=0, atol=1e-9)
 
 
-def test_twins_and_daq_read_nothing_but_sensors_and_the_runs_events() -> None:
+def test_twins_and_daq_read_nothing_but_sensors_and_the_runs_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, good = set(), MemoryClient.subscribe
+
+    def subscribe(client: MemoryClient, key: str, *arguments: Any, **settings: Any) -> None:
+        read.add(key)
+        good(client, key, *arguments, **settings)
+
+    monkeypatch.setattr(MemoryClient, "subscribe", subscribe)
     for bench in _bench("memory"):
         for name in SAMPLERS:
             bench.open(name).start()
-        client = MemoryClient(bench.server)
-        with Daq(RigSource(client)):
-            read = {row.expression for row in bench.server._subscriptions}
-        assert read == {f"rig/sensors/{group_of(name)}" for name in SAMPLERS} | {"rig/events"}
+        with Daq(RigSource(MemoryClient(bench.server))):
+            pass
+    assert read == {f"rig/sensors/{group_of(name)}" for name in SAMPLERS} | {"rig/events"}
 
 
 def test_instruments_find_a_rig_that_is_started_again() -> None:
@@ -322,7 +329,7 @@ def answers(driver: Instrument) -> bool:
 def test_the_magnet_measures_nothing(bench: Bench) -> None:
     magnet = bench.open("magnet")
     with pytest.raises(RefusedError, match="measurements"):
-        magnet._ask(protocol.Start(), protocol.Started)
+        magnet.ask(protocol.Start(), protocol.Started)
 
 
 def test_time_outs_are_errors_and_lose_nothing(bench: Bench) -> None:
@@ -378,7 +385,7 @@ def test_an_instrument_can_be_opened_again(bench: Bench) -> None:
             assert hammer.read(BLOCK).index == (number - 1) * BLOCK
             if number == 2:
                 # As where its process is killed.
-                hammer._link.close()
+                hammer.link.close()
 
 
 def test_closing_a_driver_stops_its_stream_and_no_other(memory_bench: Bench) -> None:
@@ -386,11 +393,11 @@ def test_closing_a_driver_stops_its_stream_and_no_other(memory_bench: Bench) -> 
     twin = memory_bench.twin("force")
     driver.start()
     driver.close()
-    assert twin._running is None
+    assert not twin.running
     for stream, runs in ((7, True), (2, False)):
         twin.answer(twin.CODEC.encode(protocol.Start(), 1)) if stream == 7 else None
         twin.answer(twin.CODEC.encode(protocol.Stop(stream, 0), 1))
-        assert (twin._running is not None) is runs
+        assert twin.running is runs
 
 
 def test_the_other_kind_of_instrument_is_not_taken_for_the_right_one(memory_bench: Bench) -> None:
@@ -631,7 +638,7 @@ def test_a_frame_without_an_end_takes_no_memory() -> None:
     deframer = frames.Deframer(100)
     for _ in range(1000):
         assert deframer.feed(b"x" * 1000) == []
-    assert len(deframer._part) < 200
+    assert len(deframer) < 200
     assert deframer.feed(frames.frame(b"after"))[-1:] == [b"after"]
     assert deframer.spoilt == 1
 
@@ -675,7 +682,7 @@ def test_a_line_that_nobody_reads_holds_nobody_up() -> None:
 
 
 def samples(driver: Sampler, values: np.ndarray) -> Samples:
-    group = driver.sheet.group()
+    group = driver.datasheet.group()
     return Samples(0, 0, 1000.0, 1e6, group.names, tuple(row.unit for row in group.channels), values)
 
 

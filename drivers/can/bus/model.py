@@ -15,137 +15,30 @@ indicator, which is sent as the frame has it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.can import frame as frames
-from drivers.can import kernels
+from drivers.can.bus import frame as frames
+from drivers.can.bus import kernels
+from drivers.can.bus.results import OUTCOMES, RESULT, STATES, BusState, Delivery, Latency, NodeState
 from drivers.can.timing import Speed, speed
 from rig.errors import InputError
 
 if TYPE_CHECKING:
     import can
 
-STATES = ("error active", "error passive", "bus-off")
-OUTCOMES = kernels.OUTCOMES
-"""What happened to a frame, by the number in `RESULT`; the empty text: it was sent."""
-
-RESULT = np.dtype(
-    [
-        ("start_ns", "<i8"),
-        ("end_ns", "<i8"),
-        ("offered_ns", "<i8"),
-        ("outcome", "u1"),
-        ("final", "u1"),
-        ("attempt", "<u2"),
-        ("node", "<u4"),
-        ("frame", frames.RECORD),
-    ]
-)
-"""What happened on the bus, in an array. `end_ns` is the end of frame's last bit, after an error the delimiter's last;
-`outcome` an index of `OUTCOMES`; `final` 0 where the frame will be tried again; `frame` has the end as its time."""
-
+_COUNTERS = {
+    "tec": kernels.TEC,
+    "rec": kernels.REC,
+    "queued": kernels.COUNT,
+    **{name: getattr(kernels, name.upper()) for name in (
+        "deepest", "sent", "errors", "unacknowledged", "dropped", "refused", "given_up", "outbid", "bus_offs",
+    )},
+}  # fmt: skip
+"""Column of each of a node's counters."""
 _LATENCIES = 1 << 14
 _GROWTH = 1 << 10
-
-
-class Delivery(NamedTuple):
-    """What happened to a frame; the fields are those of `RESULT`.
-
-    Attributes:
-        frame: The frame.
-        node: Who offered it.
-        start_ns: Its first bit [ns].
-        end_ns: End of its last bit, before the intermission; after an error, end of the error delimiter [ns].
-        error: Empty where it was sent, else one of `OUTCOMES`.
-        offered_ns: When it was offered [ns].
-        attempt: Number of this attempt, from 1; 0 where it never came to one.
-        final: Whether the model is done with it; false where it will be sent again.
-    """
-
-    frame: frames.Frame
-    node: int
-    start_ns: int
-    end_ns: int
-    error: str
-    offered_ns: int
-    attempt: int
-    final: bool
-
-
-@dataclass(frozen=True, slots=True)
-class NodeState:
-    """A node's counters.
-
-    Attributes:
-        state: One of `STATES`.
-        tec: Transmit error counter.
-        rec: Receive error counter.
-        queued: Frames waiting.
-        deepest: Most frames that ever waited.
-        sent: Frames sent.
-        errors: Attempts that ended in an error.
-        unacknowledged: Those of them for want of an acknowledge.
-        dropped: Frames that found the queue full.
-        refused: Frames lost because the node was or went bus-off.
-        given_up: One-shot frames given up.
-        outbid: Arbitrations lost.
-        bus_offs: How often it went bus-off.
-    """
-
-    state: str
-    tec: int
-    rec: int
-    queued: int
-    deepest: int
-    sent: int
-    errors: int
-    unacknowledged: int
-    dropped: int
-    refused: int
-    given_up: int
-    outbid: int
-    bus_offs: int
-
-
-@dataclass(frozen=True, slots=True)
-class BusState:
-    """The bus as a whole, from the start to now. What is on the wire now counts when it ends.
-
-    Attributes:
-        now_ns: Time [ns].
-        load: Share of the time that it was taken, intermissions and errors with it.
-        window_load: The same in the last window that has ended.
-        peak_load: The highest of any window that has ended.
-        frames: Frames sent.
-        bits: Bits on the wire, intermissions with them.
-        errors: Transmissions that ended in an error.
-    """
-
-    now_ns: int
-    load: float
-    window_load: float
-    peak_load: float
-    frames: int
-    bits: int
-    errors: int
-
-
-@dataclass(frozen=True, slots=True)
-class Latency:
-    """Time from offer to end of frame, of all frames with one identifier.
-
-    Attributes:
-        count: Frames sent.
-        mean_s: Mean [s].
-        worst_s: Longest [s].
-    """
-
-    count: int
-    mean_s: float
-    worst_s: float
 
 
 def warm_up() -> None:
@@ -186,7 +79,7 @@ class BusModel:
             raise InputError("start_ns", "not negative and below 2 ** 61", start_ns)
         self.speed = speed(rate)
         self._names: list[str] = []
-        self._offers = bytearray()
+        self._offers: list[np.ndarray] = []
         cells = np.zeros(kernels.CELLS, np.int64)
         for cell in (kernels.NOW, kernels.FREE, kernels.WINDOW):
             cells[cell] = start_ns
@@ -256,11 +149,9 @@ class BusModel:
             width = max(queue, bus.queues.shape[1])
             queues = np.zeros((rows, width), np.int64)
             queues[: len(bus.queues), : bus.queues.shape[1]] = bus.queues
-            nodes = np.zeros((rows, kernels.NODE_COLUMNS), np.int64)
-            nodes[: len(bus.nodes)] = bus.nodes
-            senders = np.zeros(rows, np.int64)
-            senders[: len(bus.senders)] = bus.senders
-            self._bus = bus = bus._replace(queues=queues, nodes=nodes, senders=senders)
+            self._bus = bus = bus._replace(
+                queues=queues, nodes=_longer(bus.nodes, rows), senders=_longer(bus.senders, rows)
+            )
             # One step of the kernel ends at most one transmission, or empties each queue once.
             self._results = np.zeros((rows * (width + 2) + _GROWTH, kernels.RESULT_COLUMNS), np.int64)
         if node == len(self._names):
@@ -305,13 +196,16 @@ class BusModel:
             raise InputError("frame", f"classic on a bus of {self.speed}", frame)
         time_ns = self.now_ns if at_ns is None else max(at_ns, self._start_ns)
         record = frames.record_of(frame, node=node, time_ns=time_ns)
-        self.take(frames.pack(record._replace(flags=record.flags | frames.ONE_SHOT) if one_shot else record))
+        if one_shot:
+            record = record._replace(flags=record.flags | frames.ONE_SHOT)
+        self.take(frames.packed([record], frames.FD_WIDTH))
 
     def offer_records(self, offers: np.ndarray) -> None:
         """`offer` for many frames.
 
         Args:
-            offers: Array of `drivers.can.frame.RECORD`, best in the order of its times; `node` by whom, `time_ns` when.
+            offers: Array of `drivers.can.bus.frame.RECORD`, best in the order of its times; `node` by whom, `time_ns`
+                when.
         """
         if not self.speed.fd and (offers["flags"] & frames.FD).any():
             raise InputError("frame", f"classic on a bus of {self.speed}", "a CAN FD frame")
@@ -323,11 +217,12 @@ class BusModel:
         allowed = (self._bus.nodes[:, kernels.ATTACHED] != 0) & (self._bus.nodes[:, kernels.LISTENING] == 0)
         if not allowed[nodes].all():
             raise InputError("node", "attached and not listen only", int(nodes[~allowed[nodes]][0]))
-        self.take(offers.tobytes())
+        # The caller may write to its array again before the next step.
+        self.take(offers.copy())
 
-    def take(self, offers: bytes) -> None:
-        """`offer` for frames of which it is known that their node can send them: records as bytes."""
-        self._offers += offers
+    def take(self, offers: np.ndarray) -> None:
+        """`offer_records` for frames of which it is known that their node can send them; keeps the array."""
+        self._offers.append(offers.view(frames.RECORD))
 
     def advance(self, until_ns: int) -> list[Delivery]:
         """Let time pass.
@@ -342,20 +237,11 @@ class BusModel:
         results = self.advance_records(until_ns)
         if not len(results):
             return []
-        sent = frames.frames(results["frame"])
-        rows = zip(
-            results["node"].tolist(),
-            results["start_ns"].tolist(),
-            results["end_ns"].tolist(),
-            results["outcome"].tolist(),
-            results["offered_ns"].tolist(),
-            results["attempt"].tolist(),
-            results["final"].tolist(),
-            strict=True,
-        )
+        names = ("node", "start_ns", "end_ns", "outcome", "offered_ns", "attempt", "final")
+        rows = zip(frames.frames(results["frame"]), *(results[name].tolist() for name in names), strict=True)
         return [
             Delivery(frame, node, start, end, OUTCOMES[outcome], offered, attempt, final != 0)
-            for frame, (node, start, end, outcome, offered, attempt, final) in zip(sent, rows, strict=True)
+            for frame, node, start, end, outcome, offered, attempt, final in rows
         ]
 
     def advance_records(self, until_ns: int) -> np.ndarray:
@@ -412,21 +298,8 @@ class BusModel:
     def node(self, node: int) -> NodeState:
         """A node's counters, also when it has gone."""
         row = self._row(node, gone=True)
-        return NodeState(
-            state=STATES[row[kernels.STATE]],
-            tec=int(row[kernels.TEC]),
-            rec=int(row[kernels.REC]),
-            queued=int(row[kernels.COUNT]),
-            deepest=int(row[kernels.DEEPEST]),
-            sent=int(row[kernels.SENT]),
-            errors=int(row[kernels.ERRORS]),
-            unacknowledged=int(row[kernels.UNACKNOWLEDGED]),
-            dropped=int(row[kernels.DROPPED]),
-            refused=int(row[kernels.REFUSED]),
-            given_up=int(row[kernels.GIVEN_UP]),
-            outbid=int(row[kernels.OUTBID]),
-            bus_offs=int(row[kernels.BUS_OFFS]),
-        )
+        counters = {name: int(row[column]) for name, column in _COUNTERS.items()}
+        return NodeState(state=STATES[row[kernels.STATE]], **counters)
 
     def state(self) -> BusState:
         """The bus as a whole."""
@@ -476,8 +349,8 @@ class BusModel:
         """Move what was offered since the last step into slots."""
         if not self._offers:
             return
-        batch = np.frombuffer(self._offers, frames.RECORD)
-        self._offers = bytearray()
+        batch = np.concatenate(self._offers)
+        self._offers.clear()
         cells = self._bus.cells
         missing = len(batch) - int(cells[kernels.FREE_SLOTS])
         if missing > 0:
@@ -488,18 +361,13 @@ class BusModel:
         bus = self._bus
         before = len(bus.slots)
         after = max(2 * before, before + missing, _GROWTH)
-        free = int(bus.cells[kernels.FREE_SLOTS])
-        slots = np.zeros((after, kernels.SLOT_COLUMNS), np.int64)
-        slots[:before] = bus.slots
-        store = np.zeros(after, frames.RECORD)
-        store[:before] = bus.store
-        arrivals = np.zeros(after, np.int64)
-        arrivals[:before] = bus.arrivals
-        unused = np.zeros(after, np.int64)
-        unused[:free] = bus.unused[:free]
-        unused[free : free + after - before] = np.arange(before, after)
-        bus.cells[kernels.FREE_SLOTS] = free + after - before
-        self._bus = bus._replace(slots=slots, store=store, arrivals=arrivals, unused=unused)
+        self._bus = bus._replace(
+            slots=_longer(bus.slots, after),
+            store=_longer(bus.store, after),
+            arrivals=_longer(bus.arrivals, after),
+            unused=_longer(bus.unused, after),
+        )
+        self._free(np.arange(before, after))
 
     def _collect(self, rows: np.ndarray) -> np.ndarray:
         slots = rows[:, kernels.R_SLOT]
@@ -521,3 +389,10 @@ class BusModel:
         free = int(cells[kernels.FREE_SLOTS])
         self._bus.unused[free : free + len(slots)] = slots
         cells[kernels.FREE_SLOTS] = free + len(slots)
+
+
+def _longer(array: np.ndarray, rows: int) -> np.ndarray:
+    """The same rows and more, which are zero."""
+    found = np.zeros((rows, *array.shape[1:]), array.dtype)
+    found[: len(array)] = array
+    return found

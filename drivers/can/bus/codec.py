@@ -1,4 +1,4 @@
-"""Sans-IO codec of the virtual CAN medium: frames to packed records and back, and the keys they travel under.
+"""Sans-IO codec of the virtual CAN bus: frames to packed records and back, and the keys they travel under.
 
 A message is a header and records of one width. Endpoints offer messages of frames to the hub of their channel; the
 hub sends all endpoints messages of frames, in the order of the bus and with its time stamps, and of node reports. The
@@ -10,27 +10,24 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from drivers.can.frame import (
+from drivers.can.bus.frame import (
     BRS,
-    CLASSIC_WIDTH,
     ERROR,
     ESI,
     EXTENDED,
     EXTENDED_MASK,
     FD,
-    FD_WIDTH,
-    PACKINGS,
     RECORDS,
     REMOTE,
     Record,
     fault_of,
-    pack,
+    packed,
 )
 from rig.outside import Count, Outside
 
@@ -116,8 +113,8 @@ class Joined(Outside):
     epoch_ns: Count
 
 
-class MediumError(ValueError):
-    """A payload is not a message of this medium."""
+class CodecError(ValueError):
+    """A payload is not a message of this bus, or a frame none that a controller can send."""
 
 
 class Report(NamedTuple):
@@ -138,6 +135,10 @@ class Report(NamedTuple):
     receive_errors: int
     done: int
     dropped: int
+
+
+Said = np.ndarray | list[Report]
+"""What the hub says: frames, as an array of one of the `RECORDS` layouts, or how nodes are."""
 
 
 def offer_key(channel: str, endpoint: str) -> str:
@@ -187,19 +188,7 @@ def overflow(time_ns: int) -> Record:
     return error_record(time_ns, CONTROLLER, data=bytes((0, RECEIVE_OVERFLOW, 0, 0, 0, 0, 0, 0)))
 
 
-def encode(records: Iterable[Record]) -> bytes:
-    """One message of at most MAX_RECORDS frames, as narrow as they allow."""
-    return encode_array(_packed(records))
-
-
-def _packed(records: Iterable[Record]) -> np.ndarray:
-    """Frames as an array, as narrow as they allow."""
-    rows = list(records)
-    width = FD_WIDTH if any(len(row.data) > CLASSIC_WIDTH for row in rows) else CLASSIC_WIDTH
-    return np.frombuffer(b"".join([pack(row, width) for row in rows]), RECORDS[width])
-
-
-def encode_array(records: np.ndarray) -> bytes:
+def encode(records: np.ndarray) -> bytes:
     """One message of at most MAX_RECORDS frames that are an array of one of the `RECORDS` layouts."""
     width = records.dtype["data"].itemsize
     return _HEADER.pack(_MAGIC, FRAMES, width, len(records)) + records.tobytes()
@@ -211,57 +200,24 @@ def encode_reports(reports: Iterable[Report]) -> bytes:
     return _HEADER.pack(_MAGIC, REPORTS, _REPORT.size, len(rows)) + b"".join(rows)
 
 
-def kind_of(payload: bytes) -> int:
-    """Whether a message has FRAMES or REPORTS; its length is checked too.
+def decode(payload: bytes) -> Said:
+    """What is in a message: frames as a read-only array of one of the `RECORDS` layouts, shape (frames,), or reports.
 
     Raises:
-        MediumError: It is no message of this medium.
+        CodecError: It is no message of this bus.
     """
     if len(payload) < _HEADER.size:
-        raise MediumError(f"{len(payload)} bytes, fewer than a header has")
+        raise CodecError(f"{len(payload)} bytes, fewer than a header has")
     magic, kind, width, count = _HEADER.unpack_from(payload)
     if magic != _MAGIC or kind not in (FRAMES, REPORTS):
-        raise MediumError("no header of this medium")
-    size = _REPORT.size if kind == REPORTS else PACKINGS[width].size if width in PACKINGS else 0
+        raise CodecError("no header of this bus")
+    size = _REPORT.size if kind == REPORTS else RECORDS[width].itemsize if width in RECORDS else 0
     if not size or (kind == REPORTS and width != size):
-        raise MediumError(f"records of unknown width {width}")
+        raise CodecError(f"records of unknown width {width}")
     if count > MAX_RECORDS or len(payload) != _HEADER.size + count * size:
-        raise MediumError(f"{len(payload)} bytes for {count} records of {size} bytes")
-    return kind
-
-
-def decode(payload: bytes) -> Iterator[Record]:
-    """The frames of a message, in order.
-
-    Raises:
-        MediumError: It is no message of frames.
-    """
-    if kind_of(payload) != FRAMES:
-        raise MediumError("reports where frames were expected")
-    layout = PACKINGS[payload[5]]
-    for time_ns, word, length, flags, node, data in layout.iter_unpack(memoryview(payload)[_HEADER.size :]):
-        yield Record(time_ns, word, length, flags, node, b"" if word & REMOTE else data[:length])
-
-
-def decode_array(payload: bytes) -> np.ndarray:
-    """The frames of a message as a read-only array of one of the `RECORDS` layouts, shape (frames,).
-
-    Raises:
-        MediumError: It is no message of frames.
-    """
-    if kind_of(payload) != FRAMES:
-        raise MediumError("reports where frames were expected")
-    return np.frombuffer(payload, RECORDS[payload[5]], offset=_HEADER.size)
-
-
-def decode_reports(payload: bytes) -> list[Report]:
-    """The node reports of a message.
-
-    Raises:
-        MediumError: It is no message of reports.
-    """
-    if kind_of(payload) != REPORTS:
-        raise MediumError("frames where reports were expected")
+        raise CodecError(f"{len(payload)} bytes for {count} records of {size} bytes")
+    if kind == FRAMES:
+        return np.frombuffer(payload, RECORDS[width], offset=_HEADER.size)
     rows = _REPORT.iter_unpack(memoryview(payload)[_HEADER.size :])
     return [Report(node, state, *counts) for node, state, _, *counts in rows]
 
@@ -270,11 +226,11 @@ def record_of(message: can.Message) -> Record:
     """A python-can message as an offered frame.
 
     Raises:
-        MediumError: Its identifier has more than 29 bits.
+        CodecError: Its identifier has more than 29 bits.
     """
     word = message.arbitration_id
     if not 0 <= word <= EXTENDED_MASK:
-        raise MediumError(f"identifier {word:#x} does not have 29 bits")
+        raise CodecError(f"identifier {word:#x} does not have 29 bits")
     if message.is_extended_id:
         word |= EXTENDED
     flags = 0
@@ -296,17 +252,17 @@ def offered(message: can.Message, *, fd: bool = True) -> Record:
         fd: Whether the bus takes CAN FD frames.
 
     Raises:
-        MediumError: None can; it says why.
+        CodecError: None can; it says why.
     """
     record = record_of(message)
     if (fault := fault_of(record, fd=fd)) is not None:
-        raise MediumError(fault)
+        raise CodecError(fault)
     return record
 
 
 def records_of(messages: Iterable[can.Message]) -> np.ndarray:
     """Python-can messages as an array of offered frames, shape (messages,)."""
-    return _packed(record_of(message) for message in messages)
+    return packed(map(record_of, messages))
 
 
 def messages_of(records: np.ndarray, *, channel: Any = None, node: int = NO_NODE) -> list[can.Message]:

@@ -50,8 +50,9 @@ OCTETS = {width: _layout(("u1", (width,))) for width in WIDTHS}
 """The same with single bytes of data."""
 RECORD = OCTETS[FD_WIDTH]
 """The layout that the bus model and compiled code take."""
-PACKINGS = {width: struct.Struct(f"<QIBBH{width}s") for width in WIDTHS}
 
+_FEW = 8
+"""Frames that are judged one by one; arrays would cost more than they save."""
 _IS_NO_FD_LENGTH = np.isin(np.arange(256), FD_LENGTHS, invert=True)
 
 
@@ -110,10 +111,11 @@ def sendable(records: np.ndarray, *, fd: bool = True) -> np.ndarray:
         records: Array of one of the `RECORDS` layouts.
         fd: Whether the bus takes CAN FD frames.
     """
+    if len(records) <= _FEW:
+        return np.array([fault_of(Record(*row), fd=fd) is None for row in records.tolist()], bool)
+    room = records.dtype["data"].itemsize
     wrong = np.zeros(len(records), bool)
-    for found, _ in _faults(
-        records["identifier"], records["length"], records["flags"], records.dtype["data"].itemsize, fd=fd
-    ):
+    for found, _ in _faults(records["identifier"], records["length"], records["flags"], room, fd=fd):
         wrong |= found
     return ~wrong
 
@@ -194,43 +196,47 @@ def record_of(frame: Frame, *, node: int = 0, time_ns: int = 0) -> Record:
     return record._replace(data=b"") if frame.remote else record
 
 
-def pack(record: Record, width: int = FD_WIDTH) -> bytes:
-    """A record as bytes."""
-    return PACKINGS[width].pack(*record)
+def packed(rows: Iterable[Record], width: int | None = None) -> np.ndarray:
+    """Records as an array of the layout of that width, or of the narrowest that has room for all, shape (frames,)."""
+    rows = list(rows)
+    if width is None:
+        width = FD_WIDTH if any(len(row.data) > CLASSIC_WIDTH for row in rows) else CLASSIC_WIDTH
+    pack = struct.Struct(f"<QIBBH{width}s").pack
+    return np.frombuffer(bytearray(b"".join([pack(*row) for row in rows])), RECORDS[width])
 
 
 def records(frames: Iterable[Frame]) -> np.ndarray:
     """Frames as an array of `RECORD`, shape (frames,)."""
-    return np.frombuffer(bytearray(b"".join([pack(record_of(frame)) for frame in frames])), RECORD)
+    return packed(map(record_of, frames), FD_WIDTH).view(RECORD)
 
 
 def frames(array: np.ndarray) -> list[Frame]:
     """The frames of an array of `RECORD`."""
-    return [_unpack(*fields) for fields in PACKINGS[FD_WIDTH].iter_unpack(np.ascontiguousarray(array).tobytes())]
+    return [_frame(Record(*fields)) for fields in np.ascontiguousarray(array).view(RECORDS[FD_WIDTH]).tolist()]
 
 
-def _unpack(_: int, word: int, length: int, flags: int, __: int, data: bytes) -> Frame:
-    extended = word & EXTENDED != 0
+def _frame(record: Record) -> Frame:
+    extended = record.identifier & EXTENDED != 0
     return Frame(
-        word & (EXTENDED_MASK if extended else STANDARD_MASK),
-        data[:length],
+        record.identifier & (EXTENDED_MASK if extended else STANDARD_MASK),
+        record.data[: record.length],
         extended,
-        word & REMOTE != 0,
-        flags & FD != 0,
-        flags & BRS != 0,
-        flags & ESI != 0,
+        record.identifier & REMOTE != 0,
+        record.flags & FD != 0,
+        record.flags & BRS != 0,
+        record.flags & ESI != 0,
     )
 
 
 def check_records(array: np.ndarray, *, fd: bool = True) -> np.ndarray:
     """The same array, if a controller can send all its frames; else an InputError that names the first bad one."""
     if array.dtype.itemsize != RECORD.itemsize or array.dtype.names != RECORD.names:
-        raise InputError("frames", "an array of drivers.can.frame.RECORD", array.dtype)
-    array = np.ascontiguousarray(array).view(RECORD)
+        raise InputError("frames", "an array of drivers.can.bus.frame.RECORD", array.dtype)
+    array = np.ascontiguousarray(array).view(RECORDS[FD_WIDTH])
     if not (good := sendable(array, fd=fd)).all():
-        (bad,) = PACKINGS[FD_WIDTH].iter_unpack(array[~good][:1].tobytes())
+        (bad,) = array[~good][:1].tolist()
         raise InputError("frames", "frames that a controller can send", fault_of(Record(*bad), fd=fd))
-    return array
+    return array.view(RECORD)
 
 
 def octets(array: np.ndarray) -> np.ndarray:
@@ -250,22 +256,12 @@ def resized(array: np.ndarray, width: int = FD_WIDTH) -> np.ndarray:
 
 def encode(frame: Frame) -> Encoded:
     """All bits of a frame on the bus."""
-    from drivers.can import kernels
+    from drivers.can.bus import kernels
 
-    record = records([frame])[0]
-    bits = np.zeros(kernels.LONGEST, np.uint8)
-    kinds = np.zeros(kernels.LONGEST, np.uint8)
-    count, crc = kernels.encode(
-        int(record["identifier"]), int(record["length"]), int(record["flags"]), record["data"], bits, kinds
-    )
-    kinds = kinds[:count]
-    return Encoded(
-        bits[:count],
-        kinds & kernels.FAST != 0,
-        kinds & kernels.STUFF != 0,
-        kinds & kernels.FIXED != 0,
-        int(crc),
-    )
+    work = np.zeros((3, kernels.LONGEST), np.uint8)
+    count, crc = kernels.encode(records([frame])[0], work)
+    bits, kinds = work[:2, :count]
+    return Encoded(bits, kinds & kernels.FAST != 0, kinds & kernels.STUFF != 0, kinds & kernels.FIXED != 0, int(crc))
 
 
 def frame_bits(frame: Frame) -> tuple[int, int]:
@@ -276,7 +272,7 @@ def frame_bits(frame: Frame) -> tuple[int, int]:
 
 def bits_of(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """`frame_bits` for an array of `RECORD`: nominal bits and fast bits, int64, shape (frames,)."""
-    from drivers.can import kernels
+    from drivers.can.bus import kernels
 
     array = check_records(array)
     nominal = np.zeros(len(array), np.int64)

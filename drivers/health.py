@@ -1,4 +1,4 @@
-"""What goes wrong on threads that must not end, and what is lost, told while it happens."""
+"""What goes wrong on threads that must not end, and what is lost, as warnings while it happens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an instrument says about itself: a TEDS-like sheet (after IEEE 1451.4: identification, then calibration)."""
+"""What an instrument says about itself: a TEDS-like datasheet (after IEEE 1451.4: identification, then calibration)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rig.channels import Channel, Group
 from rig.errors import InputError
 
 
-class Sheet(BaseModel):
+class Datasheet(BaseModel):
     """Identification, and for each channel its complete calibration."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -40,13 +40,13 @@ class Sheet(BaseModel):
         return Group(name=self.model, title=self.title, rate_hz=self.rate_hz or 1, channels=chosen)
 
 
-def parse_sheet(text: str) -> Sheet:
-    """The sheet in a JSON text.
+def parse_datasheet(text: str) -> Datasheet:
+    """The datasheet in a JSON text.
 
     Raises:
         InputError: It is none.
     """
     try:
-        return Sheet.model_validate_json(text)
+        return Datasheet.model_validate_json(text)
     except ValidationError:
-        raise InputError("sheet", "an instrument's sheet", text[:60]) from None
+        raise InputError("datasheet", "an instrument's datasheet", text[:60]) from None

@@ -1,4 +1,4 @@
-"""A link inside one process, for tests: two ends, each with a bounded queue."""
+"""A link inside one process: two ends, each with a bounded queue."""
 
 from __future__ import annotations
 

@@ -11,7 +11,8 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from drivers.can.health import Guard, Rising
+from drivers.can.bus import codec
+from drivers.health import Guard, Rising
 
 if TYPE_CHECKING:
     import can
@@ -31,6 +32,26 @@ _WRITTEN = 1024
 """Bytes that are written together: a client that reads as many at a time meets whole messages while it keeps up."""
 _POLL_S = 0.1
 _PARTING_S = 1.0
+
+
+def message_of(identifier: int, data: bytes, *, length: int, extended: bool, remote: bool, **kind: bool) -> can.Message:
+    """A frame that a client has written.
+
+    Raises:
+        CodecError: No controller can send it; it says why.
+    """
+    import can
+
+    message = can.Message(
+        arbitration_id=identifier,
+        is_extended_id=extended,
+        is_remote_frame=remote,
+        dlc=length,
+        data=None if remote else data,
+        **kind,
+    )
+    codec.offered(message)
+    return message
 
 
 class Outlet:
@@ -55,7 +76,7 @@ class Outlet:
         self._messages: deque[bytes] = deque()
         self._rest = b""
         """What is being written."""
-        self._bus: can.BusABC | None = None
+        self.bus: can.BusABC | None = None
         self._hearing: threading.Thread | None = None
         self._ending = False
         self._stalled = False
@@ -70,7 +91,7 @@ class Outlet:
         """What the client has written."""
         raise NotImplementedError
 
-    def _show(self, message: can.Message) -> bytes | None:
+    def show_frame(self, message: can.Message) -> bytes | None:
         """Text of a frame, or None where the client is not to have it."""
         raise NotImplementedError
 
@@ -140,11 +161,11 @@ class Outlet:
         """Put what each costs its client a question; waits for room."""
         with self._changed:
             self._changed.wait_for(lambda: len(self._messages) < self._room or self._ending)
-            self._put(text)
+            self.put(text)
 
     # To the client.
 
-    def _put(self, text: bytes) -> bool:
+    def put(self, text: bytes) -> bool:
         """Add a message that must not be torn; False where there is no room."""
         with self._changed:
             if len(self._messages) >= self._room:
@@ -189,32 +210,32 @@ class Outlet:
 
     def _enter(self, bus: can.BusABC) -> None:
         """Hear a bus from now on, which is left and shut down with the client."""
-        self._bus = bus
+        self.bus = bus
         self._hearing = threading.Thread(target=self._hear_all, args=(bus,), name=f"{self._name} hears", daemon=True)
         self._hearing.start()
 
     def _leave(self) -> None:
-        hearing, self._bus, self._hearing = self._hearing, None, None
+        hearing, self.bus, self._hearing = self._hearing, None, None
         if hearing is not None:
             hearing.join(timeout=5.0)
 
     def _send(self, message: can.Message) -> None:
         """Send a frame; waits a little for room. Raises CanError where the bus does not take it."""
-        assert self._bus is not None
-        self._bus.send(message, timeout=_SEND_S)
+        assert self.bus is not None
+        self.bus.send(message, timeout=_SEND_S)
 
     def _hear_all(self, bus: can.BusABC) -> None:
         import can
 
         crowded = False
         try:
-            while self._bus is bus:
+            while self.bus is bus:
                 message = bus.recv(_POLL_S / 2)
                 self._guard(self._tick)
-                text = None if message is None else self._guard(self._show, message)
+                text = None if message is None else self._guard(self.show_frame, message)
                 if text is None:
                     continue
-                crowded = not self._put(self._overflow() + text if crowded else text)
+                crowded = not self.put(self._overflow() + text if crowded else text)
                 self.counts["dropped"] += crowded
         except Exception as error:
             if not isinstance(error, (can.CanError, OSError, ValueError)):

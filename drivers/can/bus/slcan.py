@@ -25,9 +25,10 @@ import tty
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from drivers.can import medium
-from drivers.can.frame import FD_LENGTHS
-from drivers.can.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
+from drivers.can.bus import codec
+from drivers.can.bus.codec import CodecError
+from drivers.can.bus.frame import FD_LENGTHS
+from drivers.can.bus.outlet import PATIENCE_S, ROOM, OpenBus, Outlet, message_of
 from drivers.can.timing import Speed
 
 if TYPE_CHECKING:
@@ -54,10 +55,6 @@ _LONGEST = 160
 """Characters that a line may have: the longest FD frame has 138."""
 _FRAME = re.compile(r"(?:[tdbr]([0-9A-Fa-f]{3})|[TDBR]([0-9A-Fa-f]{8}))([0-9A-Fa-f])((?:[0-9A-Fa-f]{2})*)")
 _MINUTE_MS = 60_000
-
-
-class FrameError(ValueError):
-    """A line that is no frame."""
 
 
 class Lines:
@@ -88,34 +85,21 @@ def parse(line: str) -> can.Message:
     """The frame of a line.
 
     Raises:
-        FrameError: It is none.
+        CodecError: It is none.
     """
-    import can
-
     match = _FRAME.fullmatch(line)
     if match is None:
-        raise FrameError("no frame")
+        raise CodecError("no frame")
     kind, extended = line[0].lower(), line[0].isupper()
     identifier = int(match[1] or match[2], 16)
     code, data = int(match[3], 16), bytes.fromhex(match[4])
     fd, remote = kind in "db", kind == "r"
     length = FD_LENGTHS[code]
     if len(data) != (0 if remote else length):
-        raise FrameError("not as long as it says")
-    message = can.Message(
-        arbitration_id=identifier,
-        is_extended_id=extended,
-        is_remote_frame=remote,
-        is_fd=fd,
-        bitrate_switch=kind == "b",
-        dlc=length,
-        data=None if remote else data,
+        raise CodecError("not as long as it says")
+    return message_of(
+        identifier, data, length=length, extended=extended, remote=remote, is_fd=fd, bitrate_switch=kind == "b"
     )
-    try:
-        medium.offered(message)
-    except medium.MediumError as error:
-        raise FrameError(str(error)) from None
-    return message
 
 
 def show(message: can.Message, *, stamped: bool = False) -> bytes | None:
@@ -186,7 +170,7 @@ class SlcanPort(Outlet):
     def figures(self) -> dict[str, int]:
         """What has happened: `open` channels, `dropped` frames, `bells`, frames `refused` by the bus, `given_up`."""
         names = ("dropped", "bells", "refused", "given_up")
-        return {"open": int(self._bus is not None), **{name: self.counts[name] for name in names}}
+        return {"open": int(self.bus is not None), **{name: self.counts[name] for name in names}}
 
     # From the program.
 
@@ -206,7 +190,7 @@ class SlcanPort(Outlet):
         command, rest = line[:1], line[1:]
         if command and command in "tTrRdDbB":
             return self._transmit(line)
-        is_open = self._bus is not None
+        is_open = self.bus is not None
         match command:
             case "":
                 return OK
@@ -254,14 +238,14 @@ class SlcanPort(Outlet):
     def _transmit(self, line: str) -> bytes | None:
         import can
 
-        if self._bus is None or self._listen_only:
+        if self.bus is None or self._listen_only:
             return None
         try:
             message = parse(line)
             if message.is_fd and self._speed is not None and not self._speed.fd:
                 return None
             self._send(message)
-        except FrameError:
+        except CodecError:
             return None
         except can.CanError:
             self.counts["refused"] += 1
@@ -299,7 +283,8 @@ class SlcanPort(Outlet):
 
     # To the program, on the thread that hears the bus.
 
-    def _show(self, message: can.Message) -> bytes | None:
+    def show_frame(self, message: can.Message) -> bytes | None:
+        """Text of a frame, or None where the client is not to have it."""
         if message.is_error_frame:
             self._flags |= flags_of(message)
         return show(message, stamped=self._stamped)
@@ -322,12 +307,12 @@ def flags_of(message: can.Message) -> int:
     """The status flags that an error frame sets; its classes are those of SocketCAN."""
     kind, data = message.arbitration_id, bytes(message.data).ljust(8, b"\0")
     flags = 0
-    if kind & medium.CONTROLLER:
+    if kind & codec.CONTROLLER:
         flags |= RECEIVE_FULL | OVERRUN if data[1] & 0x01 else 0
         flags |= TRANSMIT_FULL if data[1] & 0x02 else 0
         flags |= ERROR_WARNING if data[1] & 0x0C else 0
         flags |= ERROR_PASSIVE if data[1] & 0x30 else 0
     flags |= ARBITRATION_LOST if kind & 0x002 else 0
-    flags |= BUS_ERROR if kind & (medium.PROTOCOL | medium.BUS_ERROR | medium.NO_ACKNOWLEDGE) else 0
-    flags |= ERROR_PASSIVE | BUS_ERROR if kind & medium.BUS_OFF else 0
+    flags |= BUS_ERROR if kind & (codec.PROTOCOL | codec.BUS_ERROR | codec.NO_ACKNOWLEDGE) else 0
+    flags |= ERROR_PASSIVE | BUS_ERROR if kind & codec.BUS_OFF else 0
     return flags

@@ -1,11 +1,9 @@
-"""Compiled part of the bus: bits of frames, arbitration, queues, faults and error counters.
+"""Compiled part of the bus, in one file though it is long: numba's cache looks only at the file of what it loads.
 
-All compiled code of the package is in this one file: numba's cache looks only at the file of the function it loads, so
-that a kernel calling another file's kernel could be served stale. What is imported from `drivers.can.frame` are numbers
-of the standard, which do not change.
-
-Bits of frames follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and extended format). Levels: 0 dominant,
-1 recessive. Time is an integer [ns]; bit times are integers [ps].
+A kernel that calls another file's kernel could be served stale. In order: bits of frames, arbitration, queues, faults,
+error counters. What is imported from `drivers.can.bus.frame` are numbers of the standard, which do not change. Bits
+follow ISO 11898-1:2015, 10.4 and 10.5 (classic and FD, base and extended format). Levels: 0 dominant, 1 recessive. Time
+is an integer [ns]; bit times are integers [ps].
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from drivers.can.frame import BRS, ESI, EXTENDED, FD, FD_LENGTHS, FD_WIDTH, INTERMISSION, ONE_SHOT, REMOTE
+from drivers.can.bus.frame import BRS, ESI, EXTENDED, FD, FD_LENGTHS, FD_WIDTH, INTERMISSION, ONE_SHOT, REMOTE
 
 # Kinds of an encoded bit, added up.
 FAST = 1
@@ -81,7 +79,7 @@ class Bus(NamedTuple):
         nodes: One row a node, shape (nodes, NODE_COLUMNS).
         queues: Slots in each node's queue, in no order, shape (nodes, capacity).
         slots: One row a frame that is queued or will be, shape (slots, SLOT_COLUMNS).
-        store: The frames of the slots, records of `drivers.can.frame.RECORD`, shape (slots,).
+        store: The frames of the slots, records of `drivers.can.bus.frame.RECORD`, shape (slots,).
         arrivals: Slots that are not queued yet, by time, shape (slots,).
         unused: Stack of free slots, shape (slots,).
         senders: Slots on the wire now; more than one only where nodes send the same identifier, shape (nodes,).
@@ -101,31 +99,18 @@ class Bus(NamedTuple):
     random: np.ndarray
 
 
-def _stuffing_of_bytes() -> tuple[np.ndarray, np.ndarray]:
-    """Run after a byte and stuff bits in it, by run before (level times 5, plus length) and value, shape (10, 256)."""
-    after = np.zeros((10, 256), np.uint8)
-    added = np.zeros((10, 256), np.uint8)
-    value = np.arange(256)
-    for state in range(10):
-        last = np.full(256, state // 5)
-        run = np.full(256, state % 5)
-        for k in range(7, -1, -1):
-            bit = (value >> k) & 1
-            run = np.where(bit == last, run + 1, 1)
-            full = run == 5
-            last = np.where(full, 1 - bit, bit)
-            run = np.where(full, 1, run)
-            added[state] += full.astype(np.uint8)
-        after[state] = last * 5 + run
-    return after, added
-
-
-_AFTER, _ADDED = _stuffing_of_bytes()
-
-
 _CODES = np.zeros(FD_WIDTH + 1, np.int64)
 _CODES[list(FD_LENGTHS)] = range(len(FD_LENGTHS))
 """Data length code by number of bytes."""
+
+
+@njit(cache=True, error_model="numpy")
+def _write(raw, n, value, width):
+    """Append a number to bits, its highest first; returns how many there are then."""
+    for k in range(width - 1, -1, -1):
+        raw[n] = (value >> k) & 1
+        n += 1
+    return n
 
 
 @njit(cache=True, error_model="numpy")
@@ -135,241 +120,161 @@ def header_and_data(identifier, length, flags, data, raw):
     Returns:
         Their number, and the index of the first bit that is sent at the data rate (LONGEST where none is).
     """
-    n = 1
-    raw[0] = 0
-    extended = (identifier & EXTENDED) != 0
-    remote = 1 if (identifier & REMOTE) != 0 else 0
     fd = (flags & FD) != 0
+    extended = (identifier & EXTENDED) != 0
+    remote = 1 if (identifier & REMOTE) != 0 and not fd else 0
+    raw[0] = 0
     if extended:
-        for k in range(28, 17, -1):
-            raw[n] = (identifier >> k) & 1
-            n += 1
-        raw[n] = 1  # SRR
-        raw[n + 1] = 1  # IDE
-        n += 2
-        for k in range(17, -1, -1):
-            raw[n] = (identifier >> k) & 1
-            n += 1
-        raw[n] = 0 if fd else remote  # RRS or RTR
-        n += 1
+        n = _write(raw, 1, identifier >> 18, 11)
+        n = _write(raw, n, 3, 2)  # SRR, IDE
+        n = _write(raw, n, identifier, 18)
+        n = _write(raw, n, remote, 1)  # RRS or RTR
     else:
-        for k in range(10, -1, -1):
-            raw[n] = (identifier >> k) & 1
-            n += 1
-        raw[n] = 0 if fd else remote
-        raw[n + 1] = 0  # IDE
-        n += 2
+        n = _write(raw, 1, identifier, 11)
+        n = _write(raw, n, remote << 1, 2)  # RRS or RTR, IDE
     switch = LONGEST
     if fd:
-        raw[n] = 1  # FDF
-        raw[n + 1] = 0  # res
-        raw[n + 2] = 1 if (flags & BRS) != 0 else 0
-        raw[n + 3] = 1 if (flags & ESI) != 0 else 0
+        n = _write(raw, n, 2, 2)  # FDF, res
+        n = _write(raw, n, 1 if (flags & BRS) != 0 else 0, 1)
         if (flags & BRS) != 0:
-            switch = n + 3
-        n += 4
+            switch = n
+        n = _write(raw, n, 1 if (flags & ESI) != 0 else 0, 1)
     else:
-        raw[n] = 0  # FDF
-        n += 1
-        if extended:
-            raw[n] = 0  # r0
-            n += 1
-    code = _CODES[length]
-    for k in range(3, -1, -1):
-        raw[n] = (code >> k) & 1
-        n += 1
-    if remote == 0 or fd:
+        n = _write(raw, n, 0, 2 if extended else 1)  # FDF, in extended frames r0
+    n = _write(raw, n, _CODES[length], 4)
+    if remote == 0:
         for i in range(length):
-            value = data[i]
             for k in range(7, -1, -1):
-                raw[n] = (value >> k) & 1
+                raw[n] = (data[i] >> k) & 1
                 n += 1
     return n, switch
 
 
 @njit(cache=True, error_model="numpy")
-def crc15(raw, n):
-    """CRC-15 of n bits, polynomial 0x4599 (ISO 11898-1:2015, 10.4.2.6)."""
-    crc = 0
+def _crc(bits, n, crc, width, polynomial):
+    """The CRC register after n more bits (ISO 11898-1:2015, 10.4.2.6)."""
+    mask = (1 << width) - 1
     for i in range(n):
-        feed = raw[i] ^ (crc >> 14)
-        crc = (crc << 1) & 0x7FFF
+        feed = bits[i] ^ (crc >> (width - 1))
+        crc = (crc << 1) & mask
         if feed:
-            crc ^= 0x4599
+            crc ^= polynomial
     return crc
 
 
 @njit(cache=True, error_model="numpy")
-def count_bits(identifier, length, flags, data, raw):
-    """Bits of a frame with stuffing and intermission: at the nominal rate and at the data rate.
-
-    The bit BRS and the CRC delimiter are each sent partly at one rate and partly at the other, cut at the sample
-    points; together they last exactly one nominal and one data bit time, and are counted so.
+def _stuffed(identifier, length, flags, data, work):
+    """Bits up to the end of what is stuffed by content: of a classic frame the CRC, of an FD frame the data.
 
     Args:
         identifier: Identifier with its flags.
         length: Bytes of data, or that a remote frame asks for.
         flags: FD, BRS, ESI.
         data: Bytes, at least `length`.
-        raw: Room to work in, uint8, shape (LONGEST,).
+        work: Out: levels, kinds, and room to work in, uint8, shape (3, LONGEST).
+
+    Returns:
+        Number of bits, how many of them are sent at the nominal rate, how many are stuff bits, and the CRC of a classic
+        frame.
     """
-    fd = (flags & FD) != 0
-    # Of an FD frame the first bits one by one, then whole bytes, and the last byte by bits again: after the very last
-    # bit of the data field a fixed stuff bit takes the place of one by content.
-    whole = max(length - 1, 0) if fd else 0
-    n, switch = header_and_data(identifier, 0 if whole > 0 else length, flags, data, raw)
-    if whole > 0:
-        code = _CODES[length]
-        for k in range(4):
-            raw[n - 4 + k] = (code >> (3 - k)) & 1
-    stop = n if whole > 0 else n - 1
-    if not fd:
-        crc = crc15(raw, n)
-        for k in range(14, -1, -1):
-            raw[n] = (crc >> k) & 1
-            n += 1
+    bits, kinds, raw = work[0], work[1], work[2]
+    n, switch = header_and_data(identifier, length, flags, data, raw)
+    crc = 0
+    # After the very last bit of an FD frame's data a fixed stuff bit takes the place of one by content.
+    stop = n - 1
+    if (flags & FD) == 0:
+        crc = _crc(raw, n, 0, 15, 0x4599)
+        n = _write(raw, n, crc, 15)
         stop = n
-    slow = min(n, switch)
-    quick = n - slow
+    out = 0
+    slow = 0
     last = 1
     run = 1
-    for i in range(stop):
-        if raw[i] == last:
-            run += 1
-            if run == 5:
-                if i >= switch - 1:
-                    quick += 1
-                else:
-                    slow += 1
-                last ^= 1
-                run = 1
-        else:
-            last = raw[i]
+    for i in range(n):
+        fast = FAST if i >= switch else 0
+        bits[out] = raw[i]
+        kinds[out] = fast
+        out += 1
+        slow += fast == 0
+        run = run + 1 if raw[i] == last else 1
+        last = raw[i]
+        if run == 5 and i < stop:
+            last ^= 1
             run = 1
-    if whole > 0:
-        state = 5 * last + run
-        added = 0
-        for i in range(whole):
-            added += _ADDED[state, data[i]]
-            state = _AFTER[state, data[i]]
-        last = state // 5
-        run = state % 5
-        value = data[length - 1]
-        for k in range(7, 0, -1):
-            bit = (value >> k) & 1
-            run = run + 1 if bit == last else 1
-            last = bit
-            if run == 5:
-                added += 1
-                last ^= 1
-                run = 1
-        added += 8 * length
-        if (flags & BRS) != 0:
-            quick += added
-        else:
-            slow += added
-    if not fd:
+            fast = FAST if i >= switch - 1 else 0
+            bits[out] = last
+            kinds[out] = STUFF + fast
+            out += 1
+            slow += fast == 0
+    return out, slow, out - n, crc
+
+
+@njit(cache=True, error_model="numpy")
+def count_bits(identifier, length, flags, data, work):
+    """Bits of a frame with stuffing and intermission: at the nominal rate and at the data rate.
+
+    The bit BRS and the CRC delimiter are each sent partly at one rate and partly at the other, cut at the sample
+    points; together they last exactly one nominal and one data bit time, and are counted so. Arguments as of
+    `_stuffed`.
+    """
+    count, slow, _, _ = _stuffed(identifier, length, flags, data, work)
+    if (flags & FD) == 0:
         return slow + TAIL + INTERMISSION, 0
     # Stuff count and parity 4, CRC 17 or 21, fixed stuff bits: one before, one after each fourth bit.
     tail = 4 + 17 + 6 if length <= 16 else 4 + 21 + 7
     if (flags & BRS) != 0:
-        return slow + TAIL - 1 + INTERMISSION, quick + tail + 1
+        return slow + TAIL - 1 + INTERMISSION, count - slow + tail + 1
     return slow + tail + TAIL + INTERMISSION, 0
 
 
 @njit(cache=True, error_model="numpy")
 def count_many(identifiers, lengths, flags, data, nominal, quick):
     """`count_bits` for many frames: arrays of shape (frames,), data (frames, 64)."""
-    raw = np.empty(LONGEST, np.uint8)
+    work = np.empty((3, LONGEST), np.uint8)
     for i in range(identifiers.shape[0]):
-        nominal[i], quick[i] = count_bits(np.int64(identifiers[i]), np.int64(lengths[i]), flags[i], data[i], raw)
+        nominal[i], quick[i] = count_bits(
+            np.int64(identifiers[i]), np.int64(lengths[i]), np.int64(flags[i]), data[i], work
+        )
 
 
 @njit(cache=True, error_model="numpy")
-def encode(identifier, length, flags, data, bits, kinds):
+def encode(record, work):
     """All bits of a frame as they are on the wire when it is acknowledged, with the intermission.
 
     Args:
-        identifier: Identifier with its flags.
-        length: Bytes of data, or that a remote frame asks for.
-        flags: FD, BRS, ESI.
-        data: Bytes, at least `length`.
-        bits: Out: levels, uint8, shape (LONGEST,).
-        kinds: Out: FAST, STUFF, FIXED added up, uint8, shape (LONGEST,).
+        record: The frame, of `drivers.can.bus.frame.RECORD`.
+        work: Out: levels; kinds FAST, STUFF, FIXED added up; room to work in; uint8, shape (3, LONGEST).
 
     Returns:
         Number of bits, and the CRC.
     """
-    raw = np.empty(LONGEST, np.uint8)
-    n, switch = header_and_data(identifier, length, flags, data, raw)
+    bits, kinds, raw = work[0], work[1], work[2]
+    length, flags = np.int64(record["length"]), np.int64(record["flags"])
+    out, _, stuffed, crc = _stuffed(np.int64(record["identifier"]), length, flags, record["data"], work)
     fd = (flags & FD) != 0
-    crc = 0
-    stop = n - 1
-    if not fd:
-        crc = crc15(raw, n)
-        for k in range(14, -1, -1):
-            raw[n] = (crc >> k) & 1
-            n += 1
-        stop = n
-    out = 0
-    last = 1
-    run = 1
-    stuffed = 0
-    for i in range(n):
-        bits[out] = raw[i]
-        kinds[out] = FAST if i >= switch else 0
-        out += 1
-        if raw[i] == last:
-            run += 1
-        else:
-            last = raw[i]
-            run = 1
-        if run == 5 and i < stop:
-            last ^= 1
-            run = 1
-            stuffed += 1
-            bits[out] = last
-            kinds[out] = STUFF + (FAST if i >= switch - 1 else 0)
-            out += 1
     kind = FAST if (flags & BRS) != 0 and fd else 0
     if fd:
         width = 17 if length <= 16 else 21
         polynomial = 0x1685B if length <= 16 else 0x102899
         gray = (stuffed % 8) ^ ((stuffed % 8) >> 1)
         parity = (gray ^ (gray >> 1) ^ (gray >> 2)) & 1
-        field = (gray << 1) | parity
+        n = _write(raw, 0, (gray << 1) | parity, 4)
         # The CRC covers dynamic stuff bits and the stuff count, not the fixed stuff bits; it starts at 1, 0, 0, ...
-        crc = 1 << (width - 1)
-        top = width - 1
-        mask = (1 << width) - 1
-        for i in range(out):
-            feed = bits[i] ^ (crc >> top)
-            crc = (crc << 1) & mask
-            if feed:
-                crc ^= polynomial
-        for k in range(3, -1, -1):
-            feed = ((field >> k) & 1) ^ (crc >> top)
-            crc = (crc << 1) & mask
-            if feed:
-                crc ^= polynomial
-        for i in range(4 + width):
+        crc = _crc(raw, n, _crc(bits, out, 1 << (width - 1), width, polynomial), width, polynomial)
+        n = _write(raw, n, crc, width)
+        for i in range(n):
             if i % 4 == 0:
                 bits[out] = 1 - bits[out - 1]
                 kinds[out] = FIXED + kind
                 out += 1
-            bits[out] = (field >> (3 - i)) & 1 if i < 4 else (crc >> (width + 3 - i)) & 1
+            bits[out] = raw[i]
             kinds[out] = kind
             out += 1
-    bits[out] = 1  # CRC delimiter
+    bits[out : out + TAIL + INTERMISSION] = 1
+    bits[out + 1] = 0  # ACK, behind the CRC delimiter
     kinds[out] = kind
-    bits[out + 1] = 0  # ACK
-    kinds[out + 1] = 0
-    out += 2
-    for _ in range(1 + 7 + INTERMISSION):
-        bits[out] = 1
-        kinds[out] = 0
-        out += 1
-    return out, crc
+    kinds[out + 1 : out + TAIL + INTERMISSION] = 0
+    return out + TAIL + INTERMISSION, crc
 
 
 @njit(cache=True, error_model="numpy")
@@ -393,7 +298,7 @@ def enlist(bus, batch, count, nominal_ps, data_ps):
     Frames whose time has passed are offered now. Equal times keep the order of offering. There must be room.
     """
     cells, slots, store, arrivals, unused = bus.cells, bus.slots, bus.store, bus.arrivals, bus.unused
-    raw = np.empty(LONGEST, np.uint8)
+    work = np.empty((3, LONGEST), np.uint8)
     waiting = cells[ARRIVALS] - cells[NEXT]
     if cells[NEXT] > 0:
         for k in range(waiting):
@@ -407,7 +312,7 @@ def enlist(bus, batch, count, nominal_ps, data_ps):
         record = store[s]
         identifier = np.int64(record["identifier"])
         flags = np.int64(record["flags"])
-        nominal, quick = count_bits(identifier, np.int64(record["length"]), flags, record["data"], raw)
+        nominal, quick = count_bits(identifier, np.int64(record["length"]), flags, record["data"], work)
         at = max(np.int64(record["time_ns"]), cells[NOW])
         slots[s, KEY] = priority(identifier, flags)
         slots[s, AT] = at
@@ -536,18 +441,9 @@ def _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers):
     Returns:
         Time from the start of frame to the end of the delimiter [ns], bits of the flags.
     """
-    s = bus.senders[0]
-    record = bus.store[s]
-    bits = np.empty(LONGEST, np.uint8)
-    kinds = np.empty(LONGEST, np.uint8)
-    total, _ = encode(
-        np.int64(record["identifier"]),
-        np.int64(record["length"]),
-        np.int64(record["flags"]),
-        record["data"],
-        bits,
-        kinds,
-    )
+    work = np.empty((3, LONGEST), np.uint8)
+    bits, kinds = work[0], work[1]
+    total, _ = encode(bus.store[bus.senders[0]], work)
     time_ps = np.int64(0)
     for k in range(position + 1):
         time_ps += data_ps if (kinds[k] & FAST) != 0 else nominal_ps
@@ -574,17 +470,14 @@ def _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers):
 @njit(cache=True, error_model="numpy")
 def _differ(bus):
     """First bit in which the frames on the wire differ; -1 where they are the same."""
-    bits = np.empty(LONGEST, np.uint8)
-    other = np.empty(LONGEST, np.uint8)
-    kinds = np.empty(LONGEST, np.uint8)
-    a = bus.store[bus.senders[0]]
-    n, _ = encode(np.int64(a["identifier"]), np.int64(a["length"]), np.int64(a["flags"]), a["data"], bits, kinds)
+    work = np.empty((3, LONGEST), np.uint8)
+    other = np.empty((3, LONGEST), np.uint8)
+    n, _ = encode(bus.store[bus.senders[0]], work)
     first = np.int64(-1)
     for k in range(1, bus.cells[SENDERS]):
-        b = bus.store[bus.senders[k]]
-        m, _ = encode(np.int64(b["identifier"]), np.int64(b["length"]), np.int64(b["flags"]), b["data"], other, kinds)
+        m, _ = encode(bus.store[bus.senders[k]], other)
         for i in range(min(n, m)):
-            if bits[i] != other[i]:
+            if work[0, i] != other[0, i]:
                 if first < 0 or i < first:
                     first = i
                 break

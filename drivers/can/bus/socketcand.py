@@ -14,6 +14,7 @@ clients such as python-can's read every error as a frame and stumble over mere t
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
 import socket
 import socketserver
@@ -24,9 +25,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from drivers.can import medium
-from drivers.can.health import Guard
-from drivers.can.outlet import PATIENCE_S, ROOM, OpenBus, Outlet
+from drivers.can.bus.codec import CONTROLLER, CodecError
+from drivers.can.bus.outlet import PATIENCE_S, ROOM, OpenBus, Outlet, message_of
+from drivers.health import Guard
 from rig.errors import InputError
 from rig.transport.endpoint import parse_loopback
 
@@ -53,15 +54,15 @@ _BYTE = re.compile(r"[0-9A-Fa-f]{1,2}")
 _NUMBER = re.compile(r"[0-9]{1,9}")
 
 
-class CommandError(ValueError):
-    """A command that is none, or not now."""
-
-
 class Splitter:
     """Commands out of a stream of text; what is between them is dropped."""
 
     def __init__(self) -> None:
         self._text = b""
+
+    def __len__(self) -> int:
+        """Bytes that wait for the rest of their command."""
+        return len(self._text)
 
     def feed(self, data: bytes) -> Iterator[str | None]:
         """The commands that are complete with this data, without brackets; None stands for text that is none.
@@ -95,41 +96,29 @@ def parse_frame(words: list[str], *, remote: bool = False) -> can.Message:
         remote: Whether it is a remote frame, which has a length only.
 
     Raises:
-        CommandError: They make no classic frame.
+        CodecError: They make no classic frame.
     """
-    import can
-
     identifier, extended = parse_identifier(words[0] if words else "")
     if len(words) < 2 or not _BYTE.fullmatch(words[1]) or int(words[1], 16) > 8:
-        raise CommandError("a length of 0 to 8 must follow the identifier")
+        raise CodecError("a length of 0 to 8 must follow the identifier")
     length, given = int(words[1], 16), words[2:]
     if not all(_BYTE.fullmatch(byte) for byte in given):
-        raise CommandError("data must be bytes of one or two hexadecimal digits")
+        raise CodecError("data must be bytes of one or two hexadecimal digits")
     if len(given) != (0 if remote else length):
-        raise CommandError(f"{len(given)} bytes of data for a length of {length}")
-    message = can.Message(
-        arbitration_id=identifier,
-        is_extended_id=extended,
-        is_remote_frame=remote,
-        dlc=length,
-        data=None if remote else bytes(int(byte, 16) for byte in given),
-    )
-    try:
-        medium.offered(message)
-    except medium.MediumError as error:
-        raise CommandError(str(error)) from None
-    return message
+        raise CodecError(f"{len(given)} bytes of data for a length of {length}")
+    data = bytes(int(byte, 16) for byte in given)
+    return message_of(identifier, data, length=length, extended=extended, remote=remote)
 
 
 def parse_identifier(text: str) -> tuple[int, bool]:
     """An identifier, and whether it is an extended one.
 
     Raises:
-        CommandError: It is none.
+        CodecError: It is none.
     """
     extended = len(text) == 8
     if not _HEX.fullmatch(text) or not (extended or len(text) <= 3):
-        raise CommandError("an identifier must have 1 to 3 or 8 hexadecimal digits")
+        raise CodecError("an identifier must have 1 to 3 or 8 hexadecimal digits")
     return int(text, 16), extended
 
 
@@ -151,14 +140,13 @@ def show_error(text: str) -> bytes:
     return f"< error 000 {time.time():.6f} {text} >".encode()
 
 
-class _Client(Outlet):
+class Client(Outlet):
     """One connection, from hi to its end."""
 
     def __init__(
-        self, connection: socket.socket, buses: Mapping[str, OpenBus], *, number: int, room: int, patience_s: float
+        self, descriptor: int, buses: Mapping[str, OpenBus], *, number: int, room: int, patience_s: float
     ) -> None:
-        super().__init__(connection.fileno(), name=f"socketcand {number}", room=room, patience_s=patience_s)
-        self._connection = connection
+        super().__init__(descriptor, name=f"socketcand {number}", room=room, patience_s=patience_s)
         self._buses = buses
         self._splitter = Splitter()
         self._raw = False
@@ -167,7 +155,7 @@ class _Client(Outlet):
         """Shortest time between two frames [s], and when the next may come, by identifier."""
         self._every_s = 0.0
         self._next_s = 0.0
-        self._traffic = [0, 0, 0, 0]
+        self.traffic = [0, 0, 0, 0]
         """Bytes and frames received, bytes and frames sent."""
         self._answer(b"< hi >")
 
@@ -179,9 +167,9 @@ class _Client(Outlet):
                 return
             try:
                 if command is None:
-                    raise CommandError("a command must be words in angle brackets")
+                    raise CodecError("a command must be words in angle brackets")
                 self._obey(command.split())
-            except CommandError as error:
+            except CodecError as error:
                 self.counts["malformed"] += 1
                 self._answer(show_error(str(error)))
 
@@ -193,8 +181,8 @@ class _Client(Outlet):
             self._answer(b"< echo >")
         elif word == "open":
             self._open(rest)
-        elif self._bus is None:
-            raise CommandError("a bus must be opened first")
+        elif self.bus is None:
+            raise CodecError("a bus must be opened first")
         elif word in ("send", "sendrtr"):
             message = parse_frame(rest, remote=word == "sendrtr")
             try:
@@ -204,8 +192,8 @@ class _Client(Outlet):
                 # Brackets would end the text early.
                 self._answer(show_error(f"not sent: {' '.join(re.sub('[<>]', ' ', str(error)).split())}"))
             else:
-                self._traffic[2] += len(message.data)
-                self._traffic[3] += 1
+                self.traffic[2] += len(message.data)
+                self.traffic[3] += 1
         elif word in ("rawmode", "bcmmode", "controlmode") and not rest:
             self._held_until_s = time.monotonic() + _HOLD_S
             # In this order: no frame before the answer, none lost after it.
@@ -215,23 +203,23 @@ class _Client(Outlet):
             self._every_s = self._number_of(rest, 1)[0] / 1000
             if self._every_s and not _SHORTEST_MS <= self._every_s * 1000 <= _LONGEST_MS:
                 self._every_s = 0.0
-                raise CommandError(f"an interval must be 0 or from {_SHORTEST_MS} to {_LONGEST_MS} ms")
+                raise CodecError(f"an interval must be 0 or from {_SHORTEST_MS} to {_LONGEST_MS} ms")
             self._next_s = time.monotonic() + self._every_s
         elif word == "subscribe" and len(rest) == 3:
             seconds, microseconds = self._number_of(rest[:2], 2)
             if len(self._subscribed) >= _MAX_SUBSCRIPTIONS:
-                raise CommandError(f"there may be {_MAX_SUBSCRIPTIONS} subscriptions")
+                raise CodecError(f"there may be {_MAX_SUBSCRIPTIONS} subscriptions")
             self._subscribed[parse_identifier(rest[2])] = [seconds + microseconds * 1e-6, 0.0]
         elif word == "unsubscribe" and len(rest) == 1:
             self._subscribed.pop(parse_identifier(rest[0]), None)
         else:
-            raise CommandError("unknown command")
+            raise CodecError("unknown command")
 
     def _open(self, words: list[str]) -> None:
         import can
 
-        if self._bus is not None:
-            raise CommandError("a bus is open already")
+        if self.bus is not None:
+            raise CodecError("a bus is open already")
         open_bus = self._buses.get(words[0]) if len(words) == 1 else None
         try:
             if open_bus is None:
@@ -249,19 +237,20 @@ class _Client(Outlet):
     @staticmethod
     def _number_of(words: list[str], count: int) -> list[int]:
         if len(words) != count or not all(_NUMBER.fullmatch(word) for word in words):
-            raise CommandError(f"{count} whole numbers must follow")
+            raise CodecError(f"{count} whole numbers must follow")
         return [int(word) for word in words]
 
     # To the client, on the thread that hears the bus.
 
-    def _show(self, message: can.Message) -> bytes | None:
+    def show_frame(self, message: can.Message) -> bytes | None:
+        """Text of a frame, or None where the client is not to have it."""
         text = show(message)
         if text is None:
             self.counts["fd_left_out"] += 1
             return None
         if not message.is_error_frame:
-            self._traffic[0] += len(message.data)
-            self._traffic[1] += 1
+            self.traffic[0] += len(message.data)
+            self.traffic[1] += 1
         if not self._raw:
             wanted = self._subscribed.get((message.arbitration_id, message.is_extended_id))
             now = time.monotonic()
@@ -273,41 +262,21 @@ class _Client(Outlet):
         return text
 
     def _overflow(self) -> bytes:
-        return f"< error {medium.CONTROLLER:03X} {time.time():.6f} >".encode()
+        return f"< error {CONTROLLER:03X} {time.time():.6f} >".encode()
 
     def _tick(self) -> None:
         now = time.monotonic()
         if self._every_s and now >= self._next_s:
             self._next_s = now + self._every_s
-            self._put(f"< stat {' '.join(map(str, self._traffic))} >".encode())
+            self.put(f"< stat {' '.join(map(str, self.traffic))} >".encode())
 
     def _lose(self) -> None:
         self.counts["bus_lost"] += 1
         self._ending = True
 
 
-class _Listener(socketserver.ThreadingTCPServer):
-    """Gives each connection a thread."""
-
-    allow_reuse_address = True
-    daemon_threads = True
-
-    def __init__(self, address: tuple[str, int], owner: SocketcandServer) -> None:
-        super().__init__(address, socketserver.BaseRequestHandler)
-        self._owner = owner
-
-    def verify_request(self, request: Any, client_address: Any) -> bool:
-        return self._owner._let_in(request)
-
-    def finish_request(self, request: Any, client_address: Any) -> None:
-        self._owner._serve(request)
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        self._owner._guard.tell("a connection", sys.exception() or RuntimeError())
-
-
-class SocketcandServer:
-    """Serves buses to socketcand clients.
+class SocketcandServer(socketserver.ThreadingTCPServer):
+    """Serves buses to socketcand clients, each on a thread of its own.
 
     Args:
         buses: By name, what makes a node on the bus: one for each connection.
@@ -319,6 +288,9 @@ class SocketcandServer:
     Raises:
         InputError: The host is not of this machine alone, or the port is taken.
     """
+
+    allow_reuse_address = True
+    daemon_threads = True
 
     def __init__(
         self,
@@ -333,77 +305,75 @@ class SocketcandServer:
         self._buses = dict(buses)
         self._settings: dict[str, Any] = {"room": room, "patience_s": patience_s}
         try:
-            self._listener = _Listener(("127.0.0.1" if host == "localhost" else host, port), self)
+            super().__init__(("127.0.0.1" if host == "localhost" else host, port), socketserver.BaseRequestHandler)
         except OSError as error:
             raise InputError("socketcand", f"a free HOST:PORT ({error.strerror})", f"{host}:{port}") from None
-        self.host, self.port = self._listener.server_address[:2]
+        self.host, self.port = self.server_address[:2]
         self._ended: Counter[str] = Counter()
         """Counts of connections that have ended."""
-        self._clients: list[_Client] = []
+        self.clients: list[Client] = []
         self._lock = threading.Lock()
-        self._number = 0
+        self._numbers = itertools.count(1)
         self._guard = Guard("socketcand")
-        self._thread = threading.Thread(
-            target=self._listener.serve_forever, args=(_POLL_S,), name="socketcand", daemon=True
-        )
-
-    def start(self) -> None:
-        """Take clients from now on."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """End all connections."""
-        if self._thread.is_alive():
-            self._listener.shutdown()
-        self._listener.server_close()
-        with self._lock:
-            clients = list(self._clients)
-        for client in clients:
-            client.stop()
-        deadline = time.monotonic() + _ENDING_S
-        while self._clients and time.monotonic() < deadline:
-            time.sleep(0.01)
+        self._thread = threading.Thread(target=self.serve_forever, args=(_POLL_S,), name="socketcand", daemon=True)
 
     def __enter__(self) -> SocketcandServer:
-        self.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def close(self) -> None:
+        """End all connections."""
+        if self._thread.is_alive():
+            self.shutdown()
+        self.server_close()
+        with self._lock:
+            clients = list(self.clients)
+        for client in clients:
+            client.stop()
+        deadline = time.monotonic() + _ENDING_S
+        while self.clients and time.monotonic() < deadline:
+            time.sleep(0.01)
+
     def counts(self) -> dict[str, int]:
         """What has happened: `clients` now, `dropped` frames, `fd_left_out`, `malformed`, `refused`, `given_up`."""
         with self._lock:
-            total = sum((client.counts for client in self._clients), self._ended)
+            total = sum((client.counts for client in self.clients), self._ended)
             names = ("dropped", "fd_left_out", "malformed", "refused", "given_up", "turned_away")
-            return {"clients": len(self._clients), **{name: total[name] for name in names}}
+            return {"clients": len(self.clients), **{name: total[name] for name in names}}
 
     def warnings(self) -> list[str]:
         """What a person should know of, while it is so."""
         with self._lock:
-            return [*self._guard.warnings(), *(text for client in self._clients for text in client.warnings())]
+            return [*self._guard.warnings(), *(text for client in self.clients for text in client.warnings())]
 
-    def _let_in(self, connection: socket.socket) -> bool:
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        """Let a client in where there is room; on the server's thread."""
         with self._lock:
-            full = len(self._clients) >= MAX_CLIENTS
+            full = len(self.clients) >= MAX_CLIENTS
             self._ended["turned_away"] += full
         if full:
             with contextlib.suppress(OSError):
-                connection.send(b"< error too many clients >")
+                request.send(b"< error too many clients >")
         return not full
 
-    def _serve(self, connection: socket.socket) -> None:
+    def finish_request(self, request: Any, client_address: Any) -> None:
         """Serve a connection to its end, on a thread of its own."""
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SENDING)
+        request.setblocking(False)
+        request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SENDING)
         with self._lock:
-            self._number += 1
-            client = _Client(connection, self._buses, number=self._number, **self._settings)
-            self._clients.append(client)
+            client = Client(request.fileno(), self._buses, number=next(self._numbers), **self._settings)
+            self.clients.append(client)
         try:
             client.serve()
         finally:
             with self._lock:
-                self._clients.remove(client)
+                self.clients.remove(client)
                 self._ended.update(client.counts)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Tell of a connection that failed."""
+        self._guard.tell("a connection", sys.exception() or RuntimeError())

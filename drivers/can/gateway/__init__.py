@@ -1,0 +1,378 @@
+"""The rig as a node of a CAN bus: samples, events and status go out, commands come in.
+
+A gateway is a client of the rig like any other; it may run in the rig's process or in another one. Threads: the rig's
+publisher leaves blocks in a bounded queue; the sender packs them and hands frames to the bus once a millisecond, each
+when its last sample is due; the receiver checks commands; a worker asks the rig and acknowledges. None of them can hold
+up the simulation: what does not fit is dropped, oldest first, and counted.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any
+
+import pydantic
+
+from drivers.can.bus.frame import STANDARD_MASK
+from drivers.can.gateway.commands import IDENTIFIERS, Commands
+from drivers.can.gateway.outbox import Outbox
+from drivers.can.gateway.samples import sample_frames, steps
+from drivers.can.schedule import SLOT_S, Schedule
+from drivers.can.signals import EventKind, State, default_messages
+from drivers.health import Guard, Rising
+from rig import wire
+from rig.channels import ChannelTable
+from rig.outside import DOCUMENT_BYTES, Outside, check, input_error
+from rig.transport import Client
+
+if TYPE_CHECKING:
+    import can
+
+_SYNC_S = 0.1
+_STATUS_S = 0.5
+_HEARTBEAT_S = 1.0
+_IDLE_S = 0.02
+_WAIT_S = 0.25
+"""Samples that may wait for room on the bus, after the machine had been held up [s]."""
+_FAREWELL_S = 0.5
+"""How long a bus without room is waited for at the end [s]."""
+_WORD_32 = 0xFFFFFFFF
+
+
+class _Catalogue(Outside, extra="ignore"):
+    """The rig's channels, as they come."""
+
+    tick_rate_hz: Annotated[int, pydantic.Field(ge=1, le=10**12)]
+    table: dict[str, Any]
+
+
+class Gateway:
+    """Sends what a rig publishes as CAN messages, and gives it the commands that come from the bus.
+
+    Args:
+        client: Transport to the rig, which must be ready to answer; stays the caller's to close.
+        bus: Any bus of python-can; stays the caller's to shut down.
+        schedule: Which samples, how often.
+        paced: Send each frame when its last sample is due; False: at once, and let a full queue hold up the publisher
+            (for runs that are not paced by the wall clock).
+        load: Load of the bus, for the status.
+        queue_seconds: Blocks that may wait for the sender [s of simulated time].
+        command_timeout_s: How long the rig may take for a command [s].
+        now: Clock [s].
+
+    Raises:
+        InputError: The rig's samples cannot be sent at that rate, or have another calibration than the table.
+        NoReplyError: No rig answers.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        bus: can.BusABC,
+        schedule: Schedule,
+        *,
+        paced: bool = True,
+        load: float = 0.0,
+        queue_seconds: float = 1.0,
+        command_timeout_s: float = 1.0,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._client = client
+        self._bus = bus
+        self._paced = paced
+        self._load = load
+        self._now = now
+        answer = client.request(wire.CATALOGUE, timeout_s=5.0)
+        catalogue = check(_Catalogue, answer, field="catalogue", most_bytes=DOCUMENT_BYTES)
+        try:
+            table = ChannelTable.model_validate(catalogue.table)
+        except pydantic.ValidationError as error:
+            raise input_error(error, "catalogue.table") from None
+        self._tick_rate_hz = catalogue.tick_rate_hz
+        self._messages = default_messages().by_name
+        self._rate_hz, self._steps = steps(table, schedule)
+        self._samples = sample_frames(table, self._steps)
+        self._groups = tuple(table.groups)
+        self._queue: deque[tuple[str, bytes]] = deque()
+        self._queue_seconds = queue_seconds
+        self._capacity = 8 * len(self._groups)
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._end_s = math.inf
+
+        self._time_us = 0
+        self.state = State.PREPARING
+        self._ended = False
+        self._status: dict[str, Any] = {}
+        self._beat = 0
+        self._event_number = 0
+        self._next_status_s = self._next_heartbeat_s = now()
+
+        self.blocks_dropped = 0
+        """Blocks that the sender had no time for."""
+        self.bus_errors = 0
+        """Calls of the bus that failed while receiving."""
+        self.guard = Guard("the CAN gateway")
+        self.dropping = Rising("CAN: {} frames were dropped: the bus does not take them in time")
+        self._falling_behind = Rising("CAN: {} blocks were dropped: the gateway does not keep up")
+        room = math.ceil(_WAIT_S * sum(1.0 / period_s for period_s in schedule.messages().values()))
+        self.outbox = Outbox(bus, room=room, paced=paced, now=now)
+        self.commands = Commands(client, self._acknowledge, timeout_s=command_timeout_s, now=now, guard=self.guard)
+        self._threads = [
+            threading.Thread(target=target, name=f"can gateway {name}", daemon=True)
+            for name, target in (
+                ("sends", self._send_all),
+                ("receives", self._receive),
+                ("asks", self.commands.ask_all),
+            )
+        ]
+
+    # Life.
+
+    def start(self) -> None:
+        """Begin: from now on the gateway is a node of the bus."""
+        self._bus.set_filters([{"can_id": each, "can_mask": STANDARD_MASK, "extended": False} for each in IDENTIFIERS])
+        for group in self._groups:
+            self._client.subscribe(wire.sensor_key(group), self._take)
+        for key in (wire.EDGES, wire.EVENTS, wire.STATUS):
+            self._client.subscribe(key, self._take)
+        for thread in self._threads:
+            thread.start()
+
+    def close(self, *, timeout_s: float = 2.0) -> None:
+        """Send what is still due, then end.
+
+        Args:
+            timeout_s: How long that may take [s].
+        """
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        self.commands.close()
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(timeout=timeout_s)
+
+    def __enter__(self) -> Gateway:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def figures(self) -> dict[str, float]:
+        """Counts for the rig's status."""
+        refused = dict(self.commands.refused)
+        return {
+            "can_load": round(self._load, 4),
+            "can_frames": self.outbox.sent,
+            "can_dropped": self.dropped,
+            "can_blocks_dropped": self.blocks_dropped,
+            "can_accepted": self.commands.accepted,
+            "can_refused": sum(refused.values()),
+            **{f"can_refused_{reason}": count for reason, count in refused.items()},
+        }
+
+    def warnings(self) -> list[str]:
+        """What a person should know of, while it is so."""
+        return [
+            *self.guard.warnings(),
+            *self.dropping.warnings(self.dropped),
+            *self._falling_behind.warnings(self.blocks_dropped),
+        ]
+
+    @property
+    def dropped(self) -> int:
+        """Frames that the bus did not take, or that were never made because samples were missing."""
+        return self.outbox.dropped + sum(each.skipped for each in self._samples)
+
+    # On the publisher's thread.
+
+    def _take(self, key: str, payload: bytes) -> None:
+        with self._changed:
+            if not self._paced:
+                while len(self._queue) >= self._capacity and not self._stopping:
+                    self._changed.wait(0.1)
+            while len(self._queue) >= self._capacity and key not in (wire.EVENTS, wire.STATUS):
+                self._queue.popleft()
+                self.blocks_dropped += 1
+            self._queue.append((key, payload))
+            if not self._paced:
+                self._changed.notify_all()
+
+    # On the sender's thread.
+
+    def _send_all(self) -> None:
+        while not (done := self.guard(self._send_some)):
+            if done is None:
+                if self._stopping:
+                    return
+                time.sleep(_IDLE_S)
+
+    def _send_some(self) -> bool:
+        """What is due now, and the wait for more; whether that was all."""
+        with self._changed:
+            entries = list(self._queue)
+            self._queue.clear()
+            if not self._paced:
+                self._changed.notify_all()
+        for key, payload in entries:
+            self.guard(self.unpack, key, payload)
+        now = self._now()
+        self.outbox.send_due()
+        if self._ended and self.state != State.ENDED and not self.outbox.undue and not self.outbox.waiting:
+            # Only now: who hears it must not expect samples any more.
+            self.state = State.ENDED
+            self._next_status_s = self._next_heartbeat_s = now
+        self._send_periodic(now)
+        self.commands.time_out()
+        with self._changed:
+            if self._queue and not self._paced:
+                return False
+            if self._stopping and not self._queue and not self.outbox.undue:
+                self._end_s = min(self._end_s, now + _FAREWELL_S)
+                if now >= self._end_s or not self.outbox.stuck:
+                    self.outbox.drop_all()
+                    return True
+            rest = _IDLE_S
+            if self._paced and (self._queue or self.outbox.undue or self.outbox.stuck):
+                # On a grid of slots: a block that comes in between waits for the next one.
+                rest = SLOT_S - self._now() % SLOT_S
+            self._changed.wait(rest)
+        return False
+
+    def unpack(self, key: str, payload: bytes) -> None:
+        """Make frames of what the rig has published.
+
+        Raises:
+            ValueError: It is none of what a rig publishes.
+        """
+        if key == wire.EVENTS:
+            self._on_event(wire.decode_document(payload))
+        elif key == wire.STATUS:
+            self._status = wire.decode_document(payload)
+        elif key == wire.EDGES:
+            self._on_edges(wire.decode_block(payload, wire.TRUTH_SCHEMA))
+        else:
+            self._on_samples(key.rpartition("/")[2], wire.decode_block(payload, wire.SAMPLE_SCHEMA))
+
+    def _on_samples(self, group: str, block: wire.Block) -> None:
+        if not len(block.values):
+            return
+        self._follow_time(block)
+        if self.state == State.PREPARING:
+            self.state = State.RUNNING
+        for each in self._samples:
+            if group in each.columns and (complete := each.take(group, block)) is not None:
+                # A frame is due with its last instant.
+                last, data = complete
+                self.outbox.put(each.message, data, last / self._rate_hz)
+        if group == self._groups[0]:
+            self._sync(block)
+
+    def _follow_time(self, block: wire.Block) -> None:
+        self.outbox.follow(block)
+        length_s = len(block.values) / block.rate_hz
+        self._time_us = max(self._time_us, round(1e6 * (block.tick / block.tick_rate_hz + length_s)))
+        if self._paced:
+            blocks = math.ceil(self._queue_seconds / length_s)
+            self._capacity = max(8 * len(self._groups), blocks * (len(self._groups) + 1))
+
+    def _sync(self, block: wire.Block) -> None:
+        every = round(_SYNC_S * self._rate_hz)
+        for index in range(-(-block.index // every) * every, block.index + len(block.values), every):
+            time_s = index / self._rate_hz
+            self.outbox.put_one(
+                self._messages["Sync"], time_s, index=index & _WORD_32, time=round(1e6 * time_s) & _WORD_32
+            )
+
+    def _on_edges(self, block: wire.Block) -> None:
+        for number, ticks in enumerate(block.values[:, 0].tolist(), start=block.index):
+            time_us = (block.tick + ticks) / self._tick_rate_hz * 1e6
+            fraction = min(round((time_us % 1.0) * 65536), 65535)
+            self.outbox.put_one(
+                self._messages["Keyphasor"],
+                time_us * 1e-6,
+                number=number & 0xFFFF,
+                time=int(time_us) & _WORD_32,
+                fraction=fraction,
+            )
+
+    def _on_event(self, event: dict[str, Any]) -> None:
+        name = str(event.get("event", ""))
+        kind = EventKind[name.upper()] if name.upper() in EventKind.__members__ else EventKind.OTHER
+        self._ended |= kind is EventKind.END
+        time_us = round(1e6 * float(event.get("time_s", 0.0)))
+        value = event.get("force_n" if kind is EventKind.HAMMER else "speed_hz", 0.0)
+        value = value if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
+        # With the samples of its time; its identifier loses against theirs, so that the end comes last.
+        self.outbox.put_one(
+            self._messages["Event"],
+            time_us * 1e-6,
+            event=kind,
+            number=self._event_number & 0xFF,
+            time=time_us & _WORD_32,
+            value=min(max(round(10 * value), 0), 0xFFFF),
+        )
+        self._event_number += 1
+
+    def _send_periodic(self, now: float) -> None:
+        if now >= self._next_status_s:
+            self._next_status_s = max(self._next_status_s + _STATUS_S, now)
+            self._send_status()
+        if now >= self._next_heartbeat_s:
+            self._next_heartbeat_s = max(self._next_heartbeat_s + _HEARTBEAT_S, now)
+            self._beat = self._beat + 1 & 0xFF
+            self.outbox.answer(
+                self._messages["Heartbeat"],
+                state=self.state,
+                beat=self._beat,
+                counter=self.commands.counter,
+                time=self._time_us & _WORD_32,
+            )
+            self.outbox.answer(
+                self._messages["Rates"],
+                rate=min(self._rate_hz, 0xFFFFFF),
+                fd_step=self._steps.get(True, 0),
+                classic_step=self._steps.get(False, 0),
+                latency=min(round(self.outbox.latency_s / 1e-5), 0xFFFF),
+            )
+
+    def _send_status(self) -> None:
+        status = self._status
+        spin = status.get("spin_hz")
+        late = status.get("lateness_ms", {}).get("p99") or 0.0
+        self.outbox.answer(
+            self._messages["Status"],
+            state=self.state,
+            warnings=min(len(status.get("warnings", ())), 15),
+            spin=min(max(round(1e3 * spin), 0), 0xFFFF) if isinstance(spin, (int, float)) else 0,
+            lateness=min(round(100 * late), 0xFFFF),
+            dropped=self.dropped & 0xFFF,
+            refused=self.commands.refused.total() & 0xFFF,
+        )
+
+    # Commands.
+
+    def _acknowledge(self, **raw: int) -> None:
+        self.outbox.answer(self._messages["Acknowledge"], **{"time": self._time_us & _WORD_32, **raw})
+
+    def _receive(self) -> None:
+        import can
+
+        while not self._stopping:
+            try:
+                message = self._bus.recv(0.2)
+            except Exception as error:
+                # Bus off, or no hub: it may come back, and the rig runs on meanwhile.
+                self.bus_errors += 1
+                if not isinstance(error, (can.CanError, OSError, ValueError)):
+                    self.guard.tell("hearing the bus", error)
+                time.sleep(0.1)
+                continue
+            if message is not None:
+                self.guard(self.commands.take_message, message)
