@@ -18,21 +18,18 @@ from typing import Any
 
 import numpy as np
 
+from replays.studies import provenance
 from replays.studies.peers import PEERS, Problem, Setting, scaled_error
 from replays.studies.peers.reference import find_reference
+from replays.studies.peers.window import cut_window
+from replays.studies.run import bare_sensors, run_scene
 from rig.kernels import compiled_before
 from rig.kernels.signals import COLUMN, N_STATE
 from rig.pacing import short_collections
 from rig.scenes import Scene, load_scene
 from rig.simulation import Simulation
 
-ALONE = {
-    "sensors.chain": "ideal",
-    "sensors.groups": ["hammer"],
-    "sensors.rate_hz": 1000,
-    "sensors.truth_rate_hz": 1000,
-    "model.friction": "exact",
-}
+ALONE = {**{f"sensors.{name}": value for name, value in bare_sensors().items()}, "model.friction": "exact"}
 """The engine alone: a row every 1 ms, no sensor chain to speak of."""
 _BLOCK_TICKS = 10_000
 _FRAME_TICKS = 1000
@@ -113,9 +110,7 @@ def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], No
     ready_s = time.perf_counter() - begin
 
     progress("reference")
-    problem = Problem.from_scene(
-        scenes[CASES[0].name], start_s=0.0, end_s=CASES[0].simulated_s, sample_s=1e-3, friction="exact"
-    )
+    problem = cut_window(scenes[CASES[0].name], end_s=CASES[0].simulated_s, sample_s=1e-3, friction="exact")
     reference, reference_error, source = _reference(problem)
     chosen: list[tuple[str, float, Setting, float]] = []
     missing = sorted({name for name, _ in PEER_CASES if not PEERS[name].installed}) if peers else []
@@ -138,31 +133,13 @@ def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], No
             values.append(problem.duration_s / solution.cpu_s)
 
     first = CASES[0].name
-    cases = []
-    for case in CASES:
-        rows, simulation = ends[case.name]
-        error = None
-        if case.scene == "hammer" and not case.blocks and case.simulated_s == CASES[0].simulated_s:
-            count = min(len(rows), len(reference))
-            error = scaled_error(rows[:count, :N_STATE], reference[:count])
-        summary = _summary(case.name, speeds[case.name], speeds[first])
-        reached = case.goal is None or summary["median"] >= case.goal
-        if case.error_goal is not None:
-            reached = reached and error is not None and error <= case.error_goal
-        cases.append(
-            summary
-            | {
-                "error": error,
-                "residual_share": simulation.health()["energy"]["residual_share"],
-                "spin_hz": float(rows[-1, COLUMN["theta_rate"]] / (2.0 * np.pi)),
-                "goal": case.goal,
-                "error_goal": case.error_goal,
-                "reached": reached if case.goal is not None or case.error_goal is not None else None,
-            }
-        )
+    cases = [
+        _judged(case, *ends[case.name], reference, _summary(case.name, speeds[case.name], speeds[first]))
+        for case in CASES
+    ]
     return {
         "machine": {
-            "processor": platform.processor() or platform.machine(),
+            "processor": provenance.processor(),
             "cores": os.cpu_count(),
             "python": platform.python_version(),
         },
@@ -181,19 +158,33 @@ def measure(*, runs: int, peers: bool, frames: int, progress: Callable[[str], No
     }
 
 
+def _judged(
+    case: Case, rows: np.ndarray, simulation: Simulation, reference: np.ndarray, summary: dict[str, Any]
+) -> dict[str, Any]:
+    """A case's speeds with its error, residual and goal beside them."""
+    error = None
+    if case.scene == "hammer" and not case.blocks and case.simulated_s == CASES[0].simulated_s:
+        count = min(len(rows), len(reference))
+        error = scaled_error(rows[:count, :N_STATE], reference[:count])
+    reached = case.goal is None or summary["median"] >= case.goal
+    if case.error_goal is not None:
+        reached = reached and error is not None and error <= case.error_goal
+    return summary | {
+        "error": error,
+        "residual_share": simulation.health()["energy"]["residual_share"],
+        "spin_hz": float(rows[-1, COLUMN["theta_rate"]] / (2.0 * np.pi)),
+        "goal": case.goal,
+        "error_goal": case.error_goal,
+        "reached": reached if case.goal is not None or case.error_goal is not None else None,
+    }
+
+
 def _run(scene: Scene, case: Case) -> tuple[float, np.ndarray, Simulation]:
     """Times real time, the observed rows (of the last block where there are blocks), and the simulation at its end."""
     simulation = Simulation(scene)
     _ = simulation.first_row
-    end = round(case.simulated_s * simulation.tick_rate_hz)
-    block = _BLOCK_TICKS if case.blocks else end
-    frame = None
-    begin = time.thread_time()
-    while simulation.tick < end:
-        frame = simulation.advance(block)
-    cpu_s = time.thread_time() - begin
-    assert frame is not None
-    return case.simulated_s / cpu_s, frame.rows, simulation
+    done = run_scene(simulation, block_ticks=_BLOCK_TICKS if case.blocks else simulation.end_tick, keep=False)
+    return case.simulated_s / done.cpu_s, done.rows, simulation
 
 
 def _reference(problem: Problem) -> tuple[np.ndarray, float | None, str]:
@@ -223,7 +214,7 @@ def _cheapest(
 
 
 def _with_steps_between(ladder: tuple[Setting, ...]) -> list[Setting]:
-    """A ladder of tolerances with three steps a decade: a coarse one would hold a peer to a rung below the goal."""
+    """A ladder of tolerances with three steps a decade: a coarse one would hold a peer to a setting below the goal."""
     finer = list(ladder)
     for above, below in pairwise(ladder):
         if above.absolute is None and below.absolute is None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from replays.studies.peers.problem import scaled_error
+from replays.studies.run import bare_sensors, run_scene
 from rig.engines import ENGINES
 from rig.kernels.signals import N_STATE
 from rig.scenes import Scene, parse_scene
@@ -79,11 +80,10 @@ def check(scene: Scene) -> Check:
 
 def _states(scene: Scene, changes: dict[str, float]) -> tuple[np.ndarray, int]:
     """States at the truth's rate, shape (n, N_STATE), and the number of contacts."""
-    plain = {"chain": "ideal", "groups": ["hammer"], "rate_hz": scene.sensors.truth_rate_hz}
     document = scene.model_dump()
-    document["sensors"] |= plain
+    document["sensors"] |= bare_sensors(scene.sensors.truth_rate_hz)
     document["engine"] |= changes
     simulation = Simulation(parse_scene({**document, "fidelity": "given"}))
-    frame = simulation.advance(simulation.end_tick)
     every = simulation.tick_rate_hz // scene.sensors.truth_rate_hz // simulation.row_ticks
-    return frame.rows[::every, :N_STATE].copy(), int(simulation.health()["contacts"])
+    done = run_scene(simulation, block_ticks=simulation.end_tick, every=every)
+    return done.rows[:, :N_STATE], int(simulation.health()["contacts"])

@@ -57,6 +57,8 @@ _STYLES: dict[str, tuple[str, Any]] = {
     "pereira-cylinder": (RED, "-"),
     "liu-cylinder": (SKY, "-"),
 }
+_OTHER = ("#882255", (0, (3, 1)))
+"""Of a law that has no style of its own."""
 
 
 def compare(parameters: ParameterSet) -> dict[str, Any]:
@@ -121,7 +123,7 @@ def compare(parameters: ParameterSet) -> dict[str, Any]:
 def over_speed(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[float]]:
     """Restitution returned over the approach speed [m/s], for the three ways of damping.
 
-    Memory of v0 (c from the exact rule) returns the same at any speed above the floor of v0, and more below it. A
+    Memory of v0 (c from the exact rule) returns the same at any speed above the lower limit of v0, and more below it. A
     linear law (Kelvin-Voigt) has no speed of its own. A constant D on Hertz's force, set at the reference impact,
     returns less the slower the impact.
     """
@@ -165,7 +167,7 @@ def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) ->
     curves = {name: np.array([_returned(name, float(e)) for e in asked]) for name in DAMPING}
     # From the most elastic down, as the curves stand in the picture at half.
     for name in sorted(curves, key=lambda name: -float(curves[name][90])):
-        color, dash = _STYLES[name]
+        color, dash = _STYLES.get(name, _OTHER)
         style = {"color": color, "ls": dash, "lw": 3.4 if name == "exact" else 1.8, "label": name}
         style["zorder"] = 1 if name == "exact" else 2
         wanted.plot(asked, curves[name], **style)
@@ -197,7 +199,10 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
     ):
         axes.semilogx(speeds, values, **{"lw": 1.8, "label": name, **style})
     low = max(0.0, min(min(values) for values in curves.values()) - 0.02)
-    for place, text in ((floor, f"floor of v0, {floor:g} m/s"), (impact.speed, f"reference, {impact.speed:g} m/s")):
+    for place, text in (
+        (floor, f"limit of v₀, {floor:g} m/s"),
+        (impact.speed, f"reference, {impact.speed:g} m/s"),
+    ):
         axes.axvline(place, color="0.5", lw=0.9, ls=":")
         axes.annotate(
             text, (place, low), xytext=(4, 5), textcoords="offset points", ha="left", va="bottom", rotation=90,
@@ -217,7 +222,7 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
         entry = _stiffness(parameters, pair, name)
         if entry["refused"]:
             continue
-        color, dash = _STYLES[name]
+        color, dash = _STYLES.get(name, _OTHER)
         forces = np.array([law.force(float(depth), pair) for depth in depths])
         axes.loglog(depths * 1e6, forces / depths * 1e-6, color=color, ls=dash, lw=1.8, label=name)
         if entry["fit_error"]:
@@ -227,12 +232,12 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
                 depths[within] * 1e6, (fitted / depths)[within] * 1e-6, color=color, ls="none", marker="o", ms=4,
                 mfc="white", markevery=3,
             )  # fmt: skip
-    axes.plot([], [], color="0.3", ls="none", marker="o", ms=4, mfc="white", label="K delta^n in its place")
+    axes.plot([], [], color="0.3", ls="none", marker="o", ms=4, mfc="white", label="K δⁿ in its place")
     low, high = (force / depths * 1e-6 for force in WORKING_FORCES)
     axes.fill_between(depths * 1e6, low, high, color="0.94", zorder=0, label="5 N to 3 kN")
     axes.set(
-        title=f"Stiffness laws, ring {pair.width * 1e3:g} mm wide (assumed)", xlabel="penetration [um]",
-        ylabel="force / penetration [N/um]", xlim=(0.3, 30), ylim=(2, 700),
+        title=f"Stiffness laws, ring {pair.width * 1e3:g} mm wide (assumed)", xlabel="penetration [µm]",
+        ylabel="force / penetration [N/µm]", xlim=(0.3, 30), ylim=(2, 700),
     )  # fmt: skip
     axes.legend(loc="lower right", fontsize=9, ncols=2)
 
@@ -260,7 +265,7 @@ def _resolved(
 
 
 def _returned(name: str, restitution: float) -> float:
-    """What a damping law returns at any speed above the floor of v0: Kelvin-Voigt's D is set to return it."""
+    """What a damping law returns at any speed above the lower limit of v0: Kelvin-Voigt's D is set to return it."""
     factor = DAMPING[name].factor
     return restitution if factor is None else returned_restitution(factor(restitution))
 

@@ -132,6 +132,8 @@ _STYLES: dict[str, dict[str, Any]] = {
     "cylinder map": {"color": SKY, "lw": 2.0, "ls": (0, (5, 3)), "zorder": 4},
     "exact cylinders": {"color": BLACK, "lw": 2.6},
 }
+_OTHER = {"color": "#882255", "lw": 1.6}
+"""Of a model that has no style of its own."""
 
 
 def _draw_same_magnets(axes: Any, model: Model) -> None:
@@ -139,7 +141,7 @@ def _draw_same_magnets(axes: Any, model: Model) -> None:
     geometry = model.magnets
     line = np.linspace(-geometry.reach, geometry.reach, 201)
     for each in family(geometry)[1:]:
-        style = _STYLES[each.name]
+        style = _STYLES.get(each.name, _OTHER)
         toward = -_inward(each.force, geometry, line, 0.0)
         axes.plot(line * 1e3, toward, label=f"{each.name}, K = {each.stiffness / 1e3:.3f} kN/m", **style)
         if each.name in ("far-field sum", "exact cylinders"):
@@ -161,7 +163,7 @@ def _draw_same_stiffness(axes: Any, model: Model) -> None:
     _shade_travel(axes, model, both=True)
     for each in family(geometry):
         force = -_inward(each.force, geometry, line, 0.0) * used / each.stiffness
-        axes.plot(line * 1e3, force, label=each.name, **_STYLES[each.name])
+        axes.plot(line * 1e3, force, label=each.name, **_STYLES.get(each.name, _OTHER))
     axes.set(
         title=f"At the same stiffness at the centre, the rig's {used / 1e3:.3g} kN/m",
         xlabel="displacement toward a magnet [mm]", ylabel="force along the displacement [N]",
@@ -221,7 +223,7 @@ def _draw_ripple(axes: Any, model: Model) -> None:
     axes.plot([], [], color=SKY, lw=2.0, ls=(0, (5, 3)), label="cylinder map")
     axes.plot([], [], color="0.3", lw=1.6, ls=(0, (1, 1.2)), label="far-field sum, same radii")
     axes.set(
-        title="Ripple of the force over the direction", xlabel="direction from a magnet [deg]",
+        title="Ripple of the force over the direction", xlabel="direction from a magnet [°]",
         ylabel="force / mean over directions - 1 [1]", xlim=(0.0, float(np.degrees(angle[-1]))),
         ylim=(-1.1 * peak, 1.5 * peak),
     )  # fmt: skip

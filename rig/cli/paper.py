@@ -13,7 +13,7 @@ from rig.cli.progress import reporting, tell_of_compiling
 from rig.cli.tables import echo, echo_json, new_table, table_console
 
 if TYPE_CHECKING:
-    from replays.studies.paper.document import Findings
+    from replays.studies.paper.findings import Findings
 
 
 def paper(
@@ -33,7 +33,8 @@ def paper(
 ) -> None:
     """Make the paper's figures, tables and claims again, as printed and corrected, each with a verdict."""
     from replays.report import check_report
-    from replays.studies.paper.document import draw_pictures, find, steps, write_up
+    from replays.studies.paper.document import draw_pictures, write_up
+    from replays.studies.paper.findings import find, steps
 
     if output is not None:
         check_report(output, force=force)
@@ -81,7 +82,7 @@ def summary(findings: Findings) -> dict[str, object]:
 def _show(findings: Findings) -> None:
     from rich.text import Text
 
-    from replays.studies.paper.document import JUDGED_BY, count
+    from replays.studies.paper.findings import JUDGED_BY, count
 
     headings = ("statement", "the paper", ">as-printed", ">corrected", "verdict")
     table = new_table("the paper's statements, and ours", *headings)

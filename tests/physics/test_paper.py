@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from replays.studies.paper import condition
-from replays.studies.paper.blow import Blow, Outcome, outcome
+from replays.studies.paper.pulse import Outcome, Pulse, outcome
 from replays.studies.paper.question import fall, weight_at_ring
 from replays.studies.paper.reproduction import drop_impact, drop_impulse
 from replays.studies.stability.motion import base_model, move, quiet_inputs
@@ -55,7 +55,7 @@ def drop(parameters: str) -> Run:
 @cache
 def held(speed_hz: float, stator: str = "two-houses") -> Outcome:
     changes = {"drive.mode": "ideal", "model.stator": stator}
-    return outcome(Blow(changes=changes, speed_hz=speed_hz, force_n=150.0))
+    return outcome(Pulse(changes=changes, speed_hz=speed_hz, force_n=150.0))
 
 
 def rolling(speed_hz: float) -> tuple[float, float]:

@@ -16,7 +16,8 @@ import math
 import numpy as np
 import pytest
 
-from replays.studies.stability.atlas import GROWN, LIMITS, contact_ratio, house_ratio
+from replays.studies.engines import traits
+from replays.studies.stability.atlas import GROWN, contact_ratio, house_ratio
 from replays.studies.stability.cell import Cell
 from replays.studies.stability.closed_forms import impact, runge_kutta_4_gain
 from replays.studies.stability.motion import bare_shaft, base_model, pivoted_mass
@@ -58,7 +59,7 @@ def test_impact_quadrature_against_an_integration(factor, speed):
     from scipy.integrate import solve_ivp
 
     mass, stiffness, floor = 1.99, 2.86e10, 1e-3
-    right = impact(mass=mass, speed=speed, stiffness=stiffness, exponent=1.5, factor=factor, floor=floor)
+    right = impact(mass=mass, speed=speed, stiffness=stiffness, exponent=1.5, factor=factor, speed_floor=floor)
 
     def rates(t, z):
         force = stiffness * max(0.0, z[0]) ** 1.5 * (1.0 + factor * z[1] / max(speed, floor))
@@ -75,10 +76,10 @@ def test_impact_quadrature_against_an_integration(factor, speed):
     assert run.y[0].max() == pytest.approx(right.depth, rel=1e-3)
 
 
-@pytest.mark.parametrize("engine", [name for name in LIMITS["house"] if name in ENGINES])
+@pytest.mark.parametrize("engine", [name for name in ENGINES if math.isfinite(traits(name).limit("house"))])
 @pytest.mark.parametrize("oscillator", [house_ratio, contact_ratio])
 def test_linear_limits(engine, oscillator):
-    limit = LIMITS["house"][engine]
+    limit = traits(engine).limit("house")
     mass = base_model(ModelLevels()).constants.house.inner_mass
     if oscillator is contact_ratio:
         mass = pivoted_mass(bare_shaft())
@@ -90,7 +91,7 @@ def test_linear_limits(engine, oscillator):
 
 def test_limit_of_the_contact_kick_of_split():
     mass, stiffness = pivoted_mass(bare_shaft()), 1e8
-    step = LIMITS["contact"]["split"] / math.sqrt(stiffness / mass)
+    step = traits("split").limit("contact") / math.sqrt(stiffness / mass)
     # Only the near side: beyond it the kick ceases to push, and the shaft falls through without growing by powers.
     assert contact_ratio("split", 0.97 * step, stiffness) < GROWN
 

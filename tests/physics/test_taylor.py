@@ -28,9 +28,10 @@ import numpy as np
 import pytest
 
 from replays.studies.peers import PEERS, Setting, scaled_error
-from replays.studies.peers.problem import Problem
+from replays.studies.peers.window import cut_window
+from replays.studies.stability.flight import house_oscillator
+from replays.studies.stability.impacts import first_impact
 from replays.studies.stability.motion import move, quiet_inputs, state
-from replays.studies.stability.trials import first_impact, house_oscillator
 from rig import load_scene
 from rig.engines import taylor
 from rig.engines.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, MEMORY, ONSET, PHASE, STEPS
@@ -173,7 +174,7 @@ def test_an_impact_is_its_quadrature(speed: float) -> None:
 
 def test_first_impacts_agree_with_heyoka() -> None:
     pytest.importorskip("heyoka")
-    problem = Problem.from_scene(load_scene("hammer"), end_s=0.05, sample_s=1e-3, friction="exact")
+    problem = cut_window(load_scene("hammer"), end_s=0.05, sample_s=1e-3, friction="exact")
     peer = PEERS["heyoka"].solve(problem, Setting("1e-15", 1e-15), budget_s=100.0)
     assert peer.failure is None
     simulation = ready(tolerance=1e-12)

@@ -12,7 +12,7 @@ import pytest
 from replays.studies.chart import measure, session
 from replays.studies.chart.figure import draw
 from replays.studies.chart.measure import OFF, Budget, Run, block_statistics, elastic_forces, point, run_engine
-from replays.studies.chart.methods import Rung, competitors
+from replays.studies.chart.methods import competitors
 from replays.studies.chart.phases import PANELS, plan, problem_of
 from replays.studies.chart.profile import draw_scene, shares
 from replays.studies.chart.session import make_chart
@@ -95,7 +95,7 @@ def test_error_and_verdict_of_a_hand_made_run(
     done.contacts = contacts
     done.failure = failure if failure == "nan" else ""
     monkeypatch.setattr(measure, "run", lambda *_: done)
-    found = point(competitors(peers=False)["rk4"], Rung("5 us", 5), problem, reference, ONCE)
+    found = point(competitors(peers=False)["rk4"], Setting("5 us", 0.0, step_us=5), problem, reference, ONCE)
     assert found["failure"] == failure
     assert (found["cpu_s"], found["cpu_min_s"], found["cpu_max_s"]) == (0.2, 0.1, 0.5)
     assert found["speed"] == pytest.approx(problem.duration_s / 0.2)
@@ -108,7 +108,7 @@ def test_error_and_verdict_of_a_hand_made_run(
 
 def test_engine_called_directly_agrees_with_another_code_and_closes_its_ledger() -> None:
     problem = problem_of("exact", "first-impacts", "", end_s=0.03)
-    done = run_engine("rk4", Rung("10 us", 10), problem, ONCE)
+    done = run_engine("rk4", Setting("10 us", 0.0, step_us=10), problem, ONCE)
     truth = PEERS["scipy-dop853"].solve(problem, Setting("1e-9", 1e-9))
     assert done.failure == ""
     assert measure.scaled_error(done.states, truth.states) < 1e-3
@@ -121,7 +121,7 @@ def test_engine_called_directly_agrees_with_another_code_and_closes_its_ledger()
 
 def test_engine_without_time_is_a_failure_and_no_error() -> None:
     problem = problem_of("exact", "first-impacts", "", end_s=0.01)
-    done = run_engine("rk4", Rung("10 us", 10), problem, Budget(0.0, 3))
+    done = run_engine("rk4", Setting("10 us", 0.0, step_us=10), problem, Budget(0.0, 3))
     assert done.failure == "budget"
     assert done.reached_s == pytest.approx(1e-3)
     assert np.isnan(done.states[-1]).all()
@@ -130,7 +130,7 @@ def test_engine_without_time_is_a_failure_and_no_error() -> None:
 def test_frames_must_be_whole_steps() -> None:
     problem = problem_of("exact", "first-impacts", "", end_s=0.01)
     with pytest.raises(ValueError, match="no whole number of steps"):
-        run_engine("rk4", Rung("30 us", 30), problem, ONCE)
+        run_engine("rk4", Setting("30 us", 0.0, step_us=30), problem, ONCE)
 
 
 def test_block_statistics_of_a_square_wave() -> None:
@@ -258,7 +258,7 @@ def test_a_small_chart_end_to_end_resumes_and_says_what_is_missing(
 
 def test_without_peers_there_is_still_a_reference() -> None:
     problem = problem_of("exact", "first-impacts", "", end_s=0.03)
-    own = session._own_reference(problem)
+    own = session.own_reference(problem)
     truth = PEERS["scipy-radau"].solve(problem, Setting("1e-9", 1e-9))
     assert own is not None
     assert not own.independent

@@ -29,7 +29,7 @@ fidelity = "auto"
 [drive]
 speed_hz = 6.2  # as in the paper
 
-# the blow
+# the pulse
 [[commands]]
 at_s = 0.02
 command = "hammer"
@@ -117,9 +117,9 @@ def test_a_pick_meets_its_tolerance_as_it_will_run(found: Ladder) -> None:
     impact = next(step for step in found.steps if step.label == "contact impact")
     assert impact.errors.model["peak_normal_force"] == math.inf
     assert not impact.passes
-    assert picked.rung.levels.contact == "compliant"
+    assert picked.candidate.levels.contact == "compliant"
     # The first impact comes before friction and houses have a say.
-    assert picked.rung.levels.magnet == "linear"
+    assert picked.candidate.levels.magnet == "linear"
     assert math.isclose(float(picked.values["first_impact_time"]), 0.0255, abs_tol=2e-3)
 
 
@@ -174,7 +174,7 @@ def test_only_the_table_is_replaced(found: Ladder, end: str) -> None:
     changed = with_pick(later, pick.model_copy(update={"seed": 5}))
     assert "# mine" in changed
     assert "noise = false  # quiet" in changed
-    assert "# the blow" in changed
+    assert "# the pulse" in changed
     data = tomllib.loads(changed)
     assert data["pick"]["seed"] == 5
     assert data["sensors"] == {"noise": False}

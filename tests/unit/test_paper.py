@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from replays.report.document import Heading, Picture, Report, Table
-from replays.studies.paper.blow import BLOW_AT, Blow, Outcome, outcome, outcomes
+from replays.report.document import Heading, Paragraph, Picture, Report, Table
 from replays.studies.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
-from replays.studies.paper.document import Findings, all_questions, find, planned_groups, steps, write_up
+from replays.studies.paper.document import write_up
 from replays.studies.paper.figure import first_impacts
+from replays.studies.paper.findings import Findings, find, planned_groups, steps
+from replays.studies.paper.pulse import PULSE_AT, Outcome, Pulse, outcome, outcomes
 from replays.studies.paper.spread import (
     assumed_values,
     changes,
@@ -77,9 +78,9 @@ def test_tied_value_follows():
 
 
 def test_hypercube_is_one_in_each_layer_and_the_same_again():
-    parts, blows = hypercube(8)
+    parts, pulses = hypercube(8)
     assert np.array_equal(parts, hypercube(8)[0])
-    assert len(blows) == 8
+    assert len(pulses) == 8
     for column in parts.T:
         assert sorted(np.floor(column * 8).astype(int)) == list(range(8))
 
@@ -117,15 +118,15 @@ def test_printed_values_against_the_sets():
     assert differs == {"house.outer_mass", "house.pair_stiffness_vertical"}
 
 
-def test_a_blow_that_dies_out_and_one_that_cannot_be_built():
-    weak = outcome(Blow(force_n=5.0, duration_s=0.3))
+def test_a_pulse_that_dies_out_and_one_that_cannot_be_built():
+    weak = outcome(Pulse(force_n=5.0, duration_s=0.3))
     assert not weak.whirls
     assert math.isnan(weak.whirl_hz)
-    assert outcome(Blow(changes={"magnet.count": 20})).outcome == "cannot be built"
+    assert outcome(Pulse(changes={"magnet.count": 20})).outcome == "cannot be built"
 
 
 def test_bandwidth_lowers_the_peak_and_not_the_contact():
-    plain, slow = (outcome(Blow(changes=change)) for change in ({}, {"transducer.bandwidth": 200.0}))
+    plain, slow = (outcome(Pulse(changes=change)) for change in ({}, {"transducer.bandwidth": 200.0}))
     assert slow.peak_x_n < 0.6 * plain.peak_x_n
     assert slow.normal_n == plain.normal_n
     # Butterworth of order 2 at 82 Hz.
@@ -155,7 +156,7 @@ def test_tornado_is_widest_first_and_tells_what_reaches_the_measured():
 
 
 def test_phases_cover_one_turn_of_the_shaft():
-    at = [blow.changes[BLOW_AT] for blow in phases(Blow(), 4)]
+    at = [pulse.changes[PULSE_AT] for pulse in phases(Pulse(), 4)]
     assert np.diff(at) == pytest.approx([1 / 6.2 / 4] * 3, abs=2e-4)
 
 
@@ -207,8 +208,14 @@ def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: P
     for table in (part for part in report.parts if isinstance(part, Table)):
         assert table.rows, table.caption
         assert any(re.search(r"\d", cell) for row in table.rows for cell in row.cells[1:])
-    for question in all_questions(findings):
-        assert re.search(r"\d", question.answer)
+    opened = report.parts.index(Heading("Open questions"))
+    questions = [n for n, part in enumerate(report.parts) if isinstance(part, Heading) and n > opened]
+    questions = questions[: next(n for n, place in enumerate(questions) if report.parts[place].level == 1)]
+    assert len(questions) == 6
+    for place in questions:
+        answer = report.parts[place + 2]
+        assert isinstance(answer, Paragraph)
+        assert re.search(r"\d", answer.text)
     target = tmp_path / "report.html"
     report.write(target)
     text = target.read_text(encoding="utf-8")
@@ -217,17 +224,17 @@ def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: P
 
 @pytest.mark.wallclock
 def test_two_processes_give_what_one_gives():
-    blows = [Blow(label=str(force), force_n=force, duration_s=0.3) for force in (20.0, 80.0, 100.0, 120.0)]
+    pulses = [Pulse(label=str(force), force_n=force, duration_s=0.3) for force in (20.0, 80.0, 100.0, 120.0)]
     told: list[str] = []
-    assert str(list(outcomes(blows, processes=2, progress=told.append))) == str(list(outcomes(blows, processes=1)))
-    assert told == [blow.label for blow in blows]
+    assert str(list(outcomes(pulses, processes=2, progress=told.append))) == str(list(outcomes(pulses, processes=1)))
+    assert told == [pulse.label for pulse in pulses]
 
 
 _POOL = """
 import os, signal
-from replays.studies.paper.blow import Blow, outcomes
-blows = [Blow(force_n=20.0, duration_s=0.05)] * 400
-for n, _ in enumerate(outcomes(blows, processes=2)):
+from replays.studies.paper.pulse import Pulse, outcomes
+pulses = [Pulse(force_n=20.0, duration_s=0.05)] * 400
+for n, _ in enumerate(outcomes(pulses, processes=2)):
     if n == 0:
         import multiprocessing
         print(*(child.pid for child in multiprocessing.active_children()), flush=True)
@@ -269,7 +276,7 @@ def test_number():
 
 
 def test_terminal_tells_the_total_and_the_rule(findings: Findings, capsys, monkeypatch):
-    monkeypatch.setattr("replays.studies.paper.document.find", lambda **_: findings)
+    monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
     with pytest.raises(SystemExit) as end:
         main(["paper", "--quick"])
     assert end.value.code == 0
@@ -285,7 +292,7 @@ def test_terminal_tells_the_total_and_the_rule(findings: Findings, capsys, monke
 
 
 def test_a_folder_for_pictures_is_made_beside_others(findings: Findings, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("replays.studies.paper.document.find", lambda **_: findings)
+    monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
     drawn: list[Path] = []
     monkeypatch.setattr("replays.studies.paper.document.draw_pictures", lambda _, folder: drawn.append(folder) or [])
     (tmp_path / "file").write_text("")

@@ -12,6 +12,7 @@ from replays.studies.peers.plain_python import PlainPython
 from replays.studies.peers.reference import find_reference
 from replays.studies.peers.right_hand_side import derivative, pack, switching
 from replays.studies.peers.solution import MISSED_HAMMER
+from replays.studies.peers.window import cut_window
 from rig.errors import InputError
 from rig.kernels.contact import FLIGHT, FORWARD, ROLLING, TOUCHING
 from rig.kernels.signals import STATE_SCALE
@@ -23,7 +24,7 @@ LIBRARY = {name: peer.module for name, peer in PEERS.items()}
 
 def problem(end_s: float, *, scene: str = "hammer", changes: dict | None = None, **options) -> Problem:
     options = {"friction": "smoothed", "sample_s": 1e-3} | options
-    return Problem.from_scene(load_scene(scene, changes), end_s=end_s, **options)
+    return cut_window(load_scene(scene, changes), end_s=end_s, **options)
 
 
 def solve(name: str, given: Problem, tolerance: float, **options):
@@ -44,8 +45,8 @@ def states_in_contact(given: Problem, *, count: int) -> np.ndarray:
 @pytest.mark.parametrize("scene", ["hammer", "drop", "run-up", "stable-run"])
 def test_a_problem_starts_where_the_simulation_does(scene: str) -> None:
     simulation = Simulation(load_scene(scene))
-    given = Problem.from_scene(load_scene(scene), end_s=0.01)
-    np.testing.assert_array_equal(given.y0, simulation._y[:14])
+    given = cut_window(load_scene(scene), end_s=0.01)
+    np.testing.assert_array_equal(given.y0, simulation.first_row[:14])
     drive = ("speed", "speed_slope", "speed_tick", "ideal_drive", "magnet_engaged", "tick_s")
     inputs = simulation._inputs()
     assert [getattr(given.inputs, name) for name in drive] == [getattr(inputs, name) for name in drive]
@@ -54,11 +55,11 @@ def test_a_problem_starts_where_the_simulation_does(scene: str) -> None:
 
 def test_a_window_ends_where_the_inputs_change() -> None:
     scene = load_scene("hammer", {"commands": [{"at_s": at, "command": "hammer"} for at in (0.02, 0.05)]})
-    assert Problem.from_scene(scene, end_s=0.05).corners == pytest.approx((0.02, 0.025))
+    assert cut_window(scene, end_s=0.05).corners == pytest.approx((0.02, 0.025))
     with pytest.raises(InputError, match=r"at most 0\.05 s"):
-        Problem.from_scene(scene, end_s=0.051)
+        cut_window(scene, end_s=0.051)
     with pytest.raises(InputError, match="end_s"):
-        Problem.from_scene(scene, start_s=0.03, end_s=0.03)
+        cut_window(scene, start_s=0.03, end_s=0.03)
 
 
 def test_a_later_window_goes_on_from_an_earlier_one() -> None:
@@ -88,22 +89,22 @@ def test_compiled_and_plain_python_are_the_same_equations(changes: dict, phase: 
 def test_heyoka_has_the_same_equations(changes: dict, phase: int) -> None:
     # The direction vector of the axis against the angles: compared through the flow, by a difference quotient.
     hy = pytest.importorskip("heyoka", reason="needs the extra `peers`")
-    from replays.studies.peers import taylor
+    from replays.studies.peers import taylor_equations as taylor
 
     given = replace(problem(0.03, changes=changes), phase=phase, onset_speed=0.1)
     parameters = pack(given)
-    kind = taylor._kind(given, phase, hit=True)._replace(exact=phase in (FORWARD, ROLLING))
-    variables, rates, _ = taylor._equations(kind)
+    kind = taylor.kind_of(given, phase, hit=True)._replace(exact=phase in (FORWARD, ROLLING))
+    variables, rates, _ = taylor.equations(kind)
     function = hy.cfunc(rates, vars=variables)
-    numbers = taylor._numbers(given)
+    numbers = taylor.numbers_of(given)
     values = np.array([numbers[name] for name in taylor.PARAMETERS])[: function.nparams]
     ideal = given.inputs.ideal_drive
     for y in states_in_contact(given, count=4):
         dy = derivative(0.0213, y, parameters)
         step = 1e-6 / np.max(np.abs(dy / STATE_SCALE))
-        ahead, behind = (taylor._to_series(y + way * step * dy, ideal_drive=ideal) for way in (1.0, -1.0))
+        ahead, behind = (taylor.to_series(y + way * step * dy, ideal_drive=ideal) for way in (1.0, -1.0))
         wanted = (ahead - behind) / (2.0 * step)
-        found = function(taylor._to_series(y, ideal_drive=ideal), pars=values, time=0.0213)
+        found = function(taylor.to_series(y, ideal_drive=ideal), pars=values, time=0.0213)
         np.testing.assert_allclose(found, wanted, atol=1e-8 * np.max(np.abs(wanted)))
 
 
@@ -185,9 +186,9 @@ def test_samples_do_not_move_the_steps_of_cvode() -> None:
 
 
 @pytest.mark.parametrize("name", ["cvode-bdf", "scipy-bdf"])
-def test_without_stops_a_short_blow_is_stepped_over(name: str) -> None:
-    blow = {"at_s": 0.1, "command": "hammer", "force_n": 400.0, "duration_ms": 1.0}
-    given = problem(0.12, changes={"commands": [blow]})
+def test_without_stops_a_short_pulse_is_stepped_over(name: str) -> None:
+    pulse = {"at_s": 0.1, "command": "hammer", "force_n": 400.0, "duration_ms": 1.0}
+    given = problem(0.12, changes={"commands": [pulse]})
     missed = solve(f"{name}-no-stops", given, 1e-4)
     assert missed.failure == MISSED_HAMMER
     assert missed.contacts == 0
@@ -232,7 +233,7 @@ def test_what_a_peer_cannot_express_is_a_failure() -> None:
         assert "friction" in failure
 
 
-def test_a_state_that_blows_up_is_a_failure() -> None:
+def test_a_state_that_pulses_up_is_a_failure() -> None:
     given = problem(0.01)
     wild = replace(given, y0=np.where(np.arange(14) == 3, 1e200, given.y0))
     assert solve("scipy-dop853", wild, 1e-6, budget_s=5.0).failure is not None

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.studies.chart.methods import Competitor, Rung
-from replays.studies.peers import PEERS
+from replays.studies.chart.methods import Competitor
+from replays.studies.peers import PEERS, Setting
 from replays.studies.peers.problem import Problem, scaled_error
 from replays.studies.peers.reference import Reference
 from replays.studies.peers.solution import MISSED_HAMMER, Solution
-from rig.engines import load_engine
-from rig.engines.memory import CONTACTS, EVALUATIONS, MEMORY, STEPS
+from replays.studies.run import Course
+from rig.engines.memory import CONTACTS, EVALUATIONS, STEPS
 from rig.kernels.contact import normal_force
 from rig.kernels.geometry import gap
-from rig.kernels.signals import N_ROW, N_STATE, N_VECTOR
+from rig.kernels.signals import N_ROW, N_STATE
 from rig.simulation import energy_balance
 
 OFF = 0.5
@@ -64,100 +65,129 @@ class Run:
     """Times at which contacts began, to a frame [s]."""
 
 
-def run_engine(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
+def run_engine(name: str, setting: Setting, problem: Problem, budget: Budget) -> Run:
     """Run an engine of ours: first frame by frame, then in one go for the clock."""
-    engine, constants, inputs = load_engine(name), problem.constants, problem.inputs
     times = problem.times
-    frame_ticks = round((times[1] - times[0]) / inputs.tick_s)
-    if frame_ticks % rung.step_us:
-        raise ValueError(f"frames of {frame_ticks} us are no whole number of steps of {rung.step_us} us")
-    stride, n = frame_ticks // rung.step_us, len(times) - 1
-    first = np.zeros(N_VECTOR)
-    first[:N_STATE] = problem.y0
-    step = float(rung.step_us)
+    frame_ticks = round((times[1] - times[0]) / problem.inputs.tick_s)
+    if frame_ticks % setting.step_us:
+        raise ValueError(f"frames of {frame_ticks} us are no whole number of steps of {setting.step_us} us")
+    stride, n = frame_ticks // setting.step_us, len(times) - 1
 
-    def begin() -> tuple[np.ndarray, np.ndarray]:
-        y, memory = first.copy(), np.zeros(MEMORY)
-        engine.start(constants, inputs, y, memory, step, rung.tolerance)
-        return y, memory
+    def begin() -> Course:
+        return Course(
+            name, problem.constants, problem.inputs, problem.y0, step=setting.step_us, tolerance=setting.tolerance,
+            tick=problem.start_tick,
+        )  # fmt: skip
 
     rows = np.full((n + 1, N_ROW), np.nan)
     clock = time.perf_counter()
-    y, memory = begin()
-    engine.advance(constants, inputs, y, memory, problem.start_tick, rung.step_us, 1, 1, rows[:1])
+    begin().advance(1, 1, rows[:1])
     compile_s = time.perf_counter() - clock
-    frames = np.empty(n)
-    counts = np.zeros(n + 1)
-    best = np.full(n, np.inf)
-    failure, message, reached = "", "", n
-    begun_cpu = 0.0
-    for turn in range(budget.runs):
-        y, memory = begin()
-        begun, begun_cpu = time.perf_counter(), time.thread_time()
-        for i in range(n):
-            before = time.perf_counter()
-            engine.advance(
-                constants, inputs, y, memory, problem.start_tick + i * frame_ticks, rung.step_us, stride, stride,
-                rows[i : i + 1],
-            )  # fmt: skip
-            after = time.perf_counter()
-            frames[i] = after - before
-            counts[i + 1] = memory[CONTACTS]
-            if after - begun > budget.solve_s:
-                failure, message, reached = "budget", f"over the budget of {budget.solve_s:g} s", i + 1
-                break
-        if failure:
-            break
-        best = np.minimum(best, frames)
-        if turn == 0 and frames.sum() > 0.1 * budget.solve_s:
-            break
-    cost = time.thread_time() - begun_cpu
-    last, note = y.copy(), memory.copy()
-    costs = [cost]
-    if not failure:
-        # One more row, at the window's end.
-        end = problem.start_tick + n * frame_ticks
-        engine.advance(constants, inputs, last, note, end, rung.step_us, 1, 1, rows[n:])
-        whole, costs = np.empty((n, N_ROW)), []
-        while len(costs) < budget.runs or (sum(costs) < _ENOUGH_S and len(costs) < _MOST):
-            clock = time.thread_time()
-            again, kept = begin()
-            engine.advance(constants, inputs, again, kept, problem.start_tick, rung.step_us, n * stride, stride, whole)
-            costs.append(time.thread_time() - clock)
-            if costs[-1] > budget.single_s:
-                break
-    else:
-        rows[reached:] = np.nan
+    frames = _by_frame(begin, rows, stride, budget)
+    course, costs, failure = frames.course, [frames.cpu_s], frames.failure
     states = rows[:, :N_STATE].copy()
-    if not failure and not np.isfinite(states).all():
-        failure, message = "nan", "the state is not finite"
+    if not failure:
+        costs = _in_one_go(begin, n, stride, budget)
     residual = None
+    if not failure and not np.isfinite(states).all():
+        failure = "the state is not finite"
     if not failure:
         balance = energy_balance(rows, rows[0])
         residual = float(np.max(np.abs(balance["residual"])) / max(float(balance["dissipated"][-1]), 1e-6))
     return Run(
         states=states,
         costs=costs,
-        contacts=int(memory[CONTACTS]),
-        steps=int(memory[STEPS]),
-        evaluations=int(memory[EVALUATIONS]),
-        reached_s=float(times[reached]),
-        failure=failure,
-        message=message,
+        contacts=int(course.memory[CONTACTS]),
+        steps=int(course.memory[STEPS]),
+        evaluations=int(course.memory[EVALUATIONS]),
+        reached_s=float(times[frames.reached]),
+        failure=_kind_of(failure),
+        message=failure,
         compile_s=compile_s,
         energy_residual=residual,
-        worst_frame_s=None if failure else float(best.max()),
-        onsets=np.repeat(times, np.diff(counts, prepend=0.0).clip(0).astype(int)),
+        worst_frame_s=None if failure else float(frames.best_s.max()),
+        onsets=np.repeat(times, np.diff(frames.counts, prepend=0.0).clip(0).astype(int)),
     )
 
 
-def run_peer(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
+class _Frames(NamedTuple):
+    """The window frame by frame, the last time that it was gone through."""
+
+    course: Course
+    counts: np.ndarray
+    """Contacts begun up to each instant, shape (n + 1,)."""
+    best_s: np.ndarray
+    """Least wall time of each frame [s], shape (n,)."""
+    cpu_s: float
+    """Processor time [s]."""
+    reached: int
+    """Frames that were got through."""
+    failure: str
+
+
+def _by_frame(begin: Callable[[], Course], rows: np.ndarray, stride: int, budget: Budget) -> _Frames:
+    """Go through the window frame by frame, several times where that is quick.
+
+    Args:
+        begin: Starts anew.
+        rows: Filled with a row an instant, nan from where time was over, shape (n + 1, N_ROW).
+        stride: Steps a frame.
+        budget: What it may cost.
+    """
+    n = len(rows) - 1
+    spent, counts, best = np.empty(n), np.zeros(n + 1), np.full(n, np.inf)
+    course, cpu_s = begin(), 0.0
+    for turn in range(budget.runs):
+        course = begin()
+        begun, begun_cpu = time.perf_counter(), time.thread_time()
+        for i in range(n):
+            before = time.perf_counter()
+            course.advance(stride, stride, rows[i : i + 1])
+            after = time.perf_counter()
+            spent[i] = after - before
+            counts[i + 1] = course.memory[CONTACTS]
+            if after - begun > budget.solve_s:
+                rows[i + 1 :] = np.nan
+                cpu_s = time.thread_time() - begun_cpu
+                return _Frames(course, counts, best, cpu_s, i + 1, f"over the budget of {budget.solve_s:g} s")
+        cpu_s = time.thread_time() - begun_cpu
+        best = np.minimum(best, spent)
+        if turn == 0 and spent.sum() > 0.1 * budget.solve_s:
+            break
+    course.look(rows[n:])
+    return _Frames(course, counts, best, cpu_s, n, "")
+
+
+def _in_one_go(begin: Callable[[], Course], frames: int, stride: int, budget: Budget) -> list[float]:
+    """Processor time of the whole window in one call [s], as often as a short one needs."""
+    whole, costs = np.empty((frames, N_ROW)), []
+    while len(costs) < budget.runs or (sum(costs) < _ENOUGH_S and len(costs) < _MOST):
+        clock = time.thread_time()
+        begin().advance(frames * stride, stride, whole)
+        costs.append(time.thread_time() - clock)
+        if costs[-1] > budget.single_s:
+            break
+    return costs
+
+
+def _kind_of(failure: str) -> str:
+    """The kind of a failure that is given in words."""
+    kinds = {
+        "": not failure,
+        "hammer": failure == MISSED_HAMMER,
+        "budget": failure.startswith(("over the budget", "more than")),
+        "nan": "not finite" in failure,
+    }
+    return next((kind for kind, holds in kinds.items() if holds), "error")
+
+
+def run_peer(name: str, setting: Setting, problem: Problem, budget: Budget) -> Run:
     """Run a peer; the first run counts only where it is long, as it may load what the others find loaded."""
     peer, costs, compile_s = PEERS[name], [], 0.0
     solution: Solution | None = None
     while solution is None or len(costs) < budget.runs:
         fresh = solution is None
-        solution = peer.solve(problem, rung.setting, budget_s=budget.solve_s)
+        solution = peer.solve(problem, setting, budget_s=budget.solve_s)
         compile_s = max(compile_s, solution.compile_s)
         if not fresh or solution.failure is not None or solution.cpu_s > 0.2 or solution.cpu_s > budget.single_s:
             costs.append(solution.cpu_s)
@@ -166,11 +196,6 @@ def run_peer(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
     good: np.ndarray = np.isfinite(solution.states.sum(axis=1))
     reached = len(good) if good.all() else int(np.argmin(good))
     message = solution.failure or ""
-    failure = ""
-    if message:
-        over = message.startswith(("over the budget", "more than"))
-        kinds = (("hammer", message == MISSED_HAMMER), ("budget", over), ("nan", "not finite" in message))
-        failure = next((kind for kind, holds in kinds if holds), "error")
     return Run(
         states=solution.states,
         costs=costs,
@@ -178,21 +203,23 @@ def run_peer(name: str, rung: Rung, problem: Problem, budget: Budget) -> Run:
         steps=solution.steps,
         evaluations=solution.evaluations,
         reached_s=float(problem.times[max(reached - 1, 0)]),
-        failure=failure,
+        failure=_kind_of(message),
         message=message,
         compile_s=compile_s,
         onsets=np.array([time_s for time_s, _ in solution.onsets]),
     )
 
 
-def run(contender: Competitor, rung: Rung, problem: Problem, budget: Budget) -> Run:
+def run(contender: Competitor, setting: Setting, problem: Problem, budget: Budget) -> Run:
     """Run a method."""
-    return (run_engine if contender.ours else run_peer)(contender.name, rung, problem, budget)
+    return (run_engine if contender.ours else run_peer)(contender.name, setting, problem, budget)
 
 
-def point(contender: Competitor, rung: Rung, problem: Problem, reference: Reference, budget: Budget) -> dict[str, Any]:
+def point(
+    contender: Competitor, setting: Setting, problem: Problem, reference: Reference, budget: Budget
+) -> dict[str, Any]:
     """Measure a point with a pointwise error, as columns of the store."""
-    done = run(contender, rung, problem, budget)
+    done = run(contender, setting, problem, budget)
     wanted = reference.solution.contacts
     error = scaled_error(done.states, reference.solution.states) if not done.failure else None
     failure, message = done.failure, done.message
@@ -215,10 +242,10 @@ STATISTICS = ("contact_fraction", "rms_force", "impacts_per_s")
 
 
 def statistics_point(
-    contender: Competitor, rung: Rung, problem: Problem, budget: Budget, *, settle_s: float = 1.0
+    contender: Competitor, setting: Setting, problem: Problem, budget: Budget, *, settle_s: float = 1.0
 ) -> dict[str, Any]:
     """Measure a point of chaotic motion: means over blocks of time, with 95 % bootstrap bars."""
-    done = run(contender, rung, problem, budget)
+    done = run(contender, setting, problem, budget)
     columns: dict[str, Any] = {**_cost(done, problem), "failure": done.failure, "message": done.message}
     if done.failure:
         return columns

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
+from replays.studies.engines import settings as engine_settings
 from replays.studies.peers import PEERS, Setting
 from rig.engines import ENGINES
 
@@ -12,26 +12,15 @@ OURS = "rig"
 """Family of our own engines."""
 
 
-class Rung(NamedTuple):
-    """One setting of a method."""
-
-    label: str
-    step_us: int = 0
-    """Of an engine of ours."""
-    tolerance: float = 0.0
-    setting: Setting | None = None
-    """Of a peer."""
-
-
 @dataclass(frozen=True)
 class Competitor:
-    """A method and its ladder, the coarsest rung first."""
+    """A method and its ladder of settings, the coarsest first."""
 
     name: str
     title: str
     family: str
-    rungs: tuple[Rung, ...]
-    quick: tuple[Rung, ...]
+    settings: tuple[Setting, ...]
+    quick: tuple[Setting, ...]
     known_failure: str = ""
 
     @property
@@ -46,26 +35,8 @@ class Competitor:
         return friction != "exact" or PEERS[self.name].exact_friction
 
 
-_STEPS = (50, 40, 25, 20, 10, 5, 2)
-_LADDERS: dict[str, tuple[tuple[int, float], ...]] = {
-    "split": tuple((step, 0.0) for step in (100, *_STEPS, 1)),
-    "rk8": tuple((25, 10.0**-n) for n in range(4, 13)),
-    "taylor": tuple((25, 10.0**-n) for n in (4, 5, 6, 7, 8, 9, 10, 12, 14)),
-    "tsit5": tuple((500, 10.0**-n) for n in range(3, 11)),
-    "rk4": tuple((step, 0.0) for step in _STEPS),
-}
-_QUICK: dict[str, tuple[tuple[int, float], ...]] = {
-    "split": tuple((step, 0.0) for step in (50, 40, 25, 20, 10, 5)),
-    "rk8": tuple((25, 10.0**-n) for n in (6, 8, 10, 12)),
-    "taylor": tuple((25, 10.0**-n) for n in (5, 7, 9, 11)),
-    "tsit5": tuple((500, 10.0**-n) for n in (4, 6, 8, 10)),
-    "rk4": tuple((step, 0.0) for step in (50, 20, 10, 5)),
-    "verlet": tuple((step, 0.0) for step in (50, 10, 5)),
-    "semi-implicit-euler": tuple((step, 0.0) for step in (50, 10, 5)),
-}
-"""Step [us] and tolerance of each rung; an engine that is not named gets one about its own default."""
 _QUICK_PEERS = 3
-"""Rungs of a peer in a quick chart."""
+"""Settings of a peer in a quick chart."""
 
 
 def competitors(*, peers: bool = True) -> dict[str, Competitor]:
@@ -82,29 +53,20 @@ def missing_peers() -> list[str]:
 
 
 def _engine(name: str) -> Competitor:
-    method = ENGINES[name]
-
-    def rungs(pairs: tuple[tuple[int, float], ...]) -> tuple[Rung, ...]:
+    def settings(*, quick: bool) -> tuple[Setting, ...]:
         return tuple(
-            Rung(f"{tolerance:.0e}".replace("e-0", "e-") if tolerance else f"{step} us", step, tolerance)
-            for step, tolerance in pairs
+            Setting(f"{tolerance:.0e}".replace("e-0", "e-") if tolerance else f"{step} us", tolerance, step_us=step)
+            for step, tolerance in engine_settings(name, quick=quick)
         )
 
-    own = (
-        tuple((method.step_us, method.tolerance * 10.0**n) for n in (3, 2, 1, 0, -1, -2))
-        if method.tolerance
-        else tuple((step, 0.0) for step in _STEPS)
-    )
-    ladder = _LADDERS.get(name, own)
-    return Competitor(name, name, OURS, rungs(ladder), rungs(_QUICK.get(name, ladder[1::2])))
+    return Competitor(name, name, OURS, settings(quick=False), settings(quick=True))
 
 
 def _peer(name: str) -> Competitor:
     peer = PEERS[name]
-    rungs = tuple(Rung(setting.label, setting=setting) for setting in peer.ladder)
     # The coarsest, one in the middle, and the finest that is worth its time.
-    picks = sorted({0, len(rungs) // 2, max(len(rungs) - 2, 0)})
-    quick = tuple(rungs[i] for i in picks[:_QUICK_PEERS])
+    picks = sorted({0, len(peer.ladder) // 2, max(len(peer.ladder) - 2, 0)})
+    quick = tuple(peer.ladder[i] for i in picks[:_QUICK_PEERS])
     title = peer.title + (", as installed" if peer.build == "as installed" and "Python" in peer.title else "")
-    return Competitor(name, title.replace(", plain Python, as installed", ", as installed"), peer.family, rungs, quick,
-                      peer.known_failure)  # fmt: skip
+    title = title.replace(", plain Python, as installed", ", as installed")
+    return Competitor(name, title, peer.family, peer.ladder, quick, peer.known_failure)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from replays.studies.chart.methods import Competitor, Rung
+from replays.studies.chart.methods import Competitor
+from replays.studies.peers import Setting
 from replays.studies.peers.problem import Problem
+from replays.studies.peers.window import cut_window
 from rig.errors import InputError
 from rig.scenes import load_scene, parse_scene
 
@@ -15,7 +17,7 @@ FRAME_S = 1e-3
 """Instants at which states are compared, and the frame that is timed [s]."""
 SMOOTHING = 5e-3
 """v_s of the smoothed law [m/s]."""
-FLOORS = (5e-3, 5e-4, 1e-4)
+SMOOTHED_SPEEDS = (5e-3, 5e-4, 1e-4)
 """v_s whose distance from exact Coulomb is drawn [m/s]."""
 RUB = "rub"
 
@@ -77,7 +79,7 @@ class Task:
     phase: str
     case: str
     method: str
-    rung: Rung
+    setting: Setting
     smoothing_speed: float = SMOOTHING
 
 
@@ -122,17 +124,18 @@ def _points(contender: Competitor, panel: str, phase: str, case: str, turn: int,
         return []
     if case == "smoothed" and (contender.name != "tsit5" or phase not in ("whirl", "transient")):
         return []
-    rungs = contender.rungs if mode == "full" else contender.quick
+    settings = contender.settings if mode == "full" else contender.quick
     if panel == RUB:
-        rungs = tuple(rung for rung in rungs if not rung.step_us or round(RUB_SAMPLE_S * 1e6) % rung.step_us == 0)
-        rungs = rungs[1:-1:2] if contender.ours else rungs[len(rungs) // 2 : len(rungs) // 2 + 1]
+        settings = tuple(each for each in settings if not each.step_us or round(RUB_SAMPLE_S * 1e6) % each.step_us == 0)
+        middle = len(settings) // 2
+        settings = settings[1:-1:2] if contender.ours else settings[middle : middle + 1]
         if contender.known_failure or contender.family == "scipy":
             return []
     elif mode == "quick" and contender.known_failure and panel != "memory":
-        rungs = rungs[:2]
+        settings = settings[:2]
     slow = contender.family in ("scipy", "MuJoCo")
     rank = 10 * list(_PANEL_PHASES).index(panel) + turn + (0 if contender.ours else 200 if slow else 100)
-    return [(rank, Task(panel, phase, case, contender.name, rung)) for rung in rungs]
+    return [(rank, Task(panel, phase, case, contender.name, setting)) for setting in settings]
 
 
 def friction_of(panel: str, case: str) -> Literal["none", "smoothed", "exact"]:
@@ -157,7 +160,7 @@ def problem_of(
         scene = parse_scene(
             {"name": window.name, "duration_s": end, "drive": {"speed_hz": RUB_SPEED_HZ}, "set": changes}
         )
-    return Problem.from_scene(
+    return cut_window(
         scene,
         end_s=end,
         sample_s=FRAME_S if panel != RUB else RUB_SAMPLE_S,

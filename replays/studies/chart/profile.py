@@ -1,4 +1,4 @@
-"""Performance profile: over many random scenes, how often a method is how much dearer than the best of them.
+"""Performance profile: over many random scenes, how often a method is how much more expensive than the best of them.
 
 After Dolan and More, Math. Program. 91 (2002) 201: the share of scenes that a method solves, to the error asked for,
 within a factor tau of the cheapest method.
@@ -15,6 +15,7 @@ from replays.studies.chart.methods import Competitor
 from replays.studies.chart.phases import FRAME_S
 from replays.studies.peers.problem import Problem
 from replays.studies.peers.reference import Reference
+from replays.studies.peers.window import cut_window
 from rig.scenes import Scene, parse_scene
 
 TARGET = 1e-3
@@ -26,7 +27,7 @@ SHARP = 0.1
 
 
 def draw_scene(seed: int) -> Scene:
-    """A random scene: a blow of the hammer at 5 ms, on a rotor and a contact that differ from draw to draw."""
+    """A random scene: a hammer pulse at 5 ms, on a rotor and a contact that differ from draw to draw."""
     rng = np.random.default_rng([2013, seed])
     return parse_scene(
         {
@@ -52,26 +53,26 @@ def draw_scene(seed: int) -> Scene:
 
 def draw_problem(seed: int) -> Problem:
     """Its window, with exact Coulomb friction."""
-    return Problem.from_scene(draw_scene(seed), sample_s=FRAME_S, friction="exact")
+    return cut_window(draw_scene(seed), sample_s=FRAME_S, friction="exact")
 
 
 def cheapest(contender: Competitor, problem: Problem, reference: Reference, budget: Budget) -> dict[str, Any]:
     """Walk down a method's ladder until the target is reached.
 
     Returns:
-        Columns of that rung's point; where none reaches it, of the last one tried, with failure "target".
+        Columns of that setting's point; where none reaches it, of the last one tried, with failure "target".
     """
     columns: dict[str, Any] = {}
-    for rung in contender.rungs:
+    for setting in contender.settings:
         try:
-            columns = point(contender, rung, problem, reference, budget._replace(runs=1, single_s=0.0))
+            columns = point(contender, setting, problem, reference, budget._replace(runs=1, single_s=0.0))
         except NotImplementedError as error:
             columns = {"failure": "error", "message": str(error)}
             break
-        columns |= {"rung": rung.label, "step_us": rung.step_us, "tolerance": rung.tolerance}
+        columns |= {"rung": setting.label, "step_us": setting.step_us, "tolerance": setting.tolerance}
         error = columns["error"]
         if error is not None and error <= TARGET and not columns["failure"]:
-            again = point(contender, rung, problem, reference, budget)
+            again = point(contender, setting, problem, reference, budget)
             return {**columns, **again}
         if columns["failure"] == "budget":
             return columns

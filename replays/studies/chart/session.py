@@ -10,11 +10,11 @@ from typing import Any
 
 from replays.studies.chart import profile
 from replays.studies.chart.measure import Budget, point, run_engine, statistics_point
-from replays.studies.chart.methods import OURS, Competitor, Rung, competitors, missing_peers
+from replays.studies.chart.methods import OURS, Competitor, competitors, missing_peers
 from replays.studies.chart.phases import (
-    FLOORS,
     PHASES,
     RUB,
+    SMOOTHED_SPEEDS,
     SMOOTHING,
     Mode,
     Task,
@@ -120,10 +120,10 @@ def make_chart(
     return outcome
 
 
-def _own_reference(problem: Problem) -> Reference | None:
+def own_reference(problem: Problem) -> Reference | None:
     """Where no second peer is installed: scipy's DOP853 and our rk8, which share the equations but not the code."""
     first = PEERS["scipy-dop853"].solve(problem, Setting("1e-13", 1e-13), budget_s=300.0)
-    second = run_engine("rk8", Rung("1e-12", 25, 1e-12), problem, Budget(300.0, 1))
+    second = run_engine("rk8", Setting("1e-12", 1e-12, step_us=25), problem, Budget(300.0, 1))
     if first.failure is not None or second.failure:
         return None
     error = scaled_error(first.states, second.states)
@@ -170,7 +170,7 @@ class _Work:
         return self.references[key]
 
     def solve(self, problem: Problem) -> Reference | None:
-        reference = find_reference(problem, quick=self.mode == "quick") or _own_reference(problem)
+        reference = find_reference(problem, quick=self.mode == "quick") or own_reference(problem)
         if reference is not None:
             for name, solution in zip(reference.names, (reference.solution, reference.second), strict=True):
                 self.compiling(PEERS[name].family if name in PEERS else OURS, solution.compile_s, again=False)
@@ -180,22 +180,19 @@ class _Work:
         self.store.add(row | columns)
         self.compiling(row["family"], float(columns.get("compile_s") or 0.0), again=row["family"] == OURS)
 
-    def base(self, panel: str, phase: str, case: str, contender: Competitor, rung: Rung | None) -> Row:
-        tolerance = None
-        if rung is not None:
-            tolerance = rung.tolerance if rung.setting is None else rung.setting.tolerance
+    def base(self, panel: str, phase: str, case: str, contender: Competitor, setting: Setting | None) -> Row:
         return {
             "mode": self.mode,
             "panel": panel,
             "phase": phase,
             "case": case,
             "method": contender.name,
-            "rung": "" if rung is None else rung.label,
+            "rung": "" if setting is None else setting.label,
             "title": contender.title,
             "family": contender.family,
             "known_failure": contender.known_failure,
-            "step_us": rung.step_us if rung is not None and rung.step_us else None,
-            "tolerance": tolerance,
+            "step_us": setting.step_us or None if setting is not None else None,
+            "tolerance": None if setting is None else setting.tolerance,
         }
 
 
@@ -236,12 +233,12 @@ def _references(work: _Work, panel: str, phase: str, case: str) -> None:
         "contacts": reference.solution.contacts,
         "simulated_s": reference.solution.times[-1],
     }
-    for speed in FLOORS if panel == "exact" and phase != "drop" else ():
+    for speed in SMOOTHED_SPEEDS if panel == "exact" and phase != "drop" else ():
         smooth = work.solve(work.problem(panel, phase, "smoothed", speed))
         if smooth is not None:
-            floor = scaled_error(smooth.solution.states, reference.solution.states)
+            distance = scaled_error(smooth.solution.states, reference.solution.states)
             work.store.add(
-                {**base, "case": "floor", "method": "floor", "rung": f"v_s = {speed * 1e3:g} mm/s", "error": floor,
+                {**base, "case": "floor", "method": "floor", "rung": f"v_s = {speed * 1e3:g} mm/s", "error": distance,
                  "smoothing_speed": speed, "reference_error": smooth.error}
             )  # fmt: skip
     work.store.add({**base, "method": "reference", **columns})
@@ -249,9 +246,9 @@ def _references(work: _Work, panel: str, phase: str, case: str) -> None:
 
 def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadline: float) -> None:
     contender = work.contenders[task.method]
-    progress.step(f"{task.panel}, {task.phase}: {contender.title}, {task.rung.label}")
-    row = work.base(task.panel, task.phase, task.case, contender, task.rung)
-    if work.store.has((work.mode, task.panel, task.phase, task.case, task.method, task.rung.label)):
+    progress.step(f"{task.panel}, {task.phase}: {contender.title}, {task.setting.label}")
+    row = work.base(task.panel, task.phase, task.case, contender, task.setting)
+    if work.store.has((work.mode, task.panel, task.phase, task.case, task.method, task.setting.label)):
         outcome.resumed += 1
         return
     if time.perf_counter() > deadline + work.compile_s:
@@ -264,13 +261,13 @@ def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadli
     if task.panel == RUB:
         budget = budget._replace(solve_s=_RUB_BUDGET_S[work.mode])
         settle = min(1.0, 0.25 * problem.duration_s)
-        columns = statistics_point(contender, task.rung, problem, budget, settle_s=settle)
+        columns = statistics_point(contender, task.setting, problem, budget, settle_s=settle)
     else:
         reference = work.reference(task.panel, task.phase, task.case)
         if reference is None:
             outcome.left += 1
             return
-        columns = point(contender, task.rung, problem, reference, budget)
+        columns = point(contender, task.setting, problem, reference, budget)
     work.keep(row, columns)
     outcome.measured += 1
 
@@ -292,7 +289,7 @@ def _profile(work: _Work, scenes: int, outcome: Outcome, progress: Progress, dea
             continue
         problem = profile.draw_problem(seed)
         reference = work.solve(problem)
-        # A chaotic draw has no pointwise reference: it is told, and counts for nobody.
+        # A chaotic draw has no pointwise reference: its row says so, and it counts for nobody.
         blunt = reference is None or reference.error > profile.SHARP * profile.TARGET
         for one in waiting:
             row = {**work.base("profile", scene, "", one, None), "friction": "exact"}
@@ -301,8 +298,8 @@ def _profile(work: _Work, scenes: int, outcome: Outcome, progress: Progress, dea
                                 "reference_error": None if reference is None else reference.error}  # fmt: skip
             else:
                 columns = profile.cheapest(one, problem, reference, budget)
-            # The rung found is no part of the key: a scene and a method are one point.
+            # The setting found is no part of the key: a scene and a method are one point.
             found = columns.pop("rung", "")
-            message = columns.get("message") or f"cheapest rung {found}"
+            message = columns.get("message") or f"cheapest setting {found}"
             work.keep(row, {**columns, "rung": "cheapest", "message": message})
             outcome.measured += 1

@@ -6,12 +6,10 @@ import json
 import math
 import os
 import platform
-import subprocess
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from replays.studies import provenance
 from rig.errors import InputError
 
 KEY = ("mode", "panel", "phase", "case", "method", "rung")
@@ -27,7 +25,7 @@ COLUMNS = (
 """Columns of the table; speeds are times real time, forces newtons."""
 _TEXT = {*KEY, "title", "family", "known_failure", "friction", "reference", "failure", "message", "code", "commit",
          "date", "machine", "versions"}  # fmt: skip
-_LIBRARIES = ("rotor-stator-rig", "numba", "numpy", "scipy", "heyoka", "scikit-sundae", "mujoco")
+_LIBRARIES = (provenance.RIG, "numba", "numpy", "scipy", "heyoka", "scikit-sundae", "mujoco")
 
 Row = dict[str, Any]
 
@@ -122,38 +120,11 @@ def stamp() -> dict[str, str]:
     """What a point is measured with: code, commit, date, machine, versions of libraries."""
     from rig.kernels import source_digest
 
-    versions = []
-    for library in _LIBRARIES:
-        try:
-            versions.append(f"{library} {version(library)}")
-        except PackageNotFoundError:
-            continue
+    found = {"Python": platform.python_version(), **provenance.versions(*_LIBRARIES)}
     return {
         "code": source_digest(),
-        "commit": _commit(),
-        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "machine": f"{_processor()}, {platform.system()}",
-        "versions": f"Python {platform.python_version()}, " + ", ".join(versions),
+        "commit": provenance.commit(),
+        "date": provenance.today(),
+        "machine": provenance.machine(),
+        "versions": ", ".join(f"{name} {version}" for name, version in found.items()),
     }
-
-
-def _commit() -> str:
-    here = Path(__file__).resolve().parent
-    try:
-        done = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--exclude", "*"],
-            cwd=here, capture_output=True, text=True, timeout=10, check=False,
-        )  # fmt: skip
-    except OSError:
-        return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from pathlib import Path
 from typing import Any
 
-from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, new_figure, save
+from replays.report.canvas import BLUE, RED, SKY, new_figure, save
+from replays.studies.engines import traits
 from replays.studies.ladder.document import python_line
 from replays.studies.ladder.quantity import QUANTITIES
 from replays.studies.ladder.search import Ladder, Step
 
-# Shapes tell the colours apart once more.
-_ENGINES = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PINK, "^"), (SKY, "v"), (BLACK, "P"), (RED, "X"))
 _MOST = 3
 """Quantities drawn; the document has them all."""
 
@@ -27,11 +27,11 @@ def draw(ladder: Ladder, folder: Path) -> list[Path]:
         f"parameters: {ladder.scene.parameters}, not validated on a rig)",
     )
     axes = figure.subplots(2, columns, squeeze=False, gridspec_kw={"width_ratios": [*[1.0] * len(names), 0.95]})
-    rungs = [step for step in ladder.steps if step.stage in ("full", "single", "together")]
+    levels = [step for step in ladder.steps if step.stage in ("full", "single", "together")]
     for column, name in enumerate(names):
-        _draw_levels(axes[0, column], ladder, rungs, name, named=column == 0)
+        _draw_levels(axes[0, column], ladder, levels, name, named=column == 0)
         _draw_cost(axes[1, column], ladder, name, legend=column == 0)
-    _draw_work(axes[0, -1], rungs)
+    _draw_work(axes[0, -1], levels)
     _write_evidence(axes[1, -1], ladder)
     folder.mkdir(parents=True, exist_ok=True)
     return save(figure, folder / "ladder.png", folder / "ladder.svg")
@@ -72,12 +72,12 @@ def _placed(value: float, low: float, high: float) -> float:
     return min(max(value, low * 1.3), high / 8.5) if math.isfinite(value) else high / 2.8
 
 
-def _draw_levels(axes: Any, ladder: Ladder, rungs: list[Step], name: str, *, named: bool) -> None:
+def _draw_levels(axes: Any, ladder: Ladder, levels: list[Step], name: str, *, named: bool) -> None:
     low, high = _dress(axes, ladder, name)
     reference = ladder.reference.values[name]
     unit = f" {QUANTITIES[name].unit}" if QUANTITIES[name].unit else ""
     shown = reference if isinstance(reference, str) else f"{reference:.6g}{unit}"
-    for row, step in enumerate(rungs):
+    for row, step in enumerate(levels):
         error = step.errors.model.get(name, 0.0)
         if step.stage == "full":
             axes.annotate(
@@ -104,9 +104,9 @@ def _draw_levels(axes: Any, ladder: Ladder, rungs: list[Step], name: str, *, nam
             text, (place, row), xytext=(-8 if left else 8, 0), textcoords="offset points", va="center",
             ha="right" if left else "left", fontsize=8.5, bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 0.6},
         )  # fmt: skip
-    axes.set_ylim(len(rungs) - 0.4, -0.6)
-    labels = [_row_label(step) for step in rungs] if named else [""] * len(rungs)
-    axes.set_yticks(range(len(rungs)), labels, fontsize=9)
+    axes.set_ylim(len(levels) - 0.4, -0.6)
+    labels = [_row_label(step) for step in levels] if named else [""] * len(levels)
+    axes.set_yticks(range(len(levels)), labels, fontsize=9)
     axes.set_title(f"{name.replace('_', ' ')}: model error of each level,\nconverged engines", fontsize=11)
 
 
@@ -117,8 +117,8 @@ def _row_label(step: Step) -> str:
     return f"{step.label} *" if step.note else step.label
 
 
-def _draw_work(axes: Any, rungs: list[Step]) -> None:
-    for row, step in enumerate(rungs):
+def _draw_work(axes: Any, levels: list[Step]) -> None:
+    for row, step in enumerate(levels):
         cost = step.cost
         if cost is None:
             continue
@@ -126,14 +126,14 @@ def _draw_work(axes: Any, rungs: list[Step]) -> None:
         axes.barh(row, wall, height=0.55, color=SKY if step.stage != "together" else BLUE, zorder=2)
         axes.plot([cost.spread_s[0] * 1e3, cost.spread_s[1] * 1e3], [row, row], color="0.2", lw=1.4, zorder=3)
         axes.annotate(
-            f"{wall:.3g}  ({cost.rung.method})", (max(wall, cost.spread_s[1] * 1e3), row), xytext=(5, 0),
+            f"{wall:.3g}  ({cost.candidate.label})", (max(wall, cost.spread_s[1] * 1e3), row), xytext=(5, 0),
             textcoords="offset points", va="center", fontsize=8.5,
         )  # fmt: skip
-    walls = [wall * 1e3 for step in rungs if step.cost for wall in step.cost.spread_s]
+    walls = [wall * 1e3 for step in levels if step.cost for wall in step.cost.spread_s]
     axes.set_xscale("log")
     axes.set_xlim(0.5 * min(walls), (max(walls) / min(walls)) ** 0.6 * 2.0 * max(walls))
-    axes.set_ylim(len(rungs) - 0.4, -0.6)
-    axes.set_yticks(range(len(rungs)), [""] * len(rungs))
+    axes.set_ylim(len(levels) - 0.4, -0.6)
+    axes.set_yticks(range(len(levels)), [""] * len(levels))
     axes.grid(visible=True, axis="x", color="0.88", lw=0.6)
     axes.set_axisbelow(True)
     axes.set_xlabel("wall time of a simulated second [ms]\n(median, line: least to largest; no sensors)")
@@ -149,20 +149,21 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, legend: bool) -> None:
     engines: dict[str, list[Step]] = {}
     for step in ladder.steps:
         if step.stage == "engine" and not step.measured.failure:
-            engines.setdefault(step.measured.rung.engine, []).append(step)
-    for (engine, steps), (color, marker) in zip(engines.items(), _ENGINES, strict=False):
+            engines.setdefault(step.measured.candidate.engine, []).append(step)
+    for engine, steps in engines.items():
+        color, marker = traits(engine).colour, traits(engine).marker
         walls = [step.measured.wall_s * 1e3 for step in steps]
         numerical = [_placed(step.errors.numerical[name], low, high) for step in steps]
         total = [_placed(step.errors.total[name], low, high) for step in steps]
         axes.plot(numerical, walls, color=color, marker=marker, mfc="white", ms=6, ls=":", lw=1.0, zorder=3)
         axes.plot(total, walls, color=color, marker=marker, ms=6, lw=1.4, zorder=3, label=engine)
     picked, errors = ladder.picked, ladder.picked_errors
-    assert picked is not None
-    assert errors is not None
-    chosen = next(step for step in ladder.steps if step.stage == "engine" and step.measured.rung == picked.rung)
+    chosen = next(
+        step for step in ladder.steps if step.stage == "engine" and step.measured.candidate == picked.candidate
+    )
     axes.plot(
         _placed(errors.total[name], low, high), chosen.measured.wall_s * 1e3, marker="*", ms=20, color=RED,
-        mec="black", ls="none", zorder=4, label=f"pick: {picked.rung.method}",
+        mec="black", ls="none", zorder=4, label=f"pick: {picked.candidate.label}",
     )  # fmt: skip
     axes.plot([], [], color="0.3", marker="o", mfc="white", ls=":", label="numerical error alone")
     axes.plot([], [], color="0.3", marker="o", label="total error")
@@ -182,17 +183,13 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, legend: bool) -> None:
 
 def _write_evidence(axes: Any, ladder: Ladder) -> None:
     picked, given, full, errors = ladder.picked, ladder.given, ladder.full, ladder.picked_errors
-    assert picked is not None
-    assert given is not None
-    assert full is not None
-    assert errors is not None
     axes.axis("off")
-    model = picked.rung.model
+    model = picked.candidate.model
     lines = [
         "PICK, verified as it will run",
-        *(f"  {level:8s} {rung}" for level, rung in model.items()),
+        *(f"  {level:8s} {choice}" for level, choice in model.items()),
         f"  {'sensors':8s} {ladder.sensors}",
-        f"  {'engine':8s} {picked.rung.method}",
+        f"  {'engine':8s} {picked.candidate.label}",
         "",
         "errors (model, numerical, total)",
     ]
@@ -214,19 +211,13 @@ def _write_evidence(axes: Any, ladder: Ladder) -> None:
         "wall time of a simulated second, with sensors",
         f"  pick                {picked.wall_s * 1e3:8.3g} ms",
         f"  scene as given      {given.wall_s * 1e3:8.3g} ms",
-        f"  full, {full.rung.method:<13s} {full.wall_s * 1e3:8.3g} ms",
+        f"  full, {full.candidate.label:<13s} {full.wall_s * 1e3:8.3g} ms",
         "",
-        f"reference: full model, {ladder.reference.rung.method};",
-        f"its own error: distance to {ladder.unlike.rung.method}",
-        f"seed {ladder.scene.seed}; {sum(1 for _ in ladder.steps)} rungs tried in {ladder.spent_s:.0f} s"
+        f"reference: full model, {ladder.reference.candidate.label};",
+        f"its own error: distance to {ladder.unlike.candidate.label}",
+        f"seed {ladder.scene.seed}; {len(ladder.steps)} candidates tried in {ladder.spent_s:.0f} s"
         + ("" if ladder.complete else " (budget spent)"),
-        *_wrapped(python_line(), 56),
+        *textwrap.wrap(python_line(), 56),
         "* not picked: stands in for another, or spares nothing",
     ]
     axes.text(0.0, 1.0, "\n".join(lines), transform=axes.transAxes, va="top", family="monospace", fontsize=8)
-
-
-def _wrapped(text: str, width: int) -> list[str]:
-    import textwrap
-
-    return textwrap.wrap(text, width)

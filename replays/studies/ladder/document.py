@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import math
 import platform
-import subprocess
-import sys
-from datetime import UTC, datetime
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
+from replays.studies import provenance
 from replays.studies.ladder.measurement import Measurement
 from replays.studies.ladder.quantity import QUANTITIES, Value
 from replays.studies.ladder.search import Errors, Ladder
@@ -23,10 +19,6 @@ _PACKAGES = ("numba", "numpy", "scipy")
 def ladder_document(ladder: Ladder) -> dict[str, Any]:
     """The whole search as a JSON document; what is infinite or has no value is null."""
     scene = ladder.scene
-    picked, given, full = ladder.picked, ladder.given, ladder.full
-    assert picked is not None
-    assert given is not None
-    assert full is not None
     return {
         "scene": scene.name,
         "duration_s": scene.duration_s,
@@ -41,21 +33,21 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
                 "reference": _number(ladder.reference.values[name]),
                 "unlike": _number(ladder.unlike.values[name]),
                 "reference_error": _number(ladder.reference_errors[name]),
-                "as_given": _number(given.values[name]),
-                "as_given_error": _number(ladder.given_errors.total[name]) if ladder.given_errors else None,
+                "as_given": _number(ladder.given.values[name]),
+                "as_given_error": _number(ladder.given_errors[name]),
             }
             for name, tolerance in ladder.tolerances.items()
         ],
         "reference": {
-            "engine": ladder.reference.rung.method,
-            "unlike": ladder.unlike.rung.method,
-            "model": ladder.reference.rung.model,
+            "engine": ladder.reference.candidate.method,
+            "unlike": ladder.unlike.candidate.method,
+            "model": ladder.reference.candidate.model,
         },
         "steps": [
             {
                 "stage": step.stage,
                 "label": step.label,
-                "model": step.measured.rung.model,
+                "model": step.measured.candidate.model,
                 **_run(step.measured, scene.duration_s),
                 "cost": _run(step.cost, scene.duration_s) if step.cost else None,
                 "errors": _errors(step.errors),
@@ -65,9 +57,9 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
             for step in ladder.steps
         ],
         "pick": pick_of(ladder).model_dump(mode="json"),
-        "picked": _run(picked, scene.duration_s),
-        "given": _run(given, scene.duration_s),
-        "full": _run(full, scene.duration_s),
+        "picked": _run(ladder.picked, scene.duration_s),
+        "given": _run(ladder.given, scene.duration_s),
+        "full": _run(ladder.full, scene.duration_s),
         "all_engines_tried": ladder.complete,
         "spent_s": ladder.spent_s,
         "versions": versions(),
@@ -76,21 +68,17 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
 
 def pick_of(ladder: Ladder) -> Pick:
     """The pick as a scene stores it."""
-    picked, errors, given, full = ladder.picked, ladder.picked_errors, ladder.given, ladder.full
-    assert picked is not None
-    assert errors is not None
-    assert given is not None
-    assert full is not None
-    scene, rung = ladder.scene, picked.rung
+    scene, picked, errors = ladder.scene, ladder.picked, ladder.picked_errors
+    candidate = picked.candidate
     scene_digest, parameters_digest, code_digest = pick_digests(scene)
     found = versions()
     return Pick(
-        **rung.levels.model_dump(),
-        drive=rung.drive,  # pyright: ignore[reportArgumentType]
+        **candidate.levels.model_dump(),
+        drive=candidate.drive,  # pyright: ignore[reportArgumentType]
         sensors=ladder.sensors,  # pyright: ignore[reportArgumentType]
-        engine=rung.engine,
-        step_us=rung.step_us,
-        engine_tolerance=rung.tolerance,
+        engine=candidate.engine,
+        step_us=candidate.step_us,
+        engine_tolerance=candidate.tolerance,
         quantities=tuple(
             PickedQuantity(
                 quantity=name,
@@ -106,10 +94,10 @@ def pick_of(ladder: Ladder) -> Pick:
             for name, tolerance in ladder.tolerances.items()
         ),
         wall_s=_digits(picked.wall_s),
-        wall_given_s=_digits(given.wall_s),
-        wall_full_s=_digits(full.wall_s),
-        reference_engine=ladder.reference.rung.method,
-        unlike_engine=ladder.unlike.rung.method,
+        wall_given_s=_digits(ladder.given.wall_s),
+        wall_full_s=_digits(ladder.full.wall_s),
+        reference_engine=ladder.reference.candidate.method,
+        unlike_engine=ladder.unlike.candidate.method,
         date=found["date"],
         rig=found["rig"],
         commit=found["commit"],
@@ -123,34 +111,20 @@ def pick_of(ladder: Ladder) -> Pick:
 
 def versions() -> dict[str, str]:
     """Date, machine, commit, and the versions that figures hang on."""
+    found = provenance.versions(provenance.RIG, *_PACKAGES)
     return {
-        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "rig": version("rotor-stator-rig"),
-        "commit": _commit(),
-        "machine": f"{platform.processor() or platform.machine()}, {platform.system()}",
+        "date": provenance.today(),
+        "rig": found.pop(provenance.RIG),
+        "commit": provenance.commit(),
+        "machine": provenance.machine(),
         "python": platform.python_version(),
-        **{name: version(name) for name in _PACKAGES},
+        **found,
     }
-
-
-def _commit() -> str:
-    """Commit of the sources, "+" behind it where they have changed since; empty outside a repository."""
-
-    def git(*arguments: str) -> str:
-        done = subprocess.run(
-            ["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10, check=True
-        )
-        return done.stdout.strip()
-
-    try:
-        return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain") else "")
-    except (OSError, subprocess.SubprocessError):
-        return ""
 
 
 def _run(measured: Measurement, simulated_s: float) -> dict[str, Any]:
     return {
-        "engine": measured.rung.method,
+        "engine": measured.candidate.method,
         "values": {name: _number(value) for name, value in measured.values.items()},
         "wall_s": _number(measured.wall_s),
         "wall_least_s": _number(measured.spread_s[0]),
@@ -185,6 +159,4 @@ def python_line() -> str:
     found = versions()
     packages = ", ".join(f"{name} {found[name]}" for name in _PACKAGES)
     commit = f", commit {found['commit']}" if found["commit"] else ""
-    return (
-        f"rig {found['rig']}{commit}, {found['date']}; {found['machine']}; Python {sys.version.split()[0]}, {packages}"
-    )
+    return f"rig {found['rig']}{commit}, {found['date']}; {found['machine']}; Python {found['python']}, {packages}"

@@ -1,16 +1,16 @@
-"""One rung measured: a scene run on a model, an engine and a step, with its quantities, its work and its wall time."""
+"""One candidate measured: a scene run on a model, an engine and a step, with its quantities and its cost."""
 
 from __future__ import annotations
 
 import math
 import statistics
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from replays.studies.ladder.quantity import QUANTITIES, Trace, Value
+from replays.studies.run import bare_sensors, run_scene
 from rig.engines import ENGINES
 from rig.errors import InputError, SimulationError
 from rig.kernels.signals import COLUMN
@@ -20,16 +20,14 @@ from rig.simulation import Simulation
 
 GRID_TICKS = 1_000
 """Quantities are read every 1 ms."""
-_BARE = {"chain": "ideal", "groups": ["hammer"], "rate_hz": 1_000, "truth_rate_hz": 1_000}
-"""Sensors that leave the engine alone."""
 _FINEST_ROW_US = 25
 """The first impact is looked for on rows this far apart, or a fixed step apart [us]."""
 _ENOUGH_S = 1.0
-"""No further run is timed once this much wall time is spent on one rung."""
+"""No further run is timed once this much wall time is spent on one candidate."""
 
 
 @dataclass(frozen=True)
-class Rung:
+class Candidate:
     """A model, an engine and its step: all that a pick is about."""
 
     levels: ModelLevels
@@ -45,21 +43,26 @@ class Rung:
         return f"{self.engine} {self.step_us} us{finest}"
 
     @property
+    def label(self) -> str:
+        """The same with its unit as a figure shows it."""
+        return self.method.replace(" us", " µs")
+
+    @property
     def model(self) -> dict[str, str]:
         """The levels by name, the drive among them."""
         return {**self.levels.model_dump(), "drive": self.drive}
 
-    def with_model(self, **levels: str) -> Rung:
+    def with_model(self, **levels: str) -> Candidate:
         """The same with some levels changed."""
         drive = levels.pop("drive", self.drive)
         return replace(self, levels=ModelLevels(**{**self.levels.model_dump(), **levels}), drive=drive)  # pyright: ignore[reportArgumentType]
 
-    def with_engine(self, engine: str, step_us: int, tolerance: float) -> Rung:
+    def with_engine(self, engine: str, step_us: int, tolerance: float) -> Candidate:
         """The same on another engine."""
         return replace(self, engine=engine, step_us=step_us, tolerance=tolerance)
 
     def scene(self, scene: Scene, *, sensors: dict[str, Any] | None = None) -> Scene:
-        """The scene on this rung.
+        """The scene on this candidate.
 
         Args:
             scene: As it is given.
@@ -77,17 +80,17 @@ class Rung:
                 "model": self.levels.model_dump(),
                 "drive": {**data["drive"], "mode": self.drive},
                 "engine": {"name": self.engine, "step_us": self.step_us, "tolerance": self.tolerance},
-                "sensors": _BARE if sensors is None else {**data["sensors"], **sensors},
+                "sensors": bare_sensors() if sensors is None else {**data["sensors"], **sensors},
             }
         )
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a rung gave.
+    """What a candidate gave.
 
     Attributes:
-        rung: Which one.
+        candidate: Which one.
         values: By quantity; nan where it has none, or cannot give it.
         trace: The run's rows.
         wall_s: Wall time of a simulated second, median of the runs, compiling apart [s].
@@ -98,7 +101,7 @@ class Measurement:
         failure: Why there is no result; empty where there is one.
     """
 
-    rung: Rung
+    candidate: Candidate
     values: dict[str, Value]
     trace: Trace | None
     wall_s: float
@@ -115,24 +118,24 @@ class Measurement:
 
 def measure(
     scene: Scene,
-    rung: Rung,
+    candidate: Candidate,
     quantities: list[str],
     *,
     runs: int,
     sensors: dict[str, Any] | None = None,
     limit_s: float = math.inf,
 ) -> Measurement:
-    """Run a rung, and time it.
+    """Run a candidate, and time it.
 
     Args:
         scene: The scene as it is given.
-        rung: What to run it on.
+        candidate: What to run it on.
         quantities: What to read.
         runs: Runs to time, fewer where they take long.
         sensors: Changes to the scene's own sensors; None to leave the sensors out.
         limit_s: Wall time after which a run is given up as a failure [s].
     """
-    placed = rung.scene(scene, sensors=sensors)
+    placed = candidate.scene(scene, sensors=sensors)
     Simulation(placed).warm_up()  # compiling is no part of the cost
     simulated_s = Simulation(placed).end_tick * 1e-6
     walls: list[float] = []
@@ -142,25 +145,30 @@ def measure(
             simulation = Simulation(placed)
             _ = simulation.first_row
             first = trace is None
-            rows, wall = _advance(simulation, keep=first, limit_s=limit_s)
-            if not first or runs == 1 or wall > _ENOUGH_S:
-                walls.append(wall)
+            # Short blocks where a stall has to be noticed, long ones where time is measured.
+            blocks = max(1, (GRID_TICKS if first else 100_000) // simulation.block_ticks)
+            every = max(1, GRID_TICKS // simulation.row_ticks)
+            done = run_scene(
+                simulation, block_ticks=blocks * simulation.block_ticks, every=every, keep=first, limit_s=limit_s
+            )
+            if not first or runs == 1 or done.wall_s > _ENOUGH_S:
+                walls.append(done.wall_s)
             if first:
                 health = simulation.health()
-                trace = _trace(scene, rung, simulation, rows, health, "first_impact_time" in quantities)
+                trace = _trace(scene, candidate, simulation, done.rows, health, "first_impact_time" in quantities)
     except SimulationError as error:
         nothing: dict[str, Value] = dict.fromkeys(quantities, math.nan)
-        return Measurement(rung, nothing, None, math.nan, (math.nan, math.nan), 0, 0, math.nan, str(error))
+        return Measurement(candidate, nothing, None, math.nan, (math.nan, math.nan), 0, 0, math.nan, str(error))
     assert trace is not None
     each = [wall / simulated_s for wall in walls]
     values = {
         name: math.nan
-        if QUANTITIES[name].needs_force and rung.levels.contact == "impact"
+        if QUANTITIES[name].needs_force and candidate.levels.contact == "impact"
         else QUANTITIES[name].read(trace)
         for name in quantities
     }
     return Measurement(
-        rung=rung,
+        candidate=candidate,
         values=values,
         trace=trace,
         wall_s=statistics.median(each),
@@ -171,53 +179,30 @@ def measure(
     )
 
 
-def _advance(simulation: Simulation, *, keep: bool, limit_s: float) -> tuple[list[np.ndarray], float]:
-    """Run to the end; rows every 1 ms, and the wall time [s].
-
-    Raises:
-        SimulationError: It takes too long: an engine that stalls has to be told from one that is slow.
-    """
-    # Short blocks where a stall has to be noticed, long ones where time is measured.
-    chunk = max(1, (GRID_TICKS if keep else 100_000) // simulation.block_ticks) * simulation.block_ticks
-    every = max(1, GRID_TICKS // simulation.row_ticks)
-    rows: list[np.ndarray] = []
-    wall = 0.0
-    while simulation.tick < simulation.end_tick:
-        begin = time.perf_counter()
-        frame = simulation.advance(min(chunk, simulation.end_tick - simulation.tick))
-        wall += time.perf_counter() - begin
-        if wall > limit_s:
-            raise SimulationError(f"given up after {wall:.0f} s at {simulation.tick * 1e-6:g} s of the scene")
-        if keep:
-            rows.append(frame.rows[::every].copy())
-    return rows, wall
-
-
 def _trace(
-    scene: Scene, rung: Rung, simulation: Simulation, rows: list[np.ndarray], health: dict[str, Any], first: bool
+    scene: Scene, candidate: Candidate, simulation: Simulation, rows: np.ndarray, health: dict[str, Any], first: bool
 ) -> Trace:
-    whole = np.concatenate(rows)
     constants = simulation.model.constants
     spacing = max(GRID_TICKS, simulation.row_ticks) / simulation.tick_rate_hz
     return Trace(
-        times_s=np.arange(len(whole)) * spacing,
-        rows=whole,
+        times_s=np.arange(len(rows)) * spacing,
+        rows=rows,
         peak_force=health["peak_normal_force_n"],
         clearance=constants.contact.clearance,
         surface_radius=constants.shaft.radius,
-        first_impact_s=first_impact(scene, rung) if first else math.nan,
+        first_impact_s=first_impact(scene, candidate) if first else math.nan,
     )
 
 
-def first_impact(scene: Scene, rung: Rung) -> float:
+def first_impact(scene: Scene, candidate: Candidate) -> float:
     """Instant of the first contact [s], nan where there is none: from the gap, its rate and its acceleration before.
 
     A run of its own, with a row at every step; an adaptive engine's grid is 25 us for it.
     """
-    adaptive = ENGINES[rung.engine].tolerance > 0.0
-    step_us = min(rung.step_us, _FINEST_ROW_US) if adaptive else rung.step_us
+    adaptive = ENGINES[candidate.engine].tolerance > 0.0
+    step_us = min(candidate.step_us, _FINEST_ROW_US) if adaptive else candidate.step_us
     rate = 1_000_000 // step_us
-    fine = replace(rung, step_us=step_us).scene(scene, sensors={**_BARE, "rate_hz": rate, "truth_rate_hz": rate})
+    fine = replace(candidate, step_us=step_us).scene(scene, sensors=bare_sensors(rate))
     simulation = Simulation(fine)
     block = max(1, GRID_TICKS // simulation.block_ticks) * simulation.block_ticks
     last: np.ndarray | None = None

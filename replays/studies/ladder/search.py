@@ -11,10 +11,10 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
-from replays.studies.ladder.measurement import Measurement, Rung, check_reads, measure
-from replays.studies.ladder.quantity import QUANTITIES, Value
+from replays.studies.ladder.measurement import Candidate, Measurement, check_reads, measure
+from replays.studies.ladder.quantity import QUANTITIES, Trace, Value
 from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.levels import ModelLevels
@@ -24,29 +24,31 @@ LEVELS: dict[str, tuple[str, ...]] = {
     **{name: get_args(entry.annotation) for name, entry in ModelLevels.model_fields.items()},
     "drive": ("ideal", "torque"),
 }
-"""Rungs of every level, the simplest first."""
+"""Choices of every level, the simplest first."""
 SENSORS = "sensors"
 KEEPABLE = (*LEVELS, SENSORS)
 STAND_INS = ("smoothed", "switch")
 """Friction laws that stand in for the exact one: measured, not picked, for they spare no work."""
 TIE = 1.1
 """Costs this close are the same: timings have no finer meaning."""
-DEARER = 1.25
+COSTLIER = 1.25
 """A lowered level that takes this many times the steps of the higher one spares nothing."""
 _REFERENCE = ("rk8", 25, 1e-10)
 _UNLIKE = ("split", 1, 0.0)
 """Another method in other coordinates; the converged engine of models that the reference's cannot take."""
 _GRIDS = (1000, 500, 250, 200, 125, 100, 50, 25, 20, 10, 5)
 _STEPS = (1, 2, 5, 10, 20, 25, 40, 50, 100)
+_SPARE = 0.2
+"""Part of the budget that is left to the verification."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one rung by quantity, as parts of their scales; nan where a part was not asked for."""
+    """Errors of one candidate by quantity, as parts of their scales; empty where a part was not asked for."""
 
-    model: dict[str, float]
-    numerical: dict[str, float]
-    total: dict[str, float]
+    model: dict[str, float] = field(default_factory=dict)
+    numerical: dict[str, float] = field(default_factory=dict)
+    total: dict[str, float] = field(default_factory=dict)
 
     def worst(self, tolerances: dict[str, float]) -> float:
         """The largest of all in units of the tolerance, infinite where a quantity cannot be given."""
@@ -73,7 +75,7 @@ class Step:
     note: str = ""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Ladder:
     """What a search has found.
 
@@ -81,11 +83,13 @@ class Ladder:
         scene: The scene as it is given.
         tolerances: By quantity.
         reference: The full model, converged.
-        reference_errors: Its distance from the unlike engine.
+        unlike: The same by the unlike engine.
+        reference_errors: Their distance.
         steps: Everything tried, in order.
         picked: What is picked, as it will run.
         picked_errors: Its errors.
         given: The scene as it is given.
+        given_errors: Its total errors.
         full: The full model on the engine of the reference, with the scene's own sensors.
         sensors: The chain that is picked.
         spent_s: Wall time of the search [s].
@@ -97,15 +101,15 @@ class Ladder:
     reference: Measurement
     unlike: Measurement
     reference_errors: dict[str, float]
-    steps: list[Step] = field(default_factory=list)
-    picked: Measurement | None = None
-    picked_errors: Errors | None = None
-    given: Measurement | None = None
-    given_errors: Errors | None = None
-    full: Measurement | None = None
-    sensors: str = "full"
-    spent_s: float = 0.0
-    complete: bool = True
+    steps: tuple[Step, ...]
+    picked: Measurement
+    picked_errors: Errors
+    given: Measurement
+    given_errors: dict[str, float]
+    full: Measurement
+    sensors: str
+    spent_s: float
+    complete: bool
 
 
 def search(
@@ -123,7 +127,7 @@ def search(
         scene: The scene as it is given.
         tolerances: Error allowed to each quantity, as a part of its scale.
         keep: Levels that stay as full as they are.
-        runs: Timed runs of each rung.
+        runs: Timed runs of each candidate.
         budget_s: Wall time [s].
         progress: Told what is tried.
 
@@ -134,155 +138,127 @@ def search(
     for name in keep:
         if name not in KEEPABLE:
             raise InputError("--keep", f"one of {', '.join(KEEPABLE)}", name)
-    begin = time.perf_counter()
-    names = list(tolerances)
+    work = _Work(scene, tolerances, runs, budget_s, progress)
+    standard = _standard(work)
+    best = _together(work, standard, _one_at_a_time(work, standard, keep))
+    passing, complete = _engines(work, standard, best)
+    given = work.run(_given(scene), sensors={})
+    full = work.run(standard.full.with_engine(*_usual("rk8")), sensors={})
+    sensors = scene.sensors.chain if SENSORS in keep else "ideal"
+    picked = _verified(work, standard, best, passing, sensors)
+    return Ladder(
+        scene=scene,
+        tolerances=tolerances,
+        reference=standard.reference,
+        unlike=standard.unlike,
+        reference_errors=standard.errors,
+        steps=tuple(work.steps),
+        picked=picked.measured,
+        picked_errors=picked.errors,
+        given=given,
+        given_errors=standard.against(given.values, standard.reference.values),
+        full=full,
+        sensors=sensors,
+        spent_s=work.spent_s,
+        complete=complete,
+    )
 
-    def left() -> float:
-        return budget_s - (time.perf_counter() - begin)
 
-    def run(rung: Rung, **options: Any) -> Measurement:
-        if left() <= 0.0:
-            raise InputError("--budget-s", "longer: it ended before there was a pick", budget_s)
-        return measure(scene, rung, names, **{"runs": runs, "limit_s": left(), **options})
+@dataclass
+class _Work:
+    """A search under way: what is asked, and everything tried so far."""
 
-    # Of model levels the top rung is full, of the drive the scene's own.
-    full = Rung(ModelLevels(**{name: rungs[-1] for name, rungs in LEVELS.items() if name != "drive"}),  # pyright: ignore[reportArgumentType]
-                scene.drive.mode, *_REFERENCE)  # fmt: skip
-    progress(f"full model, {full.method}, and {_UNLIKE[0]} {_UNLIKE[1]} us beside it")
-    reference = run(full)
-    unlike = run(full.with_engine(*_UNLIKE), runs=1)
-    _raise_failure(reference, unlike)
-    check_reads(scene, reference)
-    base = reference.trace
-    assert base is not None
+    scene: Scene
+    tolerances: dict[str, float]
+    runs: int
+    budget_s: float
+    progress: Callable[[str], None]
+    steps: list[Step] = field(default_factory=list)
+    _begin: float = field(default_factory=time.perf_counter)
 
-    def against(value: dict[str, Value], reference: dict[str, Value]) -> dict[str, float]:
-        return {name: QUANTITIES[name].error(value[name], reference[name], base) for name in names}
+    @property
+    def spent_s(self) -> float:
+        """Wall time so far [s]."""
+        return time.perf_counter() - self._begin
 
-    own = {
-        name: max(error, _resolution(name, reference))
-        for name, error in against(unlike.values, reference.values).items()
-    }
-    for name, error in own.items():
-        if error > 0.5 * tolerances[name]:
-            must = f"at least {2.0 * error:.2g} for {name}, twice the reference's own error"
-            raise InputError("--tolerance", must, tolerances[name])
-    # What the reference may be wrong by is taken off what is allowed.
-    allowed = {name: tolerances[name] - own[name] for name in names}
-    ladder = Ladder(scene, tolerances, reference, unlike, own)
+    @property
+    def left_s(self) -> float:
+        """What is left of the budget [s]."""
+        return self.budget_s - self.spent_s
 
-    # One level at a time.
-    top = full.with_engine(*_usual("split"))
-    top_cost = run(top)
-    _note(ladder, "full", "full model", reference, Errors({}, {}, own), allowed, cost=top_cost)
-    single: dict[str, dict[str, float]] = {}
-    for level, rungs in LEVELS.items():
-        own_rung = full.model[level]
-        for rung in rungs[: rungs.index(own_rung)]:
-            lowered = full.with_model(**{level: rung})
-            progress(f"{level} {rung}")
-            converged = run(_converged(lowered), runs=1)
-            cost = run(lowered.with_engine(*_usual(_cheap_engine(lowered))))
-            errors = Errors(against(converged.values, reference.values), {}, {})
-            stand_in = rung in STAND_INS
-            # By count, not by clock: the way down has to be the same each time.
-            dearer = not stand_in and cost.steps > DEARER * top_cost.steps
-            note = "stands in for exact, spares no work" if stand_in else "spares nothing" if dearer else ""
-            step = _note(ladder, "single", f"{level} {rung}", converged, errors, allowed, cost=cost, note=note)
-            if step.passes and not stand_in and not dearer and level not in keep:
-                single.setdefault(level, {})[rung] = errors.worst(allowed)
+    def run(self, candidate: Candidate, **options: Any) -> Measurement:
+        """Measure a candidate while there is time."""
+        if self.left_s <= 0.0:
+            raise InputError("--budget-s", "longer: it ended before there was a pick", self.budget_s)
+        options = {"runs": self.runs, "limit_s": self.left_s, **options}
+        return measure(self.scene, candidate, list(self.tolerances), **options)
 
-    # Together: all that pass alone; where they fail together, the worst of them goes back up.
-    chosen = {level: next(iter(rungs)) for level, rungs in single.items()}
-    best: Measurement | None = None
-    while best is None:
-        combined = full.with_model(**chosen)
-        label = ", ".join(f"{level} {rung}" for level, rung in chosen.items()) or "full model"
-        progress(f"together: {label}")
-        converged = run(_converged(combined), runs=1) if chosen else reference
-        errors = Errors(against(converged.values, reference.values), {}, {})
-        cost = run(combined.with_engine(*_usual(_cheap_engine(combined))))
-        if _note(ladder, "together", label, converged, errors, allowed, cost=cost).passes:
-            best = converged
-            break
-        worst = max(chosen, key=lambda level: single[level][chosen[level]])
-        rungs = list(single[worst])
-        higher = rungs[rungs.index(chosen[worst]) + 1 :]
-        if higher:
-            chosen[worst] = higher[0]
-        else:
-            del chosen[worst]
+    def cost(self, candidate: Candidate) -> Measurement:
+        """A model on the first engine that takes it, at that engine's own step."""
+        return self.run(candidate.with_engine(*_usual(_cheap_engine(candidate))))
 
-    # Engines and steps, the finest first: a setting holds only if every finer one of its engine holds.
-    passing: list[tuple[Step, int]] = []
-    for place, (engine, settings) in enumerate(_settings(scene, best.rung).items()):
-        for step_us, tolerance in settings:
-            if left() <= 0.2 * budget_s and passing:
-                ladder.complete = False
-                break
-            rung = best.rung.with_engine(engine, step_us, tolerance)
-            progress(rung.method)
-            # What takes longer than the reference is of no interest, and may be a stall.
-            done = run(rung, limit_s=max(1.0, 5.0 * reference.wall_s * scene.duration_s))
-            errors = Errors(
-                against(best.values, reference.values),
-                against(done.values, best.values),
-                against(done.values, reference.values),
-            )
-            step = _note(ladder, "engine", rung.method, done, errors, allowed, note=done.failure)
-            if not step.passes:
-                break
-            passing.append((step, place))
 
-    # The cheapest, verified as it will run.
-    ladder.given = run(_given(scene), sensors={})
-    ladder.given_errors = Errors({}, {}, against(ladder.given.values, reference.values))
-    ladder.full = run(full.with_engine(*_usual("rk8")), sensors={})
-    ladder.sensors = scene.sensors.chain if SENSORS in keep else "ideal"
-    while passing:
-        least = min(step.measured.wall_s for step, _ in passing)
-        near = [entry for entry in passing if entry[0].measured.wall_s <= TIE * least]
-        taken = min(
-            near, key=lambda entry: (entry[1], -entry[0].measured.rung.step_us, -entry[0].measured.rung.tolerance)
+class _Standard(NamedTuple):
+    """What everything is held against."""
+
+    full: Candidate
+    reference: Measurement
+    unlike: Measurement
+    errors: dict[str, float]
+    """What the reference itself may be wrong by."""
+    allowed: dict[str, float]
+    """The tolerances less that."""
+    trace: Trace
+
+    def against(self, values: dict[str, Value], others: dict[str, Value]) -> dict[str, float]:
+        """Errors of some values against others."""
+        return {name: QUANTITIES[name].error(values[name], others[name], self.trace) for name in values}
+
+    def model_errors(self, converged: Measurement) -> Errors:
+        """Errors of a model by a converged run of it."""
+        return Errors(model=self.against(converged.values, self.reference.values))
+
+    def all_errors(self, done: Measurement, best: Measurement) -> Errors:
+        """Errors of an engine's run of the picked model."""
+        return Errors(
+            self.against(best.values, self.reference.values),
+            self.against(done.values, best.values),
+            self.against(done.values, self.reference.values),
         )
-        progress(f"verifying {taken[0].label} as it will run")
-        done = run(taken[0].measured.rung, sensors={"chain": ladder.sensors})
-        errors = Errors(
-            against(best.values, reference.values),
-            against(done.values, best.values),
-            against(done.values, reference.values),
-        )
-        if _note(ladder, "verified", taken[0].label, done, errors, allowed, note=done.failure).passes:
-            ladder.picked, ladder.picked_errors = done, errors
-            break
-        passing.remove(taken)
-    ladder.spent_s = time.perf_counter() - begin
-    if ladder.picked is None:
-        raise InputError("--tolerance", "wider: no engine meets it on the levels that do", list(tolerances.values()))
-    return ladder
+
+    def step(self, stage: str, label: str, measured: Measurement, errors: Errors, **more: Any) -> Step:
+        """One thing tried, with its verdict."""
+        passes = not measured.failure and errors.worst(self.allowed) <= 1.0
+        return Step(stage, label, measured, errors, passes, **more)
 
 
-def _note(
-    ladder: Ladder,
-    stage: str,
-    label: str,
-    measured: Measurement,
-    errors: Errors,
-    allowed: dict[str, float],
-    *,
-    cost: Measurement | None = None,
-    note: str = "",
-) -> Step:
-    passes = not measured.failure and errors.worst(allowed) <= 1.0
-    step = Step(stage, label, measured, errors, passes, cost, note)
-    ladder.steps.append(step)
-    return step
+def _standard(work: _Work) -> _Standard:
+    """The full model by two unlike engines.
 
-
-def _raise_failure(*runs: Measurement) -> None:
-    for measured in runs:
+    Raises:
+        InputError: One of them fails, the scene has no such quantity, or a tolerance is finer than their distance.
+    """
+    # Of model levels the last choice is full, of the drive the scene's own.
+    levels: Any = {name: choices[-1] for name, choices in LEVELS.items() if name != "drive"}
+    full = Candidate(ModelLevels(**levels), work.scene.drive.mode, *_REFERENCE)
+    work.progress(f"full model, {full.method}, and {_UNLIKE[0]} {_UNLIKE[1]} us beside it")
+    reference = work.run(full)
+    unlike = work.run(full.with_engine(*_UNLIKE), runs=1)
+    for measured in (reference, unlike):
         if measured.failure:
-            raise InputError("scene", f"one that the reference can run ({measured.failure})", measured.rung.method)
+            must = f"one that the reference can run ({measured.failure})"
+            raise InputError("scene", must, measured.candidate.method)
+    check_reads(work.scene, reference)
+    assert reference.trace is not None  # it has not failed
+    standard = _Standard(full, reference, unlike, {}, {}, reference.trace)
+    distances = standard.against(unlike.values, reference.values)
+    own = {name: max(error, _resolution(name, reference)) for name, error in distances.items()}
+    for name, error in own.items():
+        if error > 0.5 * work.tolerances[name]:
+            must = f"at least {2.0 * error:.2g} for {name}, twice the reference's own error"
+            raise InputError("--tolerance", must, work.tolerances[name])
+    allowed = {name: tolerance - own[name] for name, tolerance in work.tolerances.items()}
+    return standard._replace(errors=own, allowed=allowed)
 
 
 def _resolution(name: str, reference: Measurement) -> float:
@@ -293,19 +269,120 @@ def _resolution(name: str, reference: Measurement) -> float:
     return quantity.resolution / abs(value)
 
 
-def _takes(engine: str, rung: Rung) -> bool:
+def _one_at_a_time(work: _Work, standard: _Standard, keep: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Lower every level alone; by level, the choices that pass and spare work, each with its worst error."""
+    full, steps = standard.full, work.steps
+    top = work.run(full.with_engine(*_usual("split")))
+    steps.append(standard.step("full", "full model", standard.reference, Errors(total=standard.errors), cost=top))
+    passing: dict[str, dict[str, float]] = {}
+    for level, choices in LEVELS.items():
+        for choice in choices[: choices.index(full.model[level])]:
+            lowered = full.with_model(**{level: choice})
+            work.progress(f"{level} {choice}")
+            converged = work.run(_converged(lowered), runs=1)
+            cost = work.cost(lowered)
+            stand_in = choice in STAND_INS
+            # By count, not by clock: the way down has to be the same each time.
+            costlier = not stand_in and cost.steps > COSTLIER * top.steps
+            note = "stands in for exact, spares no work" if stand_in else "spares nothing" if costlier else ""
+            errors = standard.model_errors(converged)
+            step = standard.step("single", f"{level} {choice}", converged, errors, cost=cost, note=note)
+            steps.append(step)
+            if step.passes and not stand_in and not costlier and level not in keep:
+                passing.setdefault(level, {})[choice] = errors.worst(standard.allowed)
+    return passing
+
+
+def _together(work: _Work, standard: _Standard, single: dict[str, dict[str, float]]) -> Measurement:
+    """Lower all levels that pass alone; while they fail together the worst goes back up. The model, converged."""
+    chosen = {level: next(iter(choices)) for level, choices in single.items()}
+    while True:
+        combined = standard.full.with_model(**chosen)
+        label = ", ".join(f"{level} {choice}" for level, choice in chosen.items()) or "full model"
+        work.progress(f"together: {label}")
+        converged = work.run(_converged(combined), runs=1) if chosen else standard.reference
+        errors, cost = standard.model_errors(converged), work.cost(combined)
+        work.steps.append(standard.step("together", label, converged, errors, cost=cost))
+        if work.steps[-1].passes:
+            return converged
+        worst = max(chosen, key=lambda level: single[level][chosen[level]])
+        choices = list(single[worst])
+        higher = choices[choices.index(chosen[worst]) + 1 :]
+        if higher:
+            chosen[worst] = higher[0]
+        else:
+            del chosen[worst]
+
+
+def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[tuple[Step, int]], bool]:
+    """Engines and steps, the finest first: a setting holds only if every finer one of its engine holds.
+
+    Returns:
+        What passes, with the engine's place among all, and whether every engine was tried.
+    """
+    passing: list[tuple[Step, int]] = []
+    complete = True
+    for place, (engine, settings) in enumerate(_settings(work.scene, best.candidate).items()):
+        for step_us, tolerance in settings:
+            if work.left_s <= _SPARE * work.budget_s and passing:
+                complete = False
+                break
+            candidate = best.candidate.with_engine(engine, step_us, tolerance)
+            work.progress(candidate.method)
+            # What takes longer than the reference is of no interest, and may be a stall.
+            done = work.run(candidate, limit_s=max(1.0, 5.0 * standard.reference.wall_s * work.scene.duration_s))
+            errors = standard.all_errors(done, best)
+            step = standard.step("engine", candidate.method, done, errors, note=done.failure)
+            work.steps.append(step)
+            if not step.passes:
+                break
+            passing.append((step, place))
+    return passing, complete
+
+
+def _verified(
+    work: _Work, standard: _Standard, best: Measurement, passing: list[tuple[Step, int]], sensors: str
+) -> Step:
+    """The cheapest, run as it will run; where that fails, the next.
+
+    Raises:
+        InputError: None of them passes.
+    """
+    passing = list(passing)
+    while passing:
+        least = min(step.measured.wall_s for step, _ in passing)
+        near = [entry for entry in passing if entry[0].measured.wall_s <= TIE * least]
+        taken = min(near, key=_preference)
+        work.progress(f"verifying {taken[0].label} as it will run")
+        done = work.run(taken[0].measured.candidate, sensors={"chain": sensors})
+        errors = standard.all_errors(done, best)
+        work.steps.append(standard.step("verified", taken[0].label, done, errors, note=done.failure))
+        if work.steps[-1].passes:
+            return work.steps[-1]
+        passing.remove(taken)
+    must = "wider: no engine meets it on the levels that do"
+    raise InputError("--tolerance", must, list(work.tolerances.values()))
+
+
+def _preference(entry: tuple[Step, int]) -> tuple[float, ...]:
+    """Among equals the earlier engine, then the longer step, then the wider tolerance."""
+    step, place = entry
+    return place, -step.measured.candidate.step_us, -step.measured.candidate.tolerance
+
+
+def _takes(engine: str, candidate: Candidate) -> bool:
     method = ENGINES[engine]
-    return rung.levels.friction in method.frictions and rung.levels.contact in method.contacts
+    return candidate.levels.friction in method.frictions and candidate.levels.contact in method.contacts
 
 
-def _converged(rung: Rung) -> Rung:
+def _converged(candidate: Candidate) -> Candidate:
     """A model on the engine of the reference, or on the unlike one at its finest where that cannot take it."""
-    return rung.with_engine(*(_REFERENCE if _takes(_REFERENCE[0], rung) else _UNLIKE))
+    return candidate.with_engine(*(_REFERENCE if _takes(_REFERENCE[0], candidate) else _UNLIKE))
 
 
-def _cheap_engine(rung: Rung) -> str:
+def _cheap_engine(candidate: Candidate) -> str:
     """The default engine, or the first that takes the model."""
-    return next(engine for engine in ENGINES if _takes(engine, rung))
+    return next(engine for engine in ENGINES if _takes(engine, candidate))
 
 
 def _usual(engine: str) -> tuple[str, int, float]:
@@ -313,30 +390,30 @@ def _usual(engine: str) -> tuple[str, int, float]:
     return engine, method.step_us, method.tolerance
 
 
-def _given(scene: Scene) -> Rung:
-    return Rung(scene.model, scene.drive.mode, scene.engine.name, scene.engine.step_us, scene.engine.tolerance)
+def _given(scene: Scene) -> Candidate:
+    return Candidate(scene.model, scene.drive.mode, scene.engine.name, scene.engine.step_us, scene.engine.tolerance)
 
 
-def _settings(scene: Scene, rung: Rung) -> dict[str, list[tuple[int, float]]]:
+def _settings(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float]]]:
     """Steps, or tolerances, of every engine that takes a model and fits the sample rates, the finest first."""
     settings: dict[str, list[tuple[int, float]]] = {}
     for engine, method in ENGINES.items():
-        if not _takes(engine, rung):
+        if not _takes(engine, candidate):
             continue
         if method.tolerance:
-            grids = [step for step in _GRIDS if step <= method.step_us and _fits(scene, rung, engine, step)]
+            grids = [step for step in _GRIDS if step <= method.step_us and _fits(scene, candidate, engine, step)]
             scales = (1e-2, 1.0, 1e2)
             settings[engine] = [(grids[0], method.tolerance * scale) for scale in scales] if grids else []
         else:
             steps = [step for step in _STEPS if 0.2 * method.step_us <= step <= 4.0 * method.step_us]
-            settings[engine] = [(step, 0.0) for step in steps if _fits(scene, rung, engine, step)]
+            settings[engine] = [(step, 0.0) for step in steps if _fits(scene, candidate, engine, step)]
     return settings
 
 
-def _fits(scene: Scene, rung: Rung, engine: str, step_us: int) -> bool:
+def _fits(scene: Scene, candidate: Candidate, engine: str, step_us: int) -> bool:
     try:
         for sensors in ({}, None):  # as it will run, and as it is measured
-            rung.with_engine(engine, step_us, 0.0).scene(scene, sensors=sensors)
+            candidate.with_engine(engine, step_us, 0.0).scene(scene, sensors=sensors)
     except InputError:
         return False
     return True

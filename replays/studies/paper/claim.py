@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.report.canvas import BLUE, GREEN, ORANGE, RED, SKY, draw_grid, new_figure
-from replays.studies.paper.blow import BANDWIDTH, Blow, Outcome
+from replays.studies.paper.pulse import BANDWIDTH, Outcome, Pulse
 from replays.studies.paper.spread import column, free_values, one_at_a_time, phases, rank_correlation
 from rig.parameters import load_parameters
 
@@ -27,7 +27,7 @@ SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
 BANDWIDTHS_HZ = (50.0, 100.0, 200.0, 500.0, 1000.0, 4900.0)
 LAWS = ("exact", "lankarani-nikravesh", "none", "hunt-crossley", "flores", "kelvin-voigt")
 
-Groups = dict[str, list[Blow]]
+Groups = dict[str, list[Pulse]]
 Results = dict[str, list[Outcome]]
 
 
@@ -38,19 +38,19 @@ def correction_keys() -> list[str]:
 
 
 def claim_groups(*, ensemble: int) -> Groups:
-    """Every blow that the claim is tested with, by group; a group of one thing holds it at `ensemble` phases.
+    """Every pulse that the claim is tested with, by group; a group of one thing holds it at `ensemble` phases.
 
     Args:
         ensemble: Places of the shaft's turn.
     """
     corrected = load_parameters("corrected").entries
-    base = Blow(label="corrected")
+    base = Pulse(label="corrected")
     groups: Groups = {
         "base corrected": phases(base, ensemble),
-        "base as-printed": phases(Blow(label="as-printed", parameters="as-printed"), ensemble),
+        "base as-printed": phases(Pulse(label="as-printed", parameters="as-printed"), ensemble),
     }
     for key in correction_keys():
-        changed = Blow(label=key, parameters="as-printed", changes={key: corrected[key].value})
+        changed = Pulse(label=key, parameters="as-printed", changes={key: corrected[key].value})
         groups[f"correction {key}"] = phases(changed, ensemble)
     for scale in SCALES:
         changes = {key: float(corrected[key].value) * scale for key in HOUSE_KEYS}
@@ -62,22 +62,22 @@ def claim_groups(*, ensemble: int) -> Groups:
         groups[f"law {law}"] = phases(replace(base, label=law, changes=changes), ensemble)
     groups["bandwidth"] = [replace(base, label=f"{hz:g} Hz", changes={BANDWIDTH: hz}) for hz in BANDWIDTHS_HZ]
     for entry, low, high in one_at_a_time():
-        # Where the blow falls in the turn is a value of its own: with phases it would be lost.
+        # Where the pulse falls in the turn is a value of its own: with phases it would be lost.
         alone = entry.key == "hammer.at"
         groups[f"low {entry.key}"] = [low] if alone else phases(low, ensemble)
         groups[f"high {entry.key}"] = [high] if alone else phases(high, ensemble)
     return groups
 
 
-def alternatives() -> dict[str, Blow]:
+def alternatives() -> dict[str, Pulse]:
     """Other readings of the model and of printed values."""
     return {
-        "house rigid": Blow(changes={"model.stator": "rigid"}),
-        "outer house fixed": Blow(changes={"model.stator": "inner-house"}),
-        "houses of dtu-2019": Blow(parameters="dtu-2019"),
-        "restitution 0.5": Blow(changes={"contact.restitution": 0.5}),
-        "friction 0.15": Blow(changes={"contact.friction": 0.15}),
-        "drive held at 6.2 Hz": Blow(changes={"drive.mode": "ideal"}),
+        "house rigid": Pulse(changes={"model.stator": "rigid"}),
+        "outer house fixed": Pulse(changes={"model.stator": "inner-house"}),
+        "houses of dtu-2019": Pulse(parameters="dtu-2019"),
+        "restitution 0.5": Pulse(changes={"contact.restitution": 0.5}),
+        "friction 0.15": Pulse(changes={"contact.friction": 0.15}),
+        "drive held at 6.2 Hz": Pulse(changes={"drive.mode": "ideal"}),
     }
 
 
@@ -149,7 +149,7 @@ def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
             there = [value for value in bar.values if math.isfinite(value)]
             if not there:
                 continue
-            # A hair of width for a bar that does not move at all.
+            # A little width for a bar that does not move at all.
             axes.barh(row, max(bar.width, 0.5), left=min(there), height=0.62, color=COLOURS[bar.kind])
             for end, mark in ((bar.values[0], "<"), (bar.values[-1], ">")):
                 if bar.kind != "other reading" and math.isfinite(end):
@@ -236,7 +236,7 @@ def draw_mobility(results: Results) -> Figure:
     shown = {
         "peak_normal_n": "highest normal force [N]",
         "contacts": "impacts until it whirls",
-        "roll_s": "from the blow until it rolls [s]",
+        "roll_s": "from the pulse until it rolls [s]",
         "reaction_x_n": "E - W amplitude in whirl [N]",
     }
     for axes, (name, label) in zip(panels, shown.items(), strict=True):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replays.studies.paper.blow import Blow, Outcome
+from replays.studies.paper.pulse import Outcome, Pulse
 from replays.studies.stability.boundary import NAMES, ROLLING, whirl_class
 from replays.studies.stability.motion import base_model, move, pivoted_mass, quiet_inputs, state
 from rig.kernels.constants import Constants
@@ -77,8 +77,8 @@ def friction_with_houses(constants: Constants, spin: float) -> float:
     22-25), each at its amplitude of forced vibration; what their dampers take on the mean, friction must bring.
     """
     own = oscillator(constants)
-    whirl, depth = rolling_whirl(constants, spin)
-    whirl, radius = -whirl, constants.contact.clearance + depth
+    whirl, radius = rolling_circle(constants, spin)
+    whirl = -whirl
     force = normal_force(own, whirl, radius)
     power = -0.5 * whirl * force * sum(amplitude.imag for amplitude in _ring_motion(constants, whirl, force))
     return least_friction(own, whirl) + power / (radius * whirl * force)
@@ -111,8 +111,8 @@ def friction_swing(constants: Constants, spin: float) -> float:
     frequency and so hurries and brakes it along the ring, by m w^2 |X - Y| / 2.
     """
     own = oscillator(constants)
-    whirl, depth = rolling_whirl(constants, spin)
-    force = normal_force(own, whirl, constants.contact.clearance + depth)
+    whirl, radius = rolling_circle(constants, spin)
+    force = normal_force(own, whirl, radius)
     across, up = _ring_motion(constants, -whirl, force)
     return 0.5 * own.mass * whirl**2 * abs(across - up)
 
@@ -134,6 +134,12 @@ def rolling_whirl(constants: Constants, spin: float) -> tuple[float, float]:
         whirl = spin * constants.shaft.radius / radius
         depth = (max(0.0, normal_force(own, whirl, radius)) / contact.stiffness) ** (1.0 / contact.exponent)
     return -spin * constants.shaft.radius / (contact.clearance + depth), depth
+
+
+def rolling_circle(constants: Constants, spin: float) -> tuple[float, float]:
+    """Whirl frequency [rad/s] and radius [m] of rolling at a spin [rad/s]."""
+    whirl, depth = rolling_whirl(constants, spin)
+    return whirl, constants.contact.clearance + depth
 
 
 def bare_rig(friction: float) -> Constants:
@@ -251,9 +257,7 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ, *, steps: int = 1
         full = base_model(ModelLevels()).constants
         values = []
         for constants in (bare, full):
-            begun = _rolled(constants, spin)
-
-            values.append(bisect(_holder(constants, begun, spin), 0.3 * closed, 6.0 * closed, steps=steps))
+            values.append(bisect(_holder(constants, spin), 0.3 * closed, 6.0 * closed, steps=steps))
         bare_mu, full_mu = values
         with_houses, used = friction_with_houses(full, spin), friction_used(full, spin)
         found.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
@@ -269,8 +273,9 @@ def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
     return abs(float(friction.mean() / normal.mean())), float(np.max(np.abs(friction[there] / normal[there])))
 
 
-def _holder(constants: Constants, begun: np.ndarray, spin: float) -> Callable[[float], bool]:
+def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
     """Whether a rolling whirl goes on at a friction."""
+    begun = _rolled(constants, spin)
 
     def holds(mu: float) -> bool:
         changed = constants._replace(contact=constants.contact._replace(friction=mu))
@@ -289,10 +294,10 @@ def _rolled(constants: Constants, spin: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Start:
-    """What becomes of one blow over friction.
+    """What becomes of one pulse over friction.
 
     Attributes:
-        force_n: Peak of the blow [N].
+        force_n: Peak of the pulse [N].
         frictions: Shape (n,).
         classes: Of `replays.studies.stability.boundary`, shape (n,).
     """
@@ -320,25 +325,25 @@ class Start:
         return ", ".join(f"{n} {NAMES[k]}" for k in range(len(NAMES)) if (n := int(np.sum(self.classes == k))))
 
 
-def start_by_blow(force_n: float, *, points: int) -> Start:
-    """Scan friction for one blow of 5 ms at 6.2 Hz."""
+def start_by_pulse(force_n: float, *, points: int) -> Start:
+    """Scan friction for one pulse of 5 ms at 6.2 Hz."""
     frictions = np.linspace(0.02, 0.40, points)
     classes = np.array([whirl_class(ENGINE, float(mu), force_n) for mu in frictions])
     return Start(force_n, frictions, classes)
 
 
-def blow_whirl(constants: Constants, *, force_n: float, duration_s: float) -> float:
-    """Whirl frequency if all of a half-sine blow at the disk became motion along the ring [rad/s]."""
+def pulse_whirl(constants: Constants, *, force_n: float, duration_s: float) -> float:
+    """Whirl frequency if all of a half-sine pulse at the disk became motion along the ring [rad/s]."""
     shaft = constants.shaft
     impulse = force_n * duration_s * 2.0 / math.pi
     speed = impulse * shaft.arm_disk * shaft.arm_ring / shaft.transverse_inertia
     return speed / constants.contact.clearance
 
 
-def sweep_blows(speeds_hz: tuple[float, ...]) -> list[Blow]:
-    """A blow at each speed, on a drive that holds it: what the whirl frequency law is held against."""
-    blow = Blow(changes={"drive.mode": "ideal"}, force_n=150.0)
-    return [replace(blow, label=f"{speed:g} Hz", speed_hz=speed) for speed in speeds_hz]
+def sweep_pulses(speeds_hz: tuple[float, ...]) -> list[Pulse]:
+    """A pulse at each speed, on a drive that holds it: what the whirl frequency law is held against."""
+    pulse = Pulse(changes={"drive.mode": "ideal"}, force_n=150.0)
+    return [replace(pulse, label=f"{speed:g} Hz", speed_hz=speed) for speed in speeds_hz]
 
 
 def law_hz(speed_hz: float) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, draw_grid, new_figure
-from replays.studies.paper.reproduction import BLOW_S, FIG_7_M, SPEEDS_HZ, Reproduction, spectra
+from replays.studies.paper.reproduction import FIG_7_M, PULSE_S, SPEEDS_HZ, Reproduction, spectra
 from rig.magnets import map_force
 
 if TYPE_CHECKING:
@@ -26,8 +26,10 @@ def _axis_lines(axes: Any, *levels: float, text: str = "the paper's axis", along
     axes.plot([], [], label=text, **_PAPER)
 
 
-def _halves(found: dict[str, Reproduction]) -> list[tuple[int, Reproduction]]:
-    return list(enumerate(found.values()))
+def _since_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Time from where a force first rises through 0 [ms], as the paper's figures begin."""
+    rises = np.flatnonzero((force[:-1] < 0.0) & (force[1:] >= 0.0))
+    return (times_s - times_s[int(rises[0]) if len(rises) else 0]) * 1e3
 
 
 def draw_magnets(one: Reproduction) -> Figure:
@@ -46,15 +48,15 @@ def draw_magnets(one: Reproduction) -> Figure:
         shown = np.where(inside, component, np.nan).reshape(81, 81)
         filled = axes.contourf(axis * 1e3, axis * 1e3, shown, levels=np.linspace(-40, 40, 17), cmap="RdBu_r",
                                extend="both")  # fmt: skip
-        axes.set(title=f"F_mag,{name} [N]", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+        axes.set(title=f"$F_{{mag,{name}}}$ [N]", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
         figure.colorbar(filled, ax=axes, shrink=0.85, ticks=[-40, -20, 0, 20, 40])
     line = panels[2]
     along = map_force(axis, np.zeros_like(axis), model.constants.magnet)[:, 0]
-    told = f"map at K_mag = {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
-    line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label=told)
-    line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="spring K_mag")
+    label = f"map at $K_{{mag}}$ = {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
+    line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label=label)
+    line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="spring $K_{mag}$")
     _axis_lines(line, -40.0, 40.0)
-    line.set(title="through the centre", xlabel="x [mm]", ylabel="F_mag,x [N]", xlim=(-10, 10), ylim=(-46, 46))
+    line.set(title="through the centre", xlabel="x [mm]", ylabel="$F_{mag,x}$ [N]", xlim=(-10, 10), ylim=(-46, 46))
     line.legend(fontsize=8, loc="lower left")
     draw_grid(line)
     return figure
@@ -78,13 +80,13 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         (14.0, 7.2), "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", title_size=12
     )
     panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in _halves(found):
+    for row, one in enumerate(found.values()):
         run, t = one.drop, one.drop.times_s * 1e3
         path, height, force, house = panels[row]
         path.plot(run["ring_x"] * 1e3, run["ring_y"] * 1e3, color=BLUE, lw=1.2)
         angle = np.linspace(0, 2 * math.pi, 181)
         r0 = run.simulation.model.constants.contact.clearance * 1e3
-        path.plot(r0 * np.cos(angle), r0 * np.sin(angle), color="0.6", lw=1.0, label="r0 (assumed)")
+        path.plot(r0 * np.cos(angle), r0 * np.sin(angle), color="0.6", lw=1.0, label="$r_0$ (assumed)")
         path.set(xlabel="x in the ring [mm]", ylabel=f"{one.parameters}\ny in the ring [mm]", aspect="equal",
                  xlim=(-1.3, 1.3), ylim=(-1.3, 1.3))  # fmt: skip
         _axis_lines(path, -1.0, 1.0)
@@ -98,8 +100,8 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         force.set(ylabel="SOUTH reaction P_S - P_N [N]")
         force.margins(y=0.35)
         house.plot(t, run["inner_ay"], color=BLACK, lw=0.5)
-        _axis_lines(house, -100.0, 100.0, text="the paper's axis, +-100")
-        house.set(ylabel="inner house [m/s^2]")
+        _axis_lines(house, -100.0, 100.0, text="the paper's axis, ±100")
+        house.set(ylabel="inner house [m/s²]")
         house.margins(y=0.35)
         height.set(xlabel="time [ms]", xlim=(0, 200))
         first = first_impacts(run["penetration"], t)
@@ -112,20 +114,20 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
 
 
 def _phases(one: Reproduction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Before the blow, impacts, whirl: masks over the rows."""
+    """Before the pulse, impacts, whirl: masks over the rows."""
     run = one.whirl
     t = run.times_s
     touching = run["penetration"] > 0.0
-    loose = np.flatnonzero(~touching & (t >= BLOW_S))
-    lasting = t[loose[-1]] if len(loose) else BLOW_S
-    return t < BLOW_S, (t >= BLOW_S) & (t <= lasting), t > lasting
+    loose = np.flatnonzero(~touching & (t >= PULSE_S))
+    lasting = t[loose[-1]] if len(loose) else PULSE_S
+    return t < PULSE_S, (t >= PULSE_S) & (t <= lasting), t > lasting
 
 
 def draw_hammer(found: dict[str, Reproduction]) -> Figure:
     """Figure 12: orbit, spin, x(t), y(t)."""
-    figure = new_figure((14.0, 7.2), "Fig. 12: blow of 100 N, 5 ms (shape assumed) at 6.2 Hz", title_size=12)
+    figure = new_figure((14.0, 7.2), "Fig. 12: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", title_size=12)
     panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in _halves(found):
+    for row, one in enumerate(found.values()):
         run, t = one.whirl, one.whirl.times_s
         orbit, spin, across, up = panels[row]
         for part, colour, name in zip(
@@ -155,7 +157,7 @@ def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
     """Figure 14: full spectrum over time."""
     figure = new_figure((13.0, 4.6), "Fig. 14: full spectrum of the disk's probes over time", title_size=12)
     panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for (_, one), axes in zip(_halves(found), panels, strict=True):
+    for one, axes in zip(found.values(), panels, strict=True):
         times, frequencies, amplitude = spectra(one.whirl)
         level = 20.0 * np.log10(np.maximum(amplitude, 1e-5))
         mesh = axes.pcolormesh(times, frequencies, level.T, cmap="magma", vmin=-80, vmax=5, shading="nearest",
@@ -172,7 +174,7 @@ def draw_reactions(found: dict[str, Reproduction]) -> Figure:
     """Figure 15: horizontal and vertical reactions, the impacts and the whirl on scales of their own."""
     figure = new_figure((14.0, 7.2), "Fig. 15: reactions, the difference of opposed transducers", title_size=12)
     panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in _halves(found):
+    for row, one in enumerate(found.values()):
         run, t = one.whirl, one.whirl.times_s
         for place, (a, b, name) in enumerate((("P_E", "P_W", "E - W"), ("P_N", "P_S", "N - S"))):
             truth, sensed = run[a] - run[b], run.samples[a] - run.samples[b]
@@ -197,14 +199,11 @@ def draw_east(found: dict[str, Reproduction]) -> Figure:
     """Figure 16: EAST in full annular whirl, over a turn and a half."""
     figure = new_figure((13.0, 4.2), "Fig. 16: EAST in full annular whirl", title_size=12)
     panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for (_, one), axes in zip(_halves(found), panels, strict=True):
+    for one, axes in zip(found.values(), panels, strict=True):
         run = one.whirl
         last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.030)
         pair = (run["P_E"] - run["P_W"])[last]
-        # From where the force rises through 0, as the paper's begins.
-        rises = np.flatnonzero((pair[:-1] < 0.0) & (pair[1:] >= 0.0))
-        start = int(rises[0]) if len(rises) else 0
-        t = (run.times_s[last] - run.times_s[last][start]) * 1e3
+        t = _since_rise_ms(run.times_s[last], pair)
         preload = run.simulation.model.constants.house.preload
         axes.plot(t, pair, color=BLUE, lw=2.0, label="E - W, truth")
         axes.plot(t, (run.samples["P_E"] - run.samples["P_W"])[last], color=RED, lw=0.8, label="E - W, transducers")
@@ -222,14 +221,12 @@ def draw_speeds(found: dict[str, Reproduction]) -> Figure:
     """Figure 17: EAST at four speeds."""
     figure = new_figure((13.0, 4.2), "Fig. 17: EAST (E - W) in full annular whirl at four speeds", title_size=12)
     panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for (_, one), axes in zip(_halves(found), panels, strict=True):
+    for one, axes in zip(found.values(), panels, strict=True):
         for speed, colour in zip(SPEEDS_HZ, (SKY, GREEN, ORANGE, PINK), strict=True):
             run = one.speeds[speed]
             pair = run["P_E"] - run["P_W"]
             last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.08)
-            rises = np.flatnonzero((pair[last][:-1] < 0.0) & (pair[last][1:] >= 0.0))
-            start = int(rises[0]) if len(rises) else 0
-            t = (run.times_s[last] - run.times_s[last][start]) * 1e3
+            t = _since_rise_ms(run.times_s[last], pair[last])
             axes.plot(t, pair[last], color=colour, lw=1.6, label=f"{speed:g} Hz")
         axes.set(title=one.parameters, xlabel="time [ms]", ylabel="E - W [N]", xlim=(0, 24), ylim=(-650, 850))
         axes.legend(fontsize=8, loc="upper right", ncols=4)

@@ -1,19 +1,16 @@
-"""What the paper leaves open, each with the numbers that there are on it."""
+"""What the paper leaves open, each with the numbers that there are on it; the report's template says what they mean."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from replays.studies.paper.blow import Blow
 from replays.studies.paper.claim import Groups, Results, median
 from replays.studies.paper.condition import oscillator
+from replays.studies.paper.pulse import Pulse
 from replays.studies.paper.reproduction import Reproduction, drop_impact, drop_impulse
 from replays.studies.paper.spread import phases
-from replays.studies.paper.statement import number
 from replays.studies.stability.closed_forms import Impact, impact, stiffest_mode
 from rig.kernels.constants import Constants
 from rig.magnets import cylinder_stiffness, field_sum_stiffness
@@ -29,35 +26,21 @@ PAIR_STIFFNESS = (0.5, 1.0, 2.0)
 K_FT = 8.88e7
 STIFFNESSES_KN_M = (0.74, 1.0, 1.3, 1.7, 2.5)
 _LENGTHS_MM = (10.0, 16.9, 25.0, 35.0, 50.0)
+_PRINTED_RATIO = 13.5
 
-
-@dataclass(frozen=True)
-class Question:
-    """One open question.
-
-    Attributes:
-        title: In words.
-        headings: Of the table.
-        rows: What is known, with its number.
-        answer: What the numbers say, made from them.
-    """
-
-    title: str
-    headings: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-    answer: str
+Numbers = dict[str, Any]
 
 
 def question_groups(*, ensemble: int) -> Groups:
-    """Blows for the questions on the houses."""
+    """Hammer pulses for the questions on the houses."""
     groups: Groups = {}
     for mass in OUTER_MASSES_KG:
-        blow = Blow(label=f"M_oh {mass:g} kg", changes={"house.outer_mass": mass})
-        groups[f"mass {mass:g}"] = phases(blow, ensemble)
+        pulse = Pulse(label=f"M_oh {mass:g} kg", changes={"house.outer_mass": mass})
+        groups[f"mass {mass:g}"] = phases(pulse, ensemble)
     for factor in PAIR_STIFFNESS:
         keys = ("house.pair_stiffness_vertical", "house.pair_stiffness_horizontal")
-        blow = Blow(label=f"k_T {factor:g} K_ft", changes=dict.fromkeys(keys, factor * K_FT))
-        groups[f"pair {factor:g}"] = phases(blow, ensemble)
+        pulse = Pulse(label=f"k_T {factor:g} K_ft", changes=dict.fromkeys(keys, factor * K_FT))
+        groups[f"pair {factor:g}"] = phases(pulse, ensemble)
     return groups
 
 
@@ -78,244 +61,172 @@ def weight_at_ring(constants: Constants) -> float:
     return shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring
 
 
-def _impact(constants: Constants, *, mass: float, speed: float, stiffness: float | None = None) -> Impact:
-    contact = constants.contact
-    return impact(
-        mass=mass,
-        speed=speed,
-        stiffness=stiffness or contact.stiffness,
-        exponent=contact.exponent,
-        factor=contact.damping_factor,
-        floor=contact.speed_floor,
-    )
-
-
-def drop_question(found: dict[str, Reproduction]) -> Question:
+def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
     """The drop's 100 N against the momentum that must be turned round."""
+    model = found["corrected"].drop.simulation.model
+    contact, masses = model.constants.contact, reference_impact(model.parameters)
+    time_s, speed = fall(model.constants)
+
+    def hit(mass: float, at: float = speed, stiffness: float = contact.stiffness) -> Impact:
+        return impact(
+            mass=mass, speed=at, stiffness=stiffness, exponent=contact.exponent, factor=contact.damping_factor,
+            speed_floor=contact.speed_floor,
+        )  # fmt: skip
+
+    stiffness = _where_peak_is_printed(lambda k: hit(masses.shaft_mass, stiffness=k).peak, 1e4, 1e12)
+    slow = _where_peak_is_printed(lambda v: hit(masses.mass, v).peak, 2e-3, 1.0)
+    free = hit(masses.mass)
+    half_sine_ms = 1e3 * math.pi / 2.0 * free.impulse / PAPER_DROP_N
+    return {
+        "fall_ms": time_s * 1e3,
+        "speed": speed,
+        "free": free,
+        "fixed": hit(masses.shaft_mass),
+        "runs": {name: _drop_run(one) for name, one in found.items()},
+        "half_sine_ms": half_sine_ms,
+        "ratio": half_sine_ms / (free.duration * 1e3),
+        "soft": {
+            "stiffness": stiffness,
+            "times": contact.stiffness / stiffness,
+            "depth_mm": hit(masses.shaft_mass, stiffness=stiffness).depth * 1e3,
+        },
+        "clearance_mm": contact.clearance * 1e3,
+        "height_um": 1e6 * 2.0 * contact.clearance * (slow / speed) ** 2,
+        "weight": weight_at_ring(model.constants),
+        "house_n": PAPER_DROP_N * model.constants.house.inner_mass,
+    }
+
+
+def _drop_run(one: Reproduction) -> Numbers:
+    run = one.drop
+    time_s, speed = drop_impact(run)
+    return {
+        "fall_ms": time_s * 1e3,
+        "speed": speed,
+        "impulse": drop_impulse(run),
+        "force": run["normal_force"].max(),
+        "reaction": one.numbers["drop_reaction"],
+        "mean_force": run["contact_impulse"][-1] / run.times_s[-1],
+    }
+
+
+def _where_peak_is_printed(peak: Callable[[float], float], low: float, high: float) -> float:
+    """Where a peak that rises [N] reaches the printed one, between logarithms."""
     from scipy.optimize import brentq
 
-    one = found["corrected"]
-    constants = one.drop.simulation.model.constants
-    masses = reference_impact(one.drop.simulation.model.parameters)
-    time_s, speed = fall(constants)
-    fixed = _impact(constants, mass=masses.shaft_mass, speed=speed)
-    free = _impact(constants, mass=masses.mass, speed=speed)
-
-    def excess(logarithm: float) -> float:
-        soft = _impact(constants, mass=masses.shaft_mass, speed=speed, stiffness=math.exp(logarithm))
-        return math.log(soft.peak / PAPER_DROP_N)
-
-    root: Any = brentq(excess, math.log(1e4), math.log(1e12), xtol=1e-6)
-    soft = _impact(constants, mass=masses.shaft_mass, speed=speed, stiffness=math.exp(float(root)))
-
-    def slow_excess(logarithm: float) -> float:
-        return math.log(_impact(constants, mass=masses.mass, speed=math.exp(logarithm)).peak / PAPER_DROP_N)
-
-    slow: Any = brentq(slow_excess, math.log(2e-3), math.log(1.0), xtol=1e-6)
-    slow_speed = math.exp(float(slow))
-    height_um = 1e6 * 2.0 * constants.contact.clearance * (slow_speed / speed) ** 2
-    half_sine_ms = 1e3 * math.pi / 2.0 * free.impulse / PAPER_DROP_N
-    rows = [
-        ("fall through 2 r0, closed form", f"{time_s * 1e3:.2f} ms, {speed:.4f} m/s"),
-        *(
-            (f"the same, {name}", f"{drop_impact(each.drop)[0] * 1e3:.2f} ms, {drop_impact(each.drop)[1]:.4f} m/s")
-            for name, each in found.items()
-        ),
-        ("impulse, house free, closed form", f"{free.impulse:.3f} N s in {free.duration * 1e3:.2f} ms, peak "
-        f"{free.peak:.0f} N"),
-        ("impulse, house fixed, closed form", f"{fixed.impulse:.3f} N s in {fixed.duration * 1e3:.2f} ms, peak "
-        f"{fixed.peak:.0f} N"),
-        *(
-            (f"impulse of the first contact, {name}", f"{drop_impulse(each.drop):.3f} N s, largest normal force "
-             f"{each.drop['normal_force'].max():.0f} N, reaction {each.numbers['drop_reaction']:.0f} N")
-            for name, each in found.items()
-        ),
-        ("time that a half-sine of 100 N needs for the smaller impulse", f"{half_sine_ms:.1f} ms"),
-        ("K at which Hertz's peak would be 100 N", f"{math.exp(float(root)):.2e} N/m^1.5, "
-        f"{constants.contact.stiffness / math.exp(float(root)):.0f} "
-         f"times softer; it would sink in by {soft.depth * 1e3:.2f} mm of r0 = "
-         f"{constants.contact.clearance * 1e3:.3f} mm (assumed)"),
-        ("fall at which our K would give 100 N", f"{height_um:.0f} um instead of "
-        f"{2e6 * constants.contact.clearance:.0f} um"),
-        ("mean force from release to rest: the weight at the ring, closed form", f"{weight_at_ring(constants):.2f} N"),
-        *(
-            (f"the same, {name}", f"{each.drop['contact_impulse'][-1] / each.drop.times_s[-1]:.2f} N")
-            for name, each in found.items()
-        ),
-        ("100 m/s^2 (Fig. 10(d), unit assumed) of the inner house",
-         f"{PAPER_DROP_N * constants.house.inner_mass:.0f} N"),
-    ]  # fmt: skip
-    ratio = half_sine_ms / (free.duration * 1e3)
-    answer = (
-        f"To turn the fall round in a push of 100 N takes {half_sine_ms:.1f} ms, {ratio:.0f} times the contact of "
-        f"{free.duration * 1e3:.2f} ms that the printed elastic constants give with the assumed radii. "
-        + ("The printed force and the printed constants do not fit each other; nothing was fitted."
-           if ratio > 2.0 else "The two fit each other.")
-    )  # fmt: skip
-    return Question("The drop's 100 N", ("quantity", "value"), rows, answer)
-
-
-def _house_row(name: str, results: Results, group: str, *, mass: float, link: float) -> tuple[str, ...]:
-    house = load_parameters("corrected")
-    vertical = stiffest_mode(
-        inner=house["house.inner_mass"], outer=mass, link=link, support=house["house.outer_beam_stiffness"]
+    root: Any = brentq(
+        lambda logarithm: math.log(peak(math.exp(logarithm)) / PAPER_DROP_N), math.log(low), math.log(high), xtol=1e-6
     )
-    values = (median(results[group], key) for key in ("reaction_x_n", "reaction_y_n", "peak_x_n", "peak_y_n"))
-    return (name, f"{vertical.frequency_hz:.0f}", *(f"{value:.0f}" for value in values))
+    return math.exp(float(root))
 
 
-_HOUSE_HEADINGS = (
-    "reading", "stiffest vertical mode [Hz]", "E - W in whirl [N]", "N - S in whirl [N]", "highest E - W [N]",
-    "highest N - S [N]",
-)  # fmt: skip
+class Reading(NamedTuple):
+    """One reading of the houses' masses and springs."""
+
+    value: float
+    mode_hz: float
+    """Stiffest vertical mode [Hz]."""
+    forces: tuple[int, ...]
+    """E - W and N - S in whirl, then the highest of each [N]."""
 
 
-def _spread(rows: list[tuple[str, ...]], place: int) -> float:
-    values = [float(row[place]) for row in rows]
-    return max(values) / min(values) - 1.0
-
-
-def mass_question(results: Results) -> Question:
-    """Is 8.88 kg the outer house alone or both houses?"""
+def house_numbers(results: Results) -> dict[str, Numbers]:
+    """Is 8.88 kg the outer house alone or both houses (`mass`)? K_ft / 2 or 2 K_ft (`pair`)?"""
     p = load_parameters("corrected")
-    link = p["house.pair_stiffness_vertical"]
-    rows = [
-        _house_row(f"M_oh = {mass:g} kg", results, f"mass {mass:g}", mass=mass, link=link) for mass in OUTER_MASSES_KG
-    ]
-    zeta, stiffness, damping = 0.054, p["house.outer_beam_stiffness"], p["house.outer_beam_damping"]
-    implied = (damping / (2.0 * zeta)) ** 2 / stiffness
-    answer = (
-        f"The printed D_bh = {damping:g} N s/m with zeta = {zeta} and K_bh implies a mass of {implied:.2f} kg on the "
-        "horizontal beams: 8.88 kg it is, not 10.58 kg. Vertically both houses move on those beams, so this fits the "
-        "total as well as an outer house alone, and does not decide between 7.18 and 8.88 kg. The force in whirl, E - "
-        f"W, differs by {_spread(rows, 2):.1%} between the three readings, the highest by {_spread(rows, 4):.0%}."
-    )
-    return Question("The outer house's mass: 8.88 kg in all, or alone?", _HOUSE_HEADINGS, rows, answer)
+
+    def reading(group: str, value: float, *, mass: float, link: float) -> Reading:
+        mode = stiffest_mode(
+            inner=p["house.inner_mass"], outer=mass, link=link, support=p["house.outer_beam_stiffness"]
+        )
+        keys = ("reaction_x_n", "reaction_y_n", "peak_x_n", "peak_y_n")
+        return Reading(value, mode.frequency_hz, tuple(round(median(results[group], key)) for key in keys))
+
+    def differences(readings: list[Reading]) -> Numbers:
+        whirl, highest = ([each.forces[place] for each in readings] for place in (0, 2))
+        return {
+            "readings": readings,
+            "whirl_spread": max(whirl) / min(whirl) - 1.0,
+            "highest_spread": max(highest) / min(highest) - 1.0,
+        }
+
+    link, outer = p["house.pair_stiffness_vertical"], p["house.outer_mass"]
+    masses = [reading(f"mass {mass:g}", mass, mass=mass, link=link) for mass in OUTER_MASSES_KG]
+    pairs = [reading(f"pair {factor:g}", factor, mass=outer, link=factor * K_FT) for factor in PAIR_STIFFNESS]
+    zeta, damping = 0.054, p["house.outer_beam_damping"]
+    implied = (damping / (2.0 * zeta)) ** 2 / p["house.outer_beam_stiffness"]
+    return {
+        "mass": {"zeta": zeta, "damping": damping, "implied_kg": implied, **differences(masses)},
+        "pair": differences(pairs),
+    }
 
 
-def pair_question(results: Results) -> Question:
-    """K_ft / 2 or 2 K_ft?"""
-    mass = load_parameters("corrected")["house.outer_mass"]
-    rows = [
-        _house_row(f"{factor:g} K_ft", results, f"pair {factor:g}", mass=mass, link=factor * K_FT)
-        for factor in PAIR_STIFFNESS
-    ]
-    answer = (
-        "Two preloaded transducers on opposite sides of a mass act in parallel, so the pair has 2 K_ft as long as "
-        f"both stay loaded. In whirl E - W differs by {_spread(rows, 2):.1%} between the readings, the highest by "
-        f"{_spread(rows, 4):.0%}; no printed force decides between them."
-    )
-    return Question("The pair's stiffness: K_ft / 2 or 2 K_ft?", _HOUSE_HEADINGS, rows, answer)
-
-
-def magnet_question() -> Question:
+def magnet_numbers() -> Numbers:
     """Can the magnets give the stiffness?"""
     base = load_parameters("corrected")
-    used = base["magnet.stiffness"]
-    rows, best = [], 0.0
+    used = base["magnet.stiffness"] / 1e3
     most = int(math.pi / math.asin(base["magnet.bearing_magnet_radius"] / base["magnet.bearing_radius"]))
+    tried: dict[tuple[int, float], tuple[float, float]] = {}
     for count in (8, most):
         for length in _LENGTHS_MM:
             geometry = magnet_geometry(base.override({"magnet.count": float(count), "magnet.length": length}))
-            exact = cylinder_stiffness(geometry)
-            if (count, length) == (8, 16.9):
-                best = exact
-            rows.append(
-                (f"{count} magnets of {length:g} mm", f"{field_sum_stiffness(geometry) / 1e3:.2f}",
-                 f"{exact / 1e3:.2f}",
-                 f"{exact / used:.0%}")
-            )  # fmt: skip
-    enough = [row[0] for row in rows if float(row[2]) * 1e3 >= used]
-    answer = (
-        f"K_mag = {used / 1e3:g} kN/m is assumed from Fig. 7 and from running free of contact. The 8 magnets of 16.9 "
-        f"mm (assumed) that give it by eq. 35 would give {best / 1e3:.2f} kN/m as exact cylinders, {best / used:.0%} "
-        f"of it. " + (f"Of those in the table {enough[0]} would do." if enough else "None in the table would do.")
-    )
-    return Question(
-        "K_mag: do the magnets give the stiffness?",
-        ("magnets (number and length assumed)", "K by eq. 35 [kN/m]", "K of exact cylinders [kN/m]", "of K_mag"),
-        rows,
-        answer,
-    )
+            tried[count, length] = field_sum_stiffness(geometry) / 1e3, cylinder_stiffness(geometry) / 1e3
+    best = tried[8, 16.9][1]
+    return {
+        "tried": tried,
+        "used_kn_m": used,
+        "best_kn_m": best,
+        "enough": next((magnets for magnets, (_, exact) in tried.items() if round(exact, 2) >= used), None),
+    }
 
 
-def running_question() -> Question:
-    """Which stiffness does running free of contact ask for?"""
-    rows, free = [], []
+def running_numbers() -> Numbers:
+    """Which stiffness does running free of contact ask for? By stiffness [kN/m], w_n [Hz] and the least gap [mm]."""
+    tried = {}
     for stiffness in STIFFNESSES_KN_M:
         changes = {"duration_s": 3.0, "magnet.stiffness": stiffness, "sensors.chain": "ideal", "sensors.rate_hz": 2000}
         run = simulate(load_scene("stable-run", {**changes, "sensors.groups": ["hammer"]}))
-        gap_mm = -1e3 * float(run["penetration"].max())
-        if gap_mm > 0.0:
-            free.append(stiffness)
         natural_hz = oscillator(run.simulation.model.constants).natural / (2.0 * math.pi)
-        rows.append((f"{stiffness:g}", f"{natural_hz:.2f}", number(gap_mm), "no" if gap_mm > 0.0 else "yes"))
-    answer = (
-        f"{len(free)} of the {len(STIFFNESSES_KN_M)} tried run at 6.2 Hz without touching the ring, the softest at "
-        f"{min(free):g} kN/m: it does not fix K_mag, where the ring is centred on the sagging shaft (assumed)."
-        if free
-        else f"None of the {len(STIFFNESSES_KN_M)} tried runs free of contact."
-    )
-    return Question(
-        "K_mag: does running free of contact at 6.2 Hz fix it?",
-        ("K_mag [kN/m]", "w_n, linear [Hz]", "least gap in 3 s from rest [mm]", "touches"),
-        rows,
-        answer,
-    )
+        tried[stiffness] = natural_hz, -1e3 * float(run["penetration"].max())
+    return {"tried": tried, "free": [stiffness for stiffness, (_, gap_mm) in tried.items() if gap_mm > 0.0]}
 
 
-def clearance_question(found: dict[str, Reproduction]) -> Question:
+class Axis(NamedTuple):
+    """One axis of the paper, and which clearance it allows."""
+
+    name: str
+    ours: float
+    low: float
+    high: float
+    allowed_mm: tuple[float, float]
+    """Clearances at which the curve would fill it and stay inside [mm]."""
+
+
+def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
     """Which clearance does each axis of the paper allow?"""
     one = found["corrected"]
-    constants = one.whirl.simulation.model.constants
+    constants, n = one.whirl.simulation.model.constants, one.numbers
     r0 = constants.contact.clearance * 1e3
     lever = constants.shaft.arm_disk / constants.shaft.arm_ring
 
-    def scaled(name: str, ours: float, low: float, high: float) -> tuple[str, ...]:
+    def axis(name: str, ours: float, low: float, high: float) -> Axis:
         # Lengths and forces of the whirl go with r0 at equal spin and R_S / r0.
-        ends = [r0 * level / ours for level in (low, high)]
-        allowed = [
-            " to ".join(f"{factor * end:.{places}f}" for end in ends) for factor, places in ((1.0, 2), (13.5, 1))
-        ]
-        return (name, number(ours), f"{low:g} to {high:g}", *allowed, "yes" if ends[0] <= r0 <= ends[1] else "no")
+        return Axis(name, ours, low, high, (r0 * low / ours, r0 * high / ours))
 
-    n = one.numbers
-    rows = [
-        scaled("orbit +-1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], 0.4, 1.0),
-        scaled("drop +-1 mm, in the ring, Fig. 10", r0, 0.4, 1.0),
-        scaled("the same, at the probes", r0 * lever, 0.4, 1.0),
-        scaled("x(t) +-2 mm at the probes, Fig. 12(c)", n["orbit_disk"], 0.8, 2.0),
-        scaled("E - W +-500 N, measured, Fig. 15(c)", n["sensed_x"], 200.0, 500.0),
-        scaled("EAST 0 to 900 N, Fig. 16", n["east"], 360.0, 900.0),
-    ]
+    orbit = axis("orbit ±1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], 0.4, 1.0)
+    drop = axis("drop ±1 mm, in the ring, Fig. 10", r0, 0.4, 1.0)
+    probes = axis("the same, at the probes", r0 * lever, 0.4, 1.0)
+    disk = axis("x(t) ±2 mm at the probes, Fig. 12(c)", n["orbit_disk"], 0.8, 2.0)
+    measured = axis("E - W ±500 N, measured, Fig. 15(c)", n["sensed_x"], 200.0, 500.0)
+    east = axis("EAST 0 to 900 N, Fig. 16", n["east"], 360.0, 900.0)
 
-    def together(*left_out: str) -> tuple[float, float]:
-        ends = [row[3].split(" to ") for row in rows if not any(text in row[0] for text in left_out)]
-        return max(float(low) for low, _ in ends), min(float(high) for _, high in ends)
+    def together(*axes: Axis) -> tuple[float, float]:
+        ends = [[round(end, 2) for end in each.allowed_mm] for each in axes]
+        return max(low for low, _ in ends), min(high for _, high in ends)
 
-    def told(low: float, high: float) -> str:
-        where = "inside" if low <= r0 <= high else "outside"
-        return f"r0 = {low:.2f} to {high:.2f} mm ({r0:.3f} mm, assumed, is {where})"
-
-    simulated, all_but_one = together("the same", "measured"), together("the same")
-    answer = (
-        f"The paper's simulated axes, but the drop at the probes, together allow {told(*simulated)}, R_S = "
-        f"{13.5 * simulated[0]:.1f} to {13.5 * simulated[1]:.1f} mm; with the measured one, which the paper's own "
-        f"simulation exceeds, {told(*all_but_one)}. An axis is taken to be filled by more than 2/5, and not left; "
-        "lengths and whirl forces go with r0 at equal spin and ratio."
-    )
-    return Question(
-        "Clearance and radius: only R_S / r0 = 13.5 is printed",
-        ("axis", "ours", "the axis", "r0 allowed [mm]", "R_S allowed [mm]", "ours inside"),
-        rows,
-        answer,
-    )
-
-
-def spectrum_of(values: np.ndarray) -> tuple[float, float, float]:
-    """5, 50 and 95 % of the finite values."""
-    there = values[np.isfinite(values)]
-    if not len(there):
-        return math.nan, math.nan, math.nan
-    low, middle, high = np.percentile(there, [5, 50, 95])
-    return float(low), float(middle), float(high)
+    return {
+        "r0_mm": r0,
+        "ratio": _PRINTED_RATIO,
+        "axes": (orbit, drop, probes, disk, measured, east),
+        "simulated": together(orbit, drop, disk, east),
+        "with_measured": together(orbit, drop, disk, measured, east),
+    }

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from replays.studies.paper.blow import FORCE_N, SPEED_HZ, Blow, Outcome, blow_scene, outcomes, read
+from replays.studies.paper.pulse import FORCE_N, SPEED_HZ, Outcome, Pulse, outcomes, pulse_scene, read
 from replays.studies.paper.spread import column, phases
 from replays.studies.paper.statement import statements
 from rig.magnets import map_force
@@ -19,8 +19,8 @@ from rig.scenes import load_scene
 SPEEDS_HZ = (3.2, 4.2, 5.2, 6.2)
 """Fig. 17's."""
 FIG_7_M = 0.010
-BLOW_S = 0.5
-"""When the blow comes in the long run [s]."""
+PULSE_S = 0.5
+"""When the pulse comes in the long run [s]."""
 _RATE_HZ = 20_000
 _RESTS = 0.01
 """A drop has settled when it leaves the ring by less than this part of the clearance."""
@@ -33,9 +33,9 @@ class Reproduction:
     Attributes:
         parameters: The set.
         drop: Section 6.1, all sensors on.
-        whirl: Sections 6.2 and 6.3, all sensors on; the blow comes at `BLOW_S`.
+        whirl: Sections 6.2 and 6.3, all sensors on; the pulse comes at `PULSE_S`.
         speeds: Section 6.4 by speed of the drive [Hz], truth alone.
-        ensemble: The blow at several places of the shaft's turn.
+        ensemble: The pulse at several places of the shaft's turn.
         numbers: What each statement asks for, in its unit.
     """
 
@@ -59,7 +59,7 @@ def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str],
     sensed = {"parameters": parameters, "sensors.rate_hz": _RATE_HZ}
     drop = simulate(load_scene("drop", {**sensed, "duration_s": 1.5}))
     tell(f"drop, {parameters}")
-    command = {"at_s": BLOW_S, "command": "hammer", "force_n": FORCE_N, "duration_ms": 5.0, "direction": "x"}
+    command = {"at_s": PULSE_S, "command": "hammer", "force_n": FORCE_N, "duration_ms": 5.0, "direction": "x"}
     whirl = simulate(
         load_scene(
             "hammer",
@@ -69,11 +69,11 @@ def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str],
     tell(f"hammer run, {parameters}")
     speeds = {}
     for speed in SPEEDS_HZ:
-        speeds[speed] = simulate(blow_scene(Blow(parameters=parameters, speed_hz=speed)))
+        speeds[speed] = simulate(pulse_scene(Pulse(parameters=parameters, speed_hz=speed)))
         tell(f"{speed:g} Hz, {parameters}")
-    held = next(iter(outcomes([Blow(parameters=parameters, changes={"drive.mode": "ideal"})], processes=1)))
-    ensemble = list(outcomes(phases(Blow(parameters=parameters), 3 if quick else 15), processes=1))
-    tell(f"blows, {parameters}")
+    held = next(iter(outcomes([Pulse(parameters=parameters, changes={"drive.mode": "ideal"})], processes=1)))
+    ensemble = list(outcomes(phases(Pulse(parameters=parameters), 3 if quick else 15), processes=1))
+    tell(f"pulses, {parameters}")
     numbers = {
         **_magnet_numbers(whirl),
         **drop_numbers(drop),
@@ -135,11 +135,11 @@ def drop_numbers(run: Run) -> dict[str, float]:
 
 
 def _whirl_numbers(run: Run) -> dict[str, float]:
-    truth = read(run, at_s=BLOW_S)
+    truth = read(run, at_s=PULSE_S)
     last = run.times_s > run.times_s[-1] - 0.5
     sensed = [run.samples[a][last] - run.samples[b][last] for a, b in (("P_E", "P_W"), ("P_N", "P_S"))]
     east = run["P_E"][last]
-    after = run.times_s > BLOW_S
+    after = run.times_s > PULSE_S
     frequencies, amplitude = full_spectrum(run.samples["disk_x"][last], run.samples["disk_y"][last], _RATE_HZ)
     return {
         "backward": float(truth.whirls and truth.whirl_hz < 0.0),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from replays.studies.paper.blow import BLOW_AT, Blow, Outcome
+from replays.studies.paper.pulse import PULSE_AT, Outcome, Pulse
 from rig.parameters import DEFAULT_SET, load_parameters
 
 SEED = 2013
@@ -23,7 +24,7 @@ class Assumed(BaseModel):
 
     key: str
     name: str = Field(default="", alias="as")
-    """What a blow takes it by, where that is not the key."""
+    """What a pulse takes it by, where that is not the key."""
     low: float = math.nan
     high: float = math.nan
     log: bool = False
@@ -39,7 +40,7 @@ class Assumed(BaseModel):
 
     @property
     def taken_as(self) -> str:
-        """The name in a blow's changes."""
+        """The name in a pulse's changes."""
         return self.name or self.key
 
     def at(self, part: float) -> float:
@@ -73,7 +74,7 @@ def present(entry: Assumed) -> str:
 
 
 def changes(values: dict[str, float]) -> dict[str, Any]:
-    """The changes of a blow for free values by key, the tied ones with them."""
+    """The changes of a pulse for free values by key, the tied ones with them."""
     found: dict[str, Any] = {}
     for entry in assumed_values():
         if entry.tied and entry.tied in values:
@@ -83,47 +84,38 @@ def changes(values: dict[str, float]) -> dict[str, Any]:
     return found
 
 
-def one_at_a_time() -> list[tuple[Assumed, Blow, Blow]]:
+def one_at_a_time() -> list[tuple[Assumed, Pulse, Pulse]]:
     """Each value at both ends of its range, the others as they are."""
     return [
         (
             entry,
-            Blow(label=f"{entry.key} low", changes=changes({entry.key: entry.at(0.0)})),
-            Blow(label=f"{entry.key} high", changes=changes({entry.key: entry.at(1.0)})),
+            Pulse(label=f"{entry.key} low", changes=changes({entry.key: entry.at(0.0)})),
+            Pulse(label=f"{entry.key} high", changes=changes({entry.key: entry.at(1.0)})),
         )
         for entry in free_values()
     ]
 
 
-def hypercube(samples: int) -> tuple[np.ndarray, list[Blow]]:
-    """Latin hypercube over all free values: parts of their ranges, shape (samples, values), and the blows."""
+def hypercube(samples: int) -> tuple[np.ndarray, list[Pulse]]:
+    """Latin hypercube over all free values: parts of their ranges, shape (samples, values), and the pulses."""
     from scipy.stats import qmc
 
     entries = free_values()
     parts = qmc.LatinHypercube(d=len(entries), rng=np.random.default_rng(SEED)).random(samples)
-    blows = [
-        Blow(
+    pulses = [
+        Pulse(
             label=f"spread {number}",
             changes=changes({entry.key: entry.at(float(part)) for entry, part in zip(entries, row, strict=True)}),
         )
         for number, row in enumerate(parts, 1)
     ]
-    return parts, blows
+    return parts, pulses
 
 
-def phases(blow: Blow, count: int) -> list[Blow]:
-    """The same blow at `count` places of the shaft's turn: impacts are chaotic, one run of them says little."""
-    return [
-        Blow(
-            label=blow.label,
-            parameters=blow.parameters,
-            changes={**blow.changes, BLOW_AT: round(0.02 + k / count / blow.speed_hz, 4)},
-            speed_hz=blow.speed_hz,
-            force_n=blow.force_n,
-            duration_s=blow.duration_s,
-        )
-        for k in range(count)
-    ]
+def phases(pulse: Pulse, count: int) -> list[Pulse]:
+    """The same pulse at `count` places of the shaft's turn: impacts are chaotic, one run of them says little."""
+    at_s = [round(0.02 + k / count / pulse.speed_hz, 4) for k in range(count)]
+    return [replace(pulse, changes={**pulse.changes, PULSE_AT: each}) for each in at_s]
 
 
 def column(results: list[Outcome], name: str) -> np.ndarray:
@@ -140,3 +132,12 @@ def rank_correlation(parts: np.ndarray, values: np.ndarray) -> np.ndarray:
         return np.full(parts.shape[1], math.nan)
     found: list[Any] = [spearmanr(parts[there, k], values[there]) for k in range(parts.shape[1])]
     return np.array([float(each.statistic) for each in found])
+
+
+def percentiles(values: np.ndarray) -> tuple[float, float, float]:
+    """5, 50 and 95 % of the finite values, nan where there are none."""
+    there = values[np.isfinite(values)]
+    if not len(there):
+        return math.nan, math.nan, math.nan
+    low, middle, high = np.percentile(there, [5, 50, 95])
+    return float(low), float(middle), float(high)

@@ -1,6 +1,6 @@
 """Other people's solvers on exactly the rig's equations, side by side: what `rig chart` compares our engines with.
 
-Every peer solves a `Problem` through `Peer.solve` and returns a `Solution`; what goes wrong is told in its `failure`
+Every peer solves a `Problem` through `Peer.solve` and returns a `Solution`; what goes wrong stands in its `failure`
 and never raised. The right-hand side is compiled for every peer that can call it so; rows "as installed" call plain
 Python, as a user of that library would.
 """
@@ -28,7 +28,7 @@ def _ladder(*tolerances: float) -> tuple[Setting, ...]:
 
 
 ODE15S = Setting("ode15s's defaults", 1e-3, 1e-6)
-"""Relative 1e-3 and absolute 1e-6 in every SI unit, as MATLAB's ode15s has them unless told otherwise."""
+"""Relative 1e-3 and absolute 1e-6 in every SI unit, as MATLAB's ode15s has them by default."""
 _CVODE = _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10)
 
 
@@ -47,7 +47,7 @@ class Peer:
         known_failure: Why it is expected to fail or to mislead; empty for a peer in good order.
         exact_friction: Whether it takes problems with Coulomb's set-valued law.
         module: Python module that must be installed; empty where the rig itself needs it anyway.
-        options: What that module's `solve` is told beside the problem.
+        options: What that module's `solve` is given beside the problem.
     """
 
     name: str

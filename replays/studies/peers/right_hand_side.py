@@ -10,21 +10,19 @@ from __future__ import annotations
 
 import functools
 import time
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 from llvmlite import ir
 from numba import carray, cfunc, extending, from_dtype, njit, types  # pyright: ignore[reportPrivateImportUsage]
 from numba.core import cgutils
 
+from replays.studies.peers.problem import Problem
 from rig.kernels import signals as S
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
 from rig.kernels.dynamics import evaluate
 from rig.kernels.geometry import gap
-
-if TYPE_CHECKING:
-    from replays.studies.peers.problem import Problem
 
 N_STATE, N_VECTOR, N_OBSERVED = S.N_STATE, S.N_VECTOR, S.N_OBSERVED
 N_SWITCH = 2

@@ -18,13 +18,15 @@ SWITCH_CEILING = 100_000
 
 
 class Setting(NamedTuple):
-    """One rung of a solver's ladder."""
+    """One setting of a method: of a solver that somebody else wrote, or of an engine of ours."""
 
     label: str
     tolerance: float
     """Relative tolerance; for a solver of fixed step, its step [s]."""
     absolute: float | None = None
     """One absolute tolerance for all states; None for tolerance times `STATE_SCALE`."""
+    step_us: int = 0
+    """Step of an engine of ours, or the grid that its steps end on [µs]; 0 of other solvers."""
 
 
 class Manner(NamedTuple):

@@ -11,26 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replays.studies.stability.closed_forms import (
-    RUNGE_KUTTA_4_LIMIT,
-    SPLIT_CONTACT_LIMIT,
-    VERLET_LIMIT,
-)
+from replays.studies.engines import traits
 from replays.studies.stability.motion import bare_shaft, base_model, move, pivoted_mass, quiet_inputs, state
 from rig.kernels.constants import Constants
 from rig.levels import ModelLevels
 
 PERIODS = 60
-LIMITS: dict[str, dict[str, float]] = {
-    "house": {"rk4": RUNGE_KUTTA_4_LIMIT, "verlet": VERLET_LIMIT, "semi-implicit-euler": VERLET_LIMIT},
-    "contact": {
-        "split": SPLIT_CONTACT_LIMIT,
-        "rk4": RUNGE_KUTTA_4_LIMIT,
-        "verlet": VERLET_LIMIT,
-        "semi-implicit-euler": VERLET_LIMIT,
-    },
-}
-"""Largest h w by oscillator and engine; engines not named have none, or none that is known here."""
 _DEPTH = 20e-6
 """Depth at rest in the contact [m]."""
 GROWN = 3.0
@@ -57,14 +43,9 @@ class Map(NamedTuple):
     ratio: np.ndarray
 
     @property
-    def hw(self) -> np.ndarray:
-        """H w at every point, shape (m, n)."""
-        return np.sqrt(self.stiffness[:, None] / self.mass) * self.steps_us[None, :] * 1e-6
-
-    @property
     def limit(self) -> float:
         """Largest h w by theory; nan where there is none."""
-        return LIMITS[self.oscillator].get(self.engine, math.nan)
+        return traits(self.engine).limit(self.oscillator)
 
 
 def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
@@ -79,14 +60,14 @@ def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = 
 def contact_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
     """Energy ratio of a small oscillation of the shaft on an undamped linear contact, pressed on by its weight.
 
-    For `split` the weight is the true one and the oscillation 1/1000 of the depth: its steps follow the gap's speed,
-    and only next to rest are they as long as asked. For the others the weight is such that the depth is 20 um, and the
+    Where steps follow the gap's speed the weight is the true one and the oscillation 1/1000 of the depth: only next to
+    rest are they as long as asked. For the others the weight is such that the depth is 20 um, and the
     oscillation 1/100 of that: with less, error control has nothing to control.
     """
     constants = bare_shaft(damping_factor=0.0, exponent=1.0, stiffness=stiffness, gravity=True)
     shaft = constants.shaft
     depth, part = shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring / stiffness, 1e-3
-    if engine != "split":
+    if not traits(engine).follows_gap:
         shaft = shaft._replace(gravity=shaft.gravity * _DEPTH / depth)
         depth, part = _DEPTH, 1e-2
     constants = constants._replace(shaft=shaft)
@@ -132,6 +113,8 @@ def _ratio(
     The first part is a quarter; for the contact a fortieth, before growth lifts the shaft off. In the contact
     `split` first settles, and its rest is where its mean is.
     """
+    settles = traits(engine).follows_gap
+    house = columns[0] == "x_ih"
     angular = math.sqrt(stiffness / mass)
     # Beyond every limit a few steps tell, and more would only follow numbers without meaning.
     longest = 40 if angular * step_s > 3.6 else 10**9
@@ -147,10 +130,10 @@ def _ratio(
         part = len(place) // 4
 
         def energy(window: slice) -> float:
-            if engine == "split" and columns[0] != "x_ih":
+            if settles and not house:
                 return stiffness * float(np.var(place[window])) + mass * float(np.var(speed[window]))
             return stiffness * float(np.mean(place[window] ** 2)) + mass * float(np.mean(speed[window] ** 2))
 
-        early = part if engine == "split" or columns[0] == "x_ih" else max(4, len(place) // 40)
+        early = part if settles or house else max(4, len(place) // 40)
         ratio = energy(slice(-part, None)) / energy(slice(None, early))
     return ratio if math.isfinite(ratio) else math.inf

@@ -1,4 +1,4 @@
-"""Where a blow leads to lasting backward whirl, over friction and the blow's force: the class by every engine."""
+"""Where a pulse leads to lasting backward whirl, over friction and the pulse's force: the class by every engine."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from replays.report.canvas import BLUE, ORANGE
 from replays.studies.stability.motion import hammer_run, move
 
 FREE, BOUNCING, SLIDING, ROLLING = range(4)
 """Class at the end of a run: out of contact; now and then in it; always in it and slipping; always, and rolling."""
 NAMES = ("free", "bouncing", "sliding whirl", "rolling whirl")
-_WINDOW_S = 0.05
+STYLES = (("#F2F2F2", "o"), ("#F0E442", "s"), (ORANGE, "^"), (BLUE, "D"))
+"""Colour and marker of each class, in every picture."""
+_DURATION_S, _WINDOW_S = 0.6, 0.05
 _ROLLS = 1e-2
 """Sliding speed up to which a contact counts as rolling [m/s]; sliding at 6.2 Hz is faster by a factor of 50."""
 
@@ -22,7 +25,7 @@ class Boundary(NamedTuple):
     Attributes:
         engine: Its name.
         frictions: mu, shape (n,).
-        forces: Peak force of the blow [N], shape (m,).
+        forces: Peak force of the pulse [N], shape (m,).
         classes: Shape (m, n).
     """
 
@@ -32,11 +35,11 @@ class Boundary(NamedTuple):
     classes: np.ndarray
 
 
-def whirl_class(engine: str, mu: float, force_n: float, *, duration_s: float = 0.6, tolerance: float = 0.0) -> int:
-    """Class of the run over its last 50 ms: the blow lasts 5 ms, the rotor runs at 6.2 Hz, friction is Coulomb's."""
+def whirl_class(engine: str, mu: float, force_n: float, *, tolerance: float = 0.0) -> int:
+    """Class of the run over its last 50 ms: the pulse lasts 5 ms, the rotor runs at 6.2 Hz, friction is Coulomb's."""
     constants, inputs, y0 = hammer_run("exact", mu=mu, force_n=force_n)
-    motion = move(engine, constants, inputs, y0, ticks=round(duration_s * 1e6), every=1000, tolerance=tolerance)
-    last = motion.times > duration_s - _WINDOW_S
+    motion = move(engine, constants, inputs, y0, ticks=round(_DURATION_S * 1e6), every=1000, tolerance=tolerance)
+    last = motion.times > _DURATION_S - _WINDOW_S
     touching = motion.column("penetration")[last] > 0.0
     if not touching.any():
         return FREE
@@ -46,19 +49,12 @@ def whirl_class(engine: str, mu: float, force_n: float, *, duration_s: float = 0
     return ROLLING if float(np.max(slip)) < _ROLLS else SLIDING
 
 
-def chart(engine: str, *, points: int, duration_s: float = 0.6, tolerance: float = 0.0) -> Boundary:
-    """Classes of an engine over mu and the force of the blow, `points` along each axis."""
+def chart(engine: str, *, points: int, tolerance: float = 0.0) -> Boundary:
+    """Classes of an engine over mu and the force of the pulse, `points` along each axis."""
     frictions, forces = np.linspace(0.02, 0.40, points), np.linspace(20.0, 200.0, points)
-    classes = np.array(
-        [
-            [
-                whirl_class(engine, float(mu), float(force), duration_s=duration_s, tolerance=tolerance)
-                for mu in frictions
-            ]
-            for force in forces
-        ]
-    )
-    return Boundary(engine, frictions, forces, classes)
+    pairs = [(mu, force) for force in forces.tolist() for mu in frictions.tolist()]
+    classes = [whirl_class(engine, mu, force, tolerance=tolerance) for mu, force in pairs]
+    return Boundary(engine, frictions, forces, np.reshape(classes, (points, points)))
 
 
 def clear_of_boundary(reference: np.ndarray) -> np.ndarray:

@@ -6,6 +6,26 @@ import math
 from typing import Any, NamedTuple
 
 
+class Case(NamedTuple):
+    """One case of a trial on one method.
+
+    Attributes:
+        name: Which one.
+        value: What was measured.
+        limit: The largest value that still holds.
+        because: Why it should hold or fail.
+        expected: Whether it should hold; None where nobody has said so: then the value alone stands.
+        unit: Unit of value and limit.
+    """
+
+    name: str
+    value: float
+    limit: float
+    because: str
+    expected: bool | None = True
+    unit: str = "1"
+
+
 class Cell(NamedTuple):
     """One trial of one method.
 
@@ -30,6 +50,11 @@ class Cell(NamedTuple):
     expected: bool | None
     because: str
     skipped: str = ""
+
+    @classmethod
+    def of(cls, trial: str, method: str, case: Case) -> Cell:
+        """A case as a cell of the table."""
+        return cls(trial, case.name, method, case.value, case.unit, case.limit, case.expected, case.because)
 
     @property
     def holds(self) -> bool:

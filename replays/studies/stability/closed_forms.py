@@ -18,8 +18,10 @@ class Impact(NamedTuple):
     depth: float  # [m]
 
 
-def impact(*, mass: float, speed: float, stiffness: float, exponent: float, factor: float, floor: float) -> Impact:
-    """A mass hits F = K d^n (1 + c d'/v0), v0 = max(speed, floor), and nothing else acts on it.
+def impact(
+    *, mass: float, speed: float, stiffness: float, exponent: float, factor: float, speed_floor: float
+) -> Impact:
+    """A mass hits F = K d^n (1 + c d'/v0), v0 = max(speed, speed_floor), and nothing else acts on it.
 
     m v dv = -K d^n (1 + g v) dd with g = c/v0 separates: K d^(n+1)/(n+1) = m G(v) with
     G(v) = int_v^speed u/(1 + g u) du, elementary. The end is the other zero of G; the time is int m dv/F.
@@ -30,12 +32,12 @@ def impact(*, mass: float, speed: float, stiffness: float, exponent: float, fact
         stiffness: K [N/m^n].
         exponent: n.
         factor: c [1].
-        floor: Floor of v0 [m/s].
+        speed_floor: Lower limit of v0 [m/s].
     """
     from scipy.integrate import quad
     from scipy.optimize import brentq, minimize_scalar
 
-    g = factor / max(speed, floor)
+    g = factor / max(speed, speed_floor)
 
     def work(v: float) -> float:
         a = g * (speed - v) / (1.0 + g * v)

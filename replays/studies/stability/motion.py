@@ -7,11 +7,10 @@ from functools import cache
 
 import numpy as np
 
-from rig.engines import ENGINES, load_engine
-from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE
+from replays.studies.run import Course
+from rig.engines.memory import CEILING, CONTACTS, FLOORED, PEAK_FORCE
 from rig.kernels import signals as S
 from rig.kernels.constants import Constants, Inputs
-from rig.kernels.contact import FLIGHT
 from rig.kernels.signals import COLUMN, N_ROW, N_STATE, N_VECTOR
 from rig.levels import ModelLevels
 from rig.model import Model, build_model
@@ -37,19 +36,19 @@ def quiet_inputs(
     spin: float = 0.0,
     magnets: bool = False,
     ideal: bool = False,
-    blow: tuple[float, int, int] = (0.0, 0, 0),
+    pulse: tuple[float, int, int] = (0.0, 0, 0),
 ) -> Inputs:
-    """Nothing happens but, perhaps, one blow along x.
+    """Nothing happens but, perhaps, one pulse along x.
 
     Args:
         tick_s: Length of a tick [s].
         spin: What the drive aims at [rad/s].
         magnets: Whether they hold.
         ideal: The drive prescribes the spin instead of a torque.
-        blow: Peak force [N], first tick and end of the pulse.
+        pulse: Peak force [N], first tick and end of the pulse.
     """
     return Inputs(
-        tick_s=tick_s, hammer_force=blow[0], hammer_x=1.0, hammer_y=0.0, hammer_start=blow[1], hammer_end=blow[2],
+        tick_s=tick_s, hammer_force=pulse[0], hammer_x=1.0, hammer_y=0.0, hammer_start=pulse[1], hammer_end=pulse[2],
         speed=spin, speed_slope=0.0, speed_tick=0, ideal_drive=ideal, magnet_engaged=magnets,
     )  # fmt: skip
 
@@ -79,6 +78,10 @@ class Motion:
         """One column of the rows, shape (n,)."""
         return self.rows[:, COLUMN[name]]
 
+    def end_of(self, name: str) -> float:
+        """One state or integral at the end."""
+        return float(self.end[COLUMN[name]])
+
     @property
     def finite(self) -> bool:
         """Whether every number of the end is finite."""
@@ -91,13 +94,8 @@ class Motion:
 
     @property
     def floored(self) -> int:
-        """Contacts begun slower than the floor of v0."""
+        """Contacts begun slower than the lower limit of v0."""
         return int(self.memory[FLOORED])
-
-    @property
-    def clamps(self) -> int:
-        """Steps at which the law would have pulled."""
-        return int(self.memory[CLAMPS])
 
     @property
     def ceiling(self) -> int:
@@ -138,16 +136,13 @@ def move(
         every: Ticks between rows, at least one step; 0 for one row only.
         tolerance: Of an adaptive engine; 0 for its own.
     """
-    method, module = ENGINES[engine], load_engine(engine)
-    step = step or method.step_us
-    stride = max(1, (every or ticks) // step)
-    steps = max(1, ticks // (stride * step)) * stride
+    course = Course(engine, constants, inputs, y0, step=step, tolerance=tolerance)
+    stride = max(1, (every or ticks) // course.step)
+    steps = max(1, ticks // (stride * course.step)) * stride
     rows = np.empty((steps // stride, N_ROW))
-    y, memory = y0.copy(), np.zeros(MEMORY)
-    module.start(constants, inputs, y, memory, float(step), tolerance or method.tolerance)
-    module.advance(constants, inputs, y, memory, 0, step, steps, stride, rows)
-    times = np.arange(len(rows)) * stride * step * inputs.tick_s
-    return Motion(times=times, rows=rows, end=y, memory=memory)
+    course.advance(steps, stride, rows)
+    times = np.arange(len(rows)) * stride * course.step * inputs.tick_s
+    return Motion(times=times, rows=rows, end=course.y, memory=course.memory)
 
 
 def state(**values: float) -> np.ndarray:
@@ -177,7 +172,7 @@ def bare_shaft(
         damping_factor: c of the contact; None for the rig's own.
         exponent: n.
         stiffness: K [N/m^n]; None for the rig's own.
-        speed_floor: Floor of v0 [m/s]; None for the rig's own.
+        speed_floor: Lower limit of v0 [m/s]; None for the rig's own.
         gravity: Whether there is any.
     """
     levels = ModelLevels(magnet="linear", shaft="planar", stator="rigid", friction="none")
@@ -209,10 +204,5 @@ def hammer_run(
         smoothing_speed=contact.smoothing_speed if smoothing_speed is None else smoothing_speed,
     )
     spin = 2.0 * np.pi * 6.2
-    inputs = quiet_inputs(spin=spin, magnets=True, blow=(force_n, 20_000, 25_000))
+    inputs = quiet_inputs(spin=spin, magnets=True, pulse=(force_n, 20_000, 25_000))
     return model.constants._replace(contact=contact), inputs, model.state(spin=spin)
-
-
-def in_flight(motion: Motion) -> bool:
-    """Whether it ends apart from the ring."""
-    return int(motion.memory[0]) == FLIGHT

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from replays.studies.peers import PEERS, Problem, Setting
-from replays.studies.stability.cell import Cell
+from replays.studies.peers.window import cut_window
+from replays.studies.stability.cell import Case, Cell
+from replays.studies.stability.flight import house_energy, house_oscillator
 from replays.studies.stability.motion import quiet_inputs, state
-from replays.studies.stability.trials import house_oscillator
 from rig.kernels.contact import FLIGHT
 from rig.kernels.signals import N_STATE
 from rig.scenes import load_scene
@@ -17,16 +19,11 @@ from rig.scenes import load_scene
 
 def peer_cells(trial: str) -> Iterator[Cell]:
     """Cells of other people's solvers in one trial; those not installed are skipped with a reason."""
-    for name, case, tolerance, limit, expected, because in _KNOWN.get(trial, ()):
+    for name, case, tolerance, expected, because in _KNOWN.get(trial, ()):
         peer = PEERS[name]
-        if not peer.installed:
-            yield Cell(
-                trial, case, name, float("nan"), "1", limit, expected, because,
-                f"needs {peer.module}: pip install 'rotor-stator-rig[peers]'",
-            )  # fmt: skip
-            continue
-        value = _RUNS[trial](name, tolerance)
-        yield Cell(trial, case, name, value, "1", limit, expected, because)
+        value = _RUNS[trial](name, tolerance) if peer.installed else math.nan
+        missing = "" if peer.installed else f"needs {peer.module}: pip install 'rotor-stator-rig[peers]'"
+        yield Cell.of(trial, name, Case(case, value, _LIMIT, because, expected))._replace(skipped=missing)
 
 
 def _ring_down(name: str, tolerance: float) -> float:
@@ -35,22 +32,16 @@ def _ring_down(name: str, tolerance: float) -> float:
     y0 = state(y_ih=1e-5 * mode.inner, y_oh=1e-5 * mode.outer)
     problem = _problem("ring-down", constants, quiet_inputs(), y0, 0.2)
     states = PEERS[name].solve(problem, Setting(f"{tolerance:g}", tolerance), budget_s=20.0).states
-    house = constants.house
-    energy = (
-        house.inner_mass * states[:, 11] ** 2
-        + house.outer_mass * states[:, 13] ** 2
-        + house.pair_stiffness_vertical * (states[:, 4] - states[:, 6]) ** 2
-        + house.outer_beam_stiffness * states[:, 6] ** 2
-    )
+    energy = house_energy(constants, states)
     return abs(float(energy[-1] / energy[0]) - 1.0)
 
 
 def _hammer(name: str, tolerance: float) -> float:
-    """1 - part of the blow's work that is seen: the rig at a standstill is hit at 0.5 s."""
+    """1 - part of the pulse's work that is seen: the rig at a standstill is hit at 0.5 s."""
     scene = load_scene("hammer", {"drive.speed_hz": 0.0, "duration_s": 0.6})
     command = scene.commands[0].model_copy(update={"at_s": 0.5})
     scene = scene.model_copy(update={"commands": (command,)})
-    problem = Problem.from_scene(scene, end_s=0.5051, sample_s=1e-3, friction="smoothed")
+    problem = cut_window(scene, end_s=0.5051, sample_s=1e-3, friction="smoothed")
     states = PEERS[name].solve(problem, Setting(f"{tolerance:g}", tolerance), budget_s=20.0).states
     right = PEERS["scipy-dop853"].solve(problem, Setting("1e-8", 1e-8), budget_s=20.0).states
     return abs(float(states[-1, 8] / right[-1, 8]) - 1.0)
@@ -64,21 +55,22 @@ def _problem(name: str, constants, inputs, y0: np.ndarray, duration_s: float) ->
 
 
 _RUNS = {"T1": _ring_down, "T5": _hammer}
-_KNOWN: dict[str, tuple[tuple[str, str, float, float, bool, str], ...]] = {
+_LIMIT = 0.01
+_KNOWN: dict[str, tuple[tuple[str, str, float, bool, str], ...]] = {
     "T1": (
         (
             "scipy-lsoda",
             "tolerance 1e-3",
             1e-3,
-            0.01,
             False,
             "multistep methods grow or damp what is near the imaginary axis",
         ),
-        ("cvode-bdf", "tolerance 1e-4", 1e-4, 0.01, False, "BDF of order 3 and up is unstable near the imaginary axis"),
-        ("scipy-dop853", "tolerance 1e-8", 1e-8, 0.01, True, "a one-step method of order 8 at a fine tolerance"),
+        ("cvode-bdf", "tolerance 1e-4", 1e-4, False, "BDF of order 3 and up is unstable near the imaginary axis"),
+        ("scipy-dop853", "tolerance 1e-8", 1e-8, True, "a one-step method of order 8 at a fine tolerance"),
     ),
     "T5": (
-        ("scipy-bdf-no-stops", "no stop at the corners", 1e-3, 0.01, False, "steps over the pulse"),
-        ("scipy-bdf", "stops at the corners", 1e-6, 0.01, True, "restarts at the pulse's corners"),
+        ("scipy-bdf-no-stops", "no stop at the corners", 1e-3, False, "steps over the pulse"),
+        ("scipy-bdf", "stops at the corners", 1e-6, True, "restarts at the pulse's corners"),
     ),
 }
+"""Peer, case, tolerance, whether it holds, and why; by trial."""

@@ -1,4 +1,4 @@
-"""A hammer blow on a changed rig, and the numbers that come of it: what every scan of the report is made of."""
+"""A hammer pulse on a changed rig, and the numbers that come of it: what every scan of the report is made of."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from rig.parameters import DEFAULT_SET, load_parameters
 from rig.scenes import Scene, load_scene
 
 FORCE_N = 100.0
-"""Peak of the blow: the paper, section 6.2."""
+"""Peak of the pulse: the paper, section 6.2."""
 SPEED_HZ = 6.2
 CENTRED_BY = "ring.off_centre_y"
 """A name of this report alone [mm]: the ring's height over where it is centred on the shaft at rest."""
 BANDWIDTH = "transducer.bandwidth"
 """A name of this report alone [Hz]: corner of a low-pass of order 2 on the reactions; left out, there is none."""
 HAMMER_MS = "hammer.duration"
-"""A name of this report alone [ms]: length of the blow."""
-BLOW_AT = "hammer.at"
-"""A name of this report alone [s]: when it comes; the shaft's turn at the blow decides which bounces follow."""
+"""A name of this report alone [ms]: length of the pulse."""
+PULSE_AT = "hammer.at"
+"""A name of this report alone [s]: when it comes; the shaft's turn at the pulse decides which bounces follow."""
 RATE_HZ = 10_000
 
 
 @dataclass(frozen=True)
-class Blow:
+class Pulse:
     """What is run.
 
     Attributes:
@@ -52,7 +52,7 @@ class Blow:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The numbers of a blow; those of the whirl are nan where it does not whirl.
+    """The numbers of a pulse; those of the whirl are nan where it does not whirl.
 
     Attributes:
         outcome: The motion at the end, in a word.
@@ -67,7 +67,7 @@ class Outcome:
         peak_x_n: Largest |P_E - P_W| of the whole run [N].
         peak_y_n: Largest |P_N - P_S| of the whole run [N].
         contacts: Contacts begun.
-        roll_s: From the blow until it rolls for good [s].
+        roll_s: From the pulse until it rolls for good [s].
         slope_n_s: Largest rate of P_E - P_W while it whirls [N/s].
     """
 
@@ -92,47 +92,46 @@ class Outcome:
         return self.outcome == "backward whirl"
 
 
-def blow_scene(blow: Blow) -> Scene:
-    """The scene of a blow: ideal sensors, few rows."""
-    changes = dict(blow.changes)
-    hammer_ms, at_s = float(changes.pop(HAMMER_MS, 5.0)), float(changes.pop(BLOW_AT, 0.02))
+def pulse_scene(pulse: Pulse) -> Scene:
+    """The scene of a pulse: ideal sensors, few rows."""
+    changes = dict(pulse.changes)
+    hammer_ms, at_s = float(changes.pop(HAMMER_MS, 5.0)), float(changes.pop(PULSE_AT, 0.02))
     changes.pop(BANDWIDTH, None)
     above_mm = changes.pop(CENTRED_BY, None)
     if above_mm is not None:
-        changes["ring.offset_y"] = _centre_mm(blow, changes) + above_mm
+        changes["ring.offset_y"] = _centre_mm(pulse, changes) + above_mm
+    hammer = {"at_s": at_s, "command": "hammer", "force_n": pulse.force_n, "duration_ms": hammer_ms, "direction": "x"}
     return load_scene(
         "hammer",
         {
-            "parameters": blow.parameters,
-            "duration_s": blow.duration_s,
-            "drive.speed_hz": blow.speed_hz,
+            "parameters": pulse.parameters,
+            "duration_s": pulse.duration_s,
+            "drive.speed_hz": pulse.speed_hz,
             "sensors.chain": "ideal",
             "sensors.groups": ["hammer"],
             "sensors.rate_hz": RATE_HZ,
-            "commands": [
-                {"at_s": at_s, "command": "hammer", "force_n": blow.force_n, "duration_ms": hammer_ms, "direction": "x"}
-            ],
+            "commands": [hammer],
             **changes,
         },
     )
 
 
-def _centre_mm(blow: Blow, changes: dict[str, Any]) -> float:
+def _centre_mm(pulse: Pulse, changes: dict[str, Any]) -> float:
     """Height at which the ring is centred on the shaft at rest [mm]."""
     from rig.model import build_model
 
-    own = load_parameters(blow.parameters)
+    own = load_parameters(pulse.parameters)
     return build_model(own.override({key: v for key, v in changes.items() if key in own.entries})).sag * 1e3
 
 
-def outcome(blow: Blow) -> Outcome:
-    """Run a blow and read its numbers; a rig that cannot be built is an outcome of its own."""
+def outcome(pulse: Pulse) -> Outcome:
+    """Run a pulse and read its numbers; a rig that cannot be built is an outcome of its own."""
     try:
-        scene = blow_scene(blow)
+        scene = pulse_scene(pulse)
         run = simulate(scene)
     except InputError:
         return Outcome("cannot be built")
-    return read(run, at_s=scene.commands[0].at_s, bandwidth_hz=blow.changes.get(BANDWIDTH))
+    return read(run, at_s=scene.commands[0].at_s, bandwidth_hz=pulse.changes.get(BANDWIDTH))
 
 
 def trace_of(run: Run) -> Trace:
@@ -153,7 +152,7 @@ def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome
 
     Args:
         run: The run.
-        at_s: When the blow came [s].
+        at_s: When the pulse came [s].
         bandwidth_hz: Corner of the low-pass on the reactions [Hz]; None: they are read as they are.
     """
     trace = trace_of(run)
@@ -207,21 +206,21 @@ def reaction(run: Run, plus: str, minus: str, *, bandwidth_hz: float | None = No
 
 
 def outcomes(
-    blows: Iterable[Blow], *, processes: int, progress: Callable[[str], None] | None = None
+    pulses: Iterable[Pulse], *, processes: int, progress: Callable[[str], None] | None = None
 ) -> Iterator[Outcome]:
-    """Run many blows, in order.
+    """Run many pulses, in order.
 
     Args:
-        blows: What to run.
+        pulses: What to run.
         processes: How many at a time; 1 for this process alone.
         progress: Told each label when it is done.
     """
-    blows = list(blows)
+    pulses = list(pulses)
     tell = progress or (lambda _: None)
     if processes == 1:
-        for blow in blows:
-            result = outcome(blow)
-            tell(blow.label)
+        for pulse in pulses:
+            result = outcome(pulse)
+            tell(pulse.label)
             yield result
         return
     from concurrent.futures import ProcessPoolExecutor
@@ -229,8 +228,8 @@ def outcomes(
 
     pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_end_with_parent)
     try:
-        for blow, result in zip(blows, pool.map(outcome, blows, chunksize=4), strict=True):
-            tell(blow.label)
+        for pulse, result in zip(pulses, pool.map(outcome, pulses, chunksize=4), strict=True):
+            tell(pulse.label)
             yield result
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
