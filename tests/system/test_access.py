@@ -25,7 +25,8 @@ from rig.transport import NoReplyError
 from rig.transport.access import DOORS, PLAIN, ROLES, WITH_TRUTH, Door, Verb, allows, doors_of
 from rig.transport.certificates import SIGNER, _host, _Issue, _write, holder_in, make
 from rig.transport.zenoh import Exposure, ZenohClient, ZenohServer
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.processes import free_endpoint
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
 

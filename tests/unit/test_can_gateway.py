@@ -29,7 +29,7 @@ from rig.service import Service
 from rig.transport.fanout import Fanout
 from rig.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, FakeSimulation
-from tests.unit.test_transport_zenoh import until
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
 TABLE = default_messages()

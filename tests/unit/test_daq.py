@@ -33,8 +33,8 @@ from rig.channels import default_table
 from rig.errors import InputError
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.processes import free_endpoint
 from tests.unit.instruments_fake import BLOCK, FakeRig, counts_of, values_of
-from tests.unit.test_transport_zenoh import free_endpoint
 
 pytestmark = pytest.mark.wallclock
 _numbers = itertools.count()

@@ -40,8 +40,9 @@ from rig.channels import default_table
 from rig.errors import InputError, RefusedError
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.processes import free_endpoint
 from tests.unit.instruments_fake import BLOCK, FakeRig, values_of
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
 

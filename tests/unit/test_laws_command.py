@@ -155,4 +155,5 @@ def test_params_tells_how_far_the_fit_is_off(capsys: pytest.CaptureFixture[str])
 
 
 def test_compare_needs_no_terminal_and_is_json() -> None:
-    json.dumps(compare(load_parameters("dtu-2019")), allow_nan=False)
+    found = compare(load_parameters("dtu-2019"))
+    assert json.loads(json.dumps(found, allow_nan=False)) == found

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from rig.service import Service, _Entry, _Queue
 from rig.transport import NoReplyError
 from rig.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, TRUTH, FakeFrame, FakeSimulation
+from tests.waiting import until
 
 BLOCK = 10_000
 
@@ -88,13 +88,6 @@ def run(simulation: FakeSimulation, clock: Clock | None = None, **options: Any) 
     listener = Listener(server)
     summary = Service(simulation, server, clock or FreeRun(), block_ticks=BLOCK, **options).run()
     return summary, listener
-
-
-def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.001)
 
 
 def test_every_row_is_published_once_and_in_order() -> None:
