@@ -299,7 +299,8 @@ def test_a_stream_that_cannot_be_published_is_told_and_ends_neither_the_run_nor_
     assert [event["text"] for event in listener.named("warning")] == [line]
     assert line in listener.statuses[-1]["warnings"]
     assert sum(len(block.values) for block in listener.blocks[wire.sensor_key("probes")]) == 10_000
-    assert listener.events[-1]["rows"][wire.sensor_key("forces")] == 10_000, "whoever lacks them learns it"
+    (end,) = listener.named("end")
+    assert end["rows"][wire.sensor_key("forces")] == 10_000, "whoever lacks them learns it"
 
 
 def test_a_status_that_cannot_be_made_is_told_and_the_run_goes_on() -> None:
