@@ -31,7 +31,7 @@ from rig.cli import can as can_command
 from rig.errors import InputError
 from rig.transport.zenoh import ZenohServer
 from tests.processes import free_endpoint
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
 
@@ -99,7 +99,7 @@ def same(one: can.Message, other: can.Message) -> bool:
     return one.equals(other, timestamp_delta=None, check_channel=False, check_direction=False)
 
 
-def read(bus: can.BusABC, count: int, *, timeout_s: float = 5.0) -> list[can.Message]:
+def read(bus: can.BusABC, count: int, *, timeout_s: float = PATIENCE_S) -> list[can.Message]:
     found = [bus.recv(timeout_s) for _ in range(count)]
     assert None not in found
     return [item for item in found if item is not None]
