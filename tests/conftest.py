@@ -17,15 +17,20 @@ import pytest
 ROOT = Path(__file__).parents[1]
 COMPILING = "tests/parity/test_compiling.py"
 LONGEST = (
+    "tests/house/test_tools.py",
     "tests/unit/test_chart.py",
-    "tests/parity/test_blocks.py",
-    "tests/hostile/test_files.py",
     "tests/physics/test_identification.py",
+    "tests/unit/test_paper.py",
+    "tests/physics/test_law_engines.py",
     "tests/hostile/test_texts.py",
-    "tests/physics/test_reference.py",
     "tests/physics/test_stability.py",
+    "tests/unit/test_import.py",
+    "tests/unit/test_identification.py",
+    "tests/unit/test_nuisance.py",
+    "tests/physics/test_reference.py",
+    "tests/hostile/test_files.py",
 )
-"""Modules that begin first, for nobody is to wait for them at the end."""
+"""Modules that take more than 10 s, for which nobody is to wait at the end."""
 _CLOCK = re.compile(r"^pytestmark = .*\bwallclock\b", re.MULTILINE)
 
 
