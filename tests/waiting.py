@@ -7,7 +7,8 @@ it waits for, and what is waited for in vain is a failure only after a time that
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 PATIENCE_S = 60.0
 """Nothing that comes at all takes this long; a test that passes never waits so long."""
@@ -21,11 +22,9 @@ def until(condition: Callable[[], object], *, timeout_s: float = PATIENCE_S, eve
         time.sleep(every_s)
 
 
-def ever(condition: Callable[[], object], *, within_s: float) -> bool:
-    """True as soon as a condition holds, False where it never did: for what must *not* come, and what may."""
-    deadline = time.monotonic() + within_s
-    while not condition():
-        if time.monotonic() >= deadline:
-            return False
-        time.sleep(0.002)
-    return True
+@contextmanager
+def sooner_than(limit_s: float) -> Iterator[None]:
+    """Fails where what is done inside lasted so long: a limit that was not to be waited for, never a speed."""
+    begin = time.monotonic()
+    yield
+    assert time.monotonic() - begin < limit_s

@@ -618,7 +618,7 @@ def test_transport_frames_of_instruments_on_a_bus_leave_them_answering() -> None
                             return True
                 return False
 
-            until(identified, timeout_s=20.0)
+            until(identified)
         finally:
             link.close()
 

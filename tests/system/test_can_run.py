@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import subprocess
 import threading
 from pathlib import Path
@@ -254,7 +255,9 @@ def test_an_overloaded_bus_drops_counts_and_does_not_slow_the_rig() -> None:
         output, errors = child.communicate(timeout=COMPILE_S)
     assert child.returncode == 0, errors
     assert "load at most 557.0 %" in errors
-    assert "real-time factor 0.99" in output or "real-time factor 1.0" in output
+    factor = re.search(r"real-time factor (\d\.\d+)", output)
+    assert factor is not None
+    assert float(factor[1]) > 0.5, "had it waited for the bus, it were 0.18"
     assert "blocks dropped 0" in output
     line = output.splitlines()[-1]
     sent, dropped = (int(line.split()[place]) for place in (1, 4))

@@ -437,7 +437,7 @@ def test_a_callback_that_blocks_holds_up_neither_requests_nor_the_token_nor_its_
         server.announce()
         until(lambda: seen == [True])
         go.set()
-        until(lambda: all(len(numbers) == messages for numbers in got.values()), timeout_s=60.0)
+        until(lambda: all(len(numbers) == messages for numbers in got.values()))
     assert all(numbers == list(range(messages)) for numbers in got.values())
     assert missed == []
 
