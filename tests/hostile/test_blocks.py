@@ -33,8 +33,8 @@ from rig.intake import Catalogue, Intake
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient, ZenohServer
 from tests.hostile import inputs
+from tests.processes import free_endpoint
 from tests.unit.recorder_stream import TRUTH_COLUMNS, ScriptedClient, block_of, documents
-from tests.unit.test_transport_zenoh import free_endpoint
 
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(7200)]
 KEYS = [wire.sensor_key(group) for group in default_table().groups] + [wire.truth_key(table) for table in TRUTH_COLUMNS]

@@ -23,14 +23,14 @@ from drivers.can.signals import ABSENT, LIMITS, Field, Kind, Result, State, comm
 from drivers.health import Rising
 from rig import wire
 from rig.channels import default_table
+from rig.commands import HammerCommand, SpeedCommand, parse_command
 from rig.errors import InputError
 from rig.pacing import FreeRun, RealTime
-from rig.scenes import HammerCommand, SpeedCommand, parse_command
 from rig.service import Service
 from rig.transport.fanout import Fanout
 from rig.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, FakeSimulation
-from tests.unit.test_transport_zenoh import until
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
 TABLE = default_messages()

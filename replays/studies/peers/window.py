@@ -12,13 +12,14 @@ from replays.studies.peers import scipy_solvers
 from replays.studies.peers.problem import Problem
 from replays.studies.peers.right_hand_side import contact_at, pack
 from replays.studies.peers.solution import Setting
+from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand
 from rig.errors import InputError
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, TOUCHING
 from rig.kernels.signals import N_STATE
 from rig.levels import FRICTION_LAWS
 from rig.model import Model, build_model
-from rig.scenes import HammerCommand, ReleaseCommand, Scene, SpeedCommand
+from rig.scenes import Scene
 
 TICK_S = 1e-6
 """Length of a tick [s]."""
