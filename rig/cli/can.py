@@ -53,8 +53,8 @@ def hub(
     """
     from drivers.can.bus.hub import Hub
     from drivers.can.bus.model import BusModel
+    from drivers.can.bus.timing import speed as parse_speed
     from drivers.can.interface import HubBus
-    from drivers.can.timing import speed as parse_speed
     from rig.cli.can_outlets import CanOutlets
     from rig.errors import InputError
     from rig.transport.endpoint import parse_loopback

@@ -62,6 +62,7 @@ BREACHES = [
     ("rig.engines.tsit5", "rig.engines.rk8", "An engine does not know"),
     ("drivers.link", "drivers.daq", "Inside the drivers"),
     ("drivers.daq", "drivers.twins", "Inside the drivers"),
+    ("drivers.can.bus.model", "drivers.can.gateway", "Inside the virtual bus"),
     ("drivers.hammer.driver", "drivers.hammer.twin", "Inside a device"),
     ("recorder.reader", "recorder.viewer.live", "Inside the recorder"),
     ("recorder.writer", "recorder.viewer.file", "Inside the recorder"),
@@ -80,8 +81,8 @@ BREACHES = [
     ("drivers.hammer.driver", "drivers.hammer.twin", "does not know its twin"),
     ("drivers.link.can", "drivers.console", "does not know its twin"),
     ("drivers.daq", "drivers.can.gateway", "inside of the virtual bus"),
-    ("drivers.force.driver", "drivers.can.hub", "inside of the virtual bus"),
-    ("recorder.reader", "drivers.can.hub", "inside of the virtual bus"),
+    ("drivers.force.driver", "drivers.can.bus.hub", "inside of the virtual bus"),
+    ("recorder.reader", "drivers.can.bus.hub", "inside of the virtual bus"),
     # Physics: other libraries, clocks, threads, processes; also by way of what it may import.
     ("rig.kernels.contact", "pandas", "Physics"),
     ("rig.parameters", "pyarrow", "Physics"),

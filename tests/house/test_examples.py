@@ -10,20 +10,23 @@ import pytest
 
 import rig
 from drivers.daq import Daq
-from rig import contacts, magnets
+from recorder.reader import Recording
+from rig import contacts, magnets, orbit
 
 MODULES = (
     "drivers.daq",
+    "recorder.reader",
     "rig.contacts",
     "rig.magnets",
     "rig.offline",
+    "rig.orbit",
     "rig.parameters",
     "rig.scenes",
 )
 CALLED = (
     rig.simulate, rig.load_scene, rig.load_parameters, contacts.restitution_factor, contacts.returned_restitution,
     contacts.linear_damping_ratio, contacts.fit_power, contacts.free_impact, magnets.field_sum_force,
-    magnets.cylinder_force, magnets.pair_force, Daq,
+    magnets.cylinder_force, magnets.pair_force, orbit.whirl_frequency, orbit.full_spectrum, Recording, Daq,
 )  # fmt: skip
 
 

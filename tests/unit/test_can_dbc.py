@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from drivers.can import dbc, schedule
+from drivers.can.bus.timing import speed
 from drivers.can.signals import (
     CLASSIC_HZ,
     FD_HZ,
@@ -21,7 +22,6 @@ from drivers.can.signals import (
     make_table,
     parse_command,
 )
-from drivers.can.timing import speed
 from rig.channels import default_table
 from rig.cli.app import app
 from rig.cli.can_output import CanOutput

@@ -25,8 +25,8 @@ from drivers.can.bus.frame import Frame
 from drivers.can.bus.hub import Hub
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.node import matching
+from drivers.can.bus.timing import speed
 from drivers.can.interface import HubBus, ZenohBus
-from drivers.can.timing import speed
 from rig import wire
 from rig.cli import can as can_command
 from rig.errors import InputError
@@ -642,9 +642,9 @@ def test_random_payloads_over_zenoh_leave_the_hub_as_it_was() -> None:
         until(lambda: rig.hub.status()["counts"]["malformed"] > 100)
         sender.send(message(0x7A5, b"unique"))
         while (found := read(receiver, 1)[0]).data != b"unique":
-            assert found.is_error_frame or frames.fault_of(medium.record_of(found)) is None
+            assert found.is_error_frame or frames.fault_of(codec.record_of(found)) is None
         nodes = {row["name"]: row for row in rig.hub.status()["nodes"]}
-        assert nodes[receiver._name]["state"] == 0
+        assert nodes[receiver.name]["state"] == 0
 
 
 def join(hub: Hub, name: str, *, token: bool = False, **more: Any) -> dict[str, Any]:

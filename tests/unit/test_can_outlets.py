@@ -29,8 +29,8 @@ from drivers.can.bus.model import BusModel
 from drivers.can.bus.outlet import Outlet
 from drivers.can.bus.slcan import Lines, SlcanPort
 from drivers.can.bus.socketcand import SocketcandServer, Splitter
+from drivers.can.bus.timing import speed
 from drivers.can.interface import HubBus
-from drivers.can.timing import speed
 from drivers.twins import Twins
 from rig.cli.can_outlets import CanOutlets
 from rig.cli.can_output import CanOptions, CanOutput
