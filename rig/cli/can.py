@@ -14,7 +14,7 @@ from rig.cli.tables import echo
 
 app = typer.Typer(help="The virtual CAN bus.", no_args_is_help=True)
 
-_LISTEN = "127.0.0.1:7461"
+LISTEN = "127.0.0.1:7461"
 _SPEED = "1M/8M"
 
 
@@ -31,7 +31,7 @@ def hub(
     speed: Annotated[
         str, typer.Option(metavar="RATE[/RATE]", help="Bit rate, and that of the data phase of CAN FD: 500k, 1M/8M.")
     ] = _SPEED,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = _LISTEN,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = LISTEN,
     socketcand: Annotated[
         str | None,
         typer.Option(

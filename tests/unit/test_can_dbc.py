@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import runpy
 import sys
 from pathlib import Path
 
@@ -138,8 +139,6 @@ def test_cantools_decodes_every_command() -> None:
 
 
 def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from cantools import _main
-
     probes = TABLE.by_name["Probes"]
     assert probes.samples is not None
     data = probes.samples.pack(np.array([10]), np.full((5, 4), 0x1000, np.int32), 64).tobytes()
@@ -149,7 +148,7 @@ def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeyp
     ]
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines) + "\n"))
     monkeypatch.setattr(sys, "argv", ["cantools", "decode", str(dbc.COPY)])
-    _main()
+    runpy.run_module("cantools", run_name="__main__")
     output = capsys.readouterr().out
     assert "Probes(" in output
     assert "index: 10" in output

@@ -552,7 +552,7 @@ def test_two_channels_at_one_address_do_not_mix() -> None:
 
 
 def test_the_command_listens_where_clients_look() -> None:
-    assert can_command._LISTEN == codec.DEFAULT_ENDPOINT
+    assert can_command.LISTEN == codec.DEFAULT_ENDPOINT
 
 
 def test_channels_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
