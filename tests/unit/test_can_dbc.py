@@ -25,7 +25,7 @@ from drivers.can.signals import (
 )
 from rig.channels import default_table
 from rig.cli.app import app
-from rig.cli.can_output import CanOutput
+from rig.cli.can_output import CanMessages, CanOptions, CanOutput
 from rig.errors import InputError
 
 TABLE = default_messages()
@@ -68,9 +68,11 @@ def test_a_bus_that_gets_too_full_is_told_in_one_line(monkeypatch: pytest.Monkey
         assert CliRunner().invoke(app, command, catch_exceptions=False).stderr == warning
     assert warning in f"{CanOutput('virtual:full')}\n"
     # What is still carried is only told; what is not is refused.
-    assert CanOutput("virtual:full", rate_hz=500).schedule.warnings(speed("1M")) == []
+    assert (
+        CanOutput("virtual:full", CanOptions(messages=CanMessages(can_rate=500))).schedule.warnings(speed("1M")) == []
+    )
     with pytest.raises(InputError, match="CAN load must be a schedule of at most 100 % of the bus"):
-        CanOutput("virtual:full", bitrate="500k")
+        CanOutput("virtual:full", CanOptions(messages=CanMessages(can_bitrate="500k")))
 
 
 def test_the_usual_bus_is_not_too_full() -> None:
