@@ -120,7 +120,7 @@ def test_picture_labels_every_axis_and_law(monkeypatch: pytest.MonkeyPatch, tmp_
     assert any(set(STIFFNESS) < legend for legend in legends)
     styles = [
         (line.get_color(), line.get_linestyle(), line._unscaled_dash_pattern)  # noqa: SLF001 (dashes are told apart by nothing public)
-        for line in panels[0].lines[:11]
+        for line in panels[0].lines[: len(DAMPING)]
     ]
     assert len(set(map(str, styles))) == len(DAMPING)
 
