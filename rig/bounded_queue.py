@@ -25,8 +25,7 @@ class BoundedQueue(Generic[T]):
         changed: Condition that is shared with other queues, to wait for all of them (`take_first`).
 
     Attributes:
-        room: What may wait.
-        used: What waits takes of it, and with `holds` what was taken last.
+        used: What waits takes of the room, and with `holds` what was taken last.
         high_water: Most that was ever used.
         dropped: Items that were refused or dropped for want of room, without those that take none.
         closed: Whether `offer` and `put` add no more items; those that wait can still be taken.

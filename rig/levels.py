@@ -1,4 +1,4 @@
-"""The ladder of models: how much of the rig's physics a scene asks for, each rung by name, the simplest first."""
+"""The ladder of models: how much of the rig's physics a scene asks for, each level by name, the simplest first."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ModelLevels(BaseModel):
     """None; tanh of the sliding speed; clamped linear; Coulomb's set-valued law."""
 
     def constants(self) -> Levels:
-        """The rungs as the kernels take them."""
+        """The levels as the kernels take them."""
         return Levels(
             euler=self.shaft == "euler",
             inner_house=self.stator != "rigid",

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 _NS = 1_000_000_000
 
@@ -88,37 +87,15 @@ class Histogram:
         return self.largest
 
 
-class Clock(Protocol):
-    """Paces a simulation; `grant` and `release` are called by the simulation thread alone."""
+class Clock:
+    """Paces a simulation; `grant` and `release` are called by the thread that runs alone.
 
-    pace: str
-    """Name of the pace: real-time, lockstep or free."""
-
-    def start(self, tick: int, tick_rate_hz: int) -> None:
-        """Take this tick as the origin; wall time runs from now on."""
-        ...
-
-    def grant(self, ticks: int) -> int:
-        """How many ticks may run now, at most `ticks`; 0 after a `wake`, so that the caller can look around."""
-        ...
-
-    def release(self, tick: int) -> bool:
-        """Return True when what was simulated up to `tick` is due; False after a `wake`, and is to be called again."""
-        ...
-
-    def wake(self) -> None:
-        """Make a waiting `grant` or `release` return; from any thread."""
-        ...
-
-    def statistics(self) -> dict[str, object]:
-        """`real_time_factor`, `lateness_ms` (p50, p99, max, last) and `overruns`; from any thread."""
-        ...
-
-
-class FreeRun:
-    """As fast as it goes; only measures the real-time factor."""
+    As it stands, it lets everything run at once and only measures the real-time factor; each kind says what it waits
+    for.
+    """
 
     pace = "free"
+    """Name of the pace: real-time, lockstep or free."""
 
     def __init__(self, *, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._now_ns = now_ns
@@ -138,19 +115,19 @@ class FreeRun:
         self._origin_ns = self._now_ns()
 
     def grant(self, ticks: int) -> int:
-        """All of them."""
+        """How many ticks may run now, at most `ticks`; 0 after a `wake`, so that the caller can look around."""
         return ticks
 
     def release(self, tick: int) -> bool:
-        """Results are due at once."""
+        """Return True when what was simulated up to `tick` is due; False after a `wake`, and is to be called again."""
         self._measure(tick, self._now_ns())
         return True
 
     def wake(self) -> None:
-        """Nothing waits here."""
+        """Make a waiting `grant` or `release` return; from any thread."""
 
     def position(self) -> int:
-        """The tick that it is now: here, the last that was released."""
+        """The tick that it is now; without a wall clock the last that was released."""
         return self._last_tick
 
     @property
@@ -180,7 +157,11 @@ class FreeRun:
             self._factor = (tick - self._origin_tick) * _NS / (self._tick_rate_hz * elapsed_ns)
 
 
-class RealTime(FreeRun):
+class FreeRun(Clock):
+    """As fast as it goes."""
+
+
+class RealTime(Clock):
     """Results are due when the wall clock reaches their tick: absolute deadlines from one origin, so nothing adds up.
 
     Where the simulation is behind, it runs on without waiting until it has caught up; each result that was not ready at
@@ -242,7 +223,7 @@ class RealTime(FreeRun):
         return True
 
 
-class Lockstep(FreeRun):
+class Lockstep(Clock):
     """Runs only what was granted by `allow`.
 
     Args:

@@ -210,7 +210,7 @@ class Scene(Written):
                 held = False
             elif isinstance(command, HammerCommand):
                 if timed.at_s < free_s:
-                    raise InputError("hammer", f"idle (in a blow until {free_s:g} s)", f"a blow at {timed.at_s:g} s")
+                    raise InputError("hammer", f"idle (in a pulse until {free_s:g} s)", f"a pulse at {timed.at_s:g} s")
                 free_s = timed.at_s + command.duration_ms * 1e-3
         return self
 

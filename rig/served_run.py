@@ -12,11 +12,10 @@ from rig.desk import Desk, Pending, finite, one_line
 from rig.errors import InputError
 from rig.pacing import Clock, StepTimeoutError, short_collections
 from rig.transport import Server
-from rig.transport.limit import CommandLimit
 
 _SUMMED_UP = (
     "scene", "pace", "tick", "time_s", "real_time_factor", "lateness_ms", "overruns", "queue", "congestion",
-    "samples_published", "commands",
+    "samples_published", "commands", "replay",
 )  # fmt: skip
 """Figures of the last status that are in the summary."""
 
@@ -29,11 +28,8 @@ class ServedRun(ABC):
         clock: Pace.
         scene: Scene document.
         tick_rate_hz: Ticks per simulated second [Hz].
-        commands: Names of those that are taken.
-        others: Commands that are known and refused, each with the line that says so.
-        running: What a command that comes too late should have been sent while, such as "the rig runs".
         linger_s: At the end of a run, wait at most this long [s] until clients have recovered what they missed.
-        limit: How many commands a second are taken.
+        desk: What commands are taken, as for `Desk`.
     """
 
     def __init__(
@@ -43,11 +39,8 @@ class ServedRun(ABC):
         *,
         scene: Mapping[str, Any],
         tick_rate_hz: int,
-        commands: tuple[str, ...],
-        others: Mapping[str, str],
-        running: str,
         linger_s: float,
-        limit: CommandLimit | None = None,
+        **desk: Any,
     ) -> None:
         self._server = server
         self._clock = clock
@@ -58,9 +51,7 @@ class ServedRun(ABC):
         self._prepared = False
         self._stop_requested = False
         self._accepted = 0
-        self._desk = Desk(
-            server, commands=commands, others=others, running=running, wake=self._wake, tell=self._warn, limit=limit
-        )
+        self._desk = Desk(server, wake=self._wake, tell=self._warn, **desk)
 
     # ---- what a kind of run provides ----
 
@@ -86,8 +77,8 @@ class ServedRun(ABC):
         """Run; returns why it ended."""
 
     @abstractmethod
-    def _end(self, reason: str) -> None:
-        """End the stream."""
+    def _end(self, reason: str) -> dict[str, Any]:
+        """Close the desk and end the stream; returns what the summary has beyond the figures of the status."""
 
     @abstractmethod
     def _carry_out(self, pending: Pending) -> dict[str, Any] | None:
@@ -98,16 +89,8 @@ class ServedRun(ABC):
         """
 
     @abstractmethod
-    def _unanswered(self) -> list[Pending]:
-        """Commands that were accepted and are not done yet."""
-
-    @abstractmethod
     def _warn(self, text: str) -> None:
         """Put a warning into the stream; from any thread."""
-
-    @abstractmethod
-    def _counts(self) -> dict[str, Any]:
-        """What the summary has beyond the figures of the status."""
 
     # ---- from any thread ----
 
@@ -132,18 +115,7 @@ class ServedRun(ABC):
         health: dict[str, Any],
         warnings: list[str],
     ) -> dict[str, Any]:
-        """What every status has.
-
-        Args:
-            tick: Where the run is [ticks].
-            end_s: Where it ends [s of simulated time]; None where that is not known.
-            pace: Name of the pace.
-            block_ms: Length of a published block [ms of simulated time].
-            queue: Depth, capacity, high_water and dropped, in blocks.
-            rate_hz: Rate of the stream that clients report on [Hz]; 0 before its first block.
-            health: `spin_hz`, `energy` and `engine`.
-            warnings: What a person should know of.
-        """
+        """What every status has, of what its kind knows (units and meaning: rig/KEYS.md)."""
         return finite(
             {
                 "scene": self._scene.get("name"),
@@ -210,18 +182,12 @@ class ServedRun(ABC):
         finally:
             wall_s = time.monotonic() - began_s
             self._state = "ended"
-            self._desk.close(f"a run that ended: {reason}", self._unanswered())
-            self._end(reason)
+            counts = self._end(reason)
             # The cache is kept until everybody who is connected has everything.
             self._desk.clients.settle(self._server, self.published, patience_s=self._linger_s)
         status = self.status()
-        return {
-            "reason": reason,
-            "wall_s": wall_s,
-            **{name: status[name] for name in _SUMMED_UP},
-            **self._counts(),
-            "troubles": self._desk.troubles,
-        }
+        figures = {name: status[name] for name in _SUMMED_UP if name in status}
+        return {"reason": reason, "wall_s": wall_s, **figures, **counts, "troubles": self._desk.troubles}
 
     def _take_commands(self) -> list[dict[str, Any]]:
         """Carry out all commands that have arrived; returns the events that tell of them."""

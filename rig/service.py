@@ -112,6 +112,7 @@ class Service(ServedRun):
             inherit=_inherit,
         )
         self._publisher = threading.Thread(target=self._publish_all, name="publisher", daemon=True)
+        self._end_event: dict[str, Any] = {}
         self._may_drop = isinstance(clock, RealTime)
         self._overflowing = False
         self._tick = simulation.tick
@@ -295,19 +296,15 @@ class Service(ServedRun):
         for text in self._health.get("warnings", []):
             self._desk.warn(text)
 
-    def _unanswered(self) -> list[Pending]:
-        return [pending for _, pending, _ in self._steps]
-
-    def _end(self, reason: str) -> None:
-        self._queue.push(_Entry([self._event("end", self._simulation.tick, reason=reason)]))
+    def _end(self, reason: str) -> dict[str, Any]:
+        self._desk.close(f"a run that ended: {reason}", [pending for _, pending, _ in self._steps])
+        self._end_event = self._event("end", self._simulation.tick, reason=reason)
         self._queue.close()
         if self._publisher.ident is not None:
             self._publisher.join(timeout=60.0)
         # Where the publisher failed, nobody else answers the steps that it left.
         while (entry := self._queue.take(0.0)) is not None:
             self._answer(entry)
-
-    def _counts(self) -> dict[str, Any]:
         return {"rows": dict(self._rows.next)}
 
     # ---- on the publisher thread ----
@@ -323,6 +320,8 @@ class Service(ServedRun):
                 self._guarded("publishing the status", self._publish_status)
                 # Not one period after the last: a status that was held up is not followed by a burst.
                 next_status_s = now + self._status_period_s
+        # Last of all events: what fails while the rest of the queue is published is told before it.
+        self._guarded("publishing events", self._publish_event, self._end_event)
         self._guarded("publishing the status", self._publish_status)
 
     def _guarded(self, what: str, work: Callable[..., None], *arguments: Any) -> None:

@@ -89,7 +89,7 @@ class Snapshot:
 
 
 _CHANGING = (
-    "tick", "first_row", "_segments", "_engaged", "_blow", "_pending", "_y", "_memory", "_last", "_conditioner",
+    "tick", "first_row", "_segments", "_engaged", "_pulse", "_pending", "_y", "_memory", "_last", "_conditioner",
     "_keyphasor",
 )  # fmt: skip
 
@@ -155,7 +155,7 @@ class Simulation:
         self.tick = 0
         self._segments = self._profile()
         self._engaged = scene.initial.magnets
-        self._blow: tuple[HammerCommand, int, int] | None = None
+        self._pulse: tuple[HammerCommand, int, int] | None = None
         self._pending = sorted(
             ((self._on_grid(timed.at_s), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
         )
@@ -224,10 +224,10 @@ class Simulation:
         command = check_command(name, request)
         waiting = [other for tick, other in self._pending if tick <= self.tick]
         if isinstance(command, HammerCommand):
-            busy_until = self._blow[2] if self._blow is not None else 0
+            busy_until = self._pulse[2] if self._pulse is not None else 0
             if self.tick < busy_until or any(isinstance(other, HammerCommand) for other in waiting):
                 until = f"until {busy_until / TICK_RATE_HZ:.6f} s" if self.tick < busy_until else "from now on"
-                raise InputError("hammer", f"idle (it is in a blow {until})", "another blow")
+                raise InputError("hammer", f"idle (it is in a pulse {until})", "another pulse")
         elif isinstance(command, SpeedCommand):
             top = self.model.parameters.entries["drive.top_speed"].value
             if not isinstance(top, str) and command.speed_hz > top:
@@ -333,7 +333,7 @@ class Simulation:
                 place = f"within {clearance * 1e3:g} mm of the shaft at rest on its magnets, (0, {sag * 1e3:.4g}) mm"
                 raise InputError("ring.offset", place, [contact.offset_x * 1e3, contact.offset_y * 1e3])
             return self.model.state(spin=spin)
-        # A hair inside the clearance, so that rounding does not make it a contact.
+        # Just inside the clearance, so that rounding does not make it a contact.
         inside = clearance * (1.0 - 1e-12)
         places = {"top": (0.0, inside), "bottom": (0.0, -inside), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}
         x, y = places[initial.position]
@@ -367,13 +367,13 @@ class Simulation:
             event: dict[str, Any] = {"event": command.command, "tick": self.tick, "time_s": self.tick / TICK_RATE_HZ}
             event |= command.model_dump(exclude={"command"})
             if isinstance(command, HammerCommand):
-                if self._blow is not None and self.tick < self._blow[2]:  # one sent by hand is under way
+                if self._pulse is not None and self.tick < self._pulse[2]:  # one sent by hand is under way
                     events.append(
-                        event | {"event": "warning", "text": "a blow of the scene found the hammer in a blow"}
+                        event | {"event": "warning", "text": "a hammer pulse of the scene found the hammer in a pulse"}
                     )
                     continue
                 length = max(1, round(command.duration_ms * 1e-3 * TICK_RATE_HZ / self.row_ticks)) * self.row_ticks
-                self._blow = (command, self.tick, self.tick + length)
+                self._pulse = (command, self.tick, self.tick + length)
             elif isinstance(command, SpeedCommand):
                 self._ramp_to(2.0 * math.pi * command.speed_hz)
             else:
@@ -410,8 +410,8 @@ class Simulation:
     def _inputs(self) -> Inputs:
         segment = self._segment()
         force, (dx, dy), begin, end = 0.0, (1.0, 0.0), 0, 0
-        if self._blow is not None:
-            command, begin, end = self._blow
+        if self._pulse is not None:
+            command, begin, end = self._pulse
             force, (dx, dy) = float(command.force_n), command.cosines
         return Inputs(
             tick_s=1.0 / TICK_RATE_HZ,

@@ -1,1 +1,4 @@
-"""Virtual CAN: frames bit by bit, a bus with arbitration and faults, response times, and what speaks to python-can."""
+"""Virtual CAN: the rig's messages (`signals`), python-can's way to them (`interface`), DBC, load and response times.
+
+Behind them stand the bus itself (`bus/`) and the rig as a node of it (`gateway/`).
+"""

@@ -67,14 +67,14 @@ class Passes:
         self.timeline = timeline
         self.part = part
         self._tick_rate_hz = tick_rate_hz
-        tape = timeline.tape
-        first_s, last_s = tape.begin_ns / NS, tape.end_ns / NS
+        track = timeline.track
+        first_s, last_s = track.begin_ns / NS, track.end_ns / NS
         for name, value in (("from", part.from_s), ("to", part.to_s), ("start", part.start_s)):
             if value is not None and not first_s <= value <= last_s:
                 raise InputError(name, f"within the recording, {first_s:g} to {last_s:g} s", value)
         if part.loops is not None and part.loops < 1:
             raise InputError("loop", "at least 1", part.loops)
-        self.from_ns = tape.begin_ns if part.from_s is None else round(part.from_s * NS)
+        self.from_ns = track.begin_ns if part.from_s is None else round(part.from_s * NS)
         self._to_ns = None if part.to_s is None else round(part.to_s * NS)
         self.start_ns = self.from_ns if part.start_s is None else round(part.start_s * NS)
         if not self.from_ns < self.end_ns:
@@ -87,7 +87,7 @@ class Passes:
     @property
     def end_ns(self) -> int:
         """Where a pass ends, as far as it is known beforehand [ns of simulated time]."""
-        return self.timeline.tape.end_ns if self._to_ns is None else self._to_ns
+        return self.timeline.track.end_ns if self._to_ns is None else self._to_ns
 
     def play(self, from_ns: int, number: int) -> Iterator[Batch | Mark]:
         """What is to come: for each pass a mark, and its batches.

@@ -18,8 +18,8 @@ from replays.player.outlet import Outlet
 from replays.player.passes import Mark, Part, Passes, has_block, size_of
 from replays.player.playhead import NS, Playhead
 from replays.player.readahead import ReadAhead
-from replays.player.tape import Tape
 from replays.player.timeline import Batch, By, Timeline
+from replays.player.track import Track
 from rig import wire
 from rig.desk import Pending, Rate, Seek, Step, finite
 from rig.errors import InputError, RefusedError
@@ -53,7 +53,7 @@ class Player(ServedRun):
     """Plays one recording to its end and serves it.
 
     Args:
-        tape: The recording.
+        track: The recording.
         server: Transport; stays open when the play ends.
         clock: `RealTime` for the recorded spacing, `FreeRun` for a burst: as fast as the clients take it, by what they
             report and by the transport, which must wait for them.
@@ -74,7 +74,7 @@ class Player(ServedRun):
 
     def __init__(
         self,
-        tape: Tape,
+        track: Track,
         server: Server,
         clock: RealTime | FreeRun,
         *,
@@ -88,7 +88,7 @@ class Player(ServedRun):
         wait_s: float = 60.0,
         linger_s: float = 10.0,
     ) -> None:
-        documents = tape.documents
+        documents = track.documents
         super().__init__(
             server,
             clock,
@@ -103,9 +103,9 @@ class Player(ServedRun):
             running="the recording plays",
             linger_s=linger_s,
         )
-        self._tape = tape
+        self._track = track
         self._parameters = documents[wire.PARAMETERS]
-        self._passes = Passes(Timeline(tape, by), part or Part(), self._rate)
+        self._passes = Passes(Timeline(track, by), part or Part(), self._rate)
         self._edit = edit or Edit(documents[wire.CATALOGUE])
         self._burst = not isinstance(clock, RealTime)
         self._playhead = Playhead(clock, rate)
@@ -172,7 +172,7 @@ class Player(ServedRun):
                 "time_s": position_s,
                 "real_time_factor": round(play.achieved_rate, 6),
                 "replay": {
-                    "files": [str(path) for path in self._tape.paths],
+                    "files": [str(path) for path in self._track.paths],
                     "from_s": begin_s,
                     "to_s": end_s,
                     "position_s": position_s,
@@ -204,7 +204,7 @@ class Player(ServedRun):
 
     def _scene_now(self) -> dict[str, Any]:
         taken = {entry["id"]: entry for entry in self._scene.get("taken", ())}
-        for entry in self._tape.commands:
+        for entry in self._track.commands:
             if entry["tick"] * NS < self._position_ns * self._rate and entry["command"] not in _OWN:
                 taken.setdefault(entry["id"], entry)
         return {**self._scene, **({"taken": list(taken.values())} if taken or "taken" in self._scene else {})}
@@ -318,14 +318,15 @@ class Player(ServedRun):
         self._pass = mark.number
         self._position_ns = mark.from_ns
         self._outlet.begin(mark.number, mark.tick)
-        if not self._begun and mark.from_ns > self._tape.begin_ns:
+        if not self._begun and mark.from_ns > self._track.begin_ns:
             # The recorded start is not in what is played.
             about = {"scene": self._scene.get("name"), "seed": self._scene.get("seed"), "pace": "replay"}
             self._outlet.tell(self._event("start", self._tick, **about))
         self._begun = True
 
-    def _end(self, reason: str) -> None:
+    def _end(self, reason: str) -> dict[str, Any]:
         """End the stream: as it was recorded, where that belongs to what was played."""
+        self._desk.close(f"a run that ended: {reason}", [] if self._step is None else [self._step.reply])
         self._playhead.hold(self._playhead.play_ns)
         if self._ahead is not None:
             self._ahead.close()
@@ -337,18 +338,9 @@ class Player(ServedRun):
             self._outlet.tell(self._event("end", self._tick, reason=reason))
         if completed:
             self._outlet.end_status()
-
-    def _unanswered(self) -> list[Pending]:
-        return [] if self._step is None else [self._step.reply]
-
-    def _counts(self) -> dict[str, Any]:
-        return {
-            "replay": self.status()["replay"],
-            "played_s": self._playhead.play_ns / NS,
-            "blocks": self._outlet.blocks,
-            "rows": self._outlet.rows,
-            "left_out": self._outlet.left_out,
-        }
+        out = self._outlet
+        counts = {"blocks": out.blocks, "rows": out.rows, "left_out": out.left_out}
+        return {"played_s": self._playhead.play_ns / NS, **counts}
 
     # Commands.
 

@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 from rig.errors import InputError
-from rig.pacing import FreeRun, RealTime
+from rig.pacing import Clock
 
 NS = 1_000_000_000
 LEAST_RATE, GREATEST_RATE = 0.01, 1000.0
@@ -24,7 +24,7 @@ class Playhead:
         rate: Recorded seconds a second, where the clock is a real one.
     """
 
-    def __init__(self, clock: RealTime | FreeRun, rate: float) -> None:
+    def __init__(self, clock: Clock, rate: float) -> None:
         self._clock = clock
         self.rate = check_rate(rate)
         self.play_ns = 0

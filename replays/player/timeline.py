@@ -1,4 +1,4 @@
-"""The payloads of a tape in the order of their deadlines; knows no clock and no transport."""
+"""The payloads of a recording in the order of their deadlines; knows no clock and no transport."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import accumulate
 
-from replays.player.tape import Message, Tape
+from replays.player.track import Message, Track
 from rig import wire
 
 _NS = 1_000_000_000
@@ -55,12 +55,12 @@ class Timeline:
     in them could be due next.
 
     Args:
-        tape: Where the messages are.
+        track: Where the messages are.
         by: What the deadlines follow.
     """
 
-    def __init__(self, tape: Tape, by: By = By.SIMULATED) -> None:
-        self.tape = tape
+    def __init__(self, track: Track, by: By = By.SIMULATED) -> None:
+        self.track = track
         self.by = by
 
     def play(self, from_ns: int, to_ns: int | None = None) -> Iterator[Batch]:
@@ -80,7 +80,7 @@ class Timeline:
             yield batch
 
     def _in_order(self, from_ns: int, to_ns: int | None) -> Iterator[Item]:
-        chunks = self.tape.chunks
+        chunks = self.track.chunks
         # Nothing that begins earlier than this stands in a chunk or in any after it.
         beginnings = list(accumulate((chunk.begin_ns for chunk in reversed(chunks)), min))[::-1]
         waiting: list[tuple[int, int, Item]] = []
@@ -94,7 +94,7 @@ class Timeline:
             if self.by is By.SIMULATED:
                 while waiting and waiting[0][0] <= beginning_ns:
                     yield heapq.heappop(waiting)[2]
-            for message in self.tape.read(chunk):
+            for message in self.track.read(chunk):
                 item = ages.item(message)
                 if message.time_ns < from_ns or (to_ns is not None and item.position_ns > to_ns):
                     continue

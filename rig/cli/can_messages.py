@@ -12,8 +12,8 @@ from rig.cli.tables import echo
 from rig.errors import whole_file
 
 if TYPE_CHECKING:
-    from drivers.can.bus.timing import Speed
     from drivers.can.schedule import Schedule
+    from drivers.can.timing import Speed
 
 
 def dbc(
@@ -25,8 +25,7 @@ def dbc(
     from rig.scenes import rig_table
 
     rig_table()
-    schedule, speed = CanMessages(can_classic=True).plan()
-    _warn(schedule, speed)
+    _warn(*CanMessages(can_classic=True).plan())
     if out is None:
         echo(text(), nl=False)
         return

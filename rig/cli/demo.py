@@ -90,9 +90,9 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
             console = Console(client, name="rig demo")
             say(f"service up, recording to {file}; spinning contact-free for {_STABLE_S:g} s")
             time.sleep(_STABLE_S)
-            blow = console.hammer(force_n=100.0, duration_ms=5.0, direction="x")
-            effect = f"takes effect at {blow.time_s:.3f} s of simulated time"
-            say(f"hammer: 100 N for 5 ms along x; command {blow.id}, {effect}")
+            pulse = console.hammer(force_n=100.0, duration_ms=5.0, direction="x")
+            effect = f"takes effect at {pulse.time_s:.3f} s of simulated time"
+            say(f"hammer: 100 N for 5 ms along x; command {pulse.id}, {effect}")
             for _ in range(3):
                 time.sleep(whirl_s / 3)
                 status = console.status()

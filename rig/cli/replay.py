@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from replays.player.edit import Edit
     from replays.player.passes import Part
     from replays.player.player import Player
-    from replays.player.tape import Tape
+    from replays.player.track import Track
     from rig.transport import Server
 
 _part, _change = panel("What is played"), panel("What is changed")
@@ -86,7 +86,7 @@ class Changed:
         None
     )
 
-    def edit(self, tape: Tape) -> Edit:
+    def edit(self, track: Track) -> Edit:
         """Which payloads go out, on which key, and which columns they have.
 
         Raises:
@@ -96,7 +96,7 @@ class Changed:
         from rig.wire import CATALOGUE
 
         return Edit(
-            tape.documents[CATALOGUE],
+            track.documents[CATALOGUE],
             keys=pairs("--remap", self.remap, "KEY=KEY"),
             channels=None if self.channels is None else names_of(self.channels),
             names=pairs("--rename", self.rename, "NAME=NAME"),
@@ -129,21 +129,21 @@ def replay(
     with rare_collections():
         from replays.player.player import Player
         from replays.player.playhead import check_rate
-        from replays.player.tape import Tape
         from replays.player.timeline import By
+        from replays.player.track import Track
 
         check_rate(rate)
         if burst and rate != 1.0:
             raise InputError("rate", "left out with --burst", rate)
         if played.wait_for and played.pause:
             raise InputError("--wait-for", "left out with --pause", played.wait_for)
-        tape = Tape(files)
-        edit = changed.edit(tape)
+        track = Track(files)
+        edit = changed.edit(track)
         bus = can.output()
 
     def make(server: Server) -> Player:
         player = Player(
-            tape,
+            track,
             server,
             FreeRun() if burst else RealTime(),
             part=played.part(),
@@ -156,7 +156,7 @@ def replay(
             wait_s=played.wait_s,
         )
         begin_s, end_s = player.reach_s
-        if not tape.complete:
+        if not track.complete:
             echo("rig: the recording was cut off; it is played as far as it goes", err=True)
         what = "paused" if played.pause else "burst" if burst else f"x{rate:g}"
         if played.wait_for:

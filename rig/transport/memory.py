@@ -6,7 +6,6 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
 
 from rig.transport import NoReplyError
 
@@ -24,13 +23,8 @@ def key_matches(expression: str, key: str) -> bool:
     return match(expression.split("/"), key.split("/"))
 
 
-@dataclass(frozen=True, slots=True)
-class Subscription:
-    """What a client asked to be handed."""
-
-    expression: str
-    on_message: Callable[[str, bytes], None]
-    owner: MemoryClient
+Subscription = tuple[str, Callable[[str, bytes], None], "MemoryClient"]
+"""Expression of the keys, what takes key and payload, and whose it is."""
 
 
 class MemoryServer:
@@ -54,11 +48,11 @@ class MemoryServer:
         """Hand one payload to all subscribers, in the order in which they subscribed."""
         with self._lock:
             self._cache.append((key, payload))
-            matching = [row for row in self._subscriptions if key_matches(row.expression, key)]
+            matching = [take for expression, take, _ in self._subscriptions if key_matches(expression, key)]
             # Delivery under the lock keeps each subscriber's messages in order; the lock is re-entrant for callbacks
             # that ask the rig something.
-            for row in matching:
-                row.on_message(key, payload)
+            for take in matching:
+                take(key, payload)
 
     def answer(self, key: str, handler: Callable[[bytes], bytes]) -> None:
         """Answer requests on a key; the handler is called on the asking thread."""
@@ -89,10 +83,11 @@ class MemoryServer:
 
     def subscribe(self, subscription: Subscription, *, history: bool) -> None:
         """Hand over what was published, where that is wanted, and what will be."""
+        expression, take, _ = subscription
         with self._lock:
             for key, payload in list(self._cache) if history else ():
-                if key_matches(subscription.expression, key):
-                    subscription.on_message(key, payload)
+                if key_matches(expression, key):
+                    take(key, payload)
             self._subscriptions.append(subscription)
 
     def handler_of(self, key: str) -> Callable[[str, bytes], bytes | Future[bytes]] | None:
@@ -119,7 +114,7 @@ class MemoryServer:
     def forget(self, client: MemoryClient) -> None:
         """Forget a client's subscriptions and watches."""
         with self._lock:
-            self._subscriptions = [row for row in self._subscriptions if row.owner is not client]
+            self._subscriptions = [row for row in self._subscriptions if row[2] is not client]
             self._watchers = [row for row in self._watchers if row[0] is not client]
 
     # ---- for the rig ----
@@ -168,7 +163,7 @@ class MemoryClient:
         lossless: bool = True,
     ) -> None:
         """Receive payloads in order; nothing is ever missed here, so `on_miss` and `lossless` change nothing."""
-        self._server.subscribe(Subscription(key, on_message, self), history=history)
+        self._server.subscribe((key, on_message, self), history=history)
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Ask the rig and return its reply.

@@ -286,8 +286,8 @@ def uses() -> dict[str, Use]:
     """What is done with a recording, each through the door that a command uses."""
     from recorder.reader import join
     from recorder.rewrite import cut, recover
-    from replays.player.tape import Tape
     from replays.player.timeline import By, Timeline
+    from replays.player.track import Track
     from replays.recordings.experiment import Experiment
     from replays.recordings.formats.export import export, merged
     from replays.recordings.formats.selection import select
@@ -307,8 +307,8 @@ def uses() -> dict[str, Use]:
         return use
 
     def played(path: Path, _: Path) -> object:
-        tape = Tape([path])
-        return [sum(1 for _ in Timeline(tape, by).play(0)) for by in By]
+        track = Track([path])
+        return [sum(1 for _ in Timeline(track, by).play(0)) for by in By]
 
     return {
         "info": told,

@@ -21,7 +21,7 @@ from recorder.reader import Recording
 from recorder.session import RecordingSession
 from replays.player.passes import Part
 from replays.player.player import Player
-from replays.player.tape import Tape
+from replays.player.track import Track
 from rig import wire
 from rig.cli.can_output import CanMessages, CanOptions, CanOutput
 from rig.errors import RefusedError
@@ -61,7 +61,7 @@ def playing(path: Path, clock: RealTime | FreeRun, **options: Any) -> Iterator[t
     """A player that waits for one client, at an endpoint of its own."""
     endpoint = free_endpoint()
     with ZenohServer(endpoint, wait=not isinstance(clock, RealTime)) as server:
-        player = Player(Tape([path]), server, clock, wait_for=1, **options)
+        player = Player(Track([path]), server, clock, wait_for=1, **options)
         player.prepare()
         thread = threading.Thread(target=player.run)
         thread.start()
@@ -131,7 +131,7 @@ def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
             # What a bus of this speed could carry does not matter to the virtual one.
             CanOutput(f"virtual:{channel}", both) as output,
         ):
-            player = Player(Tape([path]), output.beside(server), FreeRun())
+            player = Player(Track([path]), output.beside(server), FreeRun())
             player.prepare()
             output.start(paced=False)
             player.run()

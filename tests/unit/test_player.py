@@ -18,8 +18,8 @@ from replays.player import player as player_module
 from replays.player.edit import Edit
 from replays.player.passes import Part
 from replays.player.player import Player
-from replays.player.tape import Tape
 from replays.player.timeline import By, Timeline
+from replays.player.track import Track
 from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError, RefusedError
@@ -47,8 +47,8 @@ def path(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def tape(path: Path) -> Tape:
-    return Tape([path])
+def track(path: Path) -> Track:
+    return Track([path])
 
 
 class Heard:
@@ -80,14 +80,14 @@ class Heard:
         return [wire.decode_block(payload, schema) for payload in self.payloads.get(key, [])]
 
 
-def play(tape: Tape, **options: Any) -> tuple[Heard, dict[str, Any]]:
+def play(track: Track, **options: Any) -> tuple[Heard, dict[str, Any]]:
     """Play to the end with a clock of our own; returns what was heard and the summary."""
     time = FakeTime(oversleep_ns=700_000)
     server = MemoryServer()
     heard = Heard(server, time)
     clock = RealTime(now_ns=time.now_ns, sleep=time.sleep)
     heard.begin_ns = time.ns  # type: ignore[attr-defined]
-    summary = Player(tape, server, clock, **options).run()
+    summary = Player(track, server, clock, **options).run()
     return heard, summary
 
 
@@ -95,13 +95,13 @@ def play(tape: Tape, **options: Any) -> tuple[Heard, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("by", By)
-def test_every_payload_comes_once_and_in_the_order_of_its_key(tape: Tape, by: By) -> None:
-    played = [(item.key, item.payload) for batch in Timeline(tape, by).play(0) for item in batch]
+def test_every_payload_comes_once_and_in_the_order_of_its_key(track: Track, by: By) -> None:
+    played = [(item.key, item.payload) for batch in Timeline(track, by).play(0) for item in batch]
     assert by_key(played) == by_key(stream(BLOCKS))
 
 
-def test_a_block_is_due_at_its_end_and_a_document_at_its_own_time(tape: Tape) -> None:
-    for batch in Timeline(tape).play(0):
+def test_a_block_is_due_at_its_end_and_a_document_at_its_own_time(track: Track) -> None:
+    for batch in Timeline(track).play(0):
         for item in batch:
             if item.block is None:
                 assert item.due_ns == wire.decode_document(item.payload)["tick"] * 1000
@@ -109,13 +109,13 @@ def test_a_block_is_due_at_its_end_and_a_document_at_its_own_time(tape: Tape) ->
                 assert item.due_ns == item.block.tick * 1000 + BLOCK_NS
 
 
-def test_deadlines_by_arrival_are_those_of_the_recorder(tape: Tape) -> None:
-    due = [batch[0].due_ns for batch in Timeline(tape, By.ARRIVAL).play(0)]
+def test_deadlines_by_arrival_are_those_of_the_recorder(track: Track) -> None:
+    due = [batch[0].due_ns for batch in Timeline(track, By.ARRIVAL).play(0)]
     assert np.all(np.diff(due) == 1_000_000)
 
 
 def test_what_was_recorded_key_by_key_is_played_by_its_time(folder: Path) -> None:
-    history = Tape([write_recording(folder / "history.mcap", key_by_key())])
+    history = Track([write_recording(folder / "history.mcap", key_by_key())])
     due: list[int] = []
     played: list[tuple[str, bytes]] = []
     for batch in Timeline(history).play(0):
@@ -126,9 +126,9 @@ def test_what_was_recorded_key_by_key_is_played_by_its_time(folder: Path) -> Non
 
 
 @pytest.mark.parametrize("from_ms", [0, 5, 10, 333])
-def test_a_range_has_the_whole_blocks_inside_it(tape: Tape, from_ms: int) -> None:
+def test_a_range_has_the_whole_blocks_inside_it(track: Track, from_ms: int) -> None:
     to_ms = from_ms + 100
-    played = [item for batch in Timeline(tape).play(from_ms * 1_000_000, to_ms * 1_000_000) for item in batch]
+    played = [item for batch in Timeline(track).play(from_ms * 1_000_000, to_ms * 1_000_000) for item in batch]
     ticks = [item.block.tick for item in played if item.key == PROBES and item.block is not None]
     first = -(-from_ms // 10)
     assert ticks == [10_000 * number for number in range(first, to_ms // 10)]
@@ -159,8 +159,8 @@ def test_chunks_hold_every_message_once_and_tell_their_times(folder: Path, path:
 # A whole play.
 
 
-def test_a_replay_is_the_recording_byte_for_byte(tape: Tape) -> None:
-    heard, summary = play(tape)
+def test_a_replay_is_the_recording_byte_for_byte(track: Track) -> None:
+    heard, summary = play(track)
     assert heard.payloads == by_key(stream(BLOCKS))
     assert summary["reason"] == "completed"
     assert summary["left_out"] == 0
@@ -168,8 +168,8 @@ def test_a_replay_is_the_recording_byte_for_byte(tape: Tape) -> None:
 
 
 @pytest.mark.parametrize("rate", [0.01, 1.0, 1000.0])
-def test_nothing_adds_up_though_every_sleep_is_late(tape: Tape, rate: float) -> None:
-    heard, summary = play(tape, rate=rate)
+def test_nothing_adds_up_though_every_sleep_is_late(track: Track, rate: float) -> None:
+    heard, summary = play(track, rate=rate)
     begin_ns = heard.begin_ns  # type: ignore[attr-defined]
     for (key, payload), at_ns in zip(heard.all, heard.at_ns, strict=True):
         schema = wire.schema_of(key)
@@ -180,14 +180,14 @@ def test_nothing_adds_up_though_every_sleep_is_late(tape: Tape, rate: float) -> 
     assert summary["lateness_ms"]["max"] <= 0.701
 
 
-def test_one_that_cannot_keep_up_says_how_far_it_is_behind(tape: Tape) -> None:
+def test_one_that_cannot_keep_up_says_how_far_it_is_behind(track: Track) -> None:
     for slow_ns, behind in ((0, False), (20_000_000, True)):
         time = FakeTime(oversleep_ns=0)
         server = MemoryServer()
         MemoryClient(server).subscribe(
             PROBES, lambda *_, time=time, slow_ns=slow_ns: setattr(time, "ns", time.ns + slow_ns)
         )
-        player = Player(tape, server, RealTime(now_ns=time.now_ns, sleep=time.sleep))
+        player = Player(track, server, RealTime(now_ns=time.now_ns, sleep=time.sleep))
         begin_ns = time.ns
         summary = player.run()
         late_s = (time.ns - begin_ns - DURATION_NS) / 1e9
@@ -196,9 +196,9 @@ def test_one_that_cannot_keep_up_says_how_far_it_is_behind(tape: Tape) -> None:
         assert any("behind" in text for text in player.status()["warnings"]) == behind
 
 
-def test_documents_are_answered_from_the_file_and_the_status_says_what_it_is(tape: Tape) -> None:
+def test_documents_are_answered_from_the_file_and_the_status_says_what_it_is(track: Track) -> None:
     server = MemoryServer()
-    player = Player(tape, server, FreeRun(), paused=True)
+    player = Player(track, server, FreeRun(), paused=True)
     player.prepare()
     client = MemoryClient(server)
     for key in (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE):
@@ -206,7 +206,7 @@ def test_documents_are_answered_from_the_file_and_the_status_says_what_it_is(tap
     status = wire.decode_document(client.request(wire.STATUS))
     assert status["pace"] == "replay"
     assert status["replay"]["paused"] is True
-    assert status["replay"]["files"] == [str(tape.paths[0])]
+    assert status["replay"]["files"] == [str(track.paths[0])]
     assert "replayed" in status["warnings"][0]
     player.stop()
     player.run()
@@ -217,7 +217,7 @@ def test_a_cut_off_file_is_played_as_far_as_it_goes_and_then_ended(folder: Path,
     short = folder / f"cut-{cut}.mcap"
     data = path.read_bytes()
     short.write_bytes(data[: int(cut * len(data))])
-    heard, summary = play(Tape([short]))
+    heard, summary = play(Track([short]))
     recording, whole = Recording.open(short), by_key(stream(BLOCKS))
     assert 0 < recording.messages[PROBES] < BLOCKS
     for key, payloads in heard.payloads.items():
@@ -234,7 +234,7 @@ def test_parts_are_one_recording(folder: Path) -> None:
     half = next(n for n, (key, _) in enumerate(payloads) if n > len(payloads) / 2 and key == PROBES)
     parts = [write_recording(folder / "a.mcap", payloads[:half]), write_recording(folder / "b.mcap", payloads[half:])]
     for order in (parts, parts[::-1]):
-        heard, _ = play(Tape(order))
+        heard, _ = play(Track(order))
         assert heard.payloads == by_key(payloads)
 
 
@@ -242,7 +242,7 @@ def test_a_cut_off_file_can_be_sought_in(folder: Path, path: Path) -> None:
     short = folder / "killed.mcap"
     data = path.read_bytes()
     short.write_bytes(data[: int(0.97 * len(data))])
-    with running(Tape([short]), paused=True) as (_, heard, console):
+    with running(Track([short]), paused=True) as (_, heard, console):
         for position_s in (0.4, 0.1, 0.5):
             console.seek(position_s)
             console.step_blocks(1)
@@ -252,8 +252,8 @@ def test_a_cut_off_file_can_be_sought_in(folder: Path, path: Path) -> None:
 # Parts, passes, numbers.
 
 
-def test_a_range_begins_and_ends_with_events_of_its_own(tape: Tape) -> None:
-    heard, summary = play(tape, part=Part(from_s=0.2, to_s=0.4))
+def test_a_range_begins_and_ends_with_events_of_its_own(track: Track) -> None:
+    heard, summary = play(track, part=Part(from_s=0.2, to_s=0.4))
     assert [event["event"] for event in heard.events] == ["start", "end"]
     assert heard.events[0]["time_s"] == 0.2
     assert heard.events[0]["pace"] == "replay"
@@ -262,16 +262,16 @@ def test_a_range_begins_and_ends_with_events_of_its_own(tape: Tape) -> None:
     assert summary["played_s"] == pytest.approx(0.2)
 
 
-def test_passes_with_original_numbers_step_back(tape: Tape) -> None:
-    heard, summary = play(tape, part=Part(from_s=0.1, to_s=0.3, loops=3))
+def test_passes_with_original_numbers_step_back(track: Track) -> None:
+    heard, summary = play(track, part=Part(from_s=0.1, to_s=0.3, loops=3))
     assert [block.index for block in heard.blocks()] == 3 * [200 * number for number in range(10, 30)]
     assert [event["event"] for event in heard.events] == ["start", "end"]
     assert summary["replay"]["pass"] == 3
     assert summary["played_s"] == pytest.approx(0.6)
 
 
-def test_whole_passes_keep_every_payload_but_the_ends_between(tape: Tape) -> None:
-    heard, summary = play(tape, part=Part(loops=2))
+def test_whole_passes_keep_every_payload_but_the_ends_between(track: Track) -> None:
+    heard, summary = play(track, part=Part(loops=2))
     once = by_key(stream(BLOCKS))
     for key, payloads in once.items():
         if key != wire.EVENTS:
@@ -280,8 +280,8 @@ def test_whole_passes_keep_every_payload_but_the_ends_between(tape: Tape) -> Non
     assert summary["left_out"] == 1
 
 
-def test_new_numbers_run_on_through_passes_and_belong_together(tape: Tape) -> None:
-    heard, _ = play(tape, part=Part(from_s=0.1, to_s=0.3, start_s=0.2, loops=3), renumber=True)
+def test_new_numbers_run_on_through_passes_and_belong_together(track: Track) -> None:
+    heard, _ = play(track, part=Part(from_s=0.1, to_s=0.3, start_s=0.2, loops=3), renumber=True)
     continuity = wire.Continuity()
     keys = [key for key in heard.payloads if wire.schema_of(key) is not None]
     for key in keys:
@@ -313,38 +313,38 @@ def test_new_numbers_run_on_through_passes_and_belong_together(tape: Tape) -> No
         (Part(loops=0), "loop must be at least 1"),
     ],
 )
-def test_parts_that_there_are_not_are_refused(tape: Tape, part: Part, message: str) -> None:
+def test_parts_that_there_are_not_are_refused(track: Track, part: Part, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Player(tape, MemoryServer(), FreeRun(), part=part)
+        Player(track, MemoryServer(), FreeRun(), part=part)
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.009, 1001.0, float("nan"), True, "1"])
-def test_rates_that_there_are_not_are_refused(tape: Tape, rate: Any) -> None:
+def test_rates_that_there_are_not_are_refused(track: Track, rate: Any) -> None:
     with pytest.raises(InputError, match=r"rate must be a number of 0\.01 to 1000"):
-        Player(tape, MemoryServer(), FreeRun(), rate=rate)
+        Player(track, MemoryServer(), FreeRun(), rate=rate)
 
 
 # Changes.
 
 
-def edit(tape: Tape, **options: Any) -> Edit:
-    return Edit(tape.documents[wire.CATALOGUE], **options)
+def edit(track: Track, **options: Any) -> Edit:
+    return Edit(track.documents[wire.CATALOGUE], **options)
 
 
-def test_a_key_goes_elsewhere_with_the_same_payloads(tape: Tape) -> None:
+def test_a_key_goes_elsewhere_with_the_same_payloads(track: Track) -> None:
     new = wire.sensor_key("probes2")
-    heard, _ = play(tape, edit=edit(tape, keys={PROBES: new}))
+    heard, _ = play(track, edit=edit(track, keys={PROBES: new}))
     assert PROBES not in heard.payloads
     assert heard.payloads[new] == by_key(stream(BLOCKS))[PROBES]
     assert heard.events[-1]["rows"][new] == 200 * BLOCKS
 
 
-def test_channels_change_with_their_calibration(tape: Tape) -> None:
-    table = ChannelTable.model_validate(tape.documents[wire.CATALOGUE]["table"])
+def test_channels_change_with_their_calibration(track: Track) -> None:
+    table = ChannelTable.model_validate(track.documents[wire.CATALOGUE]["table"])
     first, second = table.groups["probes"].names[:2]
     force = table.groups["forces"].names[1]
-    changed = edit(tape, channels=[second, first, force], names={first: second, second: first})
-    heard, summary = play(tape, edit=changed)
+    changed = edit(track, channels=[second, first, force], names={first: second, second: first})
+    heard, summary = play(track, edit=changed)
     now = ChannelTable.model_validate(changed.catalogue["table"])
     assert {name: group.names for name, group in now.groups.items()} == {"probes": (first, second), "forces": (force,)}
     assert now.channels[first].sensitivity_v == table.channels[second].sensitivity_v
@@ -356,11 +356,11 @@ def test_channels_change_with_their_calibration(tape: Tape) -> None:
     assert summary["left_out"] == (len(table.groups) - 2) * BLOCKS
 
 
-def test_the_truth_can_stay_out(tape: Tape) -> None:
-    heard, _ = play(tape, edit=edit(tape, truth=False))
+def test_the_truth_can_stay_out(track: Track) -> None:
+    heard, _ = play(track, edit=edit(track, truth=False))
     whole = by_key(stream(BLOCKS))
     assert {key for key in whole if key not in heard.payloads} == {key for key in whole if key.startswith(wire.TRUTH)}
-    assert edit(tape, truth=False).catalogue["truth"] == {}
+    assert edit(track, truth=False).catalogue["truth"] == {}
 
 
 @pytest.mark.parametrize(
@@ -375,14 +375,14 @@ def test_the_truth_can_stay_out(tape: Tape) -> None:
         ({"names": {"disk_x": "disk_y"}}, "rename must be to names that no other channel has"),
     ],
 )
-def test_changes_that_make_no_sense_are_refused(tape: Tape, options: dict[str, Any], message: str) -> None:
+def test_changes_that_make_no_sense_are_refused(track: Track, options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        edit(tape, **options)
+        edit(track, **options)
 
 
-def test_swapped_keys_are_no_clash(tape: Tape) -> None:
+def test_swapped_keys_are_no_clash(track: Track) -> None:
     forces = wire.sensor_key("forces")
-    heard, _ = play(tape, edit=edit(tape, keys={PROBES: forces, forces: PROBES}))
+    heard, _ = play(track, edit=edit(track, keys={PROBES: forces, forces: PROBES}))
     assert heard.payloads[forces] == by_key(stream(BLOCKS))[PROBES]
 
 
@@ -390,11 +390,11 @@ def test_swapped_keys_are_no_clash(tape: Tape) -> None:
 
 
 @contextmanager
-def running(tape: Tape, **options: Any) -> Iterator[tuple[Player, Heard, Console]]:
+def running(track: Track, **options: Any) -> Iterator[tuple[Player, Heard, Console]]:
     server = MemoryServer()
     heard = Heard(server)
     clock = options.pop("clock", None) or RealTime()
-    player = Player(tape, server, clock, **options)
+    player = Player(track, server, clock, **options)
     player.prepare()
     thread = threading.Thread(target=lambda: heard.summary.update(player.run()))
     thread.start()
@@ -406,8 +406,8 @@ def running(tape: Tape, **options: Any) -> Iterator[tuple[Player, Heard, Console
     assert not thread.is_alive()
 
 
-def test_commands_of_a_rig_are_refused(tape: Tape) -> None:
-    with running(tape, paused=True) as (_, heard, console):
+def test_commands_of_a_rig_are_refused(track: Track) -> None:
+    with running(track, paused=True) as (_, heard, console):
         for command in (console.hammer, console.release, lambda: console.speed(5.0)):
             with pytest.raises(RefusedError, match="this is a recording that is replayed, which takes no"):
                 command()
@@ -424,8 +424,8 @@ def test_a_simulator_refuses_the_commands_of_a_replay() -> None:
         assert f"{name} is for a recording that is replayed" in reply["error"]
 
 
-def test_steps_while_paused(tape: Tape) -> None:
-    with running(tape, paused=True) as (player, heard, console):
+def test_steps_while_paused(track: Track) -> None:
+    with running(track, paused=True) as (player, heard, console):
         assert console.step_blocks(2).time_s == pytest.approx(0.02)
         assert len(heard.blocks()) == 2
         assert console.step(25_000).time_s == pytest.approx(0.04), "the last whole block"
@@ -438,8 +438,8 @@ def test_steps_while_paused(tape: Tape) -> None:
             assert b'"accepted":false' in heard.client.request(wire.command_key("step"), request)
 
 
-def test_a_seek_goes_on_from_there(tape: Tape) -> None:
-    with running(tape, paused=True) as (_, heard, console):
+def test_a_seek_goes_on_from_there(track: Track) -> None:
+    with running(track, paused=True) as (_, heard, console):
         console.step_blocks(1)
         assert console.seek(0.4).time_s == pytest.approx(0.4)
         console.step_blocks(1)
@@ -452,8 +452,8 @@ def test_a_seek_goes_on_from_there(tape: Tape) -> None:
     assert heard.summary["played_s"] == pytest.approx(0.03), "what was jumped over was not played"
 
 
-def test_a_seek_with_new_numbers_leaves_no_gap(tape: Tape) -> None:
-    with running(tape, paused=True, renumber=True) as (_, heard, console):
+def test_a_seek_with_new_numbers_leaves_no_gap(track: Track) -> None:
+    with running(track, paused=True, renumber=True) as (_, heard, console):
         for position_s in (0.4, 0.1, 0.5):
             console.step_blocks(3)
             console.seek(position_s)
@@ -463,8 +463,8 @@ def test_a_seek_with_new_numbers_leaves_no_gap(tape: Tape) -> None:
         assert [block.tick for block in blocks] == [10_000 * number for number in range(10)]
 
 
-def test_pause_resume_rate_and_the_end(tape: Tape) -> None:
-    with running(tape, rate=0.01) as (player, heard, console):
+def test_pause_resume_rate_and_the_end(track: Track) -> None:
+    with running(track, rate=0.01) as (player, heard, console):
         console.pause()
         assert console.pause().command == "pause", "twice is no error"
         held = len(heard.all)
@@ -480,8 +480,8 @@ def test_pause_resume_rate_and_the_end(tape: Tape) -> None:
         assert heard.payloads == by_key(stream(BLOCKS))
 
 
-def test_a_stop_ends_the_stream_well(tape: Tape) -> None:
-    with running(tape, paused=True) as (_, heard, console):
+def test_a_stop_ends_the_stream_well(track: Track) -> None:
+    with running(track, paused=True) as (_, heard, console):
         console.step_blocks(3)
         console.stop()
         until(lambda: heard.events[-1]["event"] == "end")
@@ -489,9 +489,9 @@ def test_a_stop_ends_the_stream_well(tape: Tape) -> None:
     assert heard.events[-1]["rows"][PROBES] == 600
 
 
-def test_a_burst_waits_for_what_clients_report(tape: Tape, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_burst_waits_for_what_clients_report(track: Track, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(player_module, "_AHEAD_BLOCKS", 10)
-    with running(tape, clock=FreeRun(), paused=True) as (_, heard, console):
+    with running(track, clock=FreeRun(), paused=True) as (_, heard, console):
         client = heard.client
         client.report(f"{wire.CLIENTS}/slow", b'{"received_index": 0}')
         console.resume()
@@ -504,8 +504,8 @@ def test_a_burst_waits_for_what_clients_report(tape: Tape, monkeypatch: pytest.M
         until(lambda: len(heard.blocks()) == BLOCKS)
 
 
-def test_a_play_begins_when_all_are_there_that_it_waits_for(tape: Tape) -> None:
-    with running(tape, clock=FreeRun(), wait_for=2) as (player, heard, console):
+def test_a_play_begins_when_all_are_there_that_it_waits_for(track: Track) -> None:
+    with running(track, clock=FreeRun(), wait_for=2) as (player, heard, console):
         play = player.status()["replay"]
         assert (play["waiting_for"], play["paused"]) == (2, True)
         heard.client.report(f"{wire.CLIENTS}/a", b'{"received_index": null}')
@@ -519,8 +519,8 @@ def test_a_play_begins_when_all_are_there_that_it_waits_for(tape: Tape) -> None:
 
 
 @pytest.mark.parametrize("ends", ["resume", "pause", "stop"])
-def test_waiting_is_ended_by_commands(tape: Tape, ends: str) -> None:
-    with running(tape, rate=0.01, wait_for=1) as (player, heard, console):
+def test_waiting_is_ended_by_commands(track: Track, ends: str) -> None:
+    with running(track, rate=0.01, wait_for=1) as (player, heard, console):
         getattr(console, ends)()
         assert player.status()["replay"]["paused"] is (ends != "resume")
         if ends != "stop":
@@ -530,11 +530,11 @@ def test_waiting_is_ended_by_commands(tape: Tape, ends: str) -> None:
     assert heard.blocks() == []
 
 
-def test_who_does_not_come_is_not_waited_for_for_ever(tape: Tape) -> None:
+def test_who_does_not_come_is_not_waited_for_for_ever(track: Track) -> None:
     server = MemoryServer()
     heard = Heard(server)
     with pytest.raises(RefusedError, match=r"0 of 1 clients were there after 0\.05 s"):
-        Player(tape, server, FreeRun(), wait_for=1, wait_s=0.05).run()
+        Player(track, server, FreeRun(), wait_for=1, wait_s=0.05).run()
     assert [event["reason"] for event in heard.events] == ["failed: 0 of 1 clients were there after 0.05 s"]
 
 
@@ -542,9 +542,9 @@ def test_the_scene_tells_latecomers_the_commands_so_far(folder: Path) -> None:
     command = {"event": "command", "id": 1, "tick": 200_000, "time_s": 0.2, "command": "hammer", "request": {}}
     payloads = list(stream(BLOCKS))
     payloads.insert(len(payloads) // 2, (wire.EVENTS, wire.encode_document(command)))
-    tape = Tape([write_recording(folder / "command.mcap", payloads)])
-    with running(tape, paused=True) as (_, heard, console):
-        for position_s, taken in ((0.1, []), (0.3, [{name: command[name] for name in tape.commands[0]}])):
+    track = Track([write_recording(folder / "command.mcap", payloads)])
+    with running(track, paused=True) as (_, heard, console):
+        for position_s, taken in ((0.1, []), (0.3, [{name: command[name] for name in track.commands[0]}])):
             console.seek(position_s)
             scene = wire.decode_document(heard.client.request(wire.SCENE))
             assert scene.get("taken", []) == taken
@@ -556,7 +556,7 @@ def test_the_scene_tells_latecomers_the_commands_so_far(folder: Path) -> None:
 def test_an_end_that_was_none_stays_where_it_was(folder: Path) -> None:
     late = {"event": "warning", "tick": 600_000, "time_s": 0.6, "text": "went on"}
     payloads = [*stream(BLOCKS), (wire.EVENTS, wire.encode_document(late))]
-    heard, _ = play(Tape([write_recording(folder / "on.mcap", payloads)]))
+    heard, _ = play(Track([write_recording(folder / "on.mcap", payloads)]))
     assert [event["event"] for event in heard.events] == ["start", "end", "warning", "end"]
     assert heard.payloads[wire.EVENTS][:3] == by_key(payloads)[wire.EVENTS]
 
@@ -566,7 +566,7 @@ def test_what_is_told_late_of_an_earlier_time_keeps_its_place(folder: Path) -> N
     payloads = list(stream(BLOCKS))
     for number, event in enumerate(told):
         payloads.insert(len(payloads) // 2 + number, (wire.EVENTS, wire.encode_document(event)))
-    heard, _ = play(Tape([write_recording(folder / "late.mcap", payloads)]))
+    heard, _ = play(Track([write_recording(folder / "late.mcap", payloads)]))
     assert [event.get("tick") for event in heard.events] == [0, 300_000, 295_000, 301_000, 600_000]
 
 
@@ -574,7 +574,7 @@ def test_a_status_that_the_run_has_ended_comes_after_the_end(folder: Path) -> No
     ended = wire.encode_document({"tick": 600_000, "time_s": 0.6, "state": "ended"})
     payloads = list(stream(BLOCKS))
     payloads.insert(len(payloads) - 1, (wire.STATUS, ended))
-    heard, _ = play(Tape([write_recording(folder / "status.mcap", payloads)]))
+    heard, _ = play(Track([write_recording(folder / "status.mcap", payloads)]))
     assert [key for key, _ in heard.all[-2:]] == [wire.EVENTS, wire.STATUS]
     assert heard.payloads == by_key(payloads)
 
@@ -585,12 +585,12 @@ def test_a_file_that_is_damaged_while_it_is_played_ends_the_stream_and_says_so(f
     damaged.write_bytes(data)
     server = MemoryServer()
     heard = Heard(server)
-    player = Player(Tape([damaged]), server, FreeRun())
-    chunk = Tape([path]).chunks[10]
+    player = Player(Track([damaged]), server, FreeRun())
+    chunk = Track([path]).chunks[10]
     data[chunk.offset + chunk.length // 2] ^= 0xFF
     damaged.write_bytes(data)
     with pytest.raises(InputError, match="file must be an intact recording"):
-        Tape([damaged])
+        Track([damaged])
     with pytest.raises(InputError, match="file must be an intact recording"):
         player.run()
     assert heard.events[-1]["event"] == "end"

@@ -33,6 +33,11 @@ class Reference:
     error: float
     independent: bool
 
+    def error_until(self, time_s: float) -> float:
+        """The error bar of the part up to a time from the window's start [s]."""
+        part = self.solution.times <= time_s
+        return scaled_error(self.solution.states[part], self.second.states[part])
+
 
 def find_reference(problem: Problem, *, quick: bool = False, budget_s: float = 300.0) -> Reference | None:
     """Solve a problem twice for reference.

@@ -21,10 +21,9 @@ HOUSE_FLOW = 32
 """Numbers of a flow of the houses: its horizontal and vertical block on (inner, rate, outer, rate), (4, 4) each."""
 
 _FALL_X, _FALL_Y, _PUSH, _RUSH, _DECAY, _LAG = 0, 4, 8, 9, 10, 11
-HALF, PER_STEP = 12, 13
+HALF = 12
 """Columns of the flows of shaft and drive: a block (2, 2) of each lateral direction; what gravity or the rest adds to
-uy and py; decay of the distance to the drive's speed, and its integral; the flow's time, half a step [s]; one over
-the step [1/s]."""
+uy and py; decay of the distance to the drive's speed, and its integral; the flow's time, half a step [s]."""
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -133,8 +132,8 @@ def house_flows(constants, grid_step, flows):
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def shaft_flows(plant, engaged, grid_step):
-    """Flows of shaft and drive for half a step of every level, shape (LEVELS, 14); `grid_step` in s."""
-    flows = np.empty((LEVELS, 14))
+    """Flows of shaft and drive for half a step of every level, shape (LEVELS, 13); `grid_step` in s."""
+    flows = np.empty((LEVELS, 13))
     for level in range(LEVELS):
         f = flows[level]
         t = 0.5 * 2.0 ** (level - GRID) * grid_step
@@ -149,7 +148,6 @@ def shaft_flows(plant, engaged, grid_step):
         f[_DECAY] = math.exp(-plant.drive_rate * t)
         f[_LAG] = (1.0 - f[_DECAY]) / plant.drive_rate if plant.drive_rate > 0.0 else t
         f[HALF] = t
-        f[PER_STEP] = 0.5 / t
     return flows
 
 
@@ -158,7 +156,7 @@ def flow(shaft_table, house_table, level, inner, axis, w, theta, aim, houses):
     """The exact flow over half a step of a level.
 
     Args:
-        shaft_table: Flows of shaft and drive, shape (LEVELS, 14).
+        shaft_table: Flows of shaft and drive, shape (LEVELS, 13).
         house_table: Flows of the houses, shape (LEVELS, HOUSE_FLOW).
         level: Of the step.
         inner: Whether the inner house moves.

@@ -28,7 +28,7 @@ class Message(NamedTuple):
     payload: bytes
 
 
-class Tape:
+class Track:
     """What a rig published, from one recording or from the parts of one.
 
     Only the positions of chunks are kept in memory. What the recorder added of its own is passed over.

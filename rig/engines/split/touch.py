@@ -1,0 +1,232 @@
+"""The contact in a step of `rig.engines.split`: its beginning, its impulse in a kick, and its end."""
+
+from __future__ import annotations
+
+from rig.engines.memory import CLAMPS, CONTACT_STEPS, CONTACTS, FLOORED, ONSET, PEAK_FORCE
+from rig.engines.peak import peak
+from rig.engines.split.impulse import (
+    Impulse,
+    Law,
+    Push,
+    compliant_push,
+    crossing,
+    end_impulse,
+    flow_swerve,
+    friction_impulse,
+    law_at,
+    mobility_of,
+    onset_error,
+)
+from rig.engines.split.inner_motion import Houses, inlined
+from rig.engines.split.levels import contact_level, roughness
+from rig.engines.split.place import BEFORE, BEFORE_SPAN, BOUNCE, LAST, LAST_STEP, SETTLED
+from rig.engines.split.state import Touch
+from rig.kernels import signals as S
+from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
+
+_SLOP = 200.0
+"""Depth that a rigid ring keeps in lasting contact, over the step squared [m/s^2]: a chord of the arc stays inside."""
+_RETURN = 0.1
+"""Part of a depth beyond it that is taken back in a step."""
+
+
+@inlined
+def begin_contact(constants, memory, touch, motion, h):
+    """Latch the onset speed of a contact that has begun since the last kick; what this kick misses of it [N s].
+
+    Args:
+        constants: Of the model.
+        memory: Of the engine.
+        touch: As the last kick left it.
+        motion: Now.
+        h: Step [s].
+    """
+    contact = constants.contact
+    speed, since = motion.rate, 0.5
+    if touch.depth < 0.0 and touch.ago > 0.0:
+        part, speed = crossing(touch.depth, touch.rate, motion.depth, motion.rate, touch.ago)
+        since = (1.0 - part) * touch.ago / h
+    memory[CONTACTS] += 1.0
+    if speed < contact.speed_floor:
+        memory[FLOORED] += 1.0
+        speed = contact.speed_floor
+    memory[ONSET] = speed
+    memory[BEFORE] = memory[LAST] = memory[BEFORE_SPAN] = 0.0
+    memory[SETTLED], memory[BOUNCE] = 0.0, motion.rate
+    if not constants.levels.compliant or motion.rate <= 0.0:
+        return 0.0
+    return onset_error(contact, motion.rate, since, speed, h)
+
+
+@inlined
+def record_force(memory, force, h):
+    """Follow the largest normal force [N]: this is the one in the middle of the kick of a step h [s]."""
+    span = 0.5 * (memory[LAST_STEP] + h)
+    largest = peak(memory[BEFORE], memory[BEFORE_SPAN], memory[LAST], span, force)
+    memory[PEAK_FORCE] = max(memory[PEAK_FORCE], largest)
+    memory[BEFORE], memory[LAST], memory[BEFORE_SPAN], memory[LAST_STEP] = memory[LAST], force, span, h
+
+
+@inlined
+def rigid_push(contact, motion, w, begins, rate_before, h):
+    """Normal impulse of a rigid contact: Newton's law at an onset, Moreau's in lasting contact.
+
+    The latter leaves no speed in the mean of a step.
+    """
+    goal = -0.5 * (motion.rate - rate_before) - _RETURN * (motion.depth - _SLOP * h * h) / h
+    if begins:
+        goal = -contact.restitution * motion.rate if motion.rate > contact.speed_floor else 0.0
+    return Push(max(0.0, (motion.rate - goal) / w.nn), 0.0, 0.0, w.nt / w.nn, 0.0)
+
+
+@inlined
+def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, touch, missed, step):
+    """The contact's impulse over a kick, booked in memory and ledger.
+
+    Args:
+        constants: Of the model.
+        call: What stays through the call.
+        memory: Of the engine.
+        ledger: Integrals since the last row, shape (N_VECTOR,).
+        axis: Of the shaft.
+        houses: Of the stator.
+        motion: Of the shaft against the ring, halfway through what is smooth.
+        spin: w [rad/s].
+        touch: As the last kick left it; in FLIGHT at an onset.
+        missed: What the kick misses of an onset [N s].
+        step: At hand.
+
+    Returns:
+        Impulse, and the contact after it.
+    """
+    plant, h = call.plant, step.h
+    contact, house = constants.contact, constants.house
+    compliant, inner = constants.levels.compliant, constants.levels.inner_house
+    nx, ny, per_distance, depth, rate, lateral = motion
+    w = mobility_of(plant, constants.levels.euler, axis, nx, ny)
+    swerve = 0.0
+    if compliant:
+        law = law_at(contact, depth, touch.factor)
+        swerve = flow_swerve(constants, plant, axis, houses, motion)
+        push = compliant_push(law, w, rate, swerve, missed, h)
+    else:
+        law = Law(0.0, 0.0, 0.0, 0.0)
+        push = rigid_push(contact, motion, w, touch.phase == FLIGHT, touch.rate, h)
+    jn, shift = push.jn, push.shift
+
+    # Rolling holds along the arc, not at the corners of the polygon that the kicks make of it.
+    sliding = lateral + constants.shaft.radius * spin + lateral * (1.0 / 12.0) * h * jn * w.nn * per_distance
+    jt, wanted_jt = friction_impulse(w, jn, plant.friction * jn, sliding, touch.slid)
+    if jn > 0.0:
+        jn = max(0.0, jn - push.back * jt)
+    elif compliant:
+        memory[CLAMPS] += 1.0
+    phase = ROLLING
+    if jt != wanted_jt:
+        phase = FORWARD if wanted_jt > 0.0 else BACKWARD
+    if plant.friction == 0.0:
+        phase = FORWARD if sliding > 0.0 else BACKWARD
+    slid = sliding - w.tt * jt - w.nt * jn
+    rate_after = rate - w.nn * jn - w.nt * jt
+    rate_mean = rate - 0.5 * (w.nn * jn + w.nt * jt)
+    jx, jy = -jn * nx + jt * ny, -jn * ny - jt * nx
+    force_x, force_y = jx, jy
+    loss = (jn - push.held) * rate_mean
+    if shift != 0.0:
+        aside = shift * lateral * per_distance
+        jx -= aside * ny
+        jy += aside * nx
+        # It comes after friction's clamp: the next target makes up for it, and takes it for no flow's.
+        slid -= (w.tt - plant.spin_mobility) * aside
+        springs = 0.0
+        if inner:
+            beam = house.inner_beam_stiffness * (houses.x0 - houses.x2)
+            pair = house.pair_stiffness_vertical * (houses.y0 - houses.y2)
+            springs = shift * plant.per_inner * (beam * nx + pair * ny)
+            ledger[S.HOUSE_LOSS] += springs
+        loss += law.elastic * w.nn * shift - aside * lateral - springs
+    ledger[S.CONTACT_LOSS] += loss
+    ledger[S.FRICTION_LOSS] += jt * 0.5 * (sliding + slid)
+    ledger[S.GAP_WORK] += contact.gap_counts_outer * (jx * houses.x3 + jy * houses.y3)
+    ledger[S.CONTACT_IMPULSE] += jn
+    memory[CONTACT_STEPS] += 1.0
+
+    # A rigid contact is always calm, and its force no function of time.
+    rough, calm = False, True
+    cx = cy = dcx = dcy = 0.0
+    if compliant:
+        record_force(memory, max(0.0, law.elastic + law.damping * rate_mean), h)
+        change = (rate_mean - memory[BOUNCE]) * step.per_h
+        memory[BOUNCE] = rate_mean
+        rough, calm = roughness(touch.wanted, rate_mean, change, law.slope * w.nn, push.taken)
+        cx, cy = force_x * step.per_h, force_y * step.per_h
+        growth, turn = law.relative * rate_mean, lateral * per_distance
+        swerve *= law.damping
+        dcx, dcy = growth * cx - turn * cy - swerve * nx, growth * cy + turn * cx - swerve * ny
+    wanted = contact_level(memory, touch.wanted, rough, calm, step.end)
+    after = Touch(phase, slid, motion.depth, rate_after, 0.0, wanted, touch.factor)
+    return Impulse(jx, jy, jt, shift * nx, shift * ny, cx, cy, dcx, dcy), after
+
+
+@inlined
+def end_contact(constants, plant, ledger, touch, motion, onset_speed, h):
+    """Impulse that makes up for what the last kick missed of a contact that has ended since.
+
+    Args:
+        constants: Of the model.
+        plant: Of this call.
+        ledger: Integrals since the last row, shape (N_VECTOR,).
+        touch: As the last kick left it.
+        motion: Now.
+        onset_speed: Of the contact [m/s].
+        h: Step [s].
+    """
+    jn = jt = 0.0
+    if constants.levels.compliant and touch.depth > 0.0:
+        part, speed = crossing(touch.depth, touch.rate, motion.depth, motion.rate, touch.ago)
+        jn = end_impulse(constants.contact, part, speed, onset_speed, touch.ago, h)
+        if touch.phase == FORWARD:
+            jt = plant.friction * jn
+        elif touch.phase == BACKWARD:
+            jt = -plant.friction * jn
+        ledger[S.CONTACT_IMPULSE] += jn
+    jx, jy = -jn * motion.nx + jt * motion.ny, -jn * motion.ny - jt * motion.nx
+    return Impulse(jx, jy, jt, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@inlined
+def _loose(displacement, stiffness, preload):
+    """What a pair of transducers pushes less than its linear spring, once one has lost its preload [N]."""
+    change = 0.5 * stiffness * displacement
+    if abs(change) <= preload:
+        return 0.0
+    return 2.0 * change - (max(0.0, preload + change) - max(0.0, preload - change))
+
+
+@inlined
+def house_kick(constants, plant, ledger, houses, impulse, h):
+    """The houses after a kick of the contact's impulse on the inner one, and of transducers that have come loose.
+
+    Returns:
+        Houses, and whether a transducer is loose or nearly so.
+    """
+    house = constants.house
+    x0, x1, x2, x3, y0, y1, y2, y3 = houses
+    per_inner, per_outer = plant.per_inner, plant.per_outer
+    fx, fy, work = -impulse.jx, -impulse.jy, 0.0
+    x0 += impulse.shift_x * per_inner
+    y0 += impulse.shift_y * per_inner
+    rise = y0 - y2
+    if abs(rise) > plant.loose_v:
+        slack = h * _loose(rise, house.pair_stiffness_vertical, house.preload)
+        fy += slack
+        work -= slack * (y3 - 0.5 * slack * per_outer)
+        y3 -= slack * per_outer
+    if abs(x2) > plant.loose_h:
+        slack = h * _loose(x2, house.pair_stiffness_horizontal, house.preload)
+        work += slack * (x3 + 0.5 * slack * per_outer)
+        x3 += slack * per_outer
+    gx, gy = fx * per_inner, fy * per_inner
+    ledger[S.HOUSE_LOSS] += work + fx * (x1 + 0.5 * gx) + fy * (y1 + 0.5 * gy)
+    near = abs(rise) > 0.8 * plant.loose_v or abs(x2) > 0.8 * plant.loose_h
+    return Houses(x0, x1 + gx, x2, x3, y0, y1 + gy, y2, y3), near
