@@ -135,6 +135,27 @@ class Daq:
 
     Raises:
         InputError: There is no such channel or rate.
+
+    Example:
+        Of a rig that runs: `Daq.open("zenoh:127.0.0.1:7462", channels=["P_E"])`. Here of a source of our own:
+
+        >>> class Rows:
+        ...     def streams(self):
+        ...         return {"forces": ["P_E", "P_N"]}
+        ...     def start(self, streams, rate_hz, on_samples, on_end):
+        ...         self.on_samples, self.on_end = on_samples, on_end
+        ...         return 1000.0
+        ...     def taken(self, index, *, room, lost): ...
+        ...     def close(self): ...
+        >>> source = Rows()
+        >>> with Daq(source, channels=["P_N"]) as daq:
+        ...     values = np.array([[3000.0, 2990.0], [3001.0, 2991.0], [3002.0, 2992.0]])
+        ...     source.on_samples("forces", Samples(0, 0, 1000.0, 1e6, ("P_E", "P_N"), ("N", "N"), values))
+        ...     source.on_end("forces", "completed")
+        ...     for samples in daq.blocks(2):
+        ...         print(samples.times_s, samples["P_N"], samples.gap)
+        [0.    0.001] [2990. 2991.] 0
+        [0.002] [2992.] 0
     """
 
     def __init__(

@@ -29,6 +29,14 @@ class Recording:
         damaged, unchecked, messages: As in `RecordingFile`, of all files.
         path, catalogue, table, parameters, scene, attachments: The same of the first file.
         metadata: Metadata records by name: `rig` (start), `end` (closing counts of the last file, only if complete).
+
+    Example:
+        >>> recording = Recording.open("replays/sessions/hammer-5.2.mcap")
+        >>> forces = recording.samples("forces")
+        >>> forces.names, forces.rate_hz, len(forces.times_s)
+        (('P_N', 'P_S', 'P_E', 'P_W'), 5000.0, 3000)
+        >>> f"{forces.column('P_E')[0]:.0f} N", [event["event"] for event in recording.events]
+        ('3000 N', ['start', 'hammer', 'end'])
     """
 
     def __init__(self, parts: tuple[RecordingFile, ...], surveys: tuple[Survey, ...] = ()) -> None:

@@ -1,5 +1,7 @@
 """The family of normal contact laws, each resolved to the four numbers that the kernels take.
 
+It is long because all laws stand here, each with its formula and source.
+
 F_n = K delta^n (1 + c delta'/v0) + D delta', clamped at 0 (`rig.kernels.contact.normal_force`). A stiffness law gives K
 and n, a damping law c (and D, for the one without memory). Stiffness laws that are no power of delta are fitted over
 the rig's working range, and the fit says how far off it is.
@@ -140,6 +142,10 @@ def restitution_factor(restitution: float) -> float:
 
     Raises:
         InputError: e is below 0.04, where the factor comes within rounding of its pole at 1/e, or above 1.
+
+    Example:
+        >>> round(restitution_factor(0.9), 4)
+        0.1665
     """
     if not 0.04 <= restitution <= 1.0:
         raise InputError("contact.restitution", "from 0.04 to 1", restitution)
@@ -162,6 +168,10 @@ def returned_restitution(factor: float) -> float:
 
     Args:
         factor: c [1], from 0.
+
+    Example:
+        >>> round(returned_restitution(restitution_factor(0.9)), 12)
+        0.9
     """
     if factor < _SMALL:
         return 1.0 - 2.0 / 3.0 * factor * (1.0 - 2.0 / 3.0 * factor)
@@ -184,6 +194,10 @@ def linear_damping_ratio(restitution: float) -> float:
 
     Args:
         restitution: e, above 0 and up to 1.
+
+    Example:
+        >>> round(linear_damping_ratio(0.9), 5)
+        0.03427
     """
     if restitution == 1.0:
         return 0.0
@@ -356,6 +370,12 @@ def fit_power(name: str, pair: ContactPair) -> PowerFit:
 
     Raises:
         InputError: The law does not hold for this pair.
+
+    Example:
+        >>> pair = ContactPair(shaft_radius=0.0125, clearance=0.9e-3, width=0.011, modulus=1e11)
+        >>> fit = fit_power("johnson-cylinder", pair)
+        >>> f"F = {fit.stiffness:.2e} delta^{fit.exponent:.2f}, to {100.0 * fit.error:.0f} %"
+        'F = 1.69e+09 delta^1.11, to 3 %'
     """
     law = STIFFNESS[name]
     low, high = WORKING_FORCES
@@ -463,6 +483,12 @@ def free_impact(law: NormalLaw, *, mass: float, speed: float, speed_floor: float
         mass: Reduced mass of the two bodies [kg].
         speed: Approach speed [m/s].
         speed_floor: Floor of v0 [m/s].
+
+    Example:
+        >>> law = NormalLaw(2.86e10, exponent=1.5, damping_factor=restitution_factor(0.9), viscous_damping=0.0)
+        >>> impact = free_impact(law, mass=1.0, speed=0.145)
+        >>> f"e = {impact.restitution:.3f}, {impact.peak_force:.0f} N, {1e3 * impact.duration:.3f} ms"
+        'e = 0.900, 1628 N, 0.315 ms'
     """
     from scipy.integrate import solve_ivp
 

@@ -106,6 +106,11 @@ def field_sum_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry, *, p
 
     Returns:
         Force [N], shape (n, 2).
+
+    Example:
+        >>> table_1 = MagnetGeometry(8, 0.0169, 0.006, 0.008, 0.025, 7.05e5)
+        >>> field_sum_force(np.array([1e-3]), np.array([0.0]), table_1).round(3) + 0.0
+        array([[-1.678,  0.   ]])
     """
     current = geometry.magnetisation * geometry.length
     around = 2.0 * np.pi * np.arange(points) / points
@@ -172,6 +177,11 @@ def pair_force(distance: float, geometry: MagnetGeometry, *, nodes: int = 24) ->
 
     Returns:
         Force [N].
+
+    Example:
+        >>> table_1 = MagnetGeometry(8, 0.0169, 0.006, 0.008, 0.025, 7.05e5)
+        >>> round(pair_force(0.025, table_1), 3)
+        1.867
     """
     root, weight = _gauss(nodes)
     r = geometry.shaft_magnet_radius * (root[:, None] + 1.0) / 2.0
@@ -199,6 +209,11 @@ def cylinder_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry) -> np
 
     Raises:
         InputError: A displacement beyond the reach.
+
+    Example:
+        >>> table_1 = MagnetGeometry(8, 0.0169, 0.006, 0.008, 0.025, 7.05e5)
+        >>> cylinder_force(np.array([1e-3]), np.array([0.0]), table_1).round(3) + 0.0
+        array([[-0.738,  0.   ]])
     """
     farthest = float(np.max(np.hypot(x, y), initial=0.0))
     if farthest > geometry.reach * (1.0 + 1e-9):

@@ -111,6 +111,16 @@ def simulate(
     Raises:
         InputError: The duration is none that a scene can have.
         SimulationError: The state became non-finite.
+
+    Example:
+        >>> from rig import load_scene, simulate
+        >>> run = simulate(load_scene("hammer", {"drive.speed_hz": 5.2}), duration_s=0.05)
+        >>> [event["event"] for event in run.events]
+        ['hammer']
+        >>> f"{run['normal_force'].max():.0e} {run.unit('normal_force')}"  # in the first impacts
+        '3e+03 N'
+        >>> run.samples["disk_x"].shape, run.sample_unit("disk_x")
+        ((1000,), 'mm')
     """
     if duration_s is not None:
         scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})

@@ -30,6 +30,12 @@ def whirl_frequency(times_s: np.ndarray, x: np.ndarray, y: np.ndarray, *, about:
         x: Horizontal, shape (n,).
         y: Vertical, shape (n,).
         about: The centre, in the unit of x; None: the orbit's own mean.
+
+    Example:
+        >>> times_s = np.arange(2000) / 20_000.0
+        >>> angle = -2.0 * np.pi * 81.7 * times_s
+        >>> round(whirl_frequency(times_s, np.cos(angle), np.sin(angle)), 1)  # backward
+        -81.7
     """
     centre = complex(x.mean(), y.mean()) if about is None else about
     angle = phase(x - centre.real, y - centre.imag)
@@ -76,6 +82,12 @@ def full_spectrum(
 
     Returns:
         Frequencies [Hz], ascending, and amplitudes in the unit of x, each shape (lines,).
+
+    Example:
+        >>> angle = -2.0 * np.pi * 80.0 * np.arange(2000) / 20_000.0
+        >>> frequency, amplitude = full_spectrum(0.9 * np.cos(angle), 0.9 * np.sin(angle), 20_000.0)
+        >>> f"{amplitude.max():.2f} at {frequency[amplitude.argmax()]:.0f} Hz"
+        '0.90 at -80 Hz'
     """
     orbit = x + 1j * y
     # Without its zeros at both ends, which would leave two samples out.

@@ -137,6 +137,14 @@ def load_parameters(name_or_path: str = DEFAULT_SET) -> ParameterSet:
 
     Raises:
         InputError: No such set, not a set file, an unknown key, or a value outside what the model accepts.
+
+    Example:
+        >>> parameters = load_parameters("as-printed")
+        >>> entry = parameters.entries["contact.friction"]
+        >>> entry.value, entry.unit, entry.kind
+        (0.25, '1', 'paper')
+        >>> f"{parameters['ring.clearance']:.6f} m"  # a number in SI; the set has 0.926 mm
+        '0.000926 m'
     """
     return _load(name_or_path, "parameters", ())
 

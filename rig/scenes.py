@@ -279,6 +279,14 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
 
     Raises:
         InputError: The one thing that is wrong, with its field.
+
+    Example:
+        >>> scene = load_scene("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
+        >>> scene.drive.speed_hz, scene.load_parameters()["contact.friction"]
+        (5.2, 0.3)
+        >>> load_scene("hammer", {"drive.sped_hz": 5.2})
+        Traceback (most recent call last):
+        rig.errors.InputError: drive.sped_hz must be a field of a scene or a parameter, such as drive.speed_hz, ...
     """
     path = scene_path(name_or_path)
     data = {"name": path.stem, **read_toml(path)}

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from drivers.can.bus import frame as frames
-from drivers.can.timing import Speed, speed
+from drivers.can.bus.timing import Speed, speed
 from rig.errors import InputError
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drivers.can import analysis
+from drivers.can.bus.timing import Speed
 from drivers.can.message import Message, MessageTable
 from drivers.can.signals import CLASSIC_HZ, CLASSIC_SHARE, FD_HZ, default_messages
-from drivers.can.timing import Speed
 from rig.errors import InputError
 
 SLOT_S = 1e-3

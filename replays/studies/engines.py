@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from replays.report.canvas import BLUE, GREEN, ORANGE, PINK, RED, SKY
-from replays.studies.stability.closed_forms import (
+from replays.studies.closed_forms import (
     RUNGE_KUTTA_4_LIMIT,
     RUNGE_KUTTA_4_REAL_LIMIT,
     SPLIT_CONTACT_LIMIT,

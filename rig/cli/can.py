@@ -14,7 +14,7 @@ from rig.cli.tables import echo
 
 app = typer.Typer(help="The virtual CAN bus.", no_args_is_help=True)
 
-_LISTEN = "127.0.0.1:7461"
+LISTEN = "127.0.0.1:7461"
 _SPEED = "1M/8M"
 
 
@@ -31,7 +31,7 @@ def hub(
     speed: Annotated[
         str, typer.Option(metavar="RATE[/RATE]", help="Bit rate, and that of the data phase of CAN FD: 500k, 1M/8M.")
     ] = _SPEED,
-    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = _LISTEN,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to listen.")] = LISTEN,
     socketcand: Annotated[
         str | None,
         typer.Option(
@@ -53,8 +53,8 @@ def hub(
     """
     from drivers.can.bus.hub import Hub
     from drivers.can.bus.model import BusModel
+    from drivers.can.bus.timing import speed as parse_speed
     from drivers.can.interface import HubBus
-    from drivers.can.timing import speed as parse_speed
     from rig.cli.can_outlets import CanOutlets
     from rig.errors import InputError
     from rig.transport.endpoint import parse_loopback

@@ -12,8 +12,8 @@ from rig.cli.tables import echo
 from rig.errors import whole_file
 
 if TYPE_CHECKING:
+    from drivers.can.bus.timing import Speed
     from drivers.can.schedule import Schedule
-    from drivers.can.timing import Speed
 
 
 def dbc(

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from drivers.can.bus.outlet import OpenBus
     from drivers.can.bus.slcan import SlcanPort
     from drivers.can.bus.socketcand import SocketcandServer
-    from drivers.can.timing import Speed
+    from drivers.can.bus.timing import Speed
 
 
 class CanOutlets:

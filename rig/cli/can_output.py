@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from drivers.can.bus.hub import Hub
     from drivers.can.bus.outlet import OpenBus
+    from drivers.can.bus.timing import Speed
     from drivers.can.gateway import Gateway
     from drivers.can.schedule import Schedule
-    from drivers.can.timing import Speed
     from rig.cli.can_outlets import CanOutlets
     from rig.transport import Server
 
@@ -43,8 +43,8 @@ class CanMessages:
         Raises:
             InputError: There is no such rate.
         """
+        from drivers.can.bus.timing import speed
         from drivers.can.schedule import schedule_from
-        from drivers.can.timing import speed
 
         schedule = schedule_from(classic=self.can_classic, fd=self.can_fd, rate_hz=self.can_rate)
         return schedule, speed(self.can_bitrate or ("1M" if schedule.fd_hz is None else "1M/8M"))

@@ -146,7 +146,7 @@ def make(
     from cryptography.x509.oid import ExtendedKeyUsageOID
 
     names = list(dict.fromkeys([*hosts, "localhost", "127.0.0.1"]))
-    subjects = [_host(name) for name in names]
+    subjects = [subject_of(name) for name in names]
     if unknown := sorted(set(truth) - set(ROLES)):
         raise InputError("--truth", f"one of {', '.join(ROLES)}", unknown[0])
     if folder.exists() or folder.is_symlink():
@@ -160,7 +160,7 @@ def make(
         raise InputError("DIR", "in a folder that can be written", f"{folder} ({error.strerror})") from None
     try:
         signing = ec.generate_private_key(ec.SECP256R1())
-        issue = _Issue(signing, timedelta(days=days))
+        issue = Issue(signing, timedelta(days=days))
         authority = issue.certificate(SIGNER, signing, None, [])
         for holder in HOLDERS:
             key = ec.generate_private_key(ec.SECP256R1())
@@ -169,7 +169,7 @@ def make(
             else:
                 name = holder + WITH_TRUTH if holder in truth else holder
                 certificate = issue.certificate(name, key, ExtendedKeyUsageOID.CLIENT_AUTH, [x509.DNSName(holder)])
-            _write(part / holder, authority, certificate, key)
+            write_holder(part / holder, authority, certificate, key)
         old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=part.parent))
         if folder.exists():
             folder.rename(old)
@@ -181,7 +181,7 @@ def make(
     return names
 
 
-class _Issue(NamedTuple):
+class Issue(NamedTuple):
     """What signs, and for how long."""
 
     signing: EllipticCurvePrivateKey
@@ -214,7 +214,8 @@ class _Issue(NamedTuple):
         return builder.sign(self.signing, hashes.SHA256())
 
 
-def _host(name: str) -> x509.GeneralName:
+def subject_of(name: str) -> x509.GeneralName:
+    """A computer's name or address, as a certificate has it."""
     from cryptography import x509
 
     try:
@@ -225,9 +226,10 @@ def _host(name: str) -> x509.GeneralName:
         return x509.DNSName(name)
 
 
-def _write(
+def write_holder(
     folder: Path, authority: x509.Certificate, certificate: x509.Certificate, key: EllipticCurvePrivateKey
 ) -> None:
+    """Make a holder's folder; its key is for its owner alone."""
     from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
     folder.mkdir(mode=0o700)

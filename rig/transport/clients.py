@@ -13,9 +13,9 @@ from rig import wire
 from rig.outside import Count, Name, Outside, a_line, check
 from rig.transport import Client, Server
 
-_SHOWN = 64
+SHOWN = 64
 """Clients in the status."""
-_MOST = 4096
+MOST = 4096
 """Names that are remembered: so many made-up ones cannot crowd out those that get on."""
 _FORGOTTEN_S = 600.0
 _GONE_S = 3.0
@@ -139,13 +139,13 @@ class Clients:
 
     def _make_room(self, now_s: float) -> None:
         """For other names: forget those long silent, or where none is, a quarter, of those that did not get on."""
-        if len(self._reports) < _MOST and now_s - self._swept_s < _FORGOTTEN_S:
+        if len(self._reports) < MOST and now_s - self._swept_s < _FORGOTTEN_S:
             return
         self._swept_s = now_s
         for who in [who for who, row in self._reports.items() if now_s - row.heard_s > _FORGOTTEN_S]:
             self._forget(who)
-        if len(self._reports) >= _MOST:
-            for who in sorted(self._reports, key=lambda who: self._reports[who].pace)[: _MOST // 4]:
+        if len(self._reports) >= MOST:
+            for who in sorted(self._reports, key=lambda who: self._reports[who].pace)[: MOST // 4]:
                 self._forget(who)
 
     def _forget(self, who: _Who) -> None:
@@ -169,7 +169,7 @@ class Clients:
             # Those that get on first: names can be made up by the thousand.
             first = sorted(self._reports.items(), key=lambda row: -row[1].pace)
         rows: dict[str, dict[str, Any]] = {}
-        for who, report in first[:_SHOWN]:
+        for who, report in first[:SHOWN]:
             name = who[0]
             while name in rows:
                 name += " (another)"
@@ -184,7 +184,7 @@ class Clients:
     @property
     def hidden(self) -> int:
         """How many more there are than the status shows."""
-        return max(0, len(self._reports) - _SHOWN)
+        return max(0, len(self._reports) - SHOWN)
 
     def behind(self, published: int, *, silent: bool = False, stuck_s: float = _STUCK_S) -> int:
         """Rows that the slowest client still lacks, of those that are there; 0 where nobody reports.

@@ -296,7 +296,7 @@ def uses() -> dict[str, Use]:
     def told(path: Path, _: Path) -> object:
         recording = join([path])
         with unheard():
-            info._print(recording, info.describe(recording, quick=False))
+            info.info([path])
             return json.dumps(info.describe(recording, quick=True))
 
     def exported(suffix: str) -> Use:

@@ -19,6 +19,8 @@ import pytest
 
 import recorder.session
 from drivers.daq import Daq
+from drivers.link import LinkTimeoutError
+from drivers.samples import Samples, StreamEndedError
 from drivers.sources.rig import RigSource
 from recorder.reader import Recording, join
 from recorder.room import Limits
@@ -33,8 +35,8 @@ from rig.intake import Catalogue, Intake
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient, ZenohServer
 from tests.hostile import inputs
+from tests.processes import free_endpoint
 from tests.unit.recorder_stream import TRUTH_COLUMNS, ScriptedClient, block_of, documents
-from tests.unit.test_transport_zenoh import free_endpoint
 
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(7200)]
 KEYS = [wire.sensor_key(group) for group in default_table().groups] + [wire.truth_key(table) for table in TRUTH_COLUMNS]
@@ -248,6 +250,14 @@ def test_captures_end_and_hold_only_true_rows(tmp_path: Path) -> None:
             assert found == list(range(found[0], found[-1] + 1, Truth().rows[key])) if found else number == 0, key
 
 
+def ready(daq: Daq) -> Samples | None:
+    """What can be read at once."""
+    try:
+        return daq.read(timeout_s=0.0)
+    except (LinkTimeoutError, StreamEndedError):
+        return None
+
+
 def test_a_daq_reads_on_and_gets_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     count, server = inputs(3000), MemoryServer(cache=10)
     for key, document in documents().items():
@@ -259,12 +269,12 @@ def test_a_daq_reads_on_and_gets_the_true_rows(monkeypatch: pytest.MonkeyPatch) 
     rows = 0
     for key, payload, _ in mixed(count, seed=3):
         server.publish(key, payload)
-        while daq._pile.rows:
-            samples = daq.read()
+        while (samples := ready(daq)) is not None:
             assert (samples.index, samples.gap) == (rows, 0)
             np.testing.assert_array_equal(samples["disk_x"], expected)
             rows += len(samples)
-    assert daq._ended == "the rig's run has ended: completed"
+    with pytest.raises(StreamEndedError, match=r"^the rig's run has ended: completed$"):
+        daq.read()
     assert (daq.lost, daq.gaps, daq.unmatched) == ({"probes": 0, "forces": 0}, [], 0)
     daq.close()
 

@@ -45,7 +45,7 @@ from tests.hostile import inputs
 from tests.hostile.documents import documents
 from tests.unit import link_memory as memory
 from tests.unit.instruments_fake import FakeRig
-from tests.unit.test_transport_zenoh import until
+from tests.waiting import until
 
 THREADS = {"can gateway sends", "can gateway receives", "can gateway asks"}
 pytestmark = [pytest.mark.wallclock, pytest.mark.timeout(3600)]
@@ -618,7 +618,7 @@ def test_transport_frames_of_instruments_on_a_bus_leave_them_answering() -> None
                             return True
                 return False
 
-            until(identified, timeout_s=20.0)
+            until(identified)
         finally:
             link.close()
 
@@ -684,6 +684,7 @@ def test_a_node_for_links_outlives_frames_of_all_kinds() -> None:
             for _ in range(inputs(1000)):
                 villain.send(a_frame(random, 0))
             villain.send(can.Message(arbitration_id=0x601, data=b"end", is_extended_id=False))
-            until(lambda: bool(heard) and bytes(heard[-1].data) == b"end", timeout_s=60.0)
+            until(lambda: bool(heard) and bytes(heard[-1].data) == b"end")
+        assert {frame.arbitration_id for frame in heard} == {0x601}
     finally:
         node.close()

@@ -147,7 +147,7 @@ def test_start_and_sustain_are_one_condition():
 def test_houses_take_what_forced_vibration_takes():
     constants, spin = base_model(ModelLevels()).constants, 2 * math.pi * 6.2
     whirl, depth = condition.rolling_whirl(constants, spin)
-    begun = condition._rolled(constants, spin)
+    begun = condition.rolled(constants, spin)
     run = move("split", constants, quiet_inputs(spin=spin, magnets=True, ideal=True), begun, ticks=500_000, every=100)
     lost = run.column("house_loss")
     power = (lost[-1] - lost[0]) / (run.times[-1] - run.times[0])
@@ -170,7 +170,7 @@ def test_friction_swings_as_the_ring_goes_on_an_ellipse(stator, share):
         magnet=constants.magnet._replace(damping_x=damping, damping_y=damping),
         contact=constants.contact._replace(offset_x=0.0, offset_y=0.0),
     )
-    begun = condition._rolled(constants, spin)
+    begun = condition.rolled(constants, spin)
     run = move("split", constants, quiet_inputs(spin=spin, magnets=True, ideal=True), begun, ticks=500_000, every=50)
     friction, normal = (run.column(name)[2000:] for name in ("friction_force", "normal_force"))
     times = run.times[2000:]

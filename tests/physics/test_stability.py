@@ -16,10 +16,10 @@ import math
 import numpy as np
 import pytest
 
+from replays.studies.closed_forms import impact, runge_kutta_4_gain
 from replays.studies.engines import traits
 from replays.studies.stability.atlas import GROWN, contact_ratio, house_ratio
 from replays.studies.stability.cell import Cell
-from replays.studies.stability.closed_forms import impact, runge_kutta_4_gain
 from replays.studies.stability.motion import bare_shaft, base_model, pivoted_mass
 from replays.studies.stability.trials import TRIALS
 from rig.engines import ENGINES

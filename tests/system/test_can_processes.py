@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,33 +17,22 @@ import pytest
 
 from drivers.can.bus import codec
 from drivers.can.interface import ZenohBus
+from rig.cli.main import main
 from rig.transport.zenoh import ZenohClient
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.processes import free_endpoint, python
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
-ROOT = Path(__file__).parents[2]
-PATIENCE_S = 60.0
-
-
-@contextmanager
-def process(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
-    """A Python process, ended for certain."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "stdin": subprocess.PIPE, **settings}
-    command = [sys.executable, *arguments]
-    with subprocess.Popen(command, text=True, cwd=ROOT, env=environment, **pipes) as child:
-        try:
-            yield child
-        finally:
-            child.kill()
+process = partial(python, stdin=subprocess.PIPE, stderr=subprocess.STDOUT)
+"""Says all that it says in one stream."""
 
 
 @contextmanager
 def hub_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
     """`rig can hub` in a process of its own, and where it listens."""
     endpoint = free_endpoint()
-    arguments = ("-m", "rig.cli.main", "can", "hub", "can0", "can1", "--speed", "1M/8M", "--listen", endpoint)
-    with process(*arguments) as child:
+    arguments = ("can", "hub", "can0", "can1", "--speed", "1M/8M", "--listen", endpoint)
+    with process("-m", "rig.cli.main", *arguments) as child:
         assert child.stdout is not None
         # The first start after a change compiles.
         assert "Ctrl-C ends it" in child.stdout.readline()
@@ -299,9 +287,12 @@ with can.Bus("can0", interface="zenoh", endpoint=sys.argv[1]) as bus:
         (("can0", "--listen", "0.0.0.0:7999"), "ssh -L 7999:127.0.0.1:7999"),
     ],
 )
-def test_wrong_options_of_the_hub_are_one_line(arguments: tuple[str, ...], line: str) -> None:
-    with process("-m", "rig.cli.main", "can", "hub", *arguments) as child:
-        output, _ = child.communicate(timeout=PATIENCE_S)
-    assert child.returncode == 2
+def test_wrong_options_of_the_hub_are_one_line(
+    arguments: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["can", "hub", *arguments])
+    output = "".join(capsys.readouterr())
+    assert ended.value.code == 2
     assert line in output
     assert len(output.splitlines()) == 1

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import os
+import re
 import subprocess
-import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +30,11 @@ from rig.simulation import Simulation
 from rig.transport.fanout import Fanout
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.processes import COMPILE_S, free_endpoint, rig
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
-ROOT = Path(__file__).parents[2]
 TABLE = default_messages()
-COMPILE_S = 240.0
 _channels = itertools.count()
 
 
@@ -171,19 +167,6 @@ def test_a_hammer_pulse_from_the_bus_causes_the_whirl_and_wrong_ones_do_nothing(
     assert turns / (time_s[-1] - 1.5) < -2 * 6.2
 
 
-@contextmanager
-def rig_run(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "rig.cli.main", "run", *arguments]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    ) as child:  # fmt: skip
-        try:
-            yield child
-        finally:
-            child.kill()
-
-
 def joined(endpoint: str, child: subprocess.Popen[str]) -> can.BusABC:
     """A node on the bus of a rig that is about to start."""
     for _ in range(round(COMPILE_S)):
@@ -202,8 +185,16 @@ def joined(endpoint: str, child: subprocess.Popen[str]) -> can.BusABC:
 def test_rig_run_on_a_virtual_bus_between_processes(tmp_path: Path, options: list[str], rates: dict[bool, int]) -> None:
     endpoint, medium = free_endpoint(), free_endpoint()
     frames: dict[int, list[bytes]] = {}
-    with rig_run(
-        "stable-run", "--duration-s", "2", "--listen", endpoint, "--can", f"zenoh:can0?endpoint={medium}", *options
+    with rig(
+        "run",
+        "stable-run",
+        "--duration-s",
+        "2",
+        "--listen",
+        endpoint,
+        "--can",
+        f"zenoh:can0?endpoint={medium}",
+        *options,
     ) as child:
         with joined(medium, child) as bus, ZenohClient(endpoint, wait_s=COMPILE_S) as client:
             console = Console(client, timeout_s=COMPILE_S)
@@ -259,7 +250,7 @@ def test_a_schedule_that_the_bus_cannot_carry_is_refused_before_anything_runs() 
 
 
 def test_an_overloaded_bus_drops_counts_and_does_not_slow_the_rig() -> None:
-    with rig_run(
+    with rig("run",
         "stable-run", "--duration-s", "2", "--listen", free_endpoint(),
         "--can", f"zenoh:can0?endpoint={free_endpoint()}",
         "--can-fd", "--can-bitrate", "500k/1M", "--can-overload",
@@ -267,7 +258,9 @@ def test_an_overloaded_bus_drops_counts_and_does_not_slow_the_rig() -> None:
         output, errors = child.communicate(timeout=COMPILE_S)
     assert child.returncode == 0, errors
     assert "load at most 557.0 %" in errors
-    assert "real-time factor 0.99" in output or "real-time factor 1.0" in output
+    factor = re.search(r"real-time factor (\d\.\d+)", output)
+    assert factor is not None
+    assert float(factor[1]) > 0.5, "had it waited for the bus, it were 0.18"
     assert "blocks dropped 0" in output
     line = output.splitlines()[-1]
     sent, dropped = (int(line.split()[place]) for place in (1, 4))

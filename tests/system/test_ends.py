@@ -5,24 +5,20 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import os
 import re
 import signal
 import socket
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from rig import wire
 from rig.transport.zenoh import ZenohClient
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.processes import free_endpoint, line_of, python
+from tests.processes import rig as command
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
-ROOT = Path(__file__).parents[2]
 
 SLOW = """
 import json, sys, time, zenoh
@@ -38,31 +34,12 @@ time.sleep(60.0)
 """
 
 
-@contextlib.contextmanager
-def started(*arguments: str, **options: object) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, *arguments]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes, **options) as child:  # pyright: ignore[reportCallIssue, reportArgumentType]
-        try:
-            yield child
-        finally:
-            child.kill()
-
-
-def line_of(child: subprocess.Popen[str], words: str) -> str:
-    assert child.stderr is not None
-    for line in child.stderr:
-        if words in line:
-            return line
-    raise AssertionError(f"it ended without {words!r}")
-
-
 @pytest.mark.parametrize("mode", ["peer", "client"])
 def test_a_slow_subscriber_does_not_hold_up_the_end_nor_break_it(mode: str) -> None:
     endpoint = free_endpoint()
-    with started("-m", "rig.cli.main", "run", "stable-run", "--listen", endpoint) as rig:
+    with command("run", "stable-run", "--listen", endpoint) as rig:
         line_of(rig, "listening on")
-        with started("-c", SLOW, endpoint, mode) as slow, ZenohClient(endpoint, wait_s=5.0) as client:
+        with python("-c", SLOW, endpoint, mode) as slow, ZenohClient(endpoint, wait_s=5.0) as client:
             assert slow.stdout is not None
             assert slow.stdout.readline() == "ready\n"
 
@@ -93,8 +70,8 @@ def test_a_slow_subscriber_does_not_hold_up_the_end_nor_break_it(mode: str) -> N
 )
 def test_a_signal_at_any_time_ends_a_rig_in_good_order(number: signal.Signals, ignored: bool, words: str) -> None:
     ignoring = (lambda: signal.signal(number, signal.SIG_IGN)) if ignored else None
-    arguments = ("-m", "rig.cli.main", "run", "stable-run", "--listen", free_endpoint(), "--duration-s", "2")
-    with started(*arguments, preexec_fn=ignoring) as rig:
+    arguments = ("run", "stable-run", "--listen", free_endpoint(), "--duration-s", "2")
+    with command(*arguments, preexec_fn=ignoring) as rig:
         line_of(rig, words)
         rig.send_signal(number)
         output, errors = rig.communicate(timeout=60.0)
@@ -113,7 +90,7 @@ def test_a_signal_at_any_time_ends_a_rig_in_good_order(number: signal.Signals, i
 def test_whoever_can_connect_is_answered() -> None:
     endpoint = free_endpoint()
     host, port = endpoint.split(":")
-    with started("-m", "rig.cli.main", "run", "stable-run", "--listen", endpoint, "--duration-s", "1") as rig:
+    with command("run", "stable-run", "--listen", endpoint, "--duration-s", "1") as rig:
         deadline = time.monotonic() + 60.0
         while True:
             with contextlib.suppress(OSError), socket.create_connection((host, int(port)), timeout=0.2):
@@ -142,13 +119,13 @@ with zenoh.open(config) as session:
     time.sleep(4.0)
 """
     endpoint = free_endpoint()
-    with started("-m", "rig.cli.main", "run", "stable-run", "--listen", endpoint, "--duration-s", "4") as rig:
+    with command("run", "stable-run", "--listen", endpoint, "--duration-s", "4") as rig:
         line_of(rig, "listening on")
         stamps: list[float] = []
         with ZenohClient(endpoint, wait_s=5.0) as client:
             client.subscribe(wire.STATUS, lambda *_: stamps.append(time.monotonic()))
             until(lambda: bool(stamps))
-            with started("-c", flood, endpoint) as hostile:
+            with python("-c", flood, endpoint) as hostile:
                 assert hostile.stdout is not None
                 assert hostile.stdout.readline().startswith("sent in")
                 begin = time.monotonic()

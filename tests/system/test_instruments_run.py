@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,31 +22,24 @@ from drivers.proximity.driver import Proximity
 from drivers.samples import StreamEndedError
 from rig.errors import RefusedError
 from rig.transport.zenoh import ZenohClient
-from tests.system.test_service_run import COMPILE_S, rig_run
-from tests.unit.test_transport_zenoh import free_endpoint
+from tests.processes import COMPILE_S, free_endpoint
+from tests.processes import rig as command
+from tests.system.test_service_run import rig_run
 
 pytestmark = pytest.mark.wallclock
-ROOT = Path(__file__).parents[2]
 
 
 @contextmanager
 def twins(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], dict[str, list[str]]]]:
     """`rig twins`, and its URLs by instrument."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     links = sum(name in arguments for name in ("--zenoh", "--pty"))
-    with subprocess.Popen(
-        [sys.executable, "-u", "-m", "rig.cli.main", "twins", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment,
-    ) as child:  # fmt: skip
-        try:
-            assert child.stdout is not None
-            urls: dict[str, list[str]] = {}
-            for _ in range(6 * links):
-                name, _, url = child.stdout.readline().strip().partition(" ")
-                urls.setdefault(name, []).append(url.strip())
-            yield child, urls
-        finally:
-            child.kill()
+    with command("twins", *arguments) as child:
+        assert child.stdout is not None
+        urls: dict[str, list[str]] = {}
+        for _ in range(6 * links):
+            name, _, url = child.stdout.readline().strip().partition(" ")
+            urls.setdefault(name, []).append(url.strip())
+        yield child, urls
 
 
 def read_on(driver: Sampler) -> None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import random
 import signal
-import socket
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -28,6 +26,8 @@ from rig.wire import (
     schema_of,
     sensor_key,
 )
+from tests.processes import free_port, python
+from tests.waiting import PATIENCE_S, until
 
 from ..unit.recorder_stream import documents, stream
 
@@ -36,12 +36,6 @@ PROBES = sensor_key("probes")
 BLOCK_S = 0.01
 CYCLE = list(stream(50))[1:-1]
 """Half a second of all streams; later halves are the same with other ticks and row numbers."""
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def _later(key: str, payload: bytes, cycle: int) -> bytes:
@@ -124,26 +118,8 @@ def recorder(path: Path, port: int, options: str = "", *, before: str = "") -> I
         "import sys; from pathlib import Path; from rig.cli.groups import grouped; from rig.cli.record import record; "
         f"grouped(record)(Path(sys.argv[1]), connect='127.0.0.1:{port}', {options})"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=Path(__file__).parents[2],
-    )
-    try:
+    with python("-c", code, str(path)) as process:
         yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
-
-
-def wait_for(condition: Callable[[], bool], limit_s: float = 20.0) -> None:
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
 
 
 def received(rig: Publisher) -> int:
@@ -155,11 +131,11 @@ def test_a_whole_run_arrives_without_loss(tmp_path, history):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port, f"history={history}") as process:
-        wait_for(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0)
         joined = {key: len(payloads) for key, payloads in rig.sent.items()}
-        wait_for(lambda: rig.blocks() > 150)
+        until(lambda: rig.blocks() > 150)
         rig.end()
-        output, errors = process.communicate(timeout=20.0)
+        output, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, errors
         assert "ended: completed" in output
         assert "lost: nothing" in output
@@ -170,7 +146,7 @@ def test_a_whole_run_arrives_without_loss(tmp_path, history):
             assert len(sent) - joined[key] <= len(payloads), key
             assert payloads == (sent if history else sent[len(sent) - len(payloads) :]), key
         # The last report lets the rig drop its cache.
-        wait_for(lambda: received(rig) == 200 * rig.blocks())
+        until(lambda: received(rig) == 200 * rig.blocks())
 
 
 def test_a_killed_recorder_loses_half_a_second_at_most_and_the_rest_reads(tmp_path):
@@ -181,7 +157,7 @@ def test_a_killed_recorder_loses_half_a_second_at_most_and_the_rest_reads(tmp_pa
             path = tmp_path / f"run{trial}.mcap"
             rig.beats.clear()
             with recorder(path, port) as process:
-                wait_for(lambda: received(rig) > 0)
+                until(lambda: received(rig) > 0)
                 first = rig.blocks()
                 time.sleep(0.3 + rng.random())
                 killed_at = rig.blocks()
@@ -212,22 +188,16 @@ threading.Event().wait()
 def test_a_killed_rig_leaves_a_file_that_is_closed_well(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
-    rig = subprocess.Popen(
-        [sys.executable, "-c", RIG, str(port)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
-    )
-    try:
+    with python("-c", RIG, str(port), stderr=None) as rig:
         assert rig.stdout is not None
         assert rig.stdout.readline() == "ready\n"
         with recorder(path, port) as process:
             part = path.with_name(path.name + ".part")
-            wait_for(lambda: part.exists() and part.stat().st_size > 300_000)
+            until(lambda: part.exists() and part.stat().st_size > 300_000)
             rig.kill()
-            output, errors = process.communicate(timeout=20.0)
+            output, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 1, errors
         assert "ended: rig lost" in output
-    finally:
-        rig.kill()
-        rig.communicate()
     recording = Recording.open(path)
     assert recording.complete
     assert recording.end_reason == "rig lost"
@@ -239,9 +209,9 @@ def test_a_signal_ends_the_recording_well(tmp_path, number):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port) as process:
-        wait_for(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0)
         process.send_signal(number)
-        output, errors = process.communicate(timeout=20.0)
+        output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert f"ended: interrupted by {number.name}" in output
     assert Recording.open(path).complete
@@ -251,7 +221,7 @@ def test_a_duration_ends_the_recording(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port), recorder(path, port, "duration_s=0.5") as process:
-        output, errors = process.communicate(timeout=20.0)
+        output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert "ended: duration reached" in output
     recording = Recording.open(path)
@@ -260,7 +230,7 @@ def test_a_duration_ends_the_recording(tmp_path):
 
 def test_without_a_rig_one_line_and_no_file(tmp_path):
     with recorder(tmp_path / "run.mcap", free_port()) as process:
-        output, errors = process.communicate(timeout=20.0)
+        output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
     assert "no rig answers" in errors.splitlines()[-1]
     assert output == ""
@@ -271,11 +241,11 @@ def test_a_rotating_recorder_loses_nothing_at_its_seams(tmp_path):
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port, "rotate_s=0.4") as process:
-        wait_for(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0)
         begun = rig.blocks()
-        wait_for(lambda: rig.blocks() > begun + 200)
+        until(lambda: rig.blocks() > begun + 200)
         rig.end()
-        output, errors = process.communicate(timeout=20.0)
+        output, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, errors
         assert "lost: nothing" in output
         files = sorted(tmp_path.iterdir())
@@ -294,7 +264,7 @@ def test_a_recorder_waits_for_a_rig_that_comes_later(tmp_path):
         time.sleep(3.0)  # longer than a recorder waits that was not told to
         assert process.poll() is None
         with publisher(port):
-            output, errors = process.communicate(timeout=30.0)
+            output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert "ended: duration reached" in output
 
@@ -303,12 +273,12 @@ def test_a_trigger_makes_a_file_of_its_own(tmp_path):
     port = free_port()
     options = "trigger=['hammer'], pre_s=0.2, post_s=0.3, trigger_count=1"
     with publisher(port) as rig, recorder(tmp_path / "run.mcap", port, options) as process:
-        wait_for(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0)
         begun = rig.blocks()
-        wait_for(lambda: rig.blocks() > begun + 60)  # longer than is kept before a trigger
+        until(lambda: rig.blocks() > begun + 60)  # longer than is kept before a trigger
         tick = rig.blocks() * 10_000
         rig.server.publish(EVENTS, encode_document({"event": "hammer", "tick": tick, "time_s": tick / 1e6}))
-        output, errors = process.communicate(timeout=20.0)
+        output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert "ended: 1 captures made" in output
     (path,) = tmp_path.iterdir()
@@ -323,15 +293,15 @@ def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_
     path = tmp_path / "run.mcap"
     code = "import rig.transport.session; rig.transport.session._LEASE_S = 1.0; "
     with publisher(port) as rig, recorder(path, port, before=code) as process:
-        wait_for(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0)
         links = rig.server.congestion()["links"]
         process.send_signal(signal.SIGSTOP)
-        wait_for(lambda: rig.server.congestion()["links"] < links)
+        until(lambda: rig.server.congestion()["links"] < links)
         process.send_signal(signal.SIGCONT)
-        wait_for(lambda: rig.server.congestion()["links"] == links)
-        wait_for(lambda: received(rig) > 200 * rig.blocks() - 4000)
+        until(lambda: rig.server.congestion()["links"] == links)
+        until(lambda: received(rig) > 200 * rig.blocks() - 4000)
         rig.end()
-        output, errors = process.communicate(timeout=40.0)
+        output, errors = process.communicate(timeout=PATIENCE_S)
     assert "is back" in errors
     assert "ended: completed" in output
     recording = Recording.open(path)
@@ -347,9 +317,9 @@ def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_
 def test_a_run_that_failed_is_an_exit_status(tmp_path):
     port = free_port()
     with publisher(port) as rig, recorder(tmp_path / "run.mcap", port) as process:
-        wait_for(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0)
         rig.end("failed: SimulationError: not finite")
-        output, _ = process.communicate(timeout=20.0)
+        output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
     assert "ended: failed: SimulationError: not finite" in output
     assert "lost: nothing" in output
@@ -359,15 +329,15 @@ def test_a_second_recorder_to_the_same_file_is_refused_and_the_first_one_goes_on
     port = free_port()
     path = tmp_path / "run.mcap"
     with publisher(port) as rig, recorder(path, port) as first:
-        wait_for(lambda: received(rig) > 0)
+        until(lambda: received(rig) > 0)
         with recorder(path, port, "force=True") as second, recorder(tmp_path / "other.mcap", port) as third:
-            _, errors = second.communicate(timeout=20.0)
+            _, errors = second.communicate(timeout=PATIENCE_S)
             assert second.returncode == 1
             assert "no other recording is writing to" in errors
-            wait_for(lambda: (tmp_path / "other.mcap.part").exists())
+            until(lambda: (tmp_path / "other.mcap.part").exists())
             rig.end()
             for process in (first, third):
-                output, errors = process.communicate(timeout=20.0)
+                output, errors = process.communicate(timeout=PATIENCE_S)
                 assert process.returncode == 0, errors
                 assert "lost: nothing" in output
     assert Recording.open(path).complete
@@ -382,7 +352,7 @@ def test_a_full_disk_ends_the_command_with_what_was_kept_and_recover_finishes_it
     # A limit on the size of a file stands for the disk.
     code = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, -1)); "
     with publisher(port) as rig, recorder(path, port, "keep_free_mb=0.0", before=code) as process:
-        output, errors = process.communicate(timeout=30.0)
+        output, errors = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 1
         assert "ended: disk error" in output
         assert "lost: all that came after " in output

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,13 +27,14 @@ from rig.cli.can_output import CanMessages, CanOptions, CanOutput
 from rig.errors import RefusedError
 from rig.pacing import FreeRun, RealTime
 from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.processes import free_endpoint
+from tests.processes import rig as command
 from tests.system.test_can_run import check_against_recording
 from tests.unit.player_recording import BLOCKS, by_key, write_recording
 from tests.unit.recorder_stream import stream
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
-ROOT = Path(__file__).parents[2]
 _channels = itertools.count()
 
 
@@ -142,22 +140,6 @@ def test_frames_on_a_bus_are_those_of_the_recording(path: Path) -> None:
     compared = check_against_recording(frames, path, rates={True: 10_000, False: 1000})
     # Whole frames only: of a message with many rows a frame the last instants may never be sent.
     assert 0.95 < compared / (15 * 11 * 10 * BLOCKS) <= 1.0
-
-
-@contextmanager
-def command(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        [sys.executable, "-m", "rig.cli.main", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    ) as child:
-        try:
-            yield child
-        finally:
-            child.kill()
 
 
 def test_the_command_is_led_from_elsewhere_and_stopped(path: Path) -> None:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,28 +17,16 @@ from rig import wire
 from rig.cli.app import app
 from rig.errors import InputError, RefusedError
 from rig.transport.zenoh import ZenohClient, ZenohServer
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.processes import free_endpoint, python
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
-ROOT = Path(__file__).parents[2]
-
-
-@contextmanager
-def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A Python process, ended for certain."""
-    command = [sys.executable, *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment) as child:
-        try:
-            yield child
-        finally:
-            child.kill()
 
 
 @contextmanager
 def rig(pace: str, *duration_s: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = free_endpoint()
-    with process("-m", "tests.unit.service_fake", endpoint.rpartition(":")[2], pace, *duration_s) as child:
+    with python("-m", "tests.unit.service_fake", endpoint.rpartition(":")[2], pace, *duration_s, stderr=None) as child:
         assert child.stdout is not None
         assert child.stdout.readline() == "ready\n"
         yield child, endpoint
@@ -123,7 +108,7 @@ def test_a_killed_rig_is_noticed_long_before_the_lease_ends() -> None:
         listener = Listener(client)
         until(lambda: bool(listener.follow.received) and listener.alive == [True])
         child.kill()
-        until(lambda: listener.alive == [True, False], timeout_s=10.0)
+        until(lambda: listener.alive == [True, False])
     assert listener.gaps == []
     assert [event["event"] for event in listener.events] == ["start"]
 
@@ -167,21 +152,14 @@ def stalled_subscriber(messages: int) -> tuple[str, dict[str, float]]:
 
         server.answer("rig/scene", answer)
         server.publish("rig/sensors/a", (0).to_bytes(8, "little"))
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        with subprocess.Popen(
-            [sys.executable, "-c", SUBSCRIBER, server.endpoint, str(messages)],
-            stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment,
-        ) as child:  # fmt: skip
-            try:
-                assert ready.wait(20.0)
-                child.send_signal(signal.SIGSTOP)
-                for number in range(1, messages):
-                    server.publish("rig/sensors/a", number.to_bytes(8, "little") + bytes(20_000))
-                congestion = server.congestion()
-                child.send_signal(signal.SIGCONT)
-                report, _ = child.communicate(timeout=60.0)
-            finally:
-                child.kill()
+        with python("-c", SUBSCRIBER, server.endpoint, str(messages), stderr=None) as child:
+            assert ready.wait(PATIENCE_S)
+            child.send_signal(signal.SIGSTOP)
+            for number in range(1, messages):
+                server.publish("rig/sensors/a", number.to_bytes(8, "little") + bytes(20_000))
+            congestion = server.congestion()
+            child.send_signal(signal.SIGCONT)
+            report, _ = child.communicate(timeout=60.0)
         return report, congestion
 
 
@@ -211,7 +189,7 @@ def test_a_script_that_never_closes_its_client_still_ends() -> None:
     )
     with ZenohServer(free_endpoint()) as server:
         server.announce()
-        with process("-c", script, server.endpoint) as child:
+        with python("-c", script, server.endpoint) as child:
             assert child.wait(timeout=30.0) == 0
 
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -16,9 +13,9 @@ from drivers.console import Console
 from rig.cli.options import SceneChanges
 from rig.errors import InputError
 from rig.transport.zenoh import ZenohClient
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.processes import COMPILE_S, free_endpoint, python
+from tests.waiting import until
 
-ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import sys, typer
 from rig.cli.groups import grouped
@@ -31,22 +28,14 @@ try:
 except InputError as error:
     sys.exit(f"InputError: {error}")
 """
-COMPILE_S = 240.0
 
 
 @contextmanager
 def rig_run(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     endpoint = free_endpoint()
     listen = [] if "--listen" in arguments else ["--listen", endpoint]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *arguments, *listen],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, env=environment,
-    ) as child:  # fmt: skip
-        try:
-            yield child, endpoint
-        finally:
-            child.kill()
+    with python("-c", PROGRAM, *arguments, *listen) as child:
+        yield child, endpoint
 
 
 @pytest.mark.wallclock

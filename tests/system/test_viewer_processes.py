@@ -17,12 +17,12 @@ from pathlib import Path
 import pytest
 
 from recorder.viewer.window import Window, WindowError, environment, free_port
+from tests.processes import ROOT, free_endpoint, python
 from tests.unit.viewer_recording import Saved, Synthetic, documents_of, stream_of
 
 pytestmark = pytest.mark.wallclock
 
-ROOT = Path(__file__).parents[2]
-VIEW = [sys.executable, "-c", "from rig.cli.main import main; main()", "view"]
+VIEW = ["-c", "from rig.cli.main import main; main()", "view"]
 
 
 def quiet() -> dict[str, str]:
@@ -34,25 +34,14 @@ def quiet() -> dict[str, str]:
 @contextlib.contextmanager
 def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
     """A process of ours, ended afterwards."""
-    process = subprocess.Popen(
-        command, cwd=ROOT, env=quiet(), text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, bufsize=1
-    )
-    try:
+    with python(*command, env=quiet(), stderr=subprocess.STDOUT, bufsize=1) as process:
         yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.wait()
-        assert process.stdout is not None
-        process.stdout.close()
 
 
 @contextlib.contextmanager
 def rig(*, duration_s: float) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    with started([sys.executable, "-m", "tests.system.viewer_rig", str(port), str(duration_s)]) as process:
+    port = int(free_endpoint().rpartition(":")[2])
+    with started(["-m", "tests.system.viewer_rig", str(port), str(duration_s)]) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         yield process, port
@@ -81,7 +70,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_recording_becomes_an_rrd(recorded: Path, tmp_path: Path) -> None:
     target = tmp_path / "whirl.rrd"
     done = subprocess.run(
-        [*VIEW, str(recorded), "--save", str(target)],
+        [sys.executable, *VIEW, str(recorded), "--save", str(target)],
         cwd=ROOT,
         env=quiet(),
         text=True,
@@ -225,7 +214,7 @@ def test_a_picture_where_this_machine_can_draw(recorded: Path, tmp_path: Path) -
         pytest.skip(f"no Vulkan driver here: {error}")
     picture = tmp_path / "whirl.png"
     done = subprocess.run(
-        [*VIEW, str(recorded), "--screenshot", str(picture)],
+        [sys.executable, *VIEW, str(recorded), "--screenshot", str(picture)],
         cwd=ROOT,
         env=quiet(),
         text=True,

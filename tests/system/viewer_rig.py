@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 
 from rig import wire
@@ -11,15 +12,22 @@ from tests.unit.viewer_recording import Synthetic, documents_of, stream_of
 
 
 def main(port: int, duration_s: float) -> None:
-    """Serve a synthetic recording, then stay for a second."""
+    """Serve a synthetic recording from the first report of a client on, then stay for a second."""
     recording = Synthetic(duration_s=duration_s)
     blocks = list(stream_of(recording))
     with ZenohServer(f"127.0.0.1:{port}") as server:
         for key, reply in documents_of(recording).items():
             server.answer(key, lambda _, reply=reply: reply)
-        server.hear(f"{wire.CLIENTS}/*", lambda key, payload: print(key, payload.decode(), flush=True))
+        met = threading.Event()
+
+        def hear(key: str, payload: bytes) -> None:
+            print(key, payload.decode(), flush=True)
+            met.set()
+
+        server.hear(f"{wire.CLIENTS}/*", hear)
         server.announce()
         print("ready", flush=True)
+        met.wait(60.0)
         start = time.monotonic()
         for number, block in enumerate(blocks):
             time.sleep(max(0.0, start + 0.01 * number - time.monotonic()))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from drivers.can.analysis import Errors, Message, check_load, load, worst_bits, worst_case
 from drivers.can.bus.frame import FD_LENGTHS, Frame, frame_bits
 from drivers.can.bus.model import BusModel
-from drivers.can.timing import speed
+from drivers.can.bus.timing import speed
 from rig.errors import InputError
 
 MS = 1_000_000

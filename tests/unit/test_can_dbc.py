@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import runpy
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from drivers.can import dbc, schedule
+from drivers.can.bus.timing import speed
 from drivers.can.signals import (
     CLASSIC_HZ,
     FD_HZ,
@@ -21,10 +23,9 @@ from drivers.can.signals import (
     make_table,
     parse_command,
 )
-from drivers.can.timing import speed
 from rig.channels import default_table
 from rig.cli.app import app
-from rig.cli.can_output import CanOutput
+from rig.cli.can_output import CanMessages, CanOptions, CanOutput
 from rig.errors import InputError
 
 TABLE = default_messages()
@@ -67,9 +68,11 @@ def test_a_bus_that_gets_too_full_is_told_in_one_line(monkeypatch: pytest.Monkey
         assert CliRunner().invoke(app, command, catch_exceptions=False).stderr == warning
     assert warning in f"{CanOutput('virtual:full')}\n"
     # What is still carried is only told; what is not is refused.
-    assert CanOutput("virtual:full", rate_hz=500).schedule.warnings(speed("1M")) == []
+    assert (
+        CanOutput("virtual:full", CanOptions(messages=CanMessages(can_rate=500))).schedule.warnings(speed("1M")) == []
+    )
     with pytest.raises(InputError, match="CAN load must be a schedule of at most 100 % of the bus"):
-        CanOutput("virtual:full", bitrate="500k")
+        CanOutput("virtual:full", CanOptions(messages=CanMessages(can_bitrate="500k")))
 
 
 def test_the_usual_bus_is_not_too_full() -> None:
@@ -138,8 +141,6 @@ def test_cantools_decodes_every_command() -> None:
 
 
 def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from cantools import _main
-
     probes = TABLE.by_name["Probes"]
     assert probes.samples is not None
     data = probes.samples.pack(np.array([10]), np.full((5, 4), 0x1000, np.int32), 64).tobytes()
@@ -149,7 +150,7 @@ def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeyp
     ]
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines) + "\n"))
     monkeypatch.setattr(sys, "argv", ["cantools", "decode", str(dbc.COPY)])
-    _main()
+    runpy.run_module("cantools", run_name="__main__")
     output = capsys.readouterr().out
     assert "Probes(" in output
     assert "index: 10" in output

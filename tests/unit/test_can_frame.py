@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from drivers.can.analysis import Message, best_bits, worst_bits
 from drivers.can.bus import frame as frames
 from drivers.can.bus.frame import FD_LENGTHS, RECORD, Frame, bits_of, encode, frame_bits, pad, record_of, records
-from drivers.can.timing import speed
+from drivers.can.bus.timing import speed
 from rig.errors import InputError
 
 CRC15, CRC17, CRC21 = 0xC599, 0x3685B, 0x302899

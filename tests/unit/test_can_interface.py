@@ -25,13 +25,14 @@ from drivers.can.bus.frame import Frame
 from drivers.can.bus.hub import Hub
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.node import matching
+from drivers.can.bus.timing import speed
 from drivers.can.interface import HubBus, ZenohBus
-from drivers.can.timing import speed
 from rig import wire
 from rig.cli import can as can_command
 from rig.errors import InputError
 from rig.transport.zenoh import ZenohServer
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.processes import free_endpoint
+from tests.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.wallclock
 
@@ -99,7 +100,7 @@ def same(one: can.Message, other: can.Message) -> bool:
     return one.equals(other, timestamp_delta=None, check_channel=False, check_direction=False)
 
 
-def read(bus: can.BusABC, count: int, *, timeout_s: float = 5.0) -> list[can.Message]:
+def read(bus: can.BusABC, count: int, *, timeout_s: float = PATIENCE_S) -> list[can.Message]:
     found = [bus.recv(timeout_s) for _ in range(count)]
     assert None not in found
     return [item for item in found if item is not None]
@@ -551,7 +552,7 @@ def test_two_channels_at_one_address_do_not_mix() -> None:
 
 
 def test_the_command_listens_where_clients_look() -> None:
-    assert can_command._LISTEN == codec.DEFAULT_ENDPOINT
+    assert can_command.LISTEN == codec.DEFAULT_ENDPOINT
 
 
 def test_channels_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -640,8 +641,10 @@ def test_random_payloads_over_zenoh_leave_the_hub_as_it_was() -> None:
             client.report(f"rig/can/can0/{rng.choice(['join', 'offer', 'node/x'])}", fuzz(rng))
         until(lambda: rig.hub.status()["counts"]["malformed"] > 100)
         sender.send(message(0x7A5, b"unique"))
-        while read(receiver, 1)[0].data != b"unique":
-            pass
+        while (found := read(receiver, 1)[0]).data != b"unique":
+            assert found.is_error_frame or frames.fault_of(codec.record_of(found)) is None
+        nodes = {row["name"]: row for row in rig.hub.status()["nodes"]}
+        assert nodes[receiver.name]["state"] == 0
 
 
 def join(hub: Hub, name: str, *, token: bool = False, **more: Any) -> dict[str, Any]:

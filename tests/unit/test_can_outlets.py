@@ -29,8 +29,8 @@ from drivers.can.bus.model import BusModel
 from drivers.can.bus.outlet import Outlet
 from drivers.can.bus.slcan import Lines, SlcanPort
 from drivers.can.bus.socketcand import SocketcandServer, Splitter
+from drivers.can.bus.timing import speed
 from drivers.can.interface import HubBus
-from drivers.can.timing import speed
 from drivers.twins import Twins
 from rig.cli.can_outlets import CanOutlets
 from rig.cli.can_output import CanOptions, CanOutput
@@ -38,7 +38,8 @@ from rig.cli.groups import grouped
 from rig.cli.run import run
 from rig.errors import InputError
 from rig.transport.memory import MemoryClient, MemoryServer
-from tests.unit.test_transport_zenoh import free_endpoint, until
+from tests.processes import free_endpoint
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
 
@@ -416,6 +417,7 @@ def test_random_bytes_do_no_harm() -> None:
         good = bench.socketcand(server)
         good.send(CLASSIC[0])
         until(lambda: any(same(CLASSIC[0], found) for found in iter(lambda: other.recv(0), None)))
+        assert server.counts()["clients"] >= 1
 
 
 def test_a_server_keeps_to_this_machine() -> None:
@@ -652,6 +654,7 @@ def test_random_lines_do_no_harm() -> None:
             os.write(terminal.descriptor, b"T000000010\r")
             wanted = can.Message(arbitration_id=1, data=b"")
             until(lambda: any(same(wanted, found) for found in iter(lambda: other.recv(0), None)))
+            assert port.figures()["given_up"] == 0
 
 
 def test_lines_come_in_any_portions() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.can import analysis
+from drivers.can.bus.timing import speed
 from drivers.can.schedule import Schedule, schedule_from
 from drivers.can.signals import (
     ABSENT,
@@ -26,7 +27,6 @@ from drivers.can.signals import (
     make_table,
     parse_command,
 )
-from drivers.can.timing import speed
 from rig.channels import ChannelTable, default_table
 from rig.errors import InputError
 

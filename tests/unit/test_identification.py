@@ -22,6 +22,7 @@ from rig.offline import frames
 from rig.parameters import load_parameters
 from rig.scenes import load_scene
 from rig.simulation import Simulation
+from tests.commands import run as command
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +36,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as end:
-        main(["identify", *map(str, arguments)])
-    assert isinstance(end.value.code, int)
-    return end.value.code
+    return command("identify", *arguments)
 
 
 def test_writes_a_set_that_a_run_takes_and_a_report(

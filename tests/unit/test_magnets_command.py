@@ -12,16 +12,9 @@ from replays.studies.magnets import compare, draw
 from rig.cli.main import main
 from rig.model import build_model
 from rig.parameters import load_parameters
+from tests.commands import shown as run
 
 FAMILY = ["linear", "far-field map", "far-field sum", "cylinder map", "exact cylinders"]
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    with pytest.raises(SystemExit) as end:
-        main([*arguments])
-    captured = capsys.readouterr()
-    assert end.value.code == 0, captured.err
-    return captured.out
 
 
 def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from tests.unit.player_recording import BLOCK_NS, BLOCKS, DURATION_NS, Payloads,
 from tests.unit.recorder_stream import documents, stream
 from tests.unit.service_fake import FakeSimulation
 from tests.unit.test_pacing import FakeTime
-from tests.unit.test_transport_zenoh import until
+from tests.waiting import until
 
 PROBES = wire.sensor_key("probes")
 

@@ -15,6 +15,7 @@ from recorder.writer import RecordingWriter
 from rig.cli.main import main
 from rig.cli.record import run_session, tell
 from rig.wire import CATALOGUE, EVENTS, PARAMETERS, SCENE, encode_document, sensor_key
+from tests.commands import run
 
 from .recorder_stream import documents, stream
 
@@ -33,12 +34,6 @@ def path(tmp_path_factory) -> Path:
                 file.write(key, payload, 1_700_000_000_000_000_000 + number * 1_000_000)
         file.finish("completed")
     return path
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    return int(ended.value.code or 0)
 
 
 def test_info_shows_contents_gaps_health_and_notes(path, capsys):

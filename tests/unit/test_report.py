@@ -100,8 +100,11 @@ def test_places_that_no_report_can_go_to(tmp_path: Path, name: str, complaint: s
 
 
 def test_an_existing_report_is_replaced_when_asked(tmp_path: Path) -> None:
-    (tmp_path / "old.pdf").write_bytes(b"")
+    (tmp_path / "old.pdf").write_bytes(b"old")
     check_report(tmp_path / "old.pdf", force=True)
+    assert (tmp_path / "old.pdf").read_bytes() == b"old", "only once there is a new one"
+    Report("New").write(tmp_path / "old.pdf")
+    assert (tmp_path / "old.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_tables_of_any_width_go_into_a_pdf(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from rig.simulation import Frame
 from rig.transport import NoReplyError
 from rig.transport.memory import MemoryClient, MemoryServer
 from tests.unit.service_fake import GROUPS, TRUTH, FakeSimulation
+from tests.waiting import until
 
 BLOCK = 10_000
 
@@ -89,13 +89,6 @@ def run(simulation: FakeSimulation, clock: Clock | None = None, **options: Any) 
     listener = Listener(server)
     summary = Service(simulation, server, clock or FreeRun(), block_ticks=BLOCK, **options).run()
     return summary, listener
-
-
-def until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.001)
 
 
 def test_every_row_is_published_once_and_in_order() -> None:
@@ -307,7 +300,8 @@ def test_a_stream_that_cannot_be_published_is_told_and_ends_neither_the_run_nor_
     assert [event["text"] for event in listener.named("warning")] == [line]
     assert line in listener.statuses[-1]["warnings"]
     assert sum(len(block.values) for block in listener.blocks[wire.sensor_key("probes")]) == 10_000
-    assert listener.events[-1]["rows"][wire.sensor_key("forces")] == 10_000, "whoever lacks them learns it"
+    (end,) = listener.named("end")
+    assert end["rows"][wire.sensor_key("forces")] == 10_000, "whoever lacks them learns it"
 
 
 def test_a_status_that_cannot_be_made_is_told_and_the_run_goes_on() -> None:

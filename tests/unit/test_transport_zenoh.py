@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
@@ -19,21 +19,10 @@ from rig.transport import NoReplyError
 from rig.transport.endpoint import backlog_of, parse_endpoint
 from rig.transport.recovery import Recovery
 from rig.transport.zenoh import ZenohClient, ZenohServer
+from tests.processes import free_endpoint
+from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{probe.getsockname()[1]}"
-
-
-def until(condition: Callable[[], bool], *, timeout_s: float = 20.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.002)
 
 
 @pytest.fixture
@@ -64,8 +53,12 @@ def test_a_port_in_use_is_one_clear_line(server: ZenohServer) -> None:
 def test_the_port_is_free_again_after_close() -> None:
     endpoint = free_endpoint()
     for _ in range(2):
-        with ZenohServer(endpoint), ZenohClient(endpoint):
-            pass
+        with ZenohServer(endpoint) as server, ZenohClient(endpoint) as client:
+            server.answer("rig/status", lambda _: b"yes")
+            assert client.request("rig/status", timeout_s=10.0) == b"yes"
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(("127.0.0.1", int(endpoint.rpartition(":")[2])))
 
 
 def test_only_the_named_loopback_address_is_listened_on(server: ZenohServer) -> None:
@@ -174,7 +167,8 @@ def test_the_token_appears_when_announced_and_vanishes_on_close() -> None:
             second.watch("rig/alive", late.append)
             until(lambda: late == [True])
         server.close()
-        until(lambda: seen == [True, False])
+        until(lambda: len(seen) == 2)
+        assert seen == [True, False]
 
 
 def test_a_subscriber_with_history_misses_nothing_whenever_it_comes(server: ZenohServer) -> None:
@@ -444,7 +438,7 @@ def test_a_callback_that_blocks_holds_up_neither_requests_nor_the_token_nor_its_
         server.announce()
         until(lambda: seen == [True])
         go.set()
-        until(lambda: all(len(numbers) == messages for numbers in got.values()), timeout_s=60.0)
+        until(lambda: all(len(numbers) == messages for numbers in got.values()))
     assert all(numbers == list(range(messages)) for numbers in got.values())
     assert missed == []
 
@@ -453,7 +447,10 @@ def test_closing_does_not_fail_though_a_callback_never_returns(monkeypatch: pyte
     monkeypatch.setattr("rig.transport.zenoh._FIFO", 10)
     never = threading.Event()
 
-    def block(_: str, __: bytes) -> None:
+    entered: list[str] = []
+
+    def block(key: str, __: bytes) -> None:
+        entered.append(key)
         never.wait(120.0)
 
     try:
@@ -461,6 +458,9 @@ def test_closing_does_not_fail_though_a_callback_never_returns(monkeypatch: pyte
             client.subscribe("rig/**", block)
             for _ in range(500):
                 server.publish("rig/status", bytes(1000))
+            until(lambda: entered)
+        assert not never.is_set(), "closed while it waited"
+        assert len(entered) == 1
     finally:
         never.set()
 
@@ -523,7 +523,8 @@ def test_backlog_counts_what_the_other_side_has_not_read() -> None:
                 pytest.skip("this system does not tell")
             sender.sendall(bytes(100_000))
             peer = idle.getsockname()[1]
-            until(lambda: backlog_of(port) == {peer: 100_000})
+            until(lambda: sum(backlog_of(port).values()) == 100_000)
+            assert backlog_of(port) == {peer: 100_000}
 
 
 def test_what_a_slow_plain_subscriber_missed_comes_from_the_cache_as_the_documentation_says(

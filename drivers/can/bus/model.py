@@ -22,7 +22,7 @@ import numpy as np
 from drivers.can.bus import frame as frames
 from drivers.can.bus import kernels
 from drivers.can.bus.results import OUTCOMES, RESULT, STATES, BusState, Delivery, Latency, NodeState
-from drivers.can.timing import Speed, speed
+from drivers.can.bus.timing import Speed, speed
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class BusModel:
     """A bus with its nodes.
 
     Args:
-        rate: Bit rates, as `drivers.can.timing.speed` takes them.
+        rate: Bit rates, as `drivers.can.bus.timing.speed` takes them.
         error_rate: Chance of an error a bit.
         seed: Seed of these errors.
         window_ns: Length of the windows of the load [ns].

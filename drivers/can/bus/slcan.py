@@ -29,7 +29,7 @@ from drivers.can.bus import codec
 from drivers.can.bus.codec import CodecError
 from drivers.can.bus.frame import FD_LENGTHS
 from drivers.can.bus.outlet import PATIENCE_S, ROOM, OpenBus, Outlet, message_of
-from drivers.can.timing import Speed
+from drivers.can.bus.timing import Speed
 
 if TYPE_CHECKING:
     import can

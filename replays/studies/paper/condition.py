@@ -267,7 +267,7 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ, *, steps: int = 1
 def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
     """Friction over normal force in a rolling whirl: mean, and highest [1]."""
     inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)
-    motion = move(ENGINE, constants, inputs, _rolled(constants, spin), ticks=round(0.5 * _TICKS_S), every=100)
+    motion = move(ENGINE, constants, inputs, rolled(constants, spin), ticks=round(0.5 * _TICKS_S), every=100)
     normal, friction = (motion.column(name)[1000:] for name in ("normal_force", "friction_force"))
     there = normal > 0.0
     return abs(float(friction.mean() / normal.mean())), float(np.max(np.abs(friction[there] / normal[there])))
@@ -275,7 +275,7 @@ def friction_used(constants: Constants, spin: float) -> tuple[float, float]:
 
 def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
     """Whether a rolling whirl goes on at a friction."""
-    begun = _rolled(constants, spin)
+    begun = rolled(constants, spin)
 
     def holds(mu: float) -> bool:
         changed = constants._replace(contact=constants.contact._replace(friction=mu))
@@ -284,7 +284,7 @@ def _holder(constants: Constants, spin: float) -> Callable[[float], bool]:
     return holds
 
 
-def _rolled(constants: Constants, spin: float) -> np.ndarray:
+def rolled(constants: Constants, spin: float) -> np.ndarray:
     """A settled rolling whirl of a rig, as state and integrals."""
     whirl, _ = rolling_whirl(constants, spin)
     inputs = quiet_inputs(spin=spin, magnets=True, ideal=True)

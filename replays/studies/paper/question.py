@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from replays.studies.closed_forms import Impact, impact, stiffest_mode
 from replays.studies.paper.claim import Groups, Results, median
 from replays.studies.paper.condition import oscillator
 from replays.studies.paper.pulse import Pulse
 from replays.studies.paper.reproduction import Reproduction, drop_impact, drop_impulse
 from replays.studies.paper.spread import phases
-from replays.studies.stability.closed_forms import Impact, impact, stiffest_mode
 from rig.kernels.constants import Constants
 from rig.magnets import cylinder_stiffness, field_sum_stiffness
 from rig.model import magnet_geometry, reference_impact

@@ -55,7 +55,6 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float, method: str, m
         manner: How it is driven.
     """
     import scipy.integrate
-    import scipy.optimize  # here, to be off the clock
 
     if not manner.events and problem.exact_friction:
         raise NotImplementedError("exact friction needs events")

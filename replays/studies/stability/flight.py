@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from replays.studies.closed_forms import Mode, linear_motion, stiffest_mode
 from replays.studies.engines import traits
 from replays.studies.peers.problem import scaled_error
 from replays.studies.stability.cell import Case
-from replays.studies.stability.closed_forms import Mode, linear_motion, stiffest_mode
 from replays.studies.stability.motion import bare_shaft, base_model, move, quiet_inputs, state
 from rig.engines import ENGINES
 from rig.kernels.constants import Constants

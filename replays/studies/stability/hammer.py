@@ -9,11 +9,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from replays.studies.closed_forms import RUNGE_KUTTA_4_REAL_LIMIT
 from replays.studies.engines import friction_of, is_adaptive, traits
 from replays.studies.peers.problem import scaled_error
 from replays.studies.stability.boundary import QUICK_POINTS, whirl_class
 from replays.studies.stability.cell import Case
-from replays.studies.stability.closed_forms import RUNGE_KUTTA_4_REAL_LIMIT
 from replays.studies.stability.motion import Motion, hammer_run, move
 from rig.engines import ENGINES
 from rig.kernels.signals import COLUMN

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from replays.studies.closed_forms import RUNGE_KUTTA_4_REAL_LIMIT, impact, pushed_contact
 from replays.studies.engines import friction_of, is_adaptive, traits
 from replays.studies.stability.cell import Case
-from replays.studies.stability.closed_forms import RUNGE_KUTTA_4_REAL_LIMIT, impact, pushed_contact
 from replays.studies.stability.motion import (
     Motion,
     bare_shaft,

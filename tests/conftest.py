@@ -1,0 +1,75 @@
+"""How the tests are shared out where several run at once (`-n`), and what many of them use.
+
+Tests that read the clock or start processes wait most of their time, and some of them would disturb each other: the
+modules marked so as a whole make up one queue, which one worker goes through from the beginning on. Other workers first
+compile the kernels, each engine's once, and then take module by module, the longest first.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+COMPILING = "tests/parity/test_compiling.py"
+LONGEST = (
+    "tests/house/test_tools.py",
+    "tests/unit/test_chart.py",
+    "tests/physics/test_identification.py",
+    "tests/unit/test_paper.py",
+    "tests/physics/test_law_engines.py",
+    "tests/hostile/test_texts.py",
+    "tests/physics/test_stability.py",
+    "tests/unit/test_import.py",
+    "tests/unit/test_identification.py",
+    "tests/unit/test_nuisance.py",
+    "tests/physics/test_reference.py",
+    "tests/hostile/test_files.py",
+)
+"""Modules that take more than 10 s, for which nobody is to wait at the end."""
+_CLOCK = re.compile(r"^pytestmark = .*\bwallclock\b", re.MULTILINE)
+
+
+def _module(nodeid: str) -> str:
+    return nodeid.partition("::")[0]
+
+
+@cache
+def _reads_the_clock(module: str) -> bool:
+    path = ROOT / module
+    return path.is_file() and _CLOCK.search(path.read_text(encoding="utf-8")) is not None
+
+
+def _place(nodeid: str) -> tuple[int, int]:
+    """Where a test stands in the order: what waits, what compiles, what takes long, all others."""
+    module = _module(nodeid)
+    if _reads_the_clock(module):
+        return 0, module.startswith("tests/system/")  # these start real rigs: by then their kernels are compiled
+    if module == COMPILING:
+        return 1, 0
+    if module in LONGEST:
+        return 2, LONGEST.index(module)
+    return 3, 0
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: _place(item.nodeid))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByModule(LoadScopeScheduling):
+        """Hands out a module at a time."""
+
+        def _split_scope(self, nodeid: str) -> str:
+            module = _module(nodeid)
+            return "clock" if _reads_the_clock(module) else nodeid if module == COMPILING else module
+
+    config.option.loadscopereorder = False  # the order is ours
+    return ByModule(config, log)

@@ -1,0 +1,206 @@
+"""Draws who imports whom, for the README: `python -m tests.house.architecture`.
+
+Boxes and rows are the layers that the import contracts prescribe (pyproject.toml), so a row may import what stands in
+rows below it; arrows between boxes are those of the import graph.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import grimp
+
+ROOT = Path(__file__).parents[2]
+PICTURE = ROOT / "replays/figures/architecture.svg"
+ROOTS = ("rig", "drivers", "recorder", "replays")
+OPENED = ("replays.recordings", "replays.studies")
+"""Packages whose inside is drawn as well."""
+COMMANDS = "rig.cli"
+TITLES = {
+    COMMANDS: "the commands of `rig`: the only place that knows all others",
+    "replays": "two products over one kind of report",
+    "recorder": "writes, reads and shows recordings",
+    "drivers": "what a user of the instruments writes",
+    "rig": "the simulator: numbers at the bottom, wires at the top",
+    "replays.recordings": "made of recordings",
+    "replays.studies": "of methods; no recording",
+}
+FILL = {"rig": "#dfe9f5", "drivers": "#e3f1e1", "recorder": "#fbeedb", "replays": "#eee4f3"}
+STROKE = {"rig": "#3d6a9e", "drivers": "#4a8a44", "recorder": "#b9781f", "replays": "#7d559c"}
+CHARACTER, LINE, PAD, GAP = 7.3, 26, 12, 8
+WIDTH = 1180
+
+
+@dataclass
+class Box:
+    """A module or package, perhaps opened.
+
+    Attributes:
+        name: Of the module.
+        label: What is written in it.
+        rows: Boxes inside, from the highest layer to the lowest.
+        left, top, width, height: Where it is [px].
+    """
+
+    name: str
+    label: str
+    rows: list[list[Box]] = field(default_factory=list)
+    left: float = 0.0
+    top: float = 0.0
+    width: float = 0.0
+    height: float = 0.0
+
+    def measure(self, least: float = 0.0) -> None:
+        """Work out width and height, inside first."""
+        for box in itertools.chain(*self.rows):
+            box.measure()
+        inner = [sum(box.width for box in row) + GAP * (len(row) - 1) for row in self.rows]
+        self.width = max(least, len(self.label) * CHARACTER + 2 * PAD, max(inner, default=0.0) + 2 * PAD)
+        self.height = float(LINE)
+        if self.rows:
+            self.height += sum(max(box.height for box in row) + GAP for row in self.rows) + PAD - GAP / 2
+
+    def place(self, left: float, top: float) -> None:
+        """Set where it is, and what is in it, each row in the middle."""
+        self.left, self.top = left, top
+        at = top + LINE
+        for row in self.rows:
+            across = left + (self.width - sum(box.width for box in row) - GAP * (len(row) - 1)) / 2
+            for box in row:
+                if box.rows:
+                    box.height = max(beside.height for beside in row)
+                box.place(across, at)
+                across += box.width + GAP
+            at += max(box.height for box in row) + GAP
+
+    def drawn(self) -> list[str]:
+        """The box and its inside as SVG."""
+        root = self.name.partition(".")[0]
+        opened = bool(self.rows) or self.name == COMMANDS
+        shape = (
+            f'<rect x="{self.left:.0f}" y="{self.top:.0f}" width="{self.width:.0f}" height="{self.height:.0f}" rx="5" '
+            f'fill="{FILL[root] if opened else "#ffffff"}" stroke="{STROKE[root]}" '
+            f'stroke-width="{1.6 if "." not in self.name or self.name == COMMANDS else 0.8}"/>'
+        )
+        weight = ' font-weight="bold"' if opened else ""
+        middle, base = self.left + self.width / 2, self.top + LINE / 2 + 4.5
+        text = f'<text x="{middle:.0f}" y="{base:.0f}"{weight}>{escape(self.label)}</text>'
+        return [shape, text, *itertools.chain(*(box.drawn() for box in itertools.chain(*self.rows)))]
+
+
+def layers() -> dict[str, list[list[str]]]:
+    """Rows of names by package, from the contracts about its inside."""
+    contracts: list[dict[str, Any]] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
+        "importlinter"
+    ]["contracts"]
+    return {
+        container: [[name.strip(" ()") for name in row.replace(":", "|").split("|")] for row in contract["layers"]]
+        for contract in contracts
+        for container in contract.get("containers", ())
+    }
+
+
+def box_of(name: str, rows: dict[str, list[list[str]]], graph: grimp.ImportGraph) -> Box:
+    """A package with its layers, those below opened where they are to be."""
+    if name in ROOTS or name in OPENED:
+        inside = [
+            [
+                box_of(f"{name}.{part}", rows, graph)
+                for part in row
+                if f"{name}.{part}" in graph.modules and f"{name}.{part}" != COMMANDS
+            ]
+            for row in rows[name]
+        ]
+        return Box(name, f"{name.rpartition('.')[2]}/: {TITLES[name]}", [row for row in inside if row])
+    return Box(name, name.rpartition(".")[2] + ("/" if graph.find_children(name) else ""))
+
+
+def imports(graph: grimp.ImportGraph, importer: str, imported: str) -> bool:
+    """Whether one package imports another; the rig's commands are none of its own."""
+    below = {imported, *graph.find_descendants(imported)} if imported in graph.modules else {imported}
+    if imported == "rig":
+        below -= {COMMANDS, *graph.find_descendants(COMMANDS)}
+    return any(graph.find_modules_directly_imported_by(name) & below for name in graph.find_descendants(importer))
+
+
+def arrow(*points: tuple[float, float], root: str) -> str:
+    """A line through some points, with its head at the last."""
+    way = " ".join(f"{x:.0f},{y:.0f}" for x, y in points)
+    return f'<polyline points="{way}" fill="none" stroke="{STROKE[root]}" stroke-width="2" marker-end="url(#{root})"/>'
+
+
+def picture() -> str:
+    """The whole as SVG."""
+    graph = grimp.build_graph(*ROOTS, cache_dir=None)
+    rows = layers()
+    commands = Box(COMMANDS, f"rig/cli/: {TITLES[COMMANDS]}")
+    boxes = {name: box_of(name, rows, graph) for name in ROOTS}
+    gutter, step = 70.0, 46.0
+    full = WIDTH - 2 * gutter
+    for name, least in (("replays", full), ("drivers", 0.0), ("rig", full)):
+        boxes[name].measure(least)
+    boxes["recorder"].measure(full - boxes["drivers"].width - 2 * GAP)
+    commands.measure(full)
+    commands.place(gutter, 10)
+    boxes["replays"].place(gutter, commands.top + commands.height + step)
+    middle = boxes["replays"].top + boxes["replays"].height + step
+    boxes["recorder"].place(gutter, middle)
+    boxes["drivers"].place(gutter + full - boxes["drivers"].width, middle)
+    boxes["rig"].place(gutter, middle + max(boxes["recorder"].height, boxes["drivers"].height) + step)
+    height = boxes["rig"].top + boxes["rig"].height + 12
+    return "\n".join([
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height:.0f}" width="{WIDTH}"'
+        f' height="{height:.0f}" font-family="Helvetica, Arial, DejaVu Sans, sans-serif"'
+        ' font-size="12.5" text-anchor="middle">',
+        "<!-- Generated by `python -m tests.house.architecture`; tests/house/test_architecture.py compares it. -->",
+        "<defs>",
+        *(
+            f'<marker id="{root}" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7" orient="auto">'
+            f'<path d="M0,0 L10,5 L0,10 z" fill="{color}"/></marker>'
+            for root, color in STROKE.items()
+        ),
+        "</defs>",
+        f'<rect width="{WIDTH}" height="{height:.0f}" fill="#ffffff"/>',
+        *commands.drawn(),
+        *itertools.chain(*(box.drawn() for box in boxes.values())),
+        *arrows(graph, commands, boxes),
+        "</svg>",
+        "",
+    ])  # fmt: skip
+
+
+def arrows(graph: grimp.ImportGraph, commands: Box, boxes: dict[str, Box]) -> list[str]:
+    """Imports between the packages: straight down where nothing is between, else around the outside."""
+    replays, recorder, drivers, rig = (boxes[name] for name in ("replays", "recorder", "drivers", "rig"))
+    right, drawn = replays.left + replays.width, []
+
+    def down(importer: Box, imported: Box, x: float) -> None:
+        if imports(graph, importer.name, imported.name):
+            root = importer.name.partition(".")[0]
+            drawn.append(arrow((x, importer.top + importer.height), (x, imported.top - 1), root=root))
+
+    def around(importer: Box, imported: Box, x: float, edge: float, at: float) -> None:
+        if imports(graph, importer.name, imported.name):
+            root = importer.name.partition(".")[0]
+            y, z = importer.top + importer.height / 2, imported.top + at
+            drawn.append(arrow((edge, y), (x, y), (x, z), (edge + (-1 if x < edge else 1), z), root=root))
+
+    down(commands, replays, commands.left + commands.width / 2)
+    down(replays, recorder, recorder.left + recorder.width / 2)
+    down(replays, drivers, drivers.left + drivers.width / 2)
+    down(recorder, rig, recorder.left + recorder.width / 2)
+    down(drivers, rig, drivers.left + drivers.width / 2)
+    around(commands, recorder, 46, replays.left, 40)
+    around(commands, rig, 16, replays.left, 60)
+    around(replays, rig, 31, replays.left, 40)
+    around(commands, drivers, WIDTH - 46, right, 40)
+    return drawn
+
+
+if __name__ == "__main__":
+    PICTURE.write_text(picture(), encoding="utf-8")

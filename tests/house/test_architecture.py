@@ -1,0 +1,13 @@
+"""The README's picture of who imports whom is up to date."""
+
+from __future__ import annotations
+
+from tests.house.architecture import PICTURE, ROOT, picture
+
+
+def test_picture_is_up_to_date() -> None:
+    assert PICTURE.read_text(encoding="utf-8") == picture(), "make it anew: python -m tests.house.architecture"
+
+
+def test_readme_shows_it() -> None:
+    assert f"({PICTURE.relative_to(ROOT)})" in (ROOT / "README.md").read_text(encoding="utf-8")

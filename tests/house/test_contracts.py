@@ -1,0 +1,204 @@
+"""Who may import whom (pyproject.toml), that each contract sees its breach, and what `rig --help` does not import.
+
+A breach is an import that is added to the graph of all imports, not to a file: so the files are read once only. One is
+written to a copy of the files, to show that a line of code comes to the same.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import grimp
+import pytest
+from importlinter import Contract
+from importlinter.api import read_configuration
+from importlinter.contracts.acyclic_siblings import AcyclicSiblingsContract
+from importlinter.contracts.forbidden import ForbiddenContract
+from importlinter.contracts.independence import IndependenceContract
+from importlinter.contracts.layers import LayersContract
+from importlinter.contracts.protected import ProtectedContract
+
+from rig.cli.app import app
+from tests.house.allowance import AllowanceContract
+
+ROOT = Path(__file__).parents[2]
+HEAVY = ("numba", "scipy", "zenoh", "mcap", "rerun", "matplotlib", "pyarrow", "can", "cantools", "isotp")
+CONFIGURATION = read_configuration(str(ROOT / "pyproject.toml"))
+PACKAGES = CONFIGURATION["session_options"]["root_packages"]
+TYPES: dict[str, type[Contract]] = {
+    kind.type_name: kind
+    for kind in (
+        AcyclicSiblingsContract,
+        AllowanceContract,
+        ForbiddenContract,
+        IndependenceContract,
+        LayersContract,
+        ProtectedContract,
+    )
+}
+
+# What is added, and the word of the contract's name that must see it.
+BREACHES = [
+    # The rig is the bottom.
+    ("rig.simulation", "replays.recordings.experiment", "less its commands"),
+    ("rig.model", "recorder.reader", "less its commands"),
+    ("rig.offline", "replays.sessions.session", "less its commands"),
+    ("rig.pacing", "recorder.views", "less its commands"),
+    ("rig.kernels.contact", "tests", "less its commands"),
+    ("rig.service", "replays.recordings.whirl", "less its commands"),
+    ("rig.wire", "drivers.samples", "less its commands"),
+    ("recorder.reader", "rig.cli.tables", "Tests on top"),
+    ("replays.recordings.whirl", "tests", "Tests on top"),
+    ("drivers.daq", "recorder.reader", "Tests on top"),
+    # Layers inside the packages.
+    ("rig.engines.rk4", "rig.simulation", "Inside the rig"),
+    ("rig.wire", "rig.transport", "Inside the rig"),
+    ("rig.engines.tsit5", "rig.engines.rk8", "An engine does not know"),
+    ("drivers.link", "drivers.daq", "Inside the drivers"),
+    ("drivers.daq", "drivers.twins", "Inside the drivers"),
+    ("drivers.can.bus.model", "drivers.can.gateway", "Inside the virtual bus"),
+    ("drivers.hammer.driver", "drivers.hammer.twin", "Inside a device"),
+    ("recorder.reader", "recorder.viewer.live", "Inside the recorder"),
+    ("recorder.writer", "recorder.viewer.file", "Inside the recorder"),
+    ("recorder.viewer.canvas", "recorder.viewer.painter", "Inside the viewer"),
+    ("replays.recordings.whirl", "replays.studies.paper.document", "Inside the replays"),
+    ("replays.report", "replays.recordings.whirl", "Inside the replays"),
+    ("replays.studies.laws", "replays.recordings.verdict", "Inside the replays"),
+    ("replays.recordings.whirl", "replays.recordings.validation", "Inside what is made of recordings"),
+    ("replays.studies.laws", "replays.studies.chart", "Inside the studies"),
+    ("replays.studies.bench", "recorder.reader", "Studies of methods never"),
+    ("replays.studies.ladder.quantity", "replays.studies.ladder.chart", "No ring"),
+    ("rig.sensors.noise", "rig.sensors.conditioning", "No ring"),
+    # Who must not see what.
+    ("recorder.views", "rig.kernels.signals", "cannot see the model"),
+    ("drivers.console", "rig.model", "cannot see the model"),
+    ("drivers.hammer.driver", "drivers.hammer.twin", "does not know its twin"),
+    ("drivers.link.can", "drivers.console", "does not know its twin"),
+    ("drivers.daq", "drivers.can.gateway", "inside of the virtual bus"),
+    ("drivers.force.driver", "drivers.can.bus.hub", "inside of the virtual bus"),
+    ("recorder.reader", "drivers.can.bus.hub", "inside of the virtual bus"),
+    # Physics: other libraries, clocks, threads, processes; also by way of what it may import.
+    ("rig.kernels.contact", "pandas", "Physics"),
+    ("rig.parameters", "pyarrow", "Physics"),
+    ("rig.channels", "multiprocessing", "Physics"),
+    ("rig.simulation", "concurrent", "Physics"),
+    ("rig.simulation", "time", "Physics"),
+    ("rig.kernels.contact", "zenoh", "Physics"),
+    ("rig.sensors.noise", "random", "Physics"),
+    ("rig.outside", "socket", "Physics"),
+    ("rig.errors", "threading", "Physics"),
+    ("rig.model", "rig.pacing", "Physics"),
+]
+
+
+@pytest.fixture(scope="module")
+def graph() -> grimp.ImportGraph:
+    return grimp.build_graph(*PACKAGES, include_external_packages=True, cache_dir=None)
+
+
+def contract_named(words: str) -> Contract:
+    """The one contract with these words in its name."""
+    found: list[dict[str, Any]] = [each for each in CONFIGURATION["contracts_options"] if words in each["name"]]
+    assert len(found) == 1, (words, [each["name"] for each in found])
+    return TYPES[found[0]["type"]](found[0]["name"], CONFIGURATION["session_options"], found[0])
+
+
+@pytest.mark.wallclock
+def test_contracts_hold() -> None:
+    done = lint(ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 broken" in done.stdout
+
+
+@pytest.mark.parametrize(("importer", "imported", "words"), BREACHES)
+def test_contracts_see_what_is_forbidden(graph: grimp.ImportGraph, importer: str, imported: str, words: str) -> None:
+    contract = contract_named(words)
+    broken = copy.deepcopy(graph)
+    assert importer in broken.modules, f"{importer} has moved: name another"
+    if imported.partition(".")[0] in PACKAGES:
+        assert imported in broken.modules, f"{imported} has moved: name another"
+    elif imported not in broken.modules:
+        broken.add_module(imported, is_squashed=True)
+    assert not broken.direct_import_exists(importer=importer, imported=imported)
+    broken.add_import(importer=importer, imported=imported, line_number=1, line_contents=f"import {imported}")
+    assert not contract.check(broken, verbose=False).kept
+
+
+def test_each_contract_is_seen_to_break() -> None:
+    for each in CONFIGURATION["contracts_options"]:
+        assert [words for *_, words in BREACHES if words in each["name"]], f"no breach of: {each['name']}"
+
+
+@pytest.mark.parametrize(("parent", "name"), [("rig", "utils"), ("recorder", "utils"), ("replays.studies", "utils")])
+def test_contracts_ask_where_a_new_module_belongs(graph: grimp.ImportGraph, parent: str, name: str) -> None:
+    words = {"rig": "Inside the rig", "recorder": "Inside the recorder", "replays.studies": "Inside the studies"}
+    grown = copy.deepcopy(graph)
+    grown.add_module(f"{parent}.{name}")
+    check = contract_named(words[parent]).check(grown, verbose=False)
+    assert not check.kept
+    assert name in str(check.metadata)
+
+
+@pytest.mark.wallclock
+def test_a_line_in_a_function_is_an_import(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            copied = tmp_path / path.relative_to(ROOT)
+            copied.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copied)
+    kernel = tmp_path / "rig/kernels/contact.py"
+    kernel.write_text(kernel.read_text() + "\n\ndef _at() -> float:\n    from time import time\n\n    return time()\n")
+    done = lint(tmp_path)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "1 broken" in done.stdout
+    assert "rig.kernels.contact -> time" in done.stdout
+
+
+def lint(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Import-linter over a folder, as its command does it: what lies there is what is linted, not what is installed."""
+    code = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True))"
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+@pytest.mark.wallclock
+def test_help_of_every_command_imports_nothing_heavy() -> None:
+    names = [str(command.name) for command in app.registered_commands]
+    assert {"run", "simulate", "record", "view", "demo"} <= set(names)
+    code = f"""
+import sys
+from rig.cli.main import main
+for arguments in [[], *([name] for name in {names!r})]:
+    try:
+        main([*arguments, "--help"])
+    except SystemExit as end:
+        assert end.code == 0, arguments
+print("HEAVY", *sorted(set({HEAVY!r}) & {{name.partition(".")[0] for name in sys.modules}}))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("Usage:") == len(names) + 1
+    assert done.stdout.splitlines()[-1] == "HEAVY"

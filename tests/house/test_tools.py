@@ -1,0 +1,55 @@
+"""What else has to be clean: ruff's rules, its format, pyright's types. Where it is not, the tool's words are shown."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def clean(*command: str) -> None:
+    """Run a tool of this environment over the project."""
+    done = subprocess.run(
+        [sys.executable, "-m", *command],
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.wallclock
+def test_rules_of_ruff_are_kept() -> None:
+    clean("ruff", "check", "--no-cache")
+
+
+@pytest.mark.wallclock
+def test_code_is_formatted() -> None:
+    clean("ruff", "format", "--check", "--no-cache")
+
+
+@pytest.mark.wallclock
+@pytest.mark.timeout(600)
+def test_types_are_right(pytestconfig: pytest.Config) -> None:
+    # Half a minute to four of one core, so not again for what was found right before: same files, same packages.
+    said = hashlib.sha256((ROOT / "pyproject.toml").read_bytes())
+    for package in ("rig", "drivers", "recorder", "replays"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            said.update(str(path.relative_to(ROOT)).encode() + b"\0" + path.read_bytes() + b"\0")
+    for installed in sorted(f"{each.name} {each.version}" for each in metadata.distributions()):
+        said.update(installed.encode() + b"\0")
+    cache = pytestconfig.cache
+    if cache is not None and cache.get("house/right types", None) == said.hexdigest():
+        return
+    clean("pyright", "--pythonpath", sys.executable)
+    if cache is not None:
+        cache.set("house/right types", said.hexdigest())

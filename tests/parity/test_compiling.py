@@ -1,0 +1,33 @@
+"""Every engine compiles before a run all that it needs, once, and keeps it. With several workers this comes first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numba
+import pytest
+
+from rig.engines import ENGINES
+from rig.kernels import compiled_before
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+
+pytestmark = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="this process is plain Python")
+
+
+def kept() -> set[Path]:
+    """Machine code in the cache."""
+    return set(Path(numba.config.CACHE_DIR).rglob("*.nbc"))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_warm_up_compiles_all_that_a_run_needs_and_keeps_it(engine: str) -> None:
+    friction = "exact" if "exact" in ENGINES[engine].frictions else "smoothed"
+    changes = {"sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000}
+    simulation = Simulation(load_scene("hammer", {**changes, "engine.name": engine, "model.friction": friction}))
+    simulation.warm_up()
+    assert compiled_before()
+    before = kept()
+    simulation.advance(40_000)
+    assert simulation.health()["contacts"] > 0
+    assert kept() == before
