@@ -23,7 +23,7 @@ from drivers.can.signals import ABSENT, LIMITS, Field, Kind, Result, State, comm
 from drivers.health import Rising
 from rig import wire
 from rig.channels import default_table
-from rig.commands import HammerCommand, SpeedCommand, parse_command
+from rig.commands import HammerCommand, SpeedCommand, check_command
 from rig.errors import InputError
 from rig.pacing import FreeRun, RealTime
 from rig.service import Service
@@ -403,7 +403,7 @@ def test_a_refusal_says_which_limit_was_passed(kind: Kind, values: Any, field: F
             return {"set": "fake", "title": "", "values": {"drive.top_speed": {"value": 61.5, "unit": "Hz"}}}
 
         def submit(self, name: str, request: Any) -> int:
-            command = parse_command(name, request)
+            command = check_command(name, request)
             if isinstance(command, SpeedCommand) and command.speed_hz > 61.5:
                 raise InputError("speed.speed_hz", "at most the top speed", command.speed_hz)
             return super().submit(name, request)
