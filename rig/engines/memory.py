@@ -16,4 +16,4 @@ STEPS, EVALUATIONS, REJECTED, CEILING = 7, 8, 9, 10
 still above the tolerance, or grids given up for want of parts."""
 OWN = 11
 """From here on an engine's own."""
-MEMORY = 768
+MEMORY = 800

@@ -54,7 +54,8 @@ from rig.engines.memory import (
 from rig.engines.peak import peak
 from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
-from rig.kernels.dynamics import evaluate, gap
+from rig.kernels.dynamics import evaluate
+from rig.kernels.geometry import gap
 
 _TOLERANCE, _SIZE, _BEFORE, _BEFORE_SPAN, _LAST = range(OWN, OWN + 5)
 """Scaled error a step; length proposed for the next part [ticks]; normal force before the last [N], time between both

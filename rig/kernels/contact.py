@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from numba import njit
+from rig.kernels.stage import stage
 
 NO_FRICTION, SMOOTHED, SWITCH, EXACT = range(4)
 """Friction laws: none; mu F_n tanh(v_t/v_s); clamped linear law that aims at rolling within v_s; Coulomb's, set-valued.
@@ -16,7 +17,22 @@ FLIGHT, TOUCHING, FORWARD, BACKWARD, ROLLING = range(5)
 v_t < 0; touching and rolling, the friction force being what keeps v_t at 0."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+class RingForce(NamedTuple):
+    """Force between shaft and ring, in the ring's plane."""
+
+    Fx: float  # on the shaft [N]
+    Fy: float
+    Fn: float  # normal [N]
+    elastic: float  # part of it [N]
+    Ft: float  # friction against the sliding speed [N]
+    delta: float  # penetration [m]; negative is the gap
+    rate: float  # of it [m/s]
+    sliding: float  # speed of the shaft's surface along the ring [m/s]
+    nx: float  # direction from the ring's centre to the shaft's
+    ny: float
+
+
+@stage
 def elastic_force(penetration, stiffness, exponent):
     """Elastic part of the normal force, K delta^n [N], for a penetration >= 0 [m]."""
     if exponent == 1.5:
@@ -26,7 +42,25 @@ def elastic_force(penetration, stiffness, exponent):
     return stiffness * penetration**exponent
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@stage
+def damping_per_speed(onset_speed, contact):
+    """What the elastic force grows by, per speed of the penetration [s/m]; v0 [m/s], floored."""
+    return contact.damping_factor / onset_speed
+
+
+@stage
+def damping_ratio(rate, onset_speed, contact):
+    """Force without viscous damping over its elastic part, 1 + c delta'/v0 [1]."""
+    return 1.0 + contact.damping_factor * rate / onset_speed
+
+
+@stage
+def penetration_of(distance, contact):
+    """Penetration of the shaft into the ring [m] by the distance of their centres [m]; negative is the gap."""
+    return distance - contact.clearance
+
+
+@stage
 def normal_force(penetration, rate, onset_speed, contact):
     """Compliant normal force, eq. 44 and its family.
 
@@ -46,11 +80,11 @@ def normal_force(penetration, rate, onset_speed, contact):
     if penetration <= 0.0:
         return 0.0, 0.0
     elastic = elastic_force(penetration, contact.stiffness, contact.exponent)
-    force = elastic * (1.0 + contact.damping_factor * rate / onset_speed) + contact.viscous_damping * rate
+    force = elastic * damping_ratio(rate, onset_speed, contact) + contact.viscous_damping * rate
     return max(0.0, force), elastic
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@stage
 def friction_force(law, phase, force, sliding_speed, contact):
     """Friction against the sliding speed of eq. 39 (not sgn(theta') of eq. 12), where the state or the phase decides.
 
@@ -79,7 +113,7 @@ def friction_force(law, phase, force, sliding_speed, contact):
     return 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@stage
 def ring_force(ex, ey, vx, vy, surface_speed, onset_speed, law, phase, contact):
     """Force of the ring on the shaft, eqs. 12 and 44 in the plane of the ring.
 
@@ -96,27 +130,23 @@ def ring_force(ex, ey, vx, vy, surface_speed, onset_speed, law, phase, contact):
         law: Friction law.
         phase: Phase of the contact; no force in flight.
         contact: Constants of the contact.
-
-    Returns:
-        Force on the shaft x, y [N]; normal force, its elastic part, friction force [N]; penetration [m]; its rate,
-        sliding speed [m/s]; n_x, n_y.
     """
     distance = math.sqrt(ex * ex + ey * ey)
-    penetration = distance - contact.clearance
+    penetration = penetration_of(distance, contact)
     if distance == 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, penetration, 0.0, 0.0, 1.0, 0.0
+        return RingForce(0.0, 0.0, 0.0, 0.0, 0.0, penetration, 0.0, 0.0, 1.0, 0.0)
     per_distance = 1.0 / distance
     nx = ex * per_distance
     ny = ey * per_distance
     rate = vx * nx + vy * ny
     sliding = vy * nx - vx * ny + surface_speed
     if phase == FLIGHT:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, penetration, rate, sliding, nx, ny
+        return RingForce(0.0, 0.0, 0.0, 0.0, 0.0, penetration, rate, sliding, nx, ny)
     force, elastic = normal_force(penetration, rate, onset_speed, contact)
     tangential = 0.0
     if force > 0.0:
         tangential = friction_force(law, phase, force, sliding, contact)
-    return (
+    return RingForce(
         -force * nx + tangential * ny,
         -force * ny - tangential * nx,
         force,

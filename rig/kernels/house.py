@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from numba import njit
+from rig.kernels.stage import stage
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@stage
 def pair_readings(displacement, pair_stiffness, preload):
     """Readings of one opposed, pre-compressed pair of transducers.
 

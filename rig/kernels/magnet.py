@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
-from numba import njit
+from rig.kernels.stage import stage
 
 LINEAR, RADIAL, RIPPLED = range(3)
 """How many terms of the map take part: a spring; hardening with the radius; the magnets one by one as well."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=False, forceinline=True)
+@stage
+def complex_power(x, y, exponent):
+    """Real and imaginary part of (x + i y)^exponent by squaring: the exponent's bits say which squares take part."""
+    px, py = 0.0 * x + 1.0, 0.0 * x  # of the kind of x, which may be an array
+    qx, qy = x, y
+    bits = exponent
+    while bits > 0:
+        if bits & 1:
+            px, py = px * qx - py * qy, px * qy + py * qx
+        qx, qy = qx * qx - qy * qy, 2.0 * qx * qy
+        bits >>= 1
+    return px, py
+
+
+@stage
 def magnet_force(x, y, magnet):
     """Restoring force and potential of the map.
 
@@ -33,16 +47,8 @@ def magnet_force(x, y, magnet):
     potential = 0.5 * magnet.stiffness * s * (1.0 + s * (magnet.a3 / 2.0 + s * (magnet.a5 / 3.0 + s * magnet.a7 / 4.0)))
     if magnet.terms == RADIAL:
         return gain * x, gain * y, potential
-    # p = w^(N-1) by squaring: the bits of N-1 say which squares take part.
     wx, wy = -y, x
-    px, py = 1.0, 0.0
-    qx, qy = wx, wy
-    bits = magnet.number - 1
-    while bits > 0:
-        if bits & 1:
-            px, py = px * qx - py * qy, px * qy + py * qx
-        qx, qy = qx * qx - qy * qy, 2.0 * qx * qy
-        bits >>= 1
+    px, py = complex_power(wx, wy, magnet.number - 1)
     amplitude = magnet.stiffness * magnet.ripple
     wave = px * wx - py * wy
     grown = amplitude * (1.0 + magnet.growth * s)

@@ -230,7 +230,7 @@ def test_cache_folder_is_named_by_the_digest_unless_the_user_names_one(tmp_path:
 GAP = """
 import numpy as np
 from rig.kernels.constants import Constants, Contact, House, Levels, Magnet, Shaft
-from rig.kernels.dynamics import gap
+from rig.kernels.geometry import gap
 parts = [part(*np.ones(len(part._fields))) for part in (Shaft, Magnet, Contact, House)]
 print(repr(gap(Constants(Levels(True, True, True, True, 1), *parts, 1.0), np.full(14, 0.01))))
 """

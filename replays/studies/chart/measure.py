@@ -17,7 +17,7 @@ from replays.studies.peers.solution import MISSED_HAMMER, Solution
 from rig.engines import load_engine
 from rig.engines.memory import CONTACTS, EVALUATIONS, MEMORY, STEPS
 from rig.kernels.contact import normal_force
-from rig.kernels.dynamics import gap
+from rig.kernels.geometry import gap
 from rig.kernels.signals import N_ROW, N_STATE, N_VECTOR
 from rig.simulation import energy_balance
 

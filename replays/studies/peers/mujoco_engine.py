@@ -24,7 +24,7 @@ import numpy as np
 from replays.studies.peers.problem import Problem
 from replays.studies.peers.solution import Journal, Setting, Solution
 from rig.kernels.contact import FLIGHT, NO_FRICTION, TOUCHING
-from rig.kernels.dynamics import gap
+from rig.kernels.geometry import gap
 from rig.kernels.magnet import magnet_force
 
 FACETS = 180

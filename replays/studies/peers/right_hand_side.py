@@ -20,7 +20,8 @@ from numba.core import cgutils
 from rig.kernels import signals as S
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
-from rig.kernels.dynamics import evaluate, gap
+from rig.kernels.dynamics import evaluate
+from rig.kernels.geometry import gap
 
 if TYPE_CHECKING:
     from replays.studies.peers.problem import Problem

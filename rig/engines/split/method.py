@@ -90,7 +90,8 @@ from rig.engines.split.inner_motion import (
 )
 from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
-from rig.kernels.dynamics import drive_speed, evaluate
+from rig.kernels.dynamics import evaluate
+from rig.kernels.forces import drive_speed
 from rig.kernels.magnet import magnet_force
 
 ORDER = 2

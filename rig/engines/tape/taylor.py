@@ -1,0 +1,370 @@
+"""Code of Taylor series, made of the tapes.
+
+`NUMBA_DISABLE_JIT=1 python -m rig.engines.tape.taylor` writes `rig/engines/taylor/series.py`.
+
+For every order the code works out the next coefficient of all nodes in turn. What the coefficients below give to a
+product's next is a sum over lanes, one a product, worked out for all lanes at once.
+
+Under rolling the friction is unknown. It enters the k-th coefficient of what it keeps at 0 with one factor for all k:
+everything is worked out with that coefficient left at 0, then once more with the coefficient that this asks for.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from rig.engines.tape.columns import EVENTS, FORCE, ROOT, TURNS, WIDTH
+from rig.engines.tape.trace import PHASES, Fork, Known, Node, Symbol, Tape, known, record
+from rig.kernels import signals as S
+
+SERIES = Path(__file__).parents[1] / "taylor" / "series.py"
+"""Where the code lies."""
+WAVE_LANES = 36
+"""Lanes of a complex power: enough for 64 magnets."""
+_VECTOR = 4
+"""Lanes come in multiples of this many."""
+
+_HEAD = '''"""Coefficients of the Taylor series, by phase. Made by `rig.engines.tape.taylor`: do not edit."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from rig.engines.memory import ONSET, PHASE
+from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
+from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
+from rig.kernels.geometry import sines_of
+from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def product(below, left_0, right_0, later, left, right):
+    """The k-th coefficient of a product; `later` is 0 for k = 0, else 1. No array goes in: that counts references."""
+    return below + left_0 * right + left * (later * right_0)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def quotient(below, first, divisor, dividend, inverse):
+    """The k-th coefficient of a quotient that begins with `first` (for k = 0: 0), by the inverse of the divisor's."""
+    return (dividend - below - divisor * first) * inverse
+'''
+
+
+class _Code:
+    """Lines of one function."""
+
+    def __init__(self, tape: Tape) -> None:
+        self._tape = tape
+        self._needed: set[int] = set()
+        self._constants: dict[str, str] = {}
+        self._begin: list[str] = []
+        self._lanes = 0
+        self._unknown: set[int] = set()
+        """Numbers of nodes that depend on the unknown friction."""
+        self._first: set[int] = set()
+        """Numbers of nodes that what it keeps at 0 is made of."""
+        self._lane_of: dict[int, int] = {}
+        self.widest = self.rarest = 0
+
+    def function(self) -> str:
+        """The function's source."""
+        tape = self._tape
+        outputs = self._outputs()
+        residual = tape.events.get("residual")
+        if residual is not None:
+            self._mark(tape.items, [residual])
+            self._first = set(self._needed)
+            self._depend(tape.items)
+        self._mark(tape.items, [*outputs.values(), residual])
+        self._number_lanes(tape.items, 0, rare=False)
+        self.rarest = _whole(self.widest)
+        self._number_lanes(tape.items, self.rarest, rare=True)
+        body = list(self._lines(tape.items, first=residual is not None))
+        if residual is not None:
+            body += [f"friction = {self._value(residual)} * per_friction", *self._lines(tape.items, again=True)]
+        for text, value in outputs.items():
+            body.append(f"{text} = {self._value(value)}")
+        lanes, wide = _whole(self.widest), _whole(self.rarest + WAVE_LANES)
+        body = [line.replace("WAVE", str(self.rarest)) for line in body]
+        lines = [
+            "", "", '@njit(cache=True, error_model="numpy")',
+            f"def {tape.phase}(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc):",
+            f'    """{tape.phase.capitalize()}: {self.widest} lanes."""',
+            "    levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet",
+            "    contact, house = constants.contact, constants.house",
+            "    phase, onset, slack = int(memory[PHASE]), memory[ONSET], memory[SLACK] != 0.0",
+            "    north, east = memory[NORTH], memory[EAST]",
+            *(f"    {name} = {text}" for text, name in self._constants.items()),
+            *(f"    {line}" for line in self._begin),
+            f"    Y[0, {S.N_VECTOR}] = 0.0",
+            f"    Y[0, {S.N_VECTOR + 1}], Y[0, {S.N_VECTOR + 2}] = math.sin(along), math.cos(along)",
+        ]  # fmt: skip
+        for angle in sorted(tape.turns):
+            begin = tape.turns[angle]
+            value = f"math.sin({begin}), math.cos({begin})" if angle == S.THETA else f"sines_of(levels, {begin})"
+            lines.append(f"    Y[0, {TURNS[angle]}], Y[0, {TURNS[angle] + 1}] = {value}")
+        lines += [
+            f"    wide = {_WIDE}",
+            f"    for p in range({wide}):",
+            "        A[0, p] = B[0, p] = 0.0",
+            "    z, later = 1.0, 0.0",
+            "    for k in range(ORDER):",
+            f"        for p in range({wide}):",
+            "            acc[p] = 0.0",
+            "        if wide:",
+            "            for j in range(1, k):",
+            f"                for p in range({wide}):",
+            "                    acc[p] += A[j, p] * B[k - j, p]",
+            "        else:",
+            "            for j in range(1, k):",
+            f"                for p in range({lanes}):",
+            "                    acc[p] += A[j, p] * B[k - j, p]",
+            *(f"        {line}" for line in body),
+            "        portion = 1.0 / (k + 1.0)",
+        ]
+        if tape.phase == "sliding":
+            lines += [
+                f"        for i in range({ROOT}):",
+                "            Y[k + 1, i] = 0.0",
+                "        for j in range(k + 1):",
+                f"            slow = Y[k - j, {ROOT}] * portion",
+                f"            for i in range({ROOT}):",
+                "                Y[k + 1, i] += slow * D[j, i]",
+                f"        Y[k + 1, {ROOT}] = 0.5 * {self._value(tape.events['ring'].rate)} * portion",
+            ]
+        else:
+            lines += [f"        for i in range({ROOT}):", "            Y[k + 1, i] = D[k, i] * portion"]
+            lines += [f"        Y[k + 1, {ROOT}] = 0.0"]
+        lines += ["        z, later = 0.0, 1.0", f"    for i in range({FORCE}, {WIDTH}):", "        Y[ORDER, i] = 0.0"]
+        return "\n".join(lines)
+
+    def _outputs(self) -> dict[str, Any]:
+        tape, force = self._tape, self._tape.events["ring"]
+        events: list[Any] = [tape.events["square"], 0.0, 0.0]
+        if tape.phase == "sliding":
+            pull = tape.either("contact.viscous_damping == 0.0", tape.events["ratio"], tape.events["normal"])
+            events = [0.0, force.sliding, pull]
+        elif tape.phase == "rolling":
+            events = [tape.events["depth"], tape.enter("unknown"), 0.0]
+        outputs = {f"D[k, {column}]": rate for column, rate in tape.rates.items()}
+        outputs[f"Y[k, {FORCE}]"] = force.Fn
+        return outputs | {f"Y[k, {EVENTS + i}]": event for i, event in enumerate(events)}
+
+    # What is needed, and what waits for the friction.
+
+    def _mark(self, items: list[Node | Fork], outputs: Iterable[Any]) -> None:
+        self._needed |= {value.node.number for value in outputs if isinstance(value, Symbol)}
+        for item in reversed(list(_all(items))):
+            if item.kind == "rate" or item.number in self._needed:
+                self._needed.add(item.number)
+                self._needed |= {source.number for source in _sources(item)}
+
+    def _depend(self, items: list[Node | Fork]) -> None:
+        for item in _all(items):
+            if item.kind == "unknown" or any(source.number in self._unknown for source in _sources(item)):
+                self._unknown.add(item.number)
+
+    def _wanted(self, item: Node | Fork, again: bool) -> bool:
+        if isinstance(item, Fork):
+            return any(self._wanted(each, again) for each in (*item.yes, *item.no, *item.joined))
+        late = item.number in self._unknown
+        return item.number in self._needed and (late if again else not late or item.number in self._first)
+
+    def _number_lanes(self, items: list[Node | Fork], lane: int, *, rare: bool, now: bool = False) -> int:
+        """Both branches of a fork share their lanes. What few scenes ask for comes behind the others."""
+        for item in items:
+            if isinstance(item, Fork):
+                sides = [
+                    self._number_lanes(branch, lane, rare=rare, now=now or _RARE.get(item.condition) is answer)
+                    for branch, answer in ((item.yes, True), (item.no, False))
+                ]
+                lane = max(sides)
+            elif item.number in self._needed and item.kind in _LANES and now is rare:
+                self._lane_of[item.number] = lane
+                lane += _LANES[item.kind]
+        if rare:
+            self.rarest = max(self.rarest, lane)
+        else:
+            self.widest = max(self.widest, lane)
+        return lane
+
+    # Code.
+
+    def _constant(self, value: Known) -> str:
+        if not value.over and not value.under:
+            return repr(value.number)
+        return self._constants.setdefault(value.text, f"c{len(self._constants)}")
+
+    def _term(self, coefficient: Known, factor: str) -> str:
+        if coefficient == Known():
+            return factor
+        return f"-{factor}" if coefficient == Known(-1.0) else f"{self._constant(coefficient)} * {factor}"
+
+    def _value(self, value: Any) -> str:
+        if isinstance(value, Symbol):
+            return self._term(value.coefficient, _name(value.node))
+        return "0.0" if value == 0.0 else self._term(known(value), "z")
+
+    def _lines(self, items: list[Node | Fork], *, first: bool = False, again: bool = False) -> Iterator[str]:
+        for item in items:
+            if not self._wanted(item, again):
+                continue
+            if isinstance(item, Node):
+                yield from self._node(item, first)
+                continue
+            for word, branch, side in ((f"if {item.condition}:", item.yes, 0), ("else:", item.no, 1)):
+                lines = [*self._lines(branch, first=first, again=again)]
+                lines += [
+                    f"{_name(each)} = {self._value(each.arguments[side])}"
+                    for each in item.joined
+                    if self._wanted(each, again)
+                ]
+                yield word
+                yield from (f"    {line}" for line in lines or ["pass"])
+
+    def _node(self, node: Node, first: bool) -> Iterator[str]:
+        name, arguments, p = _name(node), node.arguments, self._lane_of.get(node.number, -1)
+        at = f"acc[{p}], A[0, {p}], B[0, {p}], later"
+        match node.kind:
+            case "column":
+                yield f"{name} = Y[k, {arguments[0]}]"
+            case "rate":
+                yield f"D[k, {arguments[0]}] = {self._term(arguments[1], _name(arguments[2]))}"
+            case "unknown":
+                yield f"{name} = {'0.0' if first else 'friction'}"
+            case "sum":
+                one, two = self._term(arguments[0], _name(arguments[1])), self._term(arguments[2], _name(arguments[3]))
+                yield f"{name} = {one} + {two}".replace("+ -", "- ")
+            case "shifted":
+                yield f"{name} = {self._term(arguments[0], _name(arguments[1]))} + {self._term(arguments[2], 'z')}"
+            case "product":
+                left, right = _name(arguments[0]), _name(arguments[1])
+                yield f"A[k, {p}], B[k, {p}] = {left}, {right}"
+                yield f"{name} = product({at}, {left}, {right})"
+            case "quotient" | "reciprocal":
+                dividend, divisor = (
+                    ("z", arguments[0]) if node.kind == "reciprocal" else (_name(arguments[0]), arguments[1])
+                )
+                self._keep(f"i{node.number} = 0.0")
+                yield f"i{node.number} = 1.0 / {_name(divisor)} if k == 0 else i{node.number}"
+                yield f"{name} = quotient(acc[{p}], later * B[0, {p}], {_name(divisor)}, {dividend}, i{node.number})"
+                yield f"A[k, {p}], B[k, {p}] = {_name(divisor)}, {name}"
+            case "root":
+                square = self._term(arguments[0], _name(arguments[1]))
+                yield f"{name} = math.sqrt({square}) if k == 0 else ({square} - acc[{p}]) * (0.5 / A[0, {p}])"
+                yield f"A[k, {p}] = B[k, {p}] = {name}"
+            case "tanh":
+                # T' = (1 - T^2) v'.
+                value = self._term(arguments[0], _name(arguments[1]))
+                yield f"{name} = math.tanh({value}) if k == 0 else (acc[{p}] + k * ({value}) * B[0, {p}]) / k"
+                yield f"A[k, {p}] = k * ({value})"
+                yield f"A[k, {p + 1}], B[k, {p + 1}] = {name}, {name}"
+                yield f"B[k, {p}] = z - product({at.replace(str(p), str(p + 1))}, {name}, {name})"
+            case "power":
+                # x P' = n P x'.
+                x, exponent = _name(arguments[0]), self._constant(arguments[1])
+                yield (
+                    f"{name} = {x} ** {exponent} if k == 0 else "
+                    f"({exponent} * (acc[{p}] + k * {x} * B[0, {p}]) - acc[{p + 1}]) / (k * B[0, {p + 1}])"
+                )
+                yield f"A[k, {p}], B[k, {p}], A[k, {p + 1}], B[k, {p + 1}] = k * {x}, {name}, k * {name}, {x}"
+            case "complex_power":
+                yield from self._wave(node)
+            case "part":
+                yield f"{name} = wave_{arguments[1]}"
+            case _:
+                raise AssertionError(node.kind)
+
+    def _keep(self, line: str) -> None:
+        if line not in self._begin:
+            self._begin.append(line)
+
+    def _wave(self, node: Node) -> Iterator[str]:
+        """By squaring, as in `rig.kernels.magnet.complex_power`."""
+        times_x, x, times_y, y, exponent = node.arguments
+        yield f"square_x, square_y = {self._term(times_x, _name(x))}, {self._term(times_y, _name(y))}"
+        yield "wave_x, wave_y = z, 0.0"
+        yield f"bits, lane, begun = int({exponent.text}), WAVE, False"
+        body = """while bits > 0:
+    if bits & 1:
+        if begun:
+            A[k, lane], B[k, lane], A[k, lane + 1], B[k, lane + 1] = wave_x, square_x, wave_y, square_y
+            A[k, lane + 2], B[k, lane + 2], A[k, lane + 3], B[k, lane + 3] = wave_x, square_y, wave_y, square_x
+            one = product(acc[lane], A[0, lane], B[0, lane], later, wave_x, square_x)
+            one -= product(acc[lane + 1], A[0, lane + 1], B[0, lane + 1], later, wave_y, square_y)
+            two = product(acc[lane + 2], A[0, lane + 2], B[0, lane + 2], later, wave_x, square_y)
+            two += product(acc[lane + 3], A[0, lane + 3], B[0, lane + 3], later, wave_y, square_x)
+            wave_x, wave_y = one, two
+            lane += 4
+        else:
+            wave_x, wave_y, begun = square_x, square_y, True
+    bits >>= 1
+    if bits > 0:
+        A[k, lane], B[k, lane], A[k, lane + 1], B[k, lane + 1] = square_x, square_x, square_y, square_y
+        A[k, lane + 2], B[k, lane + 2] = square_x, square_y
+        one = product(acc[lane], A[0, lane], B[0, lane], later, square_x, square_x)
+        one -= product(acc[lane + 1], A[0, lane + 1], B[0, lane + 1], later, square_y, square_y)
+        square_y = 2.0 * product(acc[lane + 2], A[0, lane + 2], B[0, lane + 2], later, square_x, square_y)
+        square_x = one
+        lane += 3"""
+        yield from body.splitlines()
+
+
+_RARE = {
+    "contact.exponent == 1.0": False,
+    "contact.gap_counts_outer == 0.0": False,
+    "levels.friction == SMOOTHED": True,
+    "magnet.terms == RADIAL": False,
+}
+"""Conditions by which few scenes go, and the answer then."""
+_WIDE = """(
+        contact.gap_counts_outer != 0.0
+        or (contact.exponent != 1.5 and contact.exponent != 1.0)
+        or levels.friction == SMOOTHED
+        or (inputs.magnet_engaged and magnet.terms == RIPPLED)
+    )"""
+"""Whether a scene is one of these."""
+_LANES = {"product": 1, "quotient": 1, "reciprocal": 1, "root": 1, "tanh": 2, "power": 2}
+
+
+def _whole(lanes: int) -> int:
+    return -(-lanes // _VECTOR) * _VECTOR
+
+
+def _name(node: Node) -> str:
+    return f"v{node.number}"
+
+
+def _sources(node: Node) -> Iterator[Node]:
+    for each in node.arguments:
+        if isinstance(each, Node | Symbol):
+            yield each if isinstance(each, Node) else each.node
+
+
+def _all(items: list[Node | Fork]) -> Iterator[Node]:
+    """All nodes, each after what it is made of."""
+    for item in items:
+        if isinstance(item, Fork):
+            yield from _all(item.yes)
+            yield from _all(item.no)
+            yield from item.joined
+        else:
+            yield item
+
+
+def source() -> str:
+    """The text of `series.py`."""
+    assert os.environ.get("NUMBA_DISABLE_JIT") == "1", "the tapes need kernels in plain Python: NUMBA_DISABLE_JIT=1"
+    codes = [_Code(record(phase)) for phase in PHASES]
+    functions = [code.function() for code in codes]
+    lanes = max(_whole(code.rarest + WAVE_LANES) for code in codes)
+    return f"{_HEAD}\n\nLANES = {lanes}\n" + "\n".join(functions) + "\n"
+
+
+if __name__ == "__main__":
+    SERIES.write_text(source())

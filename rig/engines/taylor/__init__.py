@@ -1,0 +1,5 @@
+"""The Taylor engine; see `rig.engines.taylor.march`."""
+
+from rig.engines.taylor.march import advance, start
+
+__all__ = ["advance", "start"]

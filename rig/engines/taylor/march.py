@@ -1,0 +1,524 @@
+"""Taylor series of order 16 on the full model: the engine for errors below 1e-6.
+
+The solution's own power series by the recurrences of automatic differentiation; length of step from the last two terms
+(A. Jorba and M. Zou, A software package for the numerical integration of ODEs by means of high-order Taylor methods,
+Experimental Mathematics 14 (2005) 99-117). Their code, `rig.engines.taylor.series`, is made of the equations in
+`rig.kernels.dynamics` (`rig.engines.tape` says how); here is how the series are marched.
+
+Events are roots of polynomials: onset, lift-off, a sliding speed that comes to 0, friction that rolling needs beyond
+mu F_n, a normal law that asks for tension, a transducer that loses its preload. Steps end there; friction by Filippov,
+as in `rig.engines.parts`.
+
+Contact. delta^1.5 has branch points at onset and lift-off, next to which a series in time converges as far as to the
+nearer one: a hundred steps a contact. While it slides, the series is therefore in tau with dt = s dtau, s the root of
+delta, itself a state, s' = delta'/2 by tau: the force goes as s^3, onset and lift-off are simple zeros of s, and an
+impact takes some 16 steps. (Levi-Civita and Sundman treat collisions of bodies so.) Where the law's exponent is neither
+1 nor 1.5, contacts begin at a depth of 1e-14 m. Rolling ends before the lift-off and stays with time.
+
+Steps run on beyond the rows, which are read off the series; so the memory holds one. Where the inputs change, it is
+dropped at that instant. So neither calls nor the density of rows change a bit of the motion.
+
+Smoothed friction is taken too, but a very small smoothing speed makes it stiff, and the steps short.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from rig.engines.memory import (
+    CEILING,
+    CLAMPS,
+    CONTACT_STEPS,
+    CONTACTS,
+    EVALUATIONS,
+    FLOORED,
+    ONSET,
+    PEAK_FORCE,
+    PHASE,
+    STEPS,
+)
+from rig.engines.parts import PER_SCALE, rates
+from rig.engines.tape.columns import EVENTS, FORCE, ROOT, TIME, WIDTH
+from rig.engines.taylor.place import (
+    EAST,
+    END_FRACTION,
+    END_TICK,
+    EVENT,
+    FRACTION,
+    INPUTS,
+    KNOWN,
+    LENGTH,
+    NORTH,
+    ORDER,
+    SERIES,
+    SLACK,
+    SPAN,
+    STALLED,
+    TICK,
+    TOLERANCE,
+)
+from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
+from rig.engines.taylor.series import LANES, flight, rolling, sliding
+from rig.kernels import signals as S
+from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING, ring_force
+from rig.kernels.dynamics import unit_response
+from rig.kernels.forces import drive_speed
+from rig.kernels.geometry import State, eccentricity_of, pose_of
+
+_NOTHING, _FIRST, _SECOND, _THIRD, _HOUSE_NS, _HOUSE_EW = range(6)
+"""What ends a series: a length or a corner of the hammer's; a zero of one of the events' functions; a transducer."""
+
+_HAIR = 1e-9
+"""Depth [m] up to which a contact that does not slide has no friction: rolling needs a normal force."""
+_AT_REST = 1e-9
+"""Sliding speed [m/s] at the onset below which a contact does not slide."""
+_SLOWEST = 1e-6
+"""Speed of an onset [m/s] below which the contact begins at the depth ..."""
+_LEAST_ROOT = 1e-7
+"""... of this squared: there dt = s dtau would stand still."""
+_SAFETY = 0.9
+_LONGEST_S, _SHORTEST_S = 2e-2, 1e-9
+"""Longest and shortest step [s]; the latter not next to an event."""
+_ROUNDING = 1e-16
+"""Tolerance that no step can vouch for."""
+_SCALE_T, _SCALE_ROOT = 1e-4, 3e-3
+"""What counts as 1 in a step's error: 0.1 ms, 9 um."""
+
+
+@njit(cache=True, error_model="numpy")
+def start(constants, inputs, y, memory, step_ticks, tolerance):
+    """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
+    memory[:] = 0.0
+    memory[ONSET] = constants.contact.speed_floor
+    memory[TOLERANCE] = tolerance
+    memory[SPAN] = -1.0
+    ring, _ = _ring(constants, inputs, y)
+    if ring.delta > 0.0:
+        memory[PHASE] = TOUCHING
+        if constants.levels.friction == EXACT:
+            memory[PHASE] = FORWARD if ring.sliding > 0.0 else BACKWARD
+
+
+@njit(cache=True, error_model="numpy")
+def _loses(displacement, rate, stiffness, preload):
+    """Which transducer of a pair has lost its preload, or is about to: 0, or the sign of the displacement."""
+    change = 0.5 * stiffness * displacement
+    sign = 1.0 if change > 0.0 else -1.0
+    over = sign * change - preload
+    edge = 1e-12 * preload
+    return sign if over > edge or (over > -edge and sign * rate > 0.0) else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _ring(constants, inputs, x):
+    """Force of the ring without friction (penetration, its rate, sliding speed), and the response to friction, at x."""
+    state = State(x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8], x[9], x[10], x[11], x[12], x[13])
+    pose = pose_of(constants.levels, state)
+    e = eccentricity_of(constants, state, pose)
+    surface = constants.shaft.radius * pose.w
+    ring = ring_force(e.ex, e.ey, e.vx, e.vy, surface, 1.0, NO_FRICTION, FLIGHT, constants.contact)
+    return ring, unit_response(constants, inputs, pose, ring.nx, ring.ny)
+
+
+@njit(cache=True, error_model="numpy")
+def _make_series(constants, inputs, memory, Y, A, B, D, acc):
+    """All coefficients of a series from the state in its first row.
+
+    Returns:
+        Whether it is a series in slowed time.
+    """
+    now, phase = int(memory[TICK]), int(memory[PHASE])
+    aim = drive_speed(inputs, now, memory[FRACTION])
+    pulse = along = 0.0
+    if inputs.hammer_start <= now < inputs.hammer_end:
+        pulse = math.pi / float(inputs.hammer_end - inputs.hammer_start)
+        along = pulse * (float(now - inputs.hammer_start) + memory[FRACTION])
+        pulse /= inputs.tick_s
+    if phase == FLIGHT:
+        flight(constants, inputs, memory, aim, pulse, along, 0.0, Y, A, B, D, acc)
+    elif phase == ROLLING:
+        per_friction = -1.0 / _ring(constants, inputs, Y[0])[1]
+        rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc)
+    else:
+        sliding(constants, inputs, memory, aim, pulse, along, 0.0, Y, A, B, D, acc)
+    _events(constants, memory, Y)
+    return phase != FLIGHT and phase != ROLLING
+
+
+@njit(cache=True, error_model="numpy")
+def _events(constants, memory, Y):
+    """Functions that fall through 0 where an event happens, of what the series has in their columns."""
+    contact, phase = constants.contact, int(memory[PHASE])
+    first, second, third = Y[:, EVENTS], Y[:, EVENTS + 1], Y[:, EVENTS + 2]
+    if phase == FLIGHT:
+        for k in range(ORDER):
+            first[k] = -first[k]
+            second[k] = third[k] = 0.0
+        first[0] += contact.clearance * contact.clearance
+        second[0] = third[0] = 1.0
+        return
+    if phase == ROLLING:
+        first[0] -= _HAIR
+        for k in range(ORDER):
+            friction, limit = second[k], contact.friction * Y[k, FORCE]
+            second[k], third[k] = limit - friction, limit + friction
+        return
+    speed = second[0]
+    sign = 1.0 if phase == FORWARD else -1.0
+    if phase == TOUCHING:
+        sign = 0.0
+        if constants.levels.friction == SMOOTHED and abs(speed) > 4.0 * contact.smoothing_speed:
+            sign = math.copysign(1.0, speed)
+    away = memory[SLACK] != 0.0
+    for k in range(ORDER):
+        first[k] = Y[k, ROOT]
+        second[k] = sign * second[k]
+        if away:
+            third[k] = -third[k]
+    first[ORDER] = Y[ORDER, ROOT]
+    if away or sign == 0.0:
+        second[:] = 0.0
+        second[0] = 1.0
+    elif phase == TOUCHING:
+        # Far out the tanh is 1 to rounding, and no coefficient tells of the turn ahead: halve the way to it.
+        second[0] = 0.5 * abs(speed)
+    if phase == TOUCHING and constants.levels.friction == EXACT and Y[1, ROOT] > 0.0:
+        # Frictionless as far as the hair, on the way in.
+        for k in range(ORDER + 1):
+            second[k] = -Y[k, ROOT]
+        second[0] += math.sqrt(_HAIR)
+
+
+@njit(cache=True, error_model="numpy")
+def _length(memory, Y, slowed):
+    """How far a series holds: its last two terms stay within the tolerance."""
+    tolerance = memory[TOLERANCE]
+    last = before = 0.0
+    for i in range(S.N_STATE):
+        last = max(last, abs(Y[ORDER, i]) * PER_SCALE[i])
+        before = max(before, abs(Y[ORDER - 1, i]) * PER_SCALE[i])
+    if slowed:
+        last = max(last, abs(Y[ORDER, TIME]) / _SCALE_T, abs(Y[ORDER, ROOT]) / _SCALE_ROOT)
+        before = max(before, abs(Y[ORDER - 1, TIME]) / _SCALE_T, abs(Y[ORDER - 1, ROOT]) / _SCALE_ROOT)
+    return _SAFETY * min(
+        (tolerance / max(last, 1e-200)) ** (1.0 / ORDER), (tolerance / max(before, 1e-200)) ** (1.0 / (ORDER - 1.0))
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _settle(constants, inputs, memory, x, y, dy, out):
+    """Phase of a contact whose sliding speed is 0: rolling if that is possible, else the way it is pushed."""
+    y[:] = x[: S.N_VECTOR]
+    # Written so that it is the very call of `advance`: each kind of arguments would be compiled anew.
+    memory[PHASE] = ROLLING
+    tick, phase = int(memory[TICK]), int(memory[PHASE])
+    rates(constants, inputs, tick, memory[FRACTION], memory[ONSET], phase, True, y, dy, out)
+    memory[EVALUATIONS] += 1.0
+    needed = out[S.FRICTION_FORCE]
+    if abs(needed) > constants.contact.friction * out[S.NORMAL_FORCE]:
+        memory[PHASE] = FORWARD if needed > 0.0 else BACKWARD
+        memory[KNOWN + 1] = 1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _change_phase(constants, inputs, memory, x, y, dy, out):
+    """Go over to what is behind the event that has ended a series, at the state x where it happens."""
+    event, phase = int(memory[EVENT]), int(memory[PHASE])
+    contact, exact = constants.contact, constants.levels.friction == EXACT
+    memory[EVENT] = _NOTHING
+    known = memory[KNOWN : KNOWN + 3]
+    for i in range(3):
+        known[i] = 0.0
+    ring, _ = _ring(constants, inputs, x)
+    depth, rate, sliding = ring.delta, ring.rate, ring.sliding
+    sliding_phase = TOUCHING
+    if exact:
+        sliding_phase = FORWARD if sliding > 0.0 else BACKWARD
+    if phase == FLIGHT:
+        if event == _FIRST:
+            memory[CONTACTS] += 1.0
+            if rate < contact.speed_floor:
+                memory[FLOORED] += 1.0
+            memory[ONSET] = max(rate, contact.speed_floor)
+            memory[PHASE] = sliding_phase if abs(sliding) > _AT_REST else TOUCHING
+            x[ROOT] = 0.0
+            known[0] = 1.0
+            if rate < _SLOWEST or not (contact.exponent == 1.5 or contact.exponent == 1.0):
+                x[ROOT] = _LEAST_ROOT
+                known[0] = 0.0
+    elif memory[SLACK] != 0.0:
+        if event == _FIRST:
+            memory[PHASE], memory[SLACK] = FLIGHT, 0.0
+            known[0] = 1.0
+        elif event == _THIRD:
+            memory[PHASE], memory[SLACK] = sliding_phase, 0.0
+            known[2] = 1.0
+    elif event == _FIRST:
+        if phase == ROLLING:
+            memory[PHASE] = TOUCHING
+        else:
+            memory[PHASE] = FLIGHT
+            known[0] = 1.0
+    elif phase == ROLLING:
+        if event != _NOTHING and event <= _THIRD:
+            memory[PHASE] = FORWARD if event == _SECOND else BACKWARD
+            known[1] = 2.0
+    elif event == _THIRD:
+        memory[SLACK] = 1.0
+        memory[CLAMPS] += 1.0
+        known[2] = 1.0
+    elif event == _SECOND and exact:
+        if phase == TOUCHING and abs(sliding) > _AT_REST:
+            memory[PHASE] = sliding_phase
+        else:
+            _settle(constants, inputs, memory, x, y, dy, out)
+    # The depth itself, where it can be told, so that its root does not drift.
+    slowed = memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING
+    if slowed and (depth > 1e-10 or phase == ROLLING or memory[SPAN] < 0.0):
+        x[ROOT] = math.sqrt(max(depth, 1e-14))
+    house = constants.house
+    memory[NORTH] = memory[EAST] = 0.0
+    if constants.levels.inner_house:
+        memory[NORTH] = _loses(x[4] - x[6], x[11] - x[13], house.pair_stiffness_vertical, house.preload)
+    if constants.levels.outer_house:
+        memory[EAST] = _loses(x[5], x[12], house.pair_stiffness_horizontal, house.preload)
+
+
+@njit(cache=True, error_model="numpy")
+def _preload_end(constants, memory, Y, h):
+    """Where within h a transducer loses or finds its preload; and which pair's."""
+    house = constants.house
+    nearest, which = math.inf, _NOTHING
+    for pair in range(2):
+        if not (constants.levels.inner_house if pair == 0 else constants.levels.outer_house):
+            continue
+        stiffness = house.pair_stiffness_vertical if pair == 0 else house.pair_stiffness_horizontal
+        lost = memory[NORTH + pair]
+        # Bounds on the displacement by its coefficients.
+        middle, swing, power = 0.0, 0.0, 1.0
+        for k in range(ORDER + 1):
+            value = Y[k, 4] - Y[k, 6] if pair == 0 else Y[k, 5]
+            if k == 0:
+                middle = value
+            else:
+                power *= h
+                swing += abs(value * power)
+        limit = 2.0 * house.preload / stiffness
+        if lost == 0.0 and abs(middle) + swing < limit:
+            continue
+        for side in range(2):
+            sign = lost if lost != 0.0 else (1.0 if side == 0 else -1.0)
+            way = 1.0 if lost != 0.0 else -1.0
+            # Above 0 while nothing changes; in the last column, which events no longer need.
+            for k in range(ORDER + 1):
+                value = Y[k, 4] - Y[k, 6] if pair == 0 else Y[k, 5]
+                Y[k, EVENTS + 2] = way * sign * value / limit
+            Y[0, EVENTS + 2] -= way
+            shift = 1 if abs(Y[0, EVENTS + 2]) < 1e-11 else 0
+            zero = first_zero(Y, EVENTS + 2, shift, h)
+            if zero < nearest and not (shift == 1 and zero == 0.0):
+                nearest, which = zero, _HOUSE_NS + pair
+            if lost != 0.0:
+                break
+    return nearest, which
+
+
+@njit(cache=True, error_model="numpy")
+def _note_peak(memory, Y):
+    """The largest normal force within a series."""
+    h = memory[LENGTH]
+    most, power = Y[0, FORCE], 1.0
+    for k in range(1, ORDER):
+        power *= h
+        most += max(0.0, Y[k, FORCE] * power)
+    if not most > memory[PEAK_FORCE]:
+        return
+    slope_before, before = Y[1, FORCE], 0.0
+    peak = max(memory[PEAK_FORCE], Y[0, FORCE])
+    for i in range(1, 9):
+        s = 0.125 * i * h
+        value, slope = column_at(Y, FORCE, 0, s)
+        peak = max(peak, value)
+        if slope_before > 0.0 and slope < 0.0:
+            low, high = before, s
+            for _ in range(30):
+                middle = 0.5 * (low + high)
+                value, slope_middle = column_at(Y, FORCE, 0, middle)
+                peak = max(peak, value)
+                if slope_middle > 0.0:
+                    low = middle
+                else:
+                    high = middle
+        before, slope_before = s, slope
+    memory[PEAK_FORCE] = peak
+
+
+@njit(cache=True, error_model="numpy")
+def _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
+    """From the end of one series to the next.
+
+    Returns:
+        False where there is none: the numbers are no longer finite.
+    """
+    if memory[SPAN] >= 0.0:
+        if memory[PHASE] != FLIGHT:
+            _note_peak(memory, Y)
+        series_at(Y, memory[LENGTH], x)
+        memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
+    _change_phase(constants, inputs, memory, x, y, dy, out)
+    Y[0, : ROOT + 1] = x
+    slowed = _make_series(constants, inputs, memory, Y, A, B, D, acc)
+    memory[STEPS] += 1.0
+    memory[EVALUATIONS] += ORDER
+    if memory[PHASE] != FLIGHT:
+        memory[CONTACT_STEPS] += 1.0
+    if memory[TOLERANCE] < _ROUNDING:
+        memory[CEILING] += 1.0
+    h = _length(memory, Y, slowed)
+    if not math.isfinite(h):
+        return False
+    least = _SHORTEST_S / max(Y[0, ROOT], 1e-4) if slowed else _SHORTEST_S
+    if h < least:
+        h = least
+        memory[CEILING] += 1.0
+    # No further than a corner of the hammer's pulse.
+    now = memory[TICK]
+    corner = math.inf
+    if inputs.hammer_end > inputs.hammer_start:
+        if inputs.hammer_start > now:
+            corner = float(inputs.hammer_start)
+        elif inputs.hammer_end > now:
+            corner = float(inputs.hammer_end)
+    limit = min(_LONGEST_S, ((corner - now) - memory[FRACTION]) * inputs.tick_s)
+    at_corner = False
+    if slowed:
+        span = column_at(Y, TIME, 0, h)[0]
+        if span > limit:
+            h = refine(Y, TIME, 0, limit, 0.0, h)
+            at_corner = limit < _LONGEST_S
+    elif h >= limit:
+        h = limit
+        at_corner = limit < _LONGEST_S
+    event = _NOTHING
+    for i in range(3):
+        shift = int(memory[KNOWN + i])
+        zero = first_zero(Y, EVENTS + i, shift, h)
+        if zero <= h:
+            h, event, at_corner = zero, _FIRST + i, False
+    zero, which = _preload_end(constants, memory, Y, h)
+    if zero <= h:
+        h, event, at_corner = zero, which, False
+    span = column_at(Y, TIME, 0, h)[0] if slowed else h
+    memory[STALLED] = memory[STALLED] + 1.0 if span < 1e-13 else 0.0
+    memory[LENGTH], memory[SPAN], memory[EVENT] = h, span, event
+    if at_corner:
+        memory[END_TICK], memory[END_FRACTION] = corner, 0.0
+    else:
+        ticks = memory[FRACTION] + span / inputs.tick_s
+        whole = math.floor(ticks)
+        memory[END_TICK], memory[END_FRACTION] = now + whole, ticks - whole
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _reach(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out, tick):
+    """State at a tick, into y: series after series up to there, the last one read off.
+
+    Returns:
+        Whether the numbers are still finite.
+    """
+    while (tick - memory[END_TICK]) - memory[END_FRACTION] > 0.0 or memory[SPAN] < 0.0:
+        if memory[STALLED] > 1000.0 or not _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
+            memory[CEILING] += 1.0
+            y[:] = np.nan
+            return False
+    time = ((tick - memory[TICK]) - memory[FRACTION]) * inputs.tick_s
+    s = time
+    if time >= memory[SPAN]:
+        s = memory[LENGTH]
+    elif memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
+        s = refine(Y, TIME, 0, time, 0.0, memory[LENGTH])
+    series_at(Y, s, x)
+    y[:] = x[: S.N_VECTOR]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _same_inputs(inputs, memory):
+    """Whether the inputs are what they were; keeps them."""
+    kept = memory[INPUTS : INPUTS + 11]
+    same = (
+        kept[0] == inputs.tick_s
+        and kept[1] == inputs.hammer_force
+        and kept[2] == inputs.hammer_x
+        and kept[3] == inputs.hammer_y
+        and kept[4] == inputs.hammer_start
+        and kept[5] == inputs.hammer_end
+        and kept[6] == inputs.speed
+        and kept[7] == inputs.speed_slope
+        and kept[8] == inputs.speed_tick
+        and (kept[9] != 0.0) == inputs.ideal_drive
+        and (kept[10] != 0.0) == inputs.magnet_engaged
+    )
+    kept[0], kept[1], kept[2], kept[3] = inputs.tick_s, inputs.hammer_force, inputs.hammer_x, inputs.hammer_y
+    kept[4], kept[5], kept[6] = inputs.hammer_start, inputs.hammer_end, inputs.speed
+    kept[7], kept[8] = inputs.speed_slope, inputs.speed_tick
+    kept[9] = 1.0 if inputs.ideal_drive else 0.0
+    kept[10] = 1.0 if inputs.magnet_engaged else 0.0
+    return same
+
+
+@njit(cache=True, error_model="numpy")
+def _aligned(rows, columns):
+    """Zeros whose rows begin on cache lines: the sums over lanes take half as long again without."""
+    room = np.zeros(rows * columns + 8)
+    first = (-room.ctypes.data % 64) // 8
+    return room[first : first + rows * columns].reshape((rows, columns))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
+    """Take `steps` steps in place and write every `stride`-th instant's row (see `rig.engines`).
+
+    Args:
+        constants: Numbers of the model.
+        inputs: Hammer, drive, magnets; constant over the call.
+        y: State and integrals, in and out, shape (N_VECTOR,). Read only where no series goes on.
+        memory: In and out, shape (MEMORY,).
+        tick: Time at the start.
+        step_ticks: Ticks a step of the grid that rows and calls lie on.
+        steps: Number of steps.
+        stride: Steps a row.
+        rows: Out, shape (ceil(steps / stride), N_ROW).
+    """
+    Y = memory[SERIES : SERIES + (ORDER + 1) * WIDTH].reshape((ORDER + 1, WIDTH))
+    A = _aligned(ORDER + 1, LANES)
+    B = _aligned(ORDER + 1, LANES)
+    D = _aligned(ORDER + 1, WIDTH)
+    acc = _aligned(1, LANES)[0]
+    x = np.zeros(ROOT + 1)
+    dy = np.empty(S.N_VECTOR)
+    out = np.empty(S.N_OBSERVED)
+    if not _same_inputs(inputs, memory) or memory[SPAN] < 0.0:
+        # A new beginning, from what is here now.
+        x[: S.N_VECTOR] = y
+        if memory[SPAN] >= 0.0 and memory[PHASE] != FLIGHT:
+            _note_peak(memory, Y)
+        memory[SPAN] = -1.0
+        memory[EVENT] = _NOTHING
+        memory[TICK], memory[FRACTION] = float(tick), 0.0
+        memory[END_TICK], memory[END_FRACTION] = float(tick), 0.0
+        if not _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
+            memory[STALLED] = 1e9
+    for row in range((steps + stride - 1) // stride):
+        now = tick + row * stride * step_ticks
+        _reach(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out, now)
+        rates(constants, inputs, now, 0.0, memory[ONSET], int(memory[PHASE]), True, y, dy, out)
+        for i in range(S.N_VECTOR):
+            rows[row, i] = y[i]
+        for i in range(S.N_OBSERVED):
+            rows[row, S.N_VECTOR + i] = out[i]
+    _reach(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out, tick + steps * step_ticks)
