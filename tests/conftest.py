@@ -8,6 +8,7 @@ compile the kernels, each engine's once, and then take module by module, the lon
 from __future__ import annotations
 
 import re
+import signal
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,13 @@ def _place(nodeid: str) -> tuple[int, int]:
     if module in LONGEST:
         return 2, LONGEST.index(module)
     return 3, 0
+
+
+def pytest_configure() -> None:
+    # Whoever starts the tests in the background may have signals ignored, and what a test starts would inherit that.
+    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, usual)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -26,15 +26,8 @@ from rig.engines.memory import CEILING, CONTACTS, EVALUATIONS, MEMORY, PHASE, ST
 from rig.kernels import signals as S
 from rig.kernels.contact import ROLLING
 from rig.simulation import Simulation
+from tests.scenes import QUIET
 
-QUIET = {
-    "sensors.chain": "ideal",
-    "sensors.groups": ["hammer"],
-    "sensors.rate_hz": 1000,
-    "sensors.truth_rate_hz": 1000,
-    "sensors.noise": False,
-}
-"""Rows 1 ms apart: steps of every engine end on them."""
 _MEASURED = [0, 1, 3, 4, 7, 8, 9]
 EXACT = [name for name, method in ENGINES.items() if "exact" in method.frictions]
 
@@ -64,6 +57,12 @@ def distance(one: np.ndarray, other: np.ndarray) -> float:
 def slope(steps: list[Any], errors: list[float]) -> float:
     """Fitted exponent of the error against the step."""
     return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
+
+
+def of_engine(engine: str, table: dict[str, Any], what: str) -> Any:
+    """An engine's row of one of the tables here, or what a new engine must add."""
+    assert engine in table, f"{engine} must have a row in {what}"
+    return table[engine]
 
 
 # split's own steps in flight are 8 times these.
@@ -107,7 +106,7 @@ def test_order_on_the_smooth_problem(engine: str, monkeypatch: pytest.MonkeyPatc
         return rows[:, [0, 1, 7, 8]] / np.array([1e-2, 1e-2, 10.0, 10.0])
 
     exact = swing("rk8", 20)
-    steps = SMOOTH_STEPS[engine]
+    steps = of_engine(engine, SMOOTH_STEPS, "SMOOTH_STEPS: four or more steps [us] at which its order shows")
     errors = [float(np.linalg.norm(swing(engine, step) - exact)) for step in steps]
     assert slope(steps, errors) == pytest.approx(load_engine(engine).order, abs=0.15)
 
@@ -176,7 +175,7 @@ CLASS = {
 @pytest.mark.parametrize("engine", EXACT)
 def test_engines_agree_on_exact_friction(engine: str) -> None:
     exact = motion(ready("hammer", "rk8", engine__tolerance=1e-10), 0.05)
-    choice, limit = CLASS[engine]
+    choice, limit = of_engine(engine, CLASS, "CLASS: how it is run, and how far it may be from rk8 after 0.05 s")
     assert distance(motion(ready("hammer", engine, **choice), 0.05), exact) < limit
 
 

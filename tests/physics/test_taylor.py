@@ -43,14 +43,7 @@ from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
 from rig.kernels.dynamics import evaluate
 from rig.simulation import Simulation
-
-QUIET = {
-    "sensors.chain": "ideal",
-    "sensors.groups": ["hammer"],
-    "sensors.rate_hz": 1000,
-    "sensors.truth_rate_hz": 1000,
-    "sensors.noise": False,
-}
+from tests.scenes import QUIET
 
 
 def ready(scene: str = "hammer", engine: str = "taylor", tolerance: float = 1e-9, **changes: Any) -> Simulation:

@@ -311,8 +311,8 @@ def test_frames_that_do_not_exist_are_refused(wrong: can.Message, why: str) -> N
 
 
 def fill(bus: can.BusABC) -> None:
-    # A few may go out meanwhile.
-    for _ in range(endpoints.WINDOW + 10):
+    # Some go out meanwhile, more where this process is held up.
+    for _ in range(10 * endpoints.WINDOW):
         bus.send(message(0x100), timeout=0)
 
 
