@@ -246,7 +246,7 @@ def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
     rotation = w - geometry.share  # theta'
     pull = lI * shaft.unbalance * rotation * rotation
     pull_x, pull_y = pull * direction.cosine, pull * direction.sine
-    force = lI * hammer_mean(inputs, step.begin, step.count * call.part_ticks) if step.struck else 0.0
+    force = lI * hammer_mean(inputs, step.begin, step.parts * call.part_ticks) if step.struck else 0.0
     hammer_x, hammer_y = force * inputs.hammer_x, force * inputs.hammer_y
     Sx, Sy, ax, ay = smooth_forces(
         constants, call.plant, inputs.magnet_engaged, axis, pull_x + hammer_x, pull_y + hammer_y
@@ -441,8 +441,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
             step = _step_of(constants, inputs, call, touch, coordinates.kicked, axis, houses, owed, now, n, last)
 
             # Flow to the middle of the step. The drive's speed is that in the middle of the flow up to there.
-            middle = (n + 0.5 * step.count) * call.part_ticks
-            back = 0.25 * step.count if owed < 0 else 0.25 * (step.count + (1 << owed))
+            middle = (n + 0.5 * step.parts) * call.part_ticks
+            back = 0.25 * step.parts if owed < 0 else 0.25 * (step.parts + (1 << owed))
             aim = drive_speed(inputs, now, middle - back * call.part_ticks)
             spin = w
             if ideal:

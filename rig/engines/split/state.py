@@ -21,7 +21,7 @@ class Step(NamedTuple):
     """One step."""
 
     level: int
-    count: int  # length in shortest steps
+    parts: int  # length in shortest steps
     h: float  # length [s]
     per_h: float  # [1/s]
     begin: float  # tick at its start

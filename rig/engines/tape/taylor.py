@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT, TURNS, WIDTH
-from rig.engines.tape.trace import PHASES, Fork, Known, Node, Symbol, Tape, known, record
+from rig.engines.tape.known import Known, known
+from rig.engines.tape.trace import PHASES, Fork, Node, Symbol, Tape, record
 from rig.kernels import signals as S
 
 SERIES = Path(__file__).parents[1] / "taylor" / "series.py"
@@ -27,7 +28,12 @@ WAVE_LANES = 36
 _VECTOR = 4
 """Lanes come in multiples of this many."""
 
-_HEAD = '''"""Coefficients of the Taylor series, by phase. Made by `rig.engines.tape.taylor`: do not edit."""
+_HEAD = '''"""Coefficients of the Taylor series, by phase.
+
+Made by `NUMBA_DISABLE_JIT=1 python -m rig.engines.tape.taylor`: do not edit; tests/physics/test_taylor.py compares it.
+"""
+
+# pyright: reportPossiblyUnboundVariable=false
 
 from __future__ import annotations
 

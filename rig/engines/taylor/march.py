@@ -30,11 +30,8 @@ from numba import njit
 
 from rig.engines.memory import (
     CEILING,
-    CLAMPS,
     CONTACT_STEPS,
-    CONTACTS,
     EVALUATIONS,
-    FLOORED,
     ONSET,
     PEAK_FORCE,
     PHASE,
@@ -43,8 +40,8 @@ from rig.engines.memory import (
 )
 from rig.engines.method import PER_SCALE, rates
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT, TIME, WIDTH
+from rig.engines.taylor.events import FIRST, NOTHING, change_phase, enter_events, preload_end, ring_at
 from rig.engines.taylor.place import (
-    EAST,
     END_FRACTION,
     END_TICK,
     EVENT,
@@ -52,10 +49,8 @@ from rig.engines.taylor.place import (
     INPUTS,
     KNOWN,
     LENGTH,
-    NORTH,
     ORDER,
     SERIES,
-    SLACK,
     SPAN,
     STALLED,
     TICK,
@@ -63,22 +58,9 @@ from rig.engines.taylor.place import (
 from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
 from rig.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING, ring_force
-from rig.kernels.dynamics import unit_response
+from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
 from rig.kernels.forces import drive_speed
-from rig.kernels.geometry import State, eccentricity_of, pose_of
 
-_NOTHING, _FIRST, _SECOND, _THIRD, _HOUSE_NS, _HOUSE_EW = range(6)
-"""What ends a series: a length or a corner of the hammer's; a zero of one of the events' functions; a transducer."""
-
-_HAIR = 1e-9
-"""Depth [m] up to which a contact that does not slide has no friction: rolling needs a normal force."""
-_AT_REST = 1e-9
-"""Sliding speed [m/s] at the onset below which a contact does not slide."""
-_SLOWEST = 1e-6
-"""Speed of an onset [m/s] below which the contact begins at the depth ..."""
-_LEAST_ROOT = 1e-7
-"""... of this squared: there dt = s dtau would stand still."""
 _SAFETY = 0.9
 _LONGEST_S, _SHORTEST_S = 2e-2, 1e-9
 """Longest and shortest step [s]; the latter not next to an event."""
@@ -95,32 +77,11 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     memory[ONSET] = constants.contact.speed_floor
     memory[TOLERANCE] = tolerance
     memory[SPAN] = -1.0
-    ring, _ = _ring(constants, inputs, y)
+    ring, _ = ring_at(constants, inputs, y)
     if ring.delta > 0.0:
         memory[PHASE] = TOUCHING
         if constants.levels.friction == EXACT:
             memory[PHASE] = FORWARD if ring.sliding > 0.0 else BACKWARD
-
-
-@njit(cache=True, error_model="numpy")
-def _loses(displacement, rate, stiffness, preload):
-    """Which transducer of a pair has lost its preload, or is about to: 0, or the sign of the displacement."""
-    change = 0.5 * stiffness * displacement
-    sign = 1.0 if change > 0.0 else -1.0
-    over = sign * change - preload
-    edge = 1e-12 * preload
-    return sign if over > edge or (over > -edge and sign * rate > 0.0) else 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def _ring(constants, inputs, x):
-    """Force of the ring without friction (penetration, its rate, sliding speed), and the response to friction, at x."""
-    state = State(x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8], x[9], x[10], x[11], x[12], x[13])
-    pose = pose_of(constants.levels, state)
-    e = eccentricity_of(constants, state, pose)
-    surface = constants.shaft.radius * pose.w
-    ring = ring_force(e.ex, e.ey, e.vx, e.vy, surface, 1.0, NO_FRICTION, FLIGHT, constants.contact)
-    return ring, unit_response(constants, inputs, pose, ring.nx, ring.ny)
 
 
 @njit(cache=True, error_model="numpy")
@@ -140,56 +101,12 @@ def _make_series(constants, inputs, memory, Y, A, B, D, acc):
     if phase == FLIGHT:
         flight(constants, inputs, memory, aim, pulse, along, 0.0, Y, A, B, D, acc)
     elif phase == ROLLING:
-        per_friction = -1.0 / _ring(constants, inputs, Y[0])[1]
+        per_friction = -1.0 / ring_at(constants, inputs, Y[0])[1]
         rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc)
     else:
         sliding(constants, inputs, memory, aim, pulse, along, 0.0, Y, A, B, D, acc)
-    _events(constants, memory, Y)
+    enter_events(constants, memory, Y)
     return phase != FLIGHT and phase != ROLLING
-
-
-@njit(cache=True, error_model="numpy")
-def _events(constants, memory, Y):
-    """Functions that fall through 0 where an event happens, of what the series has in their columns."""
-    contact, phase = constants.contact, int(memory[PHASE])
-    first, second, third = Y[:, EVENTS], Y[:, EVENTS + 1], Y[:, EVENTS + 2]
-    if phase == FLIGHT:
-        for k in range(ORDER):
-            first[k] = -first[k]
-            second[k] = third[k] = 0.0
-        first[0] += contact.clearance * contact.clearance
-        second[0] = third[0] = 1.0
-        return
-    if phase == ROLLING:
-        first[0] -= _HAIR
-        for k in range(ORDER):
-            friction, limit = second[k], contact.friction * Y[k, FORCE]
-            second[k], third[k] = limit - friction, limit + friction
-        return
-    speed = second[0]
-    sign = 1.0 if phase == FORWARD else -1.0
-    if phase == TOUCHING:
-        sign = 0.0
-        if constants.levels.friction == SMOOTHED and abs(speed) > 4.0 * contact.smoothing_speed:
-            sign = math.copysign(1.0, speed)
-    away = memory[SLACK] != 0.0
-    for k in range(ORDER):
-        first[k] = Y[k, ROOT]
-        second[k] = sign * second[k]
-        if away:
-            third[k] = -third[k]
-    first[ORDER] = Y[ORDER, ROOT]
-    if away or sign == 0.0:
-        second[:] = 0.0
-        second[0] = 1.0
-    elif phase == TOUCHING:
-        # Far out the tanh is 1 to rounding, and no coefficient tells of the turn ahead: halve the way to it.
-        second[0] = 0.5 * abs(speed)
-    if phase == TOUCHING and constants.levels.friction == EXACT and Y[1, ROOT] > 0.0:
-        # Frictionless as far as the hair, on the way in.
-        for k in range(ORDER + 1):
-            second[k] = -Y[k, ROOT]
-        second[0] += math.sqrt(_HAIR)
 
 
 @njit(cache=True, error_model="numpy")
@@ -206,124 +123,6 @@ def _length(memory, Y, slowed):
     return _SAFETY * min(
         (tolerance / max(last, 1e-200)) ** (1.0 / ORDER), (tolerance / max(before, 1e-200)) ** (1.0 / (ORDER - 1.0))
     )
-
-
-@njit(cache=True, error_model="numpy")
-def _settle(constants, inputs, memory, x, y, dy, out):
-    """Phase of a contact whose sliding speed is 0: rolling if that is possible, else the way it is pushed."""
-    y[:] = x[: S.N_VECTOR]
-    # Written so that it is the very call of `advance`: each kind of arguments would be compiled anew.
-    memory[PHASE] = ROLLING
-    tick, phase = int(memory[TICK]), int(memory[PHASE])
-    rates(constants, inputs, tick, memory[FRACTION], memory[ONSET], phase, True, y, dy, out)
-    memory[EVALUATIONS] += 1.0
-    needed = out[S.FRICTION_FORCE]
-    if abs(needed) > constants.contact.friction * out[S.NORMAL_FORCE]:
-        memory[PHASE] = FORWARD if needed > 0.0 else BACKWARD
-        memory[KNOWN + 1] = 1.0
-
-
-@njit(cache=True, error_model="numpy")
-def _change_phase(constants, inputs, memory, x, y, dy, out):
-    """Go over to what is behind the event that has ended a series, at the state x where it happens."""
-    event, phase = int(memory[EVENT]), int(memory[PHASE])
-    contact, exact = constants.contact, constants.levels.friction == EXACT
-    memory[EVENT] = _NOTHING
-    known = memory[KNOWN : KNOWN + 3]
-    for i in range(3):
-        known[i] = 0.0
-    ring, _ = _ring(constants, inputs, x)
-    depth, rate, sliding = ring.delta, ring.rate, ring.sliding
-    sliding_phase = TOUCHING
-    if exact:
-        sliding_phase = FORWARD if sliding > 0.0 else BACKWARD
-    if phase == FLIGHT:
-        if event == _FIRST:
-            memory[CONTACTS] += 1.0
-            if rate < contact.speed_floor:
-                memory[FLOORED] += 1.0
-            memory[ONSET] = max(rate, contact.speed_floor)
-            memory[PHASE] = sliding_phase if abs(sliding) > _AT_REST else TOUCHING
-            x[ROOT] = 0.0
-            known[0] = 1.0
-            if rate < _SLOWEST or not (contact.exponent == 1.5 or contact.exponent == 1.0):
-                x[ROOT] = _LEAST_ROOT
-                known[0] = 0.0
-    elif memory[SLACK] != 0.0:
-        if event == _FIRST:
-            memory[PHASE], memory[SLACK] = FLIGHT, 0.0
-            known[0] = 1.0
-        elif event == _THIRD:
-            memory[PHASE], memory[SLACK] = sliding_phase, 0.0
-            known[2] = 1.0
-    elif event == _FIRST:
-        if phase == ROLLING:
-            memory[PHASE] = TOUCHING
-        else:
-            memory[PHASE] = FLIGHT
-            known[0] = 1.0
-    elif phase == ROLLING:
-        if event != _NOTHING and event <= _THIRD:
-            memory[PHASE] = FORWARD if event == _SECOND else BACKWARD
-            known[1] = 2.0
-    elif event == _THIRD:
-        memory[SLACK] = 1.0
-        memory[CLAMPS] += 1.0
-        known[2] = 1.0
-    elif event == _SECOND and exact:
-        if phase == TOUCHING and abs(sliding) > _AT_REST:
-            memory[PHASE] = sliding_phase
-        else:
-            _settle(constants, inputs, memory, x, y, dy, out)
-    # The depth itself, where it can be told, so that its root does not drift.
-    slowed = memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING
-    if slowed and (depth > 1e-10 or phase == ROLLING or memory[SPAN] < 0.0):
-        x[ROOT] = math.sqrt(max(depth, 1e-14))
-    house = constants.house
-    memory[NORTH] = memory[EAST] = 0.0
-    if constants.levels.inner_house:
-        memory[NORTH] = _loses(x[4] - x[6], x[11] - x[13], house.pair_stiffness_vertical, house.preload)
-    if constants.levels.outer_house:
-        memory[EAST] = _loses(x[5], x[12], house.pair_stiffness_horizontal, house.preload)
-
-
-@njit(cache=True, error_model="numpy")
-def _preload_end(constants, memory, Y, h):
-    """Where within h a transducer loses or finds its preload; and which pair's."""
-    house = constants.house
-    nearest, which = math.inf, _NOTHING
-    for pair in range(2):
-        if not (constants.levels.inner_house if pair == 0 else constants.levels.outer_house):
-            continue
-        stiffness = house.pair_stiffness_vertical if pair == 0 else house.pair_stiffness_horizontal
-        lost = memory[NORTH + pair]
-        # Bounds on the displacement by its coefficients.
-        middle, swing, power = 0.0, 0.0, 1.0
-        for k in range(ORDER + 1):
-            value = Y[k, 4] - Y[k, 6] if pair == 0 else Y[k, 5]
-            if k == 0:
-                middle = value
-            else:
-                power *= h
-                swing += abs(value * power)
-        limit = 2.0 * house.preload / stiffness
-        if lost == 0.0 and abs(middle) + swing < limit:
-            continue
-        for side in range(2):
-            sign = lost if lost != 0.0 else (1.0 if side == 0 else -1.0)
-            way = 1.0 if lost != 0.0 else -1.0
-            # Above 0 while nothing changes; in the last column, which events no longer need.
-            for k in range(ORDER + 1):
-                value = Y[k, 4] - Y[k, 6] if pair == 0 else Y[k, 5]
-                Y[k, EVENTS + 2] = way * sign * value / limit
-            Y[0, EVENTS + 2] -= way
-            shift = 1 if abs(Y[0, EVENTS + 2]) < 1e-11 else 0
-            zero = first_zero(Y, EVENTS + 2, shift, h)
-            if zero < nearest and not (shift == 1 and zero == 0.0):
-                nearest, which = zero, _HOUSE_NS + pair
-            if lost != 0.0:
-                break
-    return nearest, which
 
 
 @njit(cache=True, error_model="numpy")
@@ -368,7 +167,7 @@ def _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
             _note_peak(memory, Y)
         series_at(Y, memory[LENGTH], x)
         memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
-    _change_phase(constants, inputs, memory, x, y, dy, out)
+    change_phase(constants, inputs, memory, x, y, dy, out)
     Y[0, : ROOT + 1] = x
     slowed = _make_series(constants, inputs, memory, Y, A, B, D, acc)
     memory[STEPS] += 1.0
@@ -402,13 +201,13 @@ def _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
     elif h >= limit:
         h = limit
         at_corner = limit < _LONGEST_S
-    event = _NOTHING
+    event = NOTHING
     for i in range(3):
         shift = int(memory[KNOWN + i])
         zero = first_zero(Y, EVENTS + i, shift, h)
         if zero <= h:
-            h, event, at_corner = zero, _FIRST + i, False
-    zero, which = _preload_end(constants, memory, Y, h)
+            h, event, at_corner = zero, FIRST + i, False
+    zero, which = preload_end(constants, memory, Y, h)
     if zero <= h:
         h, event, at_corner = zero, which, False
     span = column_at(Y, TIME, 0, h)[0] if slowed else h
@@ -508,7 +307,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         if memory[SPAN] >= 0.0 and memory[PHASE] != FLIGHT:
             _note_peak(memory, Y)
         memory[SPAN] = -1.0
-        memory[EVENT] = _NOTHING
+        memory[EVENT] = NOTHING
         memory[TICK], memory[FRACTION] = float(tick), 0.0
         memory[END_TICK], memory[END_FRACTION] = float(tick), 0.0
         if not _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):

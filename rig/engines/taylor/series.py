@@ -1,4 +1,9 @@
-"""Coefficients of the Taylor series, by phase. Made by `rig.engines.tape.taylor`: do not edit."""
+"""Coefficients of the Taylor series, by phase.
+
+Made by `NUMBA_DISABLE_JIT=1 python -m rig.engines.tape.taylor`: do not edit; tests/physics/test_taylor.py compares it.
+"""
+
+# pyright: reportPossiblyUnboundVariable=false
 
 from __future__ import annotations
 
