@@ -15,7 +15,7 @@ from rig.engines.memory import BEFORE, BEFORE_SPAN, CONTACTS, EVALUATIONS, FLOOR
 from rig.engines.method import Step, method_step, rates
 from rig.engines.peak import peak
 from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
+from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
 
 NONE, ONSET_EVENT, LIFT_OFF, TURN, BREAK = range(5)
 """Events: none; onset; lift-off; the sliding speed comes to 0; rolling needs more than mu F_n."""
@@ -135,11 +135,10 @@ def change_phase(event, constants, inputs, tick, fraction, memory, y, dy, out):
     """Go over to the phase behind an event, at the state where it happens."""
     phase = int(memory[PHASE])
     if event == ONSET_EVENT:
-        speed, slowest = out[S.PENETRATION_RATE], constants.contact.speed_floor
         memory[CONTACTS] += 1.0
-        if speed < slowest:
+        if out[S.PENETRATION_RATE] < constants.contact.speed_floor:
             memory[FLOORED] += 1.0
-        memory[ONSET] = max(speed, slowest)
+        memory[ONSET] = held_speed(out[S.PENETRATION_RATE], constants.contact)
         memory[PHASE] = sliding_phase(constants, out[S.SLIDING_SPEED])
         memory[BEFORE] = memory[LAST] = 0.0
     elif event == LIFT_OFF:

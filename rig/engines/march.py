@@ -45,7 +45,7 @@ from rig.engines.memory import (
 )
 from rig.engines.method import Step, method_error, method_prepare, method_step, rates
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT, TOUCHING
+from rig.kernels.contact import FLIGHT, TOUCHING, held_speed
 from rig.kernels.geometry import gap
 
 _LEAST = 1.0 / 64.0
@@ -189,7 +189,7 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
     memory[:] = 0.0
-    memory[ONSET] = constants.contact.speed_floor
+    memory[ONSET] = held_speed(0.0, constants.contact)
     memory[SIZE] = step_ticks
     memory[TOLERANCE] = tolerance
     if gap(constants, y)[0] > 0.0:

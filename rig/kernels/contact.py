@@ -43,6 +43,12 @@ def elastic_force(penetration, stiffness, exponent):
 
 
 @stage
+def held_speed(speed, contact):
+    """Impact speed v0 that a contact holds until it ends, by that at its onset [m/s]."""
+    return max(speed, contact.speed_floor)
+
+
+@stage
 def damping_per_speed(onset_speed, contact):
     """What the elastic force grows by, per speed of the penetration [s/m]; v0 [m/s], floored."""
     return contact.damping_factor / onset_speed

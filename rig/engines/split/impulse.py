@@ -12,7 +12,7 @@ from typing import NamedTuple
 from numba import njit
 
 from rig.engines.split.inner_motion import FAST, inlined
-from rig.kernels.contact import elastic_force
+from rig.kernels.contact import damping_ratio, elastic_force
 
 
 class Law(NamedTuple):
@@ -124,7 +124,7 @@ def mobility_of(plant, euler, axis, nx, ny):
 def onset_error(contact, rate, since, onset_speed, h):
     """What a kick misses of a force that began `since` of a step h before, at a rate of the gap > 0 [N s]."""
     exponent = contact.exponent
-    damped = 1.0 + contact.damping_factor * rate / onset_speed
+    damped = damping_ratio(rate, onset_speed, contact)
     elastic = -h * contact.stiffness * (h * rate) ** exponent * damped * end_error(exponent, since)
     return elastic - h * contact.viscous_damping * rate * (0.5 - since)
 
@@ -136,7 +136,7 @@ def end_impulse(contact, part, speed, onset_speed, ago, h):
     The gap opened at a speed < 0; h is the step of the kick that finds it open.
     """
     exponent = contact.exponent
-    size = 1.0 + contact.damping_factor * speed / onset_speed
+    size = damping_ratio(speed, onset_speed, contact)
     if speed >= 0.0 or size <= 0.0:
         return 0.0
     return -h * contact.stiffness * (-h * speed) ** exponent * size * end_error(exponent, part * ago / h)

@@ -93,7 +93,7 @@ from rig.engines.split.place import (
 from rig.engines.split.state import Call, Coordinates, Direction, Smooth, Step, Touch, Work
 from rig.engines.split.touch import begin_contact, end_contact, house_kick, kick_contact
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT, damping_per_speed
+from rig.kernels.contact import FLIGHT, damping_per_speed, held_speed
 from rig.kernels.dynamics import evaluate
 from rig.kernels.forces import drive_speed
 
@@ -104,7 +104,7 @@ ORDER = 2
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: the inner state, and the flows for this step."""
     memory[:] = 0.0
-    memory[ONSET] = constants.contact.speed_floor
+    memory[ONSET] = held_speed(0.0, constants.contact)
     axis, w, theta, houses = from_coordinates(constants, y)
     keep(memory, axis, w, theta, houses)
     memory[ANGLE] = theta

@@ -22,7 +22,7 @@ from rig.engines.split.levels import contact_level, roughness
 from rig.engines.split.place import BOUNCE, LAST_STEP, SETTLED
 from rig.engines.split.state import Touch
 from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
+from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, held_speed
 
 _SLOP = 200.0
 """Depth that a rigid ring keeps in lasting contact, over the step squared [m/s^2]: a chord of the arc stays inside."""
@@ -49,7 +49,7 @@ def begin_contact(constants, memory, touch, motion, h):
     memory[CONTACTS] += 1.0
     if speed < contact.speed_floor:
         memory[FLOORED] += 1.0
-        speed = contact.speed_floor
+    speed = held_speed(speed, contact)
     memory[ONSET] = speed
     memory[BEFORE] = memory[LAST] = memory[BEFORE_SPAN] = 0.0
     memory[SETTLED], memory[BOUNCE] = 0.0, motion.rate

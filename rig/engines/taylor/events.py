@@ -12,7 +12,18 @@ from rig.engines.tape.columns import EVENTS, FORCE, ROOT
 from rig.engines.taylor.place import EAST, EVENT, FRACTION, KNOWN, NORTH, ORDER, SLACK, SPAN, TICK
 from rig.engines.taylor.polynomial import first_zero
 from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING, ring_force
+from rig.kernels.contact import (
+    BACKWARD,
+    EXACT,
+    FLIGHT,
+    FORWARD,
+    NO_FRICTION,
+    ROLLING,
+    SMOOTHED,
+    TOUCHING,
+    held_speed,
+    ring_force,
+)
 from rig.kernels.dynamics import unit_response
 from rig.kernels.geometry import State, eccentricity_of, pose_of
 
@@ -128,7 +139,7 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
             memory[CONTACTS] += 1.0
             if rate < contact.speed_floor:
                 memory[FLOORED] += 1.0
-            memory[ONSET] = max(rate, contact.speed_floor)
+            memory[ONSET] = held_speed(rate, contact)
             memory[PHASE] = sliding_phase if abs(sliding) > _AT_REST else TOUCHING
             x[ROOT] = 0.0
             known[0] = 1.0

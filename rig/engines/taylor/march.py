@@ -58,7 +58,7 @@ from rig.engines.taylor.place import (
 from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
 from rig.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
+from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
 from rig.kernels.forces import drive_speed
 
 _SAFETY = 0.9
@@ -74,7 +74,7 @@ _SCALE_T, _SCALE_ROOT = 1e-4, 3e-3
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
     memory[:] = 0.0
-    memory[ONSET] = constants.contact.speed_floor
+    memory[ONSET] = held_speed(0.0, constants.contact)
     memory[TOLERANCE] = tolerance
     memory[SPAN] = -1.0
     ring, _ = ring_at(constants, inputs, y)
