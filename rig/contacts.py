@@ -7,7 +7,7 @@ and n, a damping law c (and D, for the one without memory). Stiffness laws that 
 the rig's working range, and the fit says how far off it is.
 
 None of them is validated on this rig. The sphere laws take shaft and ring for spheres; the cylinder laws take them for
-parallel cylinders that touch over the ring's whole width, while this shaft leans by up to r0 / l0A. Goldsmith's
+parallel cylinders that touch over the ring's whole width, while this shaft tilts by up to r0 / l0A. Goldsmith's
 cylinder law is left out, as its logarithm has a unit, and Radzimovsky's, as sources differ on whether the contact's
 half or full width stands in it.
 """

@@ -101,7 +101,7 @@ def draw(recording: Recording, path: Path) -> None:
     times, frequency, amplitude = waterfall(probes.times_s, disk_x, disk_y, probes.rate_hz)
     level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
     mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
-    figure.colorbar(mesh, ax=ax, label="[dB re 1 um]")
+    figure.colorbar(mesh, ax=ax, label="[dB re 1 µm]")
     ax.axhline(hammer_s, color="w", lw=0.8, ls=":")
     ax.set(title="Full-spectrum waterfall", xlabel="backward  -  frequency [Hz]  -  forward", ylabel="time [s]")
     save(figure, path)

@@ -123,8 +123,8 @@ def _orbit_row(recording: Recording, figures: WhirlFigures) -> VerdictRow:
     delta_m = figures.radius_m - parameter_si(recording, "ring.clearance")
     force_n = (figures.reaction_x_n + figures.reaction_y_n) / 2
     hertz_m = (force_n / parameter_si(recording, "contact.stiffness")) ** (2 / 3)
-    orbit = f"{figures.radius_m * 1e3:.4f} mm = r0 {delta_m * 1e6:+.1f} um"
-    hertz = f"r0 {hertz_m * 1e6:+.1f} um, Hertz at {force_n:.0f} N, within 15 %"
+    orbit = f"{figures.radius_m * 1e3:.4f} mm = r0 {delta_m * 1e6:+.1f} µm"
+    hertz = f"r0 {hertz_m * 1e6:+.1f} µm, Hertz at {force_n:.0f} N, within 15 %"
     return _judged("orbit in the ring", orbit, hertz, _near(delta_m, hertz_m, within=0.15))
 
 

@@ -33,7 +33,7 @@ LEAST = 0.05
 SPEEDS = (1e-4, 1.0)
 """Approach speeds compared [m/s]."""
 DEPTHS_UM = (5, 10)
-"""Penetrations at which the stiffness laws are compared [um]."""
+"""Penetrations at which the stiffness laws are compared [µm]."""
 
 # A dash for each law beside its colour.
 _STYLES: dict[str, tuple[str, Any]] = {

@@ -39,7 +39,7 @@ class Asked:
         list[str],
         typer.Option(
             metavar="KEY,...",
-            help="What is asked for: a parameter, a number of the scene, or of a blow (hammer.1.force_n).",
+            help="What is asked for: a parameter, a number of the scene, or of an impact (hammer.1.force_n).",
         ),
     ]
     start: Annotated[
@@ -137,7 +137,7 @@ def identify(
     exact: Annotated[
         bool,
         typer.Option(
-            "--exact", help="Of an imported log: take its clock, the shaft's angle and the blow as it tells them."
+            "--exact", help="Of an imported log: take its clock, the shaft's angle and the impact as it tells them."
         ),
     ] = False,
     json_output: Json = False,

@@ -37,7 +37,7 @@ def ladder(
         list[str] | None, typer.Option(metavar="LEVEL", help="A level that stays as full as it is; may be repeated.")
     ] = None,
     changes: Changes = None,
-    runs: Annotated[int, typer.Option(min=1, help="Timed runs of each rung.")] = 3,
+    runs: Annotated[int, typer.Option(min=1, help="Timed runs of each candidate.")] = 3,
     budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
 ) -> None:
     """Go down the ladder of models: what does each level cost, what does it err by, what is good enough here?"""

@@ -54,8 +54,8 @@ def _show(document: dict[str, Any]) -> None:
     lean = document["lean"]
     console.print(
         "\nfit: largest error of K delta^n over 5 N to 3 kN, for laws that are no power. Cylinder laws take the axes "
-        f"for parallel; here the shaft leans by up to r0 / l0A = {lean['angle_mrad']:.1f} mrad, "
-        f"{lean['over_width_um']:.0f} um over the ring's assumed width: none is validated on this rig.",
+        f"for parallel; here the shaft tilts by up to r0 / l0A = {lean['angle_mrad']:.1f} mrad, "
+        f"{lean['over_width_um']:.0f} µm over the ring's assumed width: none is validated on this rig.",
         highlight=False,
     )
     if not notes:
@@ -94,7 +94,7 @@ def _damping_table(document: dict[str, Any], *, notes: bool) -> Table:
 def _stiffness_table(document: dict[str, Any], *, notes: bool) -> Table:
     from rich.text import Text
 
-    headings = ("", "law", ">K [N/m^n]", ">n", ">fit", ">from - to [um]", ">5 um [N]", ">10 um [N]")
+    headings = ("", "law", ">K [N/m^n]", ">n", ">fit", ">from - to [µm]", ">5 µm [N]", ">10 µm [N]")
     table = new_table("stiffness laws", *headings, *(["holds for; source"] if notes else []), whole=("", "law"))
     for law in document["stiffness"]:
         if law["refused"]:

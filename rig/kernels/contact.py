@@ -72,7 +72,7 @@ def normal_force(penetration, rate, onset_speed, contact):
 
     F = K delta^n (1 + c delta'/v0) + D delta', clamped at 0: a contact cannot pull.
 
-    Trap: v0 -> 0 at grazing onsets blows the damping term up; the caller floors v0.
+    Trap: v0 -> 0 at grazing onsets makes the damping term grow without bound; `held_speed` keeps v0 from 0.
 
     Args:
         penetration: delta [m]; no force unless positive.

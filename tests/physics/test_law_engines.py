@@ -43,7 +43,7 @@ def limit_of(engine: str) -> float:
     """
     if tolerance := ENGINES[engine].tolerance:
         return 300.0 * tolerance
-    return 5.0 * LIMIT if load_engine(engine).ORDER < 2 else LIMIT
+    return 5.0 * LIMIT if load_engine(engine).order < 2 else LIMIT
 
 
 def falling(engine: str, field: str, law: str, friction: str, **choice: object) -> Simulation:

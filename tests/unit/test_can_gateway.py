@@ -10,6 +10,7 @@ import time
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import can  # noqa: TID253 - the subject
@@ -48,7 +49,7 @@ class Fake(FakeSimulation):
 
     def advance(self, ticks: int) -> Any:
         frame = super().advance(ticks)
-        frame.samples = {name: frame.samples[name] for name in self.groups}
+        frame = replace(frame, samples={name: frame.samples[name] for name in self.groups})
         return frame
 
 

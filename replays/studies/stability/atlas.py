@@ -61,7 +61,7 @@ def contact_ratio(engine: str, step_s: float, stiffness: float, *, periods: int 
     """Energy ratio of a small oscillation of the shaft on an undamped linear contact, pressed on by its weight.
 
     Where steps follow the gap's speed the weight is the true one and the oscillation 1/1000 of the depth: only next to
-    rest are they as long as asked. For the others the weight is such that the depth is 20 um, and the
+    rest are they as long as asked. For the others the weight is such that the depth is 20 µm, and the
     oscillation 1/100 of that: with less, error control has nothing to control.
     """
     constants = bare_shaft(damping_factor=0.0, exponent=1.0, stiffness=stiffness, gravity=True)

@@ -103,7 +103,7 @@ def _axis_flow(stiffness, damping, t):
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def magnet_springs(constants):
-    """Where the shaft rests on its magnets, uy [1], and their torque per lean about it, horizontal, vertical [N m]."""
+    """Where the shaft rests on its magnets, uy [1], and their torque per tilt u about it, x and y [N m]."""
     shaft, magnet = constants.shaft, constants.magnet
     lB, weight = shaft.arm_magnet, shaft.arm_centre * shaft.mass * shaft.gravity
     rest, slope, eps = 0.0, 0.0, 1e-6

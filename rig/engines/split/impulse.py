@@ -110,7 +110,7 @@ def law_at(contact, depth, factor_per_speed):
 
 @inlined
 def mobility_of(plant, euler, axis, nx, ny):
-    """Speed of the shaft against the ring per impulse: less where the axis leans that way."""
+    """Speed of the shaft against the ring per impulse: less where the axis tilts that way."""
     un = ut = 0.0
     if euler:
         un, ut = axis.ux * nx + axis.uy * ny, axis.uy * nx - axis.ux * ny
@@ -143,29 +143,29 @@ def end_impulse(contact, part, speed, onset_speed, ago, h):
 
 
 @inlined
-def flow_swerve(constants, plant, axis, houses, motion):
+def flow_acceleration(constants, plant, axis, houses, motion):
     """What the flow alone would add to the rate of the gap [m/s^2]."""
     house = constants.house
     nx, ny = motion.nx, motion.ny
-    swerve = motion.lateral * motion.lateral * motion.per_distance - plant.arm * (
+    flow_rate = motion.lateral * motion.lateral * motion.per_distance - plant.arm * (
         plant.spring_x * axis.ux * nx + plant.spring_y * (axis.uy - plant.rest) * ny
     )
     if constants.levels.inner_house:
         beam = house.inner_beam_stiffness * (houses.x0 - houses.x2) + house.inner_beam_damping * (houses.x1 - houses.x3)
         pair = house.pair_stiffness_vertical * (houses.y0 - houses.y2)
-        swerve += plant.per_inner * (beam * nx + pair * ny)
-    return swerve
+        flow_rate += plant.per_inner * (beam * nx + pair * ny)
+    return flow_rate
 
 
 @inlined
-def compliant_push(law, w, rate, swerve, missed, h):
+def compliant_push(law, w, rate, flow_rate, missed, h):
     """Normal impulse of a compliant contact over a step: damping in closed form, commutator and all.
 
     Args:
         law: At this depth.
         w: Mobility.
         rate: Of the depth, before the impulse [m/s].
-        swerve: What the flow alone adds to it [m/s^2].
+        flow_rate: What the flow alone adds to it [m/s^2].
         missed: What the step misses of a force that has just begun [N s].
         h: Step [s].
     """
@@ -175,7 +175,7 @@ def compliant_push(law, w, rate, swerve, missed, h):
     jn = (h * law.elastic + damping * rate) * share
     bend = jn * law.relative * h * w.nn * (1.0 / 12.0)
     held = h * law.elastic + missed - jn * bend * (1.0 + 0.25 * z - (7.0 / 6.0) * bend)
-    held += damping * damping * w.nn * h * swerve * (1.0 / 24.0)
+    held += damping * damping * w.nn * h * flow_rate * (1.0 / 24.0)
     jn = (held + damping * rate) * share
     shift = h * jn * damping * w.nn * (1.0 / 24.0)
     return Push(max(0.0, jn), held, shift, 0.5 * damping * w.nt * share, z)

@@ -69,7 +69,7 @@ class Motion(NamedTuple):
 
 
 class Plant(NamedTuple):
-    """What a call makes of the constants and the inputs, once. Torques of the shaft count per lean u."""
+    """What a call makes of the constants and the inputs, once. Torques of the shaft count per tilt u."""
 
     per_Ixx: float  # [1/(kg m^2)]
     per_Izz: float  # [1/(kg m^2)]
@@ -101,7 +101,7 @@ def plant_of(constants, inputs, rest, spring_x, spring_y):
         constants: Of the model.
         inputs: Of this call.
         rest: uy of the shaft at rest on its magnets [1].
-        spring_x: Torque of the magnets per lean about it, horizontal [N m].
+        spring_x: Torque of the magnets per tilt about it, horizontal [N m].
         spring_y: The same, vertical [N m].
     """
     levels = constants.levels
@@ -168,14 +168,14 @@ def geometry_of(euler, axis):
     ux, uy, px, py = axis
     if not euler:
         return Geometry(1.0, 0.0, 1.0, 0.0, 0.0)
-    lean = ux * ux + uy * uy
+    tilt2 = ux * ux + uy * uy
     q = ux * ux
-    if lean < 2e-3:  # series to rounding
-        uz = 1.0 - lean * (0.5 + lean * (0.125 + lean * (0.0625 + lean * (0.0390625 + lean * 0.02734375))))
-        per_uz = 1.0 + lean * (0.5 + lean * (0.375 + lean * (0.3125 + lean * (0.2734375 + lean * 0.24609375))))
+    if tilt2 < 2e-3:  # series to rounding
+        uz = 1.0 - tilt2 * (0.5 + tilt2 * (0.125 + tilt2 * (0.0625 + tilt2 * (0.0390625 + tilt2 * 0.02734375))))
+        per_uz = 1.0 + tilt2 * (0.5 + tilt2 * (0.375 + tilt2 * (0.3125 + tilt2 * (0.2734375 + tilt2 * 0.24609375))))
         share_per = ux * (1.0 + q * (1.0 + q * (1.0 + q * (1.0 + q * (1.0 + q)))))
     else:
-        uz = math.sqrt(1.0 - lean)
+        uz = math.sqrt(1.0 - tilt2)
         per_uz = 1.0 / uz
         share_per = ux / (1.0 - q)
     pz = -(ux * px + uy * py) * per_uz

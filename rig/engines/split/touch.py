@@ -11,7 +11,7 @@ from rig.engines.split.impulse import (
     compliant_push,
     crossing,
     end_impulse,
-    flow_swerve,
+    flow_acceleration,
     friction_impulse,
     law_at,
     mobility_of,
@@ -104,11 +104,11 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     compliant, inner = constants.levels.compliant, constants.levels.inner_house
     nx, ny, per_distance, depth, rate, lateral = motion
     w = mobility_of(plant, constants.levels.euler, axis, nx, ny)
-    swerve = 0.0
+    flow_rate = 0.0
     if compliant:
         law = law_at(contact, depth, touch.factor)
-        swerve = flow_swerve(constants, plant, axis, houses, motion)
-        push = compliant_push(law, w, rate, swerve, missed, h)
+        flow_rate = flow_acceleration(constants, plant, axis, houses, motion)
+        push = compliant_push(law, w, rate, flow_rate, missed, h)
     else:
         law = Law(0.0, 0.0, 0.0, 0.0)
         push = rigid_push(contact, motion, w, touch.phase == FLIGHT, touch.rate, h)
@@ -133,18 +133,18 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     force_x, force_y = jx, jy
     loss = (jn - push.held) * rate_mean
     if shift != 0.0:
-        aside = shift * lateral * per_distance
-        jx -= aside * ny
-        jy += aside * nx
+        lateral_jump = shift * lateral * per_distance
+        jx -= lateral_jump * ny
+        jy += lateral_jump * nx
         # It comes after friction's clamp: the next target makes up for it, and takes it for no flow's.
-        slid -= (w.tt - plant.spin_mobility) * aside
+        slid -= (w.tt - plant.spin_mobility) * lateral_jump
         springs = 0.0
         if inner:
             beam = house.inner_beam_stiffness * (houses.x0 - houses.x2)
             pair = house.pair_stiffness_vertical * (houses.y0 - houses.y2)
             springs = shift * plant.per_inner * (beam * nx + pair * ny)
             ledger[S.HOUSE_LOSS] += springs
-        loss += law.elastic * w.nn * shift - aside * lateral - springs
+        loss += law.elastic * w.nn * shift - lateral_jump * lateral - springs
     ledger[S.CONTACT_LOSS] += loss
     ledger[S.FRICTION_LOSS] += jt * 0.5 * (sliding + slid)
     ledger[S.GAP_WORK] += contact.gap_counts_outer * (jx * houses.x3 + jy * houses.y3)
@@ -161,8 +161,8 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
         rough, calm = roughness(touch.wanted, rate_mean, change, law.slope * w.nn, push.taken)
         cx, cy = force_x * step.per_h, force_y * step.per_h
         growth, turn = law.relative * rate_mean, lateral * per_distance
-        swerve *= law.damping
-        dcx, dcy = growth * cx - turn * cy - swerve * nx, growth * cy + turn * cx - swerve * ny
+        flow_rate *= law.damping
+        dcx, dcy = growth * cx - turn * cy - flow_rate * nx, growth * cy + turn * cx - flow_rate * ny
     wanted = contact_level(memory, touch.wanted, rough, calm, step.end)
     after = Touch(phase, slid, motion.depth, rate_after, 0.0, wanted, touch.factor)
     return Impulse(jx, jy, jt, shift * nx, shift * ny, cx, cy, dcx, dcy), after

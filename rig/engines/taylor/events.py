@@ -30,7 +30,7 @@ from rig.kernels.geometry import State, eccentricity_of, pose_of
 NOTHING, FIRST, _SECOND, _THIRD, _HOUSE_NS, _HOUSE_EW = range(6)
 """What ends a series: a length or a corner of the hammer's; a zero of one of the events' functions; a transducer."""
 
-_HAIR = 1e-9
+_FRICTIONLESS = 1e-9
 """Depth [m] up to which a contact that does not slide has no friction: rolling needs a normal force."""
 _AT_REST = 1e-9
 """Sliding speed [m/s] at the onset below which a contact does not slide."""
@@ -74,7 +74,7 @@ def enter_events(constants, memory, Y):
         second[0] = third[0] = 1.0
         return
     if phase == ROLLING:
-        first[0] -= _HAIR
+        first[0] -= _FRICTIONLESS
         for k in range(ORDER):
             friction, limit = second[k], contact.friction * Y[k, FORCE]
             second[k], third[k] = limit - friction, limit + friction
@@ -99,10 +99,10 @@ def enter_events(constants, memory, Y):
         # Far out the tanh is 1 to rounding, and no coefficient tells of the turn ahead: halve the way to it.
         second[0] = 0.5 * abs(speed)
     if phase == TOUCHING and constants.levels.friction == EXACT and Y[1, ROOT] > 0.0:
-        # Frictionless as far as the hair, on the way in.
+        # Frictionless up to that depth, on the way in.
         for k in range(ORDER + 1):
             second[k] = -Y[k, ROOT]
-        second[0] += math.sqrt(_HAIR)
+        second[0] += math.sqrt(_FRICTIONLESS)
 
 
 @njit(cache=True, error_model="numpy")

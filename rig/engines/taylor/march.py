@@ -67,7 +67,7 @@ _LONGEST_S, _SHORTEST_S = 2e-2, 1e-9
 _ROUNDING = 1e-16
 """Tolerance that no step can vouch for."""
 _SCALE_T, _SCALE_ROOT = 1e-4, 3e-3
-"""What counts as 1 in a step's error: 0.1 ms, 9 um."""
+"""What counts as 1 in a step's error: 0.1 ms, 9 µm."""
 
 
 @njit(cache=True, error_model="numpy")
