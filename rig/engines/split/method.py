@@ -175,18 +175,6 @@ def _touch_with(touch, ago, wanted):
 
 
 @inlined
-def begun(touch, wanted, factor):
-    """A contact that has just begun."""
-    return Touch(FLIGHT, np.nan, touch.depth, touch.rate, touch.ago, wanted, factor)
-
-
-@inlined
-def apart(touch, depth, rate):
-    """No contact, with a penetration [m] and its rate [m/s] after the last kick."""
-    return Touch(FLIGHT, touch.slid, depth, rate, 0.0, touch.wanted, touch.factor)
-
-
-@inlined
 def _step_of(constants, inputs, call, touch, kicked, axis, houses, owed, now, n, last):
     """The next step: as long as the state allows; it starts at a multiple of its length, and ends at the row.
 
@@ -268,6 +256,33 @@ def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
         constants.levels.euler, call.plant, axis, geometry.uz, axis.px, axis.py, geometry.pz, w
     )
     return Smooth(Sx, Sy, ax, ay, turning_x, turning_y, pull_x, pull_y, hammer_x, hammer_y, rotation)
+
+
+@inlined
+def _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch):
+    """The contact's impulse: at an onset, in contact, at a lift-off, or none; and the contact after it."""
+    h, r0 = step.h, constants.contact.clearance
+    qx = axis.px + 0.5 * h * (smooth.ax + smooth.turning_x)
+    qy = axis.py + 0.5 * h * (smooth.ay + smooth.turning_y)
+    impulse = Impulse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    ex, ey = eccentricity(constants, axis, houses)
+    if ex * ex + ey * ey > r0 * r0:
+        motion = motion_of(constants, qx, qy, houses, ex, ey)
+        missed = 0.0
+        if touch.phase == FLIGHT:
+            missed = begin_contact(constants, memory, touch, motion, h)
+            factor = damping_per_speed(memory[ONSET], constants.contact)
+            touch = Touch(FLIGHT, np.nan, touch.depth, touch.rate, touch.ago, min(step.level, GRID), factor)
+        return kick_contact(constants, call, memory, ledger, axis, houses, motion, w, touch, missed, step)
+    depth, rate = touch.depth, touch.rate
+    if touch.phase != FLIGHT:
+        motion = motion_of(constants, qx, qy, houses, ex, ey)
+        impulse = end_contact(constants, call.plant, ledger, touch, motion, memory[ONSET], h)
+        depth, rate = motion.depth, motion.rate
+    elif step.level <= GRID:
+        motion = motion_of(constants, qx, qy, houses, ex, ey)
+        depth, rate = motion.depth, motion.rate
+    return impulse, Touch(FLIGHT, touch.slid, depth, rate, 0.0, touch.wanted, touch.factor)
 
 
 @inlined
@@ -387,7 +402,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     """See `rig.engines`."""
     # params:
     euler, inner, ideal = constants.levels.euler, constants.levels.inner_house, inputs.ideal_drive
-    Izz, r0 = constants.shaft.polar_inertia, constants.contact.clearance
+    Izz = constants.shaft.polar_inertia
     plant = plant_of(constants, inputs, memory[REST], memory[SPRING_X], memory[SPRING_Y])
     shaft_table = shaft_flows(plant, inputs.magnet_engaged, step_ticks * inputs.tick_s)
     house_table = memory[FLOWS:FLOWS_END].reshape(LEVELS, HOUSE_FLOW)
@@ -444,29 +459,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
 
             # The kick.
             smooth = _smooth(constants, inputs, call, step, axis, geometry, w, direction)
-            h = step.h
-            qx = axis.px + 0.5 * h * (smooth.ax + smooth.turning_x)
-            qy = axis.py + 0.5 * h * (smooth.ay + smooth.turning_y)
-            impulse = Impulse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            ex, ey = eccentricity(constants, axis, houses)
-            if ex * ex + ey * ey > r0 * r0:
-                motion = motion_of(constants, qx, qy, houses, ex, ey)
-                missed = 0.0
-                if touch.phase == FLIGHT:
-                    missed = begin_contact(constants, memory, touch, motion, h)
-                    touch = begun(touch, min(step.level, GRID), damping_per_speed(memory[ONSET], constants.contact))
-                impulse, touch = kick_contact(
-                    constants, call, memory, ledger, axis, houses, motion, w, touch, missed, step
-                )
-            elif touch.phase != FLIGHT:
-                motion = motion_of(constants, qx, qy, houses, ex, ey)
-                impulse = end_contact(constants, plant, ledger, touch, motion, memory[ONSET], h)
-                touch = apart(touch, motion.depth, motion.rate)
-            elif step.level <= GRID:
-                motion = motion_of(constants, qx, qy, houses, ex, ey)
-                touch = apart(touch, motion.depth, motion.rate)
-            else:
-                touch = apart(touch, touch.depth, touch.rate)
+            impulse, touch = _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch)
             axis, w, theta, kick, work = _kick_shaft(
                 constants, inputs, call, step, axis, geometry, w, theta, gained, moved, direction, smooth, impulse, work
             )
