@@ -20,7 +20,7 @@ from numba.core import cgutils
 from replays.studies.peers.problem import Problem
 from rig.kernels import signals as S
 from rig.kernels.constants import Constants, Inputs
-from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING
+from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
 from rig.kernels.dynamics import evaluate
 from rig.kernels.geometry import gap
 
@@ -197,7 +197,7 @@ def follow_sign(t, y, parameters):
     depth, rate = gap(p.constants, y)
     began = depth > 0.0 and p.phase == FLIGHT
     if began:
-        p.onset_speed = max(rate, p.constants.contact.speed_floor)
+        p.onset_speed = held_speed(rate, p.constants.contact)
         p.phase = TOUCHING
     elif depth <= 0.0:
         p.phase = FLIGHT
@@ -218,7 +218,7 @@ def take_switch(t, y, parameters, which):
         return False
     if which == 0:
         _, rate, sliding, _, _ = contact_at(t, y, p, FLIGHT)
-        p.onset_speed = max(rate, p.constants.contact.speed_floor)
+        p.onset_speed = held_speed(rate, p.constants.contact)
         p.phase = TOUCHING
         if p.constants.levels.friction == EXACT:
             if sliding == 0.0:
