@@ -131,14 +131,20 @@ def sliding_phase(constants, speed):
 
 
 @njit(cache=True, error_model="numpy")
+def latch_onset(memory, speed, contact):
+    """Count a contact that begins at a speed [m/s], and keep the impact speed that it holds."""
+    memory[CONTACTS] += 1.0
+    if speed < contact.speed_floor:
+        memory[FLOORED] += 1.0
+    memory[ONSET] = held_speed(speed, contact)
+
+
+@njit(cache=True, error_model="numpy")
 def change_phase(event, constants, inputs, tick, fraction, memory, y, dy, out):
     """Go over to the phase behind an event, at the state where it happens."""
     phase = int(memory[PHASE])
     if event == ONSET_EVENT:
-        memory[CONTACTS] += 1.0
-        if out[S.PENETRATION_RATE] < constants.contact.speed_floor:
-            memory[FLOORED] += 1.0
-        memory[ONSET] = held_speed(out[S.PENETRATION_RATE], constants.contact)
+        latch_onset(memory, out[S.PENETRATION_RATE], constants.contact)
         memory[PHASE] = sliding_phase(constants, out[S.SLIDING_SPEED])
         memory[BEFORE] = memory[LAST] = 0.0
     elif event == LIFT_OFF:

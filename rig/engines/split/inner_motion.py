@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from numba import njit
 
+from rig.kernels import signals as S
 from rig.kernels.axis import angles_of, axis_of
 from rig.kernels.contact import NO_FRICTION
 
@@ -145,21 +146,23 @@ def plant_of(constants, inputs, rest, spring_x, spring_y):
 def from_coordinates(constants, y):
     """Generalised coordinates y as axis, spin about it [rad/s], spin angle [rad], houses."""
     euler = constants.levels.euler
-    ux, uy, px, py = axis_of(euler, y[0], y[1], y[7], y[8])
+    ux, uy, px, py = axis_of(euler, y[S.GAMMA], y[S.BETA], y[S.GAMMA_RATE], y[S.BETA_RATE])
     axis = Axis(ux, uy, px, py)
-    w = y[9] + y[7] * ux if euler else y[9]
-    return axis, w, y[2], Houses(y[3], y[10], y[5], y[12], y[4], y[11], y[6], y[13])
+    w = y[S.THETA_RATE] + y[S.GAMMA_RATE] * ux if euler else y[S.THETA_RATE]
+    houses = Houses(y[S.X_IH], y[S.VX_IH], y[S.X_OH], y[S.VX_OH], y[S.Y_IH], y[S.VY_IH], y[S.Y_OH], y[S.VY_OH])
+    return axis, w, y[S.THETA], houses
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def into_coordinates(constants, axis, w, theta, houses, y):
     """The same the other way, into y."""
     euler = constants.levels.euler
-    y[2] = theta
-    y[0], y[1], y[7], y[8] = angles_of(euler, axis.ux, axis.uy, axis.px, axis.py)
-    y[9] = w - axis.ux * y[7] if euler else w
-    y[3], y[10], y[5], y[12] = houses.x0, houses.x1, houses.x2, houses.x3
-    y[4], y[11], y[6], y[13] = houses.y0, houses.y1, houses.y2, houses.y3
+    y[S.THETA] = theta
+    angles = angles_of(euler, axis.ux, axis.uy, axis.px, axis.py)
+    y[S.GAMMA], y[S.BETA], y[S.GAMMA_RATE], y[S.BETA_RATE] = angles
+    y[S.THETA_RATE] = w - axis.ux * y[S.GAMMA_RATE] if euler else w
+    y[S.X_IH], y[S.VX_IH], y[S.X_OH], y[S.VX_OH] = houses.x0, houses.x1, houses.x2, houses.x3
+    y[S.Y_IH], y[S.VY_IH], y[S.Y_OH], y[S.VY_OH] = houses.y0, houses.y1, houses.y2, houses.y3
 
 
 @inlined

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from rig.engines.memory import BEFORE, BEFORE_SPAN, CLAMPS, CONTACT_STEPS, CONTACTS, FLOORED, LAST, ONSET, PEAK_FORCE
+from rig.engines.events import latch_onset
+from rig.engines.memory import BEFORE, BEFORE_SPAN, CLAMPS, CONTACT_STEPS, LAST, ONSET, PEAK_FORCE
 from rig.engines.peak import peak
 from rig.engines.split.impulse import (
     Impulse,
@@ -22,7 +23,7 @@ from rig.engines.split.levels import contact_level, roughness
 from rig.engines.split.place import BOUNCE, LAST_STEP, SETTLED
 from rig.engines.split.state import Touch
 from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING, held_speed
+from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
 
 _SLOP = 200.0
 """Depth that a rigid ring keeps in lasting contact, over the step squared [m/s^2]: a chord of the arc stays inside."""
@@ -46,16 +47,12 @@ def begin_contact(constants, memory, touch, motion, h):
     if touch.depth < 0.0 and touch.ago > 0.0:
         part, speed = crossing(touch.depth, touch.rate, motion.depth, motion.rate, touch.ago)
         since = (1.0 - part) * touch.ago / h
-    memory[CONTACTS] += 1.0
-    if speed < contact.speed_floor:
-        memory[FLOORED] += 1.0
-    speed = held_speed(speed, contact)
-    memory[ONSET] = speed
+    latch_onset(memory, speed, contact)
     memory[BEFORE] = memory[LAST] = memory[BEFORE_SPAN] = 0.0
     memory[SETTLED], memory[BOUNCE] = 0.0, motion.rate
     if not constants.levels.compliant or motion.rate <= 0.0:
         return 0.0
-    return onset_error(contact, motion.rate, since, speed, h)
+    return onset_error(contact, motion.rate, since, memory[ONSET], h)
 
 
 @inlined

@@ -69,7 +69,6 @@ class _Code:
         self._needed: set[int] = set()
         self._constants: dict[str, str] = {}
         self._begin: list[str] = []
-        self._lanes = 0
         self._unknown: set[int] = set()
         """Numbers of nodes that depend on the unknown friction."""
         self._first: set[int] = set()
@@ -168,11 +167,11 @@ class _Code:
         for item in reversed(list(_all(items))):
             if item.kind == "rate" or item.number in self._needed:
                 self._needed.add(item.number)
-                self._needed |= {source.number for source in _sources(item)}
+                self._needed |= {source.number for source in item.sources}
 
     def _depend(self, items: list[Node | Fork]) -> None:
         for item in _all(items):
-            if item.kind == "unknown" or any(source.number in self._unknown for source in _sources(item)):
+            if item.kind == "unknown" or any(source.number in self._unknown for source in item.sources):
                 self._unknown.add(item.number)
 
     def _wanted(self, item: Node | Fork, again: bool) -> bool:
@@ -235,7 +234,10 @@ class _Code:
 
     def _node(self, node: Node, first: bool) -> Iterator[str]:
         name, arguments, p = _name(node), node.arguments, self._lane_of.get(node.number, -1)
-        at = f"acc[{p}], A[0, {p}], B[0, {p}], later"
+
+        def at(lane: int) -> str:
+            return f"acc[{lane}], A[0, {lane}], B[0, {lane}], later"
+
         match node.kind:
             case "column":
                 yield f"{name} = Y[k, {arguments[0]}]"
@@ -251,7 +253,7 @@ class _Code:
             case "product":
                 left, right = _name(arguments[0]), _name(arguments[1])
                 yield f"A[k, {p}], B[k, {p}] = {left}, {right}"
-                yield f"{name} = product({at}, {left}, {right})"
+                yield f"{name} = product({at(p)}, {left}, {right})"
             case "quotient" | "reciprocal":
                 dividend, divisor = (
                     ("z", arguments[0]) if node.kind == "reciprocal" else (_name(arguments[0]), arguments[1])
@@ -270,7 +272,7 @@ class _Code:
                 yield f"{name} = math.tanh({value}) if k == 0 else (acc[{p}] + k * ({value}) * B[0, {p}]) / k"
                 yield f"A[k, {p}] = k * ({value})"
                 yield f"A[k, {p + 1}], B[k, {p + 1}] = {name}, {name}"
-                yield f"B[k, {p}] = z - product({at.replace(str(p), str(p + 1))}, {name}, {name})"
+                yield f"B[k, {p}] = z - product({at(p + 1)}, {name}, {name})"
             case "power":
                 # x P' = n P x'.
                 x, exponent = _name(arguments[0]), self._constant(arguments[1])
@@ -344,12 +346,6 @@ def _whole(lanes: int) -> int:
 
 def _name(node: Node) -> str:
     return f"v{node.number}"
-
-
-def _sources(node: Node) -> Iterator[Node]:
-    for each in node.arguments:
-        if isinstance(each, Node | Symbol):
-            yield each if isinstance(each, Node) else each.node
 
 
 def _all(items: list[Node | Fork]) -> Iterator[Node]:

@@ -67,7 +67,9 @@ class Node:
     @property
     def sources(self) -> Iterator[Node]:
         """The nodes it is made of."""
-        return (each for each in self.arguments if isinstance(each, Node))
+        for each in self.arguments:
+            if isinstance(each, Node | Symbol):
+                yield each if isinstance(each, Node) else each.node
 
 
 @dataclass
@@ -178,7 +180,7 @@ class Tape:
         self.phase = phase
         self.items: list[Node | Fork] = []
         self.turns: dict[int, str] = {}
-        """Angles whose sine and cosine are columns: how they begin. The rates are entered in their branch."""
+        """Angles whose sine and cosine are columns: how they begin. Their rates are nodes."""
         self.rates: dict[int, Any] = {}
         """Of every other column, by number."""
         self.events: dict[str, Any] = {}
@@ -191,7 +193,6 @@ class Tape:
         self._open: list[list[Node | Fork]] = [self.items]
         self._numbers = count()
         self._answers: dict[str, bool] = {}
-        self._trail: list[str] = []
 
     def enter(self, kind: str, *arguments: Any) -> Symbol:
         """The symbol of an operation, entered where it is new."""
@@ -396,10 +397,6 @@ def _on_symbols(tape: Tape) -> Iterator[None]:
 
 class _Meanings:
     """Stages by name that are something else, or are to be remembered, for series. The plain stage comes along."""
-
-    @staticmethod
-    def evaluate(tape: Tape, plain: Any, *arguments: Any) -> None:
-        plain(*arguments)
 
     @staticmethod
     def sines_of(tape: Tape, plain: Any, levels: Any, angle: Symbol) -> tuple[Symbol, Symbol]:

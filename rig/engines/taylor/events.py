@@ -6,7 +6,8 @@ import math
 
 from numba import njit
 
-from rig.engines.memory import CLAMPS, CONTACTS, EVALUATIONS, FLOORED, ONSET, PHASE
+from rig.engines.events import latch_onset, sliding_phase
+from rig.engines.memory import CLAMPS, EVALUATIONS, ONSET, PHASE
 from rig.engines.method import rates
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT
 from rig.engines.taylor.place import EAST, EVENT, FRACTION, KNOWN, NORTH, ORDER, SLACK, SPAN, TICK
@@ -21,7 +22,6 @@ from rig.kernels.contact import (
     ROLLING,
     SMOOTHED,
     TOUCHING,
-    held_speed,
     ring_force,
 )
 from rig.kernels.dynamics import unit_response
@@ -131,16 +131,11 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
         known[i] = 0.0
     ring, _ = ring_at(constants, inputs, x)
     depth, rate, sliding = ring.delta, ring.rate, ring.sliding
-    sliding_phase = TOUCHING
-    if exact:
-        sliding_phase = FORWARD if sliding > 0.0 else BACKWARD
+    slides = sliding_phase(constants, sliding)
     if phase == FLIGHT:
         if event == FIRST:
-            memory[CONTACTS] += 1.0
-            if rate < contact.speed_floor:
-                memory[FLOORED] += 1.0
-            memory[ONSET] = held_speed(rate, contact)
-            memory[PHASE] = sliding_phase if abs(sliding) > _AT_REST else TOUCHING
+            latch_onset(memory, rate, contact)
+            memory[PHASE] = slides if abs(sliding) > _AT_REST else TOUCHING
             x[ROOT] = 0.0
             known[0] = 1.0
             if rate < _SLOWEST or not (contact.exponent == 1.5 or contact.exponent == 1.0):
@@ -151,7 +146,7 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
             memory[PHASE], memory[SLACK] = FLIGHT, 0.0
             known[0] = 1.0
         elif event == _THIRD:
-            memory[PHASE], memory[SLACK] = sliding_phase, 0.0
+            memory[PHASE], memory[SLACK] = slides, 0.0
             known[2] = 1.0
     elif event == FIRST:
         if phase == ROLLING:
@@ -169,7 +164,7 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
         known[2] = 1.0
     elif event == _SECOND and exact:
         if phase == TOUCHING and abs(sliding) > _AT_REST:
-            memory[PHASE] = sliding_phase
+            memory[PHASE] = slides
         else:
             _settle(constants, inputs, memory, x, y, dy, out)
     # The depth itself, where it can be told, so that its root does not drift.
@@ -179,9 +174,11 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
     house = constants.house
     memory[NORTH] = memory[EAST] = 0.0
     if constants.levels.inner_house:
-        memory[NORTH] = _loses(x[4] - x[6], x[11] - x[13], house.pair_stiffness_vertical, house.preload)
+        memory[NORTH] = _loses(
+            x[S.Y_IH] - x[S.Y_OH], x[S.VY_IH] - x[S.VY_OH], house.pair_stiffness_vertical, house.preload
+        )
     if constants.levels.outer_house:
-        memory[EAST] = _loses(x[5], x[12], house.pair_stiffness_horizontal, house.preload)
+        memory[EAST] = _loses(x[S.X_OH], x[S.VX_OH], house.pair_stiffness_horizontal, house.preload)
 
 
 @njit(cache=True, error_model="numpy")
@@ -197,7 +194,7 @@ def preload_end(constants, memory, Y, h):
         # Bounds on the displacement by its coefficients.
         middle, swing, power = 0.0, 0.0, 1.0
         for k in range(ORDER + 1):
-            value = Y[k, 4] - Y[k, 6] if pair == 0 else Y[k, 5]
+            value = Y[k, S.Y_IH] - Y[k, S.Y_OH] if pair == 0 else Y[k, S.X_OH]
             if k == 0:
                 middle = value
             else:
@@ -211,7 +208,7 @@ def preload_end(constants, memory, Y, h):
             way = 1.0 if lost != 0.0 else -1.0
             # Above 0 while nothing changes; in the last column, which events no longer need.
             for k in range(ORDER + 1):
-                value = Y[k, 4] - Y[k, 6] if pair == 0 else Y[k, 5]
+                value = Y[k, S.Y_IH] - Y[k, S.Y_OH] if pair == 0 else Y[k, S.X_OH]
                 Y[k, EVENTS + 2] = way * sign * value / limit
             Y[0, EVENTS + 2] -= way
             shift = 1 if abs(Y[0, EVENTS + 2]) < 1e-11 else 0

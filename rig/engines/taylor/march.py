@@ -28,6 +28,7 @@ import math
 import numpy as np
 from numba import njit
 
+from rig.engines.events import sliding_phase
 from rig.engines.memory import (
     CEILING,
     CONTACT_STEPS,
@@ -58,7 +59,7 @@ from rig.engines.taylor.place import (
 from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
 from rig.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
+from rig.kernels.contact import FLIGHT, ROLLING, held_speed
 from rig.kernels.forces import drive_speed
 
 _SAFETY = 0.9
@@ -79,9 +80,7 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     memory[SPAN] = -1.0
     ring, _ = ring_at(constants, inputs, y)
     if ring.delta > 0.0:
-        memory[PHASE] = TOUCHING
-        if constants.levels.friction == EXACT:
-            memory[PHASE] = FORWARD if ring.sliding > 0.0 else BACKWARD
+        memory[PHASE] = sliding_phase(constants, ring.sliding)
 
 
 @njit(cache=True, error_model="numpy")
