@@ -22,7 +22,7 @@ import numpy as np
 from drivers.link import LinkTimeoutError
 from drivers.samples import Pile, Samples, StreamEndedError, follow
 from drivers.sources import Source, open_source
-from rig.errors import InputError
+from rig.errors import InputError, UnknownNameError
 from rig.wire import Continuity, Gap
 
 _GAPS = 1000
@@ -108,11 +108,11 @@ class Aligner:
     def _join(self, heads: dict[str, Samples], rows: int) -> Samples:
         first = next(iter(heads.values()))
         chosen = [heads[name].values[:rows, columns] for name, columns in self._columns.items()]
-        names = [heads[name].channels[n] for name, columns in self._columns.items() for n in columns]
+        names = [heads[name].names[n] for name, columns in self._columns.items() for n in columns]
         units = [heads[name].units[n] for name, columns in self._columns.items() for n in columns]
         joint = replace(
             first,
-            channels=tuple(names[n] for n in self._order),
+            names=tuple(names[n] for n in self._order),
             units=tuple(units[n] for n in self._order),
             values=np.concatenate(chosen, axis=1)[:, self._order],
             gap=0,
@@ -180,7 +180,7 @@ class Daq:
             raise InputError("channels", "at least one, each once", list(self.channels))
         for channel in self.channels:
             if channel not in home:
-                raise InputError("channel", f"one of {', '.join(home)}", channel)
+                raise UnknownNameError("channel", "one of the source's", channel, home)
         wanted = {name: [channel for channel in names if channel in self.channels] for name, names in available.items()}
         wanted = {name: chosen for name, chosen in wanted.items() if chosen}
         columns = {name: [list(available[name]).index(channel) for channel in wanted[name]] for name in wanted}

@@ -9,24 +9,30 @@ from pathlib import Path
 import pytest
 
 import rig
+from drivers.console import Console
 from drivers.daq import Daq
 from recorder.reader import Recording
-from rig import contacts, magnets, orbit
+from rig import contacts, magnets
 
 MODULES = (
+    "drivers.console",
     "drivers.daq",
     "recorder.reader",
     "rig.contacts",
+    "rig.errors",
     "rig.magnets",
     "rig.offline",
     "rig.orbit",
     "rig.parameters",
+    "rig.samples",
     "rig.scenes",
+    "rig.simulation",
+    "rig.text",
 )
 CALLED = (
-    rig.simulate, rig.load_scene, rig.load_parameters, contacts.restitution_factor, contacts.returned_restitution,
+    *(getattr(rig, name) for name in rig.__all__), contacts.restitution_factor, contacts.returned_restitution,
     contacts.linear_damping_ratio, contacts.fit_power, contacts.free_impact, magnets.field_sum_force,
-    magnets.cylinder_force, magnets.pair_force, orbit.whirl_frequency, orbit.full_spectrum, Recording, Daq,
+    magnets.cylinder_force, magnets.pair_force, Recording, Daq, Console,
 )  # fmt: skip
 
 

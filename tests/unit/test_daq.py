@@ -102,7 +102,7 @@ def test_rows_are_joined_by_number_and_columns_come_in_the_order_asked_for() -> 
     made = aligner()
     assert made.feed("a", part(0, 10, columns=2)) == []
     (first,) = made.feed("b", part(4, 4, name="b", columns=2))
-    assert first.channels == ("a1", "b1", "a0")
+    assert first.names == ("a1", "b1", "a0")
     assert (first.index, first.tick) == (4, 4000)
     np.testing.assert_array_equal(first.values[:, 2], np.arange(4, 8))
     np.testing.assert_array_equal(first.values[:, 0], first.values[:, 1])
@@ -177,7 +177,7 @@ def test_chosen_channels_come_aligned_in_engineering_units() -> None:
     with on_memory(channels=CHANNELS) as (rig, daq):
         rig.publish(*GROUPS, "drive", blocks=3)
         samples = daq.read(3 * BLOCK)
-        assert (samples.channels, samples.units) == (("P_W", "disk_x", "hammer"), ("N", "mm", "N"))
+        assert (samples.names, samples.units) == (("P_W", "disk_x", "hammer"), ("N", "mm", "N"))
         assert (samples.index, samples.gap, samples.rate_hz, daq.rate_hz) == (0, 0, 20_000.0, 20_000.0)
         np.testing.assert_allclose(samples.values, expected(0, 3 * BLOCK), rtol=0, atol=1e-9)
         np.testing.assert_array_equal(samples["disk_x"], samples.values[:, 1])

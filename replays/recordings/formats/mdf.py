@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.recordings.formats import export
-from replays.recordings.formats import unit as units
 from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz, library
+from rig import units
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -17,6 +16,7 @@ from recorder.reader import Recording
 from recorder.survey import Stream
 from rig.channels import Channel
 from rig.errors import InputError
+from rig.text import nearest
 from rig.wire import Block, sensor_key, truth_key
 
 Unit = Literal["engineering", "volts", "counts"]
@@ -359,13 +359,13 @@ def _near(channel: str, groups: dict[str, list[str]], truths: dict[str, list[str
     prefix, _, rest = channel.partition(".")
     table, _, column = rest.partition(".")
     if prefix == "truth" and table in truths:
-        near = difflib.get_close_matches(column, truths[table], n=3)
+        near = nearest(column, truths[table])
         return f"truth.{table}.COLUMN with one of {', '.join(near or truths[table])}"
     if prefix == "truth":
         tables = ", ".join(f"truth.{name}" for name in truths)
         return f"one of {tables}" if truths else "one of the sensors: the recording has no truth"
     sensors = [*(name for group in groups.values() for name in group), *groups]
-    near = difflib.get_close_matches(channel, sensors, n=3)
+    near = nearest(channel, sensors)
     if near:
         return f"one of the recording's, such as {', '.join(near)}"
     return f"a channel of the recording, one of its groups ({', '.join(groups)}) or truth.TABLE"

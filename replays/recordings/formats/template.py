@@ -9,9 +9,9 @@ from contextlib import suppress
 from importlib.resources import files as files_of
 from pathlib import Path
 
-from replays.recordings.formats import unit as units
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import Entry, Source, open_source
+from rig import units
 from rig.channels import default_table
 
 CHECK = "PLEASE CHECK"

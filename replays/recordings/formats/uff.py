@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from replays.recordings.formats import export
-from replays.recordings.formats import unit as units
 from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, library
+from rig import units
 from rig.errors import InputError
 from rig.outside import open_file
 from rig.text import printable
