@@ -45,7 +45,7 @@ class UnknownNameError(InputError, KeyError):
         ...     rig.simulate("hammer", duration_s=0.01)["disk_z"]
         ... except KeyError as error:
         ...     print(error)
-        signal must be one of those that there are, such as disk_y, disk_x, ... (66 in all); instead received 'disk_z'
+        signal must be one of those that there are, such as disk_y, disk_x (66 in all); instead received 'disk_z'
     """
 
     def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:

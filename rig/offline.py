@@ -51,7 +51,7 @@ class Run:
         '1.57 mm'
         >>> run["disk_z"]
         Traceback (most recent call last):
-        rig.errors.UnknownNameError: signal must be one of those that there are, such as disk_y, disk_x, ...
+        rig.errors.UnknownNameError: signal must be one of those that there are, such as disk_y, disk_x (66 ...
         >>> sorted(run.energy())  # each [J], shape (n,)
         ['dissipated', 'residual', 'stored', 'supplied']
     """

@@ -116,15 +116,12 @@ class Simulation:
         end_tick: Where the scene ends.
         row_ticks: Ticks between observed rows.
 
-    Raises:
-        InputError: The scene cannot run, as with a parameter that its model does not take.
-
     Example:
         >>> import rig
         >>> simulation = rig.Simulation(rig.load_scene("hammer"))
         >>> frame = simulation.advance(100 * simulation.block_ticks)
         >>> simulation
-        Simulation(hammer: at 0.05 of 2 s; split 25 us)
+        Simulation(hammer: at 0.05 of 2 s; split)
         >>> frame.samples["probes"].values.shape, frame.rows.shape  # ADC counts; the model's signals, SI
         ((1000, 4), (2000, 66))
         >>> tick = simulation.submit("hammer", {"force_n": 80.0, "direction": "y"})  # takes effect at that tick
@@ -180,8 +177,7 @@ class Simulation:
 
     def __repr__(self) -> str:
         at_s, end_s = self.tick / self.tick_rate_hz, self.end_tick / self.tick_rate_hz
-        engine = self.scene.engine
-        return f"Simulation({self.scene.name}: at {at_s:g} of {end_s:g} s; {engine.name} {engine.step_us} us)"
+        return f"Simulation({self.scene.name}: at {at_s:g} of {end_s:g} s; {self.scene.engine.name})"
 
     @cached_property
     def first_row(self) -> np.ndarray:

@@ -43,7 +43,7 @@ def nearest(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
     import difflib
 
     folded = {each.casefold(): each for each in known}
-    return [folded[each] for each in difflib.get_close_matches(str(name)[:100].casefold(), folded, most, 0.4)]
+    return [folded[each] for each in difflib.get_close_matches(str(name)[:100].casefold(), folded, most, 0.5)]
 
 
 class _Shown(reprlib.Repr):

@@ -21,6 +21,7 @@ from replays.recordings.formats.export import check_output
 from rig import wire
 from rig.errors import whole_file
 from rig.kernels.signals import ROW
+from rig.offline import frames
 from rig.simulation import Frame, Simulation
 
 SUFFIXES = (".mcap", ".parquet", ".csv")
@@ -55,6 +56,35 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
     if path.suffix == ".mcap":
         return McapRun(path, simulation, force=force)
     return _TableRun(path, simulation, columnar.ParquetRows if path.suffix == ".parquet" else delimited.CsvRows)
+
+
+def write_run(
+    simulation: Simulation, path: Path, *, force: bool = False, progress: Callable[[float], None] = lambda part: None
+) -> None:
+    """Run a scene to its end as fast as it goes, into a file that grows with it; nothing is left behind on an error.
+
+    Args:
+        simulation: What is run, from where it is.
+        path: File that ends in .mcap (as `rig record` would have made it), .parquet or .csv.
+        force: Replace an existing file.
+        progress: Told the part done, 0 to 1.
+
+    Raises:
+        InputError: The destination cannot be used.
+        SimulationError: The state became non-finite.
+
+    Example:
+        >>> import rig, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "run.mcap"
+        ...     write_run(rig.Simulation(rig.load_scene("hammer", {"duration_s": 0.1})), path)
+        ...     path.stat().st_size > 100_000
+        True
+    """
+    with writer_for(path, simulation, force=force) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+            progress(simulation.tick / (simulation.end_tick or simulation.tick))
 
 
 def table_columns(simulation: Simulation) -> list[str]:

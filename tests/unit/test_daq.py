@@ -304,7 +304,10 @@ def test_a_user_who_is_slow_loses_rows_that_are_counted_and_memory_stays() -> No
 
 def test_what_is_malformed_is_one_line() -> None:
     for options, message in [
-        ({"channels": ["P_N", "disk_z"]}, "channel must be one of disk_x, .*; instead received 'disk_z'"),
+        (
+            {"channels": ["P_N", "disk_z"]},
+            "channel must be one of the source's, such as disk_y, .*'disk_z'",
+        ),
         ({"channels": []}, "channels must be at least one, each once"),
         ({"channels": ["P_N", "P_N"]}, "channels must be at least one, each once"),
         ({"channels": ["P_N"], "rate_hz": 3000.0}, "rate_hz must be 20000 divided by a whole number"),

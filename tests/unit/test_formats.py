@@ -16,13 +16,12 @@ import pytest
 from recorder.head import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from replays.recordings.export import writer_for
+from replays.recordings.export import write_run
 from replays.recordings.formats import clock
 from replays.recordings.formats.export import SUFFIXES, Written, export
 from replays.recordings.formats.selection import Selection, Unit, select
 from rig.cli.main import main
 from rig.errors import InputError
-from rig.offline import frames
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 from rig.wire import Block, encode_block, sensor_key
@@ -34,9 +33,7 @@ DURATION_S = 0.12
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     path = tmp_path_factory.mktemp("formats") / "run.mcap"
     simulation = Simulation(load_scene("hammer", {"duration_s": DURATION_S, "seed": 7, "sensors.truth_rate_hz": 2000}))
-    with writer_for(path, simulation) as writer:
-        for frame in frames(simulation):
-            writer.write(frame)
+    write_run(simulation, path)
     return Recording.open(path)
 
 
