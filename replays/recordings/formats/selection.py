@@ -8,20 +8,23 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from recorder.reader import Recording
+from recorder.schemas import event_text
 from recorder.survey import Stream
 from rig.channels import Channel
 from rig.errors import InputError
-from rig.text import nearest
+from rig.text import nearest, printable
 from rig.wire import Block, sensor_key, truth_key
 
 Unit = Literal["engineering", "volts", "counts"]
 ROWS = 1 << 14
 """Rows of a chunk."""
+_MOST_S = 1e12
+"""Latest time that an event may have [s]."""
 NO_VOLTS = "imported in its own unit"
 """Provenance of an imported channel of whose voltage nothing is known."""
 
@@ -73,9 +76,19 @@ class Column:
             }  # fmt: skip
         return about
 
-    def about(self) -> str:
-        """The same in a line, for formats that have a comment only."""
-        return json.dumps(self.metadata, ensure_ascii=False)
+    def about(self, sensor: str) -> str:
+        """What it is, by which sensor, and its calibration, in a line for a person.
+
+        Args:
+            sensor: What the group is.
+        """
+        texts = [self.label]
+        if (channel := self.source) is not None:
+            texts += [sensor, f"{channel.adc_bits} bits over +-{channel.adc_v:g} V, to {channel.bandwidth_hz:g} Hz"]
+            if channel.kind != NO_VOLTS:
+                texts.append(f"{channel.sensitivity_v:g} V per {channel.unit}, {channel.bias_v:g} V at 0")
+            texts.append(f"calibration {channel.kind}")
+        return "; ".join(text for text in texts if text)
 
 
 @dataclass(frozen=True)
@@ -145,14 +158,68 @@ class ExportTable:
         return values.copy()
 
 
+class ExportEvent(NamedTuple):
+    """What happened during a recording.
+
+    Attributes:
+        time_s: Simulated time [s].
+        name: `hammer`, `speed`, `note`, ...
+        text: All of it in a line, for a person.
+        document: The same as the rig told it.
+    """
+
+    time_s: float
+    name: str
+    text: str
+    document: dict[str, Any]
+
+
 @dataclass(frozen=True)
 class Selection:
-    """What is exported of a recording."""
+    """What is exported of a recording.
+
+    Attributes:
+        recording: The recording.
+        tables: Its tables.
+        unit: What the sensors' values are given in.
+        from_s, to_s: Ends that were asked for, simulated time [s].
+        notes: What was done to the values.
+    """
 
     recording: Recording
     tables: tuple[ExportTable, ...]
     unit: Unit
+    from_s: float = -math.inf
+    to_s: float = math.inf
     notes: dict[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def events(self) -> tuple[ExportEvent, ...]:
+        """Impacts, commands and notes in the range, in order; a command that took effect at once stands once."""
+        told = [
+            event
+            for event in self.recording.events
+            if event.get("time_s") is not None and max(self.from_s, 0.0) <= event["time_s"] <= min(self.to_s, _MOST_S)
+        ]
+        effects = {(event.get("tick"), event["event"]) for event in told}
+        senders = {
+            (event["tick"], event["command"]): event.get("from") for event in told if event["event"] == "command"
+        }
+        events = []
+        for event in sorted(told, key=lambda event: event["time_s"]):
+            if event["event"] == "command" and (event["tick"], event["command"]) in effects:
+                continue
+            sender = senders.get((event.get("tick"), event["event"]))
+            whole = event if sender is None else {**event, "from": sender}
+            text = printable(event_text(whole)[1])
+            events.append(ExportEvent(float(event["time_s"]), printable(event["event"]), text, whole))
+        return tuple(events)
+
+    @property
+    def documents(self) -> dict[str, str]:
+        """The rig's catalogue, parameters and scene, by name, as the recording has them."""
+        names = ("catalogue.json", "parameters.json", "scene.json")
+        return {name: self.recording.attachments[name].decode() for name in names}
 
     @cached_property
     def start(self) -> datetime:
@@ -172,8 +239,15 @@ class Selection:
         }  # fmt: skip
 
     def summary(self) -> str:
-        """The same in a line."""
-        return json.dumps(self.metadata, ensure_ascii=False)
+        """The same for a person, line by line."""
+        about, scene = self.metadata, self.recording.scene.get("scene") or {}
+        title = f" ({printable(str(scene['title']))})" if scene.get("title") else ""
+        seed = f", seed {about['seed']}" if about["seed"] else ""
+        return "\n".join([
+            f"Virtual rotor-stator rig, scene {about['scene']}{title}, parameters {about['parameter_set']}{seed}",
+            f"Time 0 is {about['start']}; from the recording {about['recording']}; sensors in {about['values']} values",
+            *(f"{name}: {text}" for name, text in self.notes.items()),
+        ])  # fmt: skip
 
     def sidecar(self) -> dict[str, Any]:
         """All metadata as a document, for formats that have no place for it."""
@@ -182,7 +256,9 @@ class Selection:
              "columns": [column.metadata for column in table.columns]}
             for table in self.tables
         ]  # fmt: skip
-        return {**self.metadata, "tables": tables}
+        documents = {name.removesuffix(".json"): json.loads(text) for name, text in self.documents.items()}
+        events = [event.document for event in self.events]
+        return {**self.metadata, "tables": tables, "events": events, "documents": documents}
 
     @cached_property
     def missing(self) -> dict[str, int]:
@@ -319,7 +395,10 @@ def select(
         low, high = min((s.first_time_s for s in held), default=0.0), max((s.last_time_s for s in held), default=0.0)
         ends = [f"{word} {end:g} s" for word, end in (("from", from_s), ("to", to_s)) if end is not None]
         raise InputError("range", f"in the recording, {low:g} to {high:g} s", " ".join(ends) or "all of it")
-    return Selection(recording=recording, tables=tuple(_merge(alike) for alike in tables.values()), unit=unit)
+    return Selection(
+        recording=recording, tables=tuple(_merge(alike) for alike in tables.values()), unit=unit,
+        from_s=-math.inf if from_s is None else from_s, to_s=math.inf if to_s is None else to_s,
+    )  # fmt: skip
 
 
 def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> dict[str, list[int]]:
