@@ -17,8 +17,9 @@ from replays.recordings.formats.source import Entry, FileSignal, Source, damaged
 from rig import units
 
 if TYPE_CHECKING:
+    from replays.recordings.formats.history import ExportEvent
     from replays.recordings.formats.mapping import FileOptions
-    from replays.recordings.formats.selection import ExportChunk, ExportEvent, ExportTable, Selection
+    from replays.recordings.formats.selection import ExportChunk, ExportTable, Selection
 
 _TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
 """The text in a comment that is XML."""

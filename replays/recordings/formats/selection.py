@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
 from recorder.reader import Recording
-from recorder.schemas import event_text
 from recorder.survey import Stream
+from replays.recordings.formats.history import ExportEvent, happenings
 from rig.channels import Channel
 from rig.errors import InputError
 from rig.text import nearest, printable
@@ -23,8 +23,6 @@ from rig.wire import Block, sensor_key, truth_key
 Unit = Literal["engineering", "volts", "counts"]
 ROWS = 1 << 14
 """Rows of a chunk."""
-_MOST_S = 1e12
-"""Latest time that an event may have [s]."""
 NO_VOLTS = "imported in its own unit"
 """Provenance of an imported channel of whose voltage nothing is known."""
 
@@ -158,22 +156,6 @@ class ExportTable:
         return values.copy()
 
 
-class ExportEvent(NamedTuple):
-    """What happened during a recording.
-
-    Attributes:
-        time_s: Simulated time [s].
-        name: `hammer`, `speed`, `note`, ...
-        text: All of it in a line, for a person.
-        document: The same as the rig told it.
-    """
-
-    time_s: float
-    name: str
-    text: str
-    document: dict[str, Any]
-
-
 @dataclass(frozen=True)
 class Selection:
     """What is exported of a recording.
@@ -195,25 +177,8 @@ class Selection:
 
     @cached_property
     def events(self) -> tuple[ExportEvent, ...]:
-        """Impacts, commands and notes in the range, in order; a command that took effect at once stands once."""
-        told = [
-            event
-            for event in self.recording.events
-            if event.get("time_s") is not None and max(self.from_s, 0.0) <= event["time_s"] <= min(self.to_s, _MOST_S)
-        ]
-        effects = {(event.get("tick"), event["event"]) for event in told}
-        senders = {
-            (event["tick"], event["command"]): event.get("from") for event in told if event["event"] == "command"
-        }
-        events = []
-        for event in sorted(told, key=lambda event: event["time_s"]):
-            if event["event"] == "command" and (event["tick"], event["command"]) in effects:
-                continue
-            sender = senders.get((event.get("tick"), event["event"]))
-            whole = event if sender is None else {**event, "from": sender}
-            text = printable(event_text(whole)[1])
-            events.append(ExportEvent(float(event["time_s"]), printable(event["event"]), text, whole))
-        return tuple(events)
+        """Impacts, commands and notes in the range, in order."""
+        return happenings(self.recording, self.from_s, self.to_s)
 
     @property
     def documents(self) -> dict[str, str]:
