@@ -153,9 +153,9 @@ class Daq:
         ...     source.on_samples("forces", Samples(0, 0, 1000.0, 1e6, ("P_E", "P_N"), ("N", "N"), values))
         ...     source.on_end("forces", "completed")
         ...     for samples in daq.blocks(2):
-        ...         print(samples.times_s, samples["P_N"], samples.gap)
-        [0.    0.001] [2990. 2991.] 0
-        [0.002] [2992.] 0
+        ...         print(samples.times_s, samples["P_N"], samples.unit("P_N"), samples.gap)
+        [0.    0.001] [2990. 2991.] N 0
+        [0.002] [2992.] N 0
     """
 
     def __init__(

@@ -1,18 +1,22 @@
-"""A virtual rotor-stator test rig: its scenes run as fast as they go, its motion, forces and sensors as arrays.
+"""A virtual rotor-stator test rig: motion, forces and sensors as arrays.
 
     import rig
     run = rig.simulate("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
-    run["disk_x"].max(), run.unit("disk_x")                  # any state, force or energy of the model, in SI
-    run.samples["disk_x"].max(), run.samples.unit("disk_x")  # what the sensors showed, in their own units
-    run.samples.to_si()["disk_x"], run.times_s               # ... and in SI
+    run["disk_x"].max(), run.unit("disk_x")  # all that the model has, in SI
+    run.samples["disk_x"].max(), run.samples.unit("disk_x")  # what the sensors showed
+    run.samples.to_si()["disk_x"], run.times_s  # ... in SI, and when
 
-`run.names` and `run.samples.names` list what there is; a name that is none raises a KeyError that tells the nearest.
-`rig.load_scene` checks a scene without running it, `rig.load_parameters` gives the numbers with their sources, and
-`rig.Simulation` goes on step by step. `rig.full_spectrum`, `rig.waterfall`, `rig.whirl_frequency` and `rig.synchronous`
-(1X of a run-up) make of samples what is plotted of a rotor.
+`run.names` and `run.samples.names` list what there is; a name that is none
+raises a KeyError that tells the nearest. `rig.load_scene` checks a scene
+without running it, `rig.load_parameters` gives the numbers with their sources,
+and `rig.Simulation` goes on step by step. `rig.full_spectrum`, `rig.waterfall`,
+`rig.whirl_frequency` and `rig.synchronous` (1X of a run-up) make of samples
+what is plotted of a rotor.
 
-Recordings are opened by `recorder.reader.Recording`, whose samples are of the same kind; a running rig is read by
-`drivers.daq.Daq` and commanded by `drivers.console.Console`. The same objects carry the commands of `rig`.
+Recordings are opened by `recorder.reader.Recording`, whose samples are of the
+same kind, and written by `replays.recordings.export.write_run`; a running rig
+is read by `drivers.daq.Daq` and commanded by `drivers.console.Console`. The
+same objects carry the commands of `rig`.
 """
 
 from __future__ import annotations

@@ -117,6 +117,12 @@ class ChannelTable(BaseModel):
 
     groups: dict[str, Group]
 
+    def __repr__(self) -> str:
+        groups = [f"{name}: {', '.join(group.names)}" for name, group in self.groups.items()]
+        return f"ChannelTable({'; '.join(groups)})"
+
+    __str__ = __repr__
+
     @model_validator(mode="after")
     def _names_once(self) -> ChannelTable:
         names = [channel.name for group in self.groups.values() for channel in group.channels]

@@ -127,9 +127,12 @@ def test_a_name_that_is_none_tells_the_nearest(run: Run) -> None:
 
 
 def test_what_is_shown_of_each_object_is_a_line(run: Run) -> None:
-    for each in (run, run.simulation, run.simulation.scene, run.simulation.model.parameters):
+    frame = Simulation(run.simulation.scene).advance(50_000)
+    assert len(repr(frame)) < 2_000
+    for each in (run, run.simulation, run.simulation.scene, run.simulation.model.parameters, run.table):
+        assert str(each) == repr(each)
         assert repr(each).startswith(f"{type(each).__name__}(")
-        assert len(repr(each)) < 140
+        assert len(repr(each)) < 200
     assert repr(run.samples).startswith("Samples(disk_x, disk_y, ring_x, ring_y [mm], P_N, ")
     assert repr(run.samples).endswith("; 40000 rows at 20000 Hz, 0 to 1.99995 s)")
     assert "\n" not in repr(run.samples)
