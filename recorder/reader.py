@@ -34,7 +34,7 @@ class Recording:
     Example:
         >>> with Recording.open("replays/sessions/hammer-5.2.mcap") as recording:
         ...     forces = recording.samples("forces")
-        ...     both = recording.samples("probes", "drive")  # row by row; without names, all groups
+        ...     both = recording.samples("disk_x", "speed")  # without names: all there are
         >>> recording
         Recording(replays/sessions/hammer-5.2.mcap: scene hammer, 0 to 0.5998 s, completed; probes, forces, ...)
         >>> forces
@@ -176,22 +176,27 @@ class Recording:
         found = zip(names, self._surveyed(), strict=True)
         return tuple(name + text for name, survey in found for text in what(survey))
 
-    def samples(self, *groups: str) -> Samples:
-        """Sensor groups in engineering units, shape (n, channels).
+    def samples(self, *names: str) -> Samples:
+        """Sensors in engineering units, shape (n, channels).
 
         Args:
-            groups: Names of groups of the channel table; none: all that are in the recording. One alone comes in order
-                of arrival. Several are joined row by row, in order of their numbers, where all of them have one.
+            names: Channels and groups of the channel table; none: all groups that are in the recording. Those of one
+                group come in order of arrival. Several groups are joined row by row, in order of their numbers, where
+                all of them have one.
 
         Raises:
-            InputError: The recording has no such group, several do not have the same instants, or the file is damaged.
+            InputError: The recording has no such channel or group, several groups do not have the same instants, or
+                the file is damaged.
         """
-        known = self.table.groups
-        for name in groups:
-            if name not in known:
-                raise UnknownNameError("group", "one of the recording's", name, known)
-        parts = [self._group(name) for name in groups or known if groups or sensor_key(name) in self.messages]
-        return joined(parts)
+        groups, homes = self.table.groups, {name: each.group for name, each in self.table.channels.items()}
+        for name in names:
+            if name not in groups and name not in homes:
+                raise UnknownNameError("samples", "a channel or a group of the recording", name, [*homes, *groups])
+        wanted = dict.fromkeys(name if name in groups else homes[name] for name in names)
+        whole = joined([self._group(name) for name in wanted or groups if names or sensor_key(name) in self.messages])
+        if all(name in groups for name in names):
+            return whole
+        return whole.only(*(each for name in names for each in (groups[name].names if name in groups else (name,))))
 
     def _group(self, name: str) -> Samples:
         group = self.table.groups[name]

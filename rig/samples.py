@@ -70,6 +70,16 @@ class Columns:
         """
         return self.units[place(name, self.names)]
 
+    def only(self, *names: str) -> Self:
+        """Some of the columns, in this order.
+
+        Raises:
+            UnknownNameError: There is no such column.
+        """
+        places = [place(name, self.names) for name in names]
+        chosen = tuple(self.units[each] for each in places)
+        return cast(Self, replace(cast(Any, self), names=names, units=chosen, values=self.values[:, places]))
+
     def to_si(self) -> Self:
         """The same rows in SI: mm become m, Hz of a speed rad/s. A unit that is not known stays."""
         names, sizes = zip(*map(units.in_si, self.units), strict=True) if self.units else ((), ())

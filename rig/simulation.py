@@ -120,11 +120,8 @@ class Simulation:
         >>> import rig
         >>> simulation = rig.Simulation(rig.load_scene("hammer"))
         >>> frame = simulation.advance(100 * simulation.block_ticks)
-        >>> simulation
-        Simulation(hammer: at 0.05 of 2 s; split)
-        >>> frame.samples["probes"].values.shape, frame.rows.shape  # ADC counts; the model's signals, SI
-        ((1000, 4), (2000, 66))
-        >>> tick = simulation.submit("hammer", {"force_n": 80.0, "direction": "y"})  # takes effect at that tick
+        >>> simulation, frame.samples["probes"].values.shape, frame.rows.shape  # ADC counts; the model's signals [SI]
+        (Simulation(hammer: at 0.05 of 2 s), (1000, 4), (2000, 66))
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -176,8 +173,7 @@ class Simulation:
         self._last: np.ndarray | None = None
 
     def __repr__(self) -> str:
-        at_s, end_s = self.tick / self.tick_rate_hz, self.end_tick / self.tick_rate_hz
-        return f"Simulation({self.scene.name}: at {at_s:g} of {end_s:g} s; {self.scene.engine.name})"
+        return f"Simulation({self.scene.name}: at {self.tick / self.tick_rate_hz:g} of {self.scene.duration_s:g} s)"
 
     @cached_property
     def first_row(self) -> np.ndarray:

@@ -95,7 +95,10 @@ def test_streams_tell_their_extent(recording):
 @pytest.mark.parametrize(
     ("ask", "must"),
     [
-        (lambda recording: recording.samples("probe"), "group must be one of the recording's, such as probes"),
+        (
+            lambda recording: recording.samples("probe"),
+            "samples must be a channel or a group .*, such as probes",
+        ),
         (
             lambda recording: recording.truth("energies"),
             "truth must be one of the recording's tables, such as state, contact",
@@ -123,6 +126,12 @@ def test_groups_are_joined_where_all_have_a_row(recording):
     np.testing.assert_allclose(si["ring_y"], probes["ring_y"] * 1e-3, rtol=1e-15)
     assert (both.unit("ring_y"), si.unit("ring_y"), si.unit("P_N")) == ("mm", "m", "N")
     assert whole.names == tuple(recording.table.channels)
+    few = opened.samples("ring_y", "P_N", "hammer")
+    assert (few.names, few.units) == (("ring_y", "P_N", "hammer"), ("mm", "N", "N"))
+    np.testing.assert_array_equal(few["ring_y"], probes["ring_y"])
+    for ask in (lambda: few.only("ring_z"), lambda: opened.samples("ring_z")):
+        with pytest.raises(KeyError, match="such as ring_y"):
+            ask()
     shorter = replace(probes, index=probes.index[7:], times_s=probes.times_s[7:], values=probes.values[7:])
     np.testing.assert_array_equal(joined([opened.samples("forces"), shorter]).index, shorter.index)
     late = replace(probes, times_s=probes.times_s + 20e-6)
