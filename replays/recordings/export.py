@@ -6,6 +6,7 @@ Tables have one row a sample: `time [s]`, every signal of the model as `truth.NA
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -118,7 +119,9 @@ class _TableRun:
         self._background = Background()
 
     def __enter__(self) -> Self:
-        schema = columnar.float_schema(table_columns(self.simulation))
+        about = {"parameters": self.simulation.parameters_document(), "scene": self.simulation.scene_document()}
+        told = {f"{name}.json": json.dumps(document) for name, document in about.items()}  # where a format has a place
+        schema = columnar.float_schema(table_columns(self.simulation)).with_metadata(told)
         with ExitStack() as stack:
             self._writer = self._open_table(stack.enter_context(whole_file(self.path)), schema)
             stack.callback(self._writer.close)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,8 @@ def test_parquet_is_the_run(folder: Path, run: Run) -> None:
 
     table = parquet.read_table(folder / "run.parquet")
     assert table.column_names == table_columns(run.simulation)
+    assert json.loads(table.schema.metadata[b"scene.json"])["scene"]["drive"]["speed_hz"] == 7.0
+    assert "contact.friction" in json.loads(table.schema.metadata[b"parameters.json"])["values"]
     values = np.column_stack([column.to_numpy() for column in table.columns])
     np.testing.assert_array_equal(values, expected(run))
 

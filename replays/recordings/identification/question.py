@@ -311,10 +311,10 @@ def _check_key(experiment: Experiment, key: str) -> None:
     close = nearest(key, own)
     must = "of a parameter, a number of the scene ("
     must += f"{', '.join(_SCENE_KEYS)}) or of a command (hammer.1.force_n)"
-    if close:
-        must += f", such as {', '.join(close)}"
-    elif key in parameters or key.split(".")[0] in Scene.model_fields:
+    if key in parameters or key.split(".")[0] in Scene.model_fields:
         must += ", all properties of the rig or of what was done to it and none of the simulation"
+    elif close:
+        must += f", such as {', '.join(close)}"
     raise InputError("fit", must, key)
 
 
