@@ -42,10 +42,10 @@ class UnknownNameError(InputError, KeyError):
     Example:
         >>> import rig
         >>> try:
-        ...     rig.simulate("hammer", duration_s=0.01)["disk_z"]
+        ...     rig.simulate("hammer", duration_s=0.01).samples["disk_z"]
         ... except KeyError as error:
         ...     print(error)
-        signal must be one of those that there are, such as disk_y, disk_x (66 in all); instead received 'disk_z'
+        name must be one of those that there are, such as disk_y, disk_x (15 in all); instead received 'disk_z'
     """
 
     def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:

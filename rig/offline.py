@@ -17,6 +17,7 @@ from rig.scenes import Scene, change_scene, load_scene, parse_scene
 from rig.simulation import Frame, Simulation, energy_balance
 
 NAMES = tuple(COLUMN)
+_MUST = "one of the model's signals (those of the sensors are in run.samples)"
 
 
 class SentCommand(NamedTuple):
@@ -51,9 +52,9 @@ class Run:
         '1.57 mm'
         >>> run["disk_z"]
         Traceback (most recent call last):
-        rig.errors.UnknownNameError: signal must be one of those that there are, such as disk_y, disk_x (66 ...
-        >>> sorted(run.energy())  # each [J], shape (n,)
-        ['dissipated', 'residual', 'stored', 'supplied']
+        rig.errors.UnknownNameError: name must be one of the model's signals (...), such as disk_y, ...
+        >>> run.energy()
+        Samples(stored, supplied, dissipated, residual [J]; 1000 rows at 20000 Hz, 0 to 0.04995 s)
     """
 
     simulation: Simulation
@@ -70,11 +71,11 @@ class Run:
         Raises:
             UnknownNameError: There is no such signal; it is a KeyError.
         """
-        return self.signals[:, place(name, NAMES, what="signal")]
+        return self.signals[:, place(name, NAMES, must=_MUST)]
 
     def unit(self, name: str) -> str:
         """SI unit of one signal of the model, `run[name]`."""
-        return ROW[place(name, NAMES, what="signal")].unit
+        return ROW[place(name, NAMES, must=_MUST)].unit
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -94,9 +95,11 @@ class Run:
         """Channel table of the sensors that were on."""
         return self.simulation.table
 
-    def energy(self) -> dict[str, np.ndarray]:
-        """Energy ledger: stored, supplied, dissipated, residual [J], each shape (n,)."""
-        return energy_balance(self.signals, self.signals[0])
+    def energy(self) -> Samples:
+        """Energy ledger: stored, supplied, dissipated, residual [J], shape (n, 4)."""
+        ledger = energy_balance(self.signals, self.signals[0])
+        values, units = np.column_stack(list(ledger.values())), ("J",) * len(ledger)
+        return replace(self.samples, name="energy", values=values, names=tuple(ledger), units=units)
 
 
 def frames(simulation: Simulation, *, chunk_s: float = 0.1, commands: Iterable[SentCommand] = ()) -> Iterator[Frame]:

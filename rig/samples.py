@@ -17,14 +17,14 @@ _SAME_S = 1e-6
 """Instants that are closer are the same [s]."""
 
 
-def place(name: str, names: Sequence[str], *, what: str = "column") -> int:
+def place(name: str, names: Sequence[str], *, must: str = "one of those that there are") -> int:
     """Where a name stands.
 
     Raises:
         UnknownNameError: Nowhere.
     """
     if name not in names:
-        raise UnknownNameError(what, "one of those that there are", name, names)
+        raise UnknownNameError("name", must, name, names)
     return names.index(name)
 
 
@@ -114,7 +114,7 @@ class Samples(Columns):
         ((1000,), 'mm', 'm')
         >>> samples["disk_z"]
         Traceback (most recent call last):
-        rig.errors.UnknownNameError: column must be one of those that there are, such as disk_y, disk_x (15 in all); ...
+        rig.errors.UnknownNameError: name must be one of those that there are, such as disk_y, disk_x (15 in all); ...
     """
 
     name: str

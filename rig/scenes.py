@@ -282,6 +282,8 @@ def scene_path(name_or_path: str | Path) -> Path:
     Raises:
         InputError: There is none.
     """
+    if not isinstance(name_or_path, str | Path):
+        raise InputError("scene", "a name, or the path of a .toml file", name_or_path)
     path = SCENES / f"{name_or_path}.toml"
     if not path.is_file():
         path = Path(name_or_path)
