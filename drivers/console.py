@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 from rig import wire
 from rig.errors import InputError, RefusedError
-from rig.transport import Client
+from rig.transport import DEFAULT_ENDPOINT, Client
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +36,50 @@ class Console:
         client: Transport to the rig.
         name: Who asks; appears in the stream's events.
         timeout_s: How long to wait for a reply [s].
+
+    Example:
+        Of a rig that runs: `with Console.open("zenoh:127.0.0.1:7460") as console`. Here of one that takes everything:
+
+        >>> class Rig:
+        ...     def request(self, key, payload=b"", *, timeout_s):
+        ...         return b'{"accepted": true, "id": 1, "tick": 2500, "time_s": 0.0025}'
+        >>> console = Console(Rig())
+        >>> console.hammer(force_n=100.0, duration_ms=5.0, direction="x")
+        Accepted(command='hammer', id=1, tick=2500, time_s=0.0025)
+        >>> console.speed(float("nan"))
+        Traceback (most recent call last):
+        rig.errors.InputError: speed_hz must be a finite number; instead received nan
     """
 
     def __init__(self, client: Client, *, name: str | None = None, timeout_s: float = 5.0) -> None:
         self._client = client
         self._name = name or f"console pid {os.getpid()}"
         self._timeout_s = timeout_s
+
+    @classmethod
+    def open(cls, url: str = "zenoh:" + DEFAULT_ENDPOINT, *, name: str | None = None, wait_s: float = 3.0) -> Self:
+        """A console of the rig at a URL, as for `Daq.open`; close it, or use it as a context manager.
+
+        Raises:
+            InputError: The URL is malformed.
+            ConnectionError: Nothing is there.
+        """
+        from rig.transport.zenoh import client_at
+
+        kind, _, address = url.partition(":")
+        if kind != "zenoh" or not address:
+            raise InputError("url", "zenoh:HOST:PORT[?tls=DIR]", url)
+        return cls(client_at(address, wait_s=wait_s), name=name)
+
+    def close(self) -> None:
+        """Close the client."""
+        self._client.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def hammer(self, *, force_n: float = 100.0, duration_ms: float = 5.0, direction: str | float = "x") -> Accepted:
         """Hit the shaft at the disk.

@@ -22,7 +22,7 @@ import numpy as np
 from drivers.link import LinkTimeoutError
 from drivers.samples import Pile, Samples, StreamEndedError, follow
 from drivers.sources import Source, open_source
-from rig.errors import InputError
+from rig.errors import InputError, UnknownNameError
 from rig.wire import Continuity, Gap
 
 _GAPS = 1000
@@ -108,11 +108,11 @@ class Aligner:
     def _join(self, heads: dict[str, Samples], rows: int) -> Samples:
         first = next(iter(heads.values()))
         chosen = [heads[name].values[:rows, columns] for name, columns in self._columns.items()]
-        names = [heads[name].channels[n] for name, columns in self._columns.items() for n in columns]
+        names = [heads[name].names[n] for name, columns in self._columns.items() for n in columns]
         units = [heads[name].units[n] for name, columns in self._columns.items() for n in columns]
         joint = replace(
             first,
-            channels=tuple(names[n] for n in self._order),
+            names=tuple(names[n] for n in self._order),
             units=tuple(units[n] for n in self._order),
             values=np.concatenate(chosen, axis=1)[:, self._order],
             gap=0,
@@ -153,9 +153,9 @@ class Daq:
         ...     source.on_samples("forces", Samples(0, 0, 1000.0, 1e6, ("P_E", "P_N"), ("N", "N"), values))
         ...     source.on_end("forces", "completed")
         ...     for samples in daq.blocks(2):
-        ...         print(samples.times_s, samples["P_N"], samples.gap)
-        [0.    0.001] [2990. 2991.] 0
-        [0.002] [2992.] 0
+        ...         print(samples.times_s, samples["P_N"], samples.unit("P_N"), samples.gap)
+        [0.    0.001] [2990. 2991.] N 0
+        [0.002] [2992.] N 0
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class Daq:
             raise InputError("channels", "at least one, each once", list(self.channels))
         for channel in self.channels:
             if channel not in home:
-                raise InputError("channel", f"one of {', '.join(home)}", channel)
+                raise UnknownNameError("channel", "one of the source's", channel, home)
         wanted = {name: [channel for channel in names if channel in self.channels] for name, names in available.items()}
         wanted = {name: chosen for name, chosen in wanted.items() if chosen}
         columns = {name: [list(available[name]).index(channel) for channel in wanted[name]] for name in wanted}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rig.samples import Columns
 from rig.wire import Continuity
 
 
@@ -14,16 +15,16 @@ class StreamEndedError(EOFError):
     """Nothing more will come; the message says why."""
 
 
-@dataclass(frozen=True, slots=True)
-class Samples:
-    """Consecutive rows of some channels.
+@dataclass(frozen=True, slots=True, repr=False)
+class Samples(Columns):
+    """Consecutive rows of some channels: `samples["disk_x"]` in its `samples.unit("disk_x")`, `samples.to_si()` in SI.
 
     Attributes:
         index: Number of the first row since the start of the rig's stream, at `rate_hz`.
         tick: Time of the first row [ticks of the simulated clock].
         rate_hz: Rows per second [Hz].
         tick_rate_hz: Ticks per second [Hz].
-        channels: Names of the columns.
+        names: Names of the columns, which are channels.
         units: Unit of each column.
         values: Engineering values, float64, shape (rows, columns).
         gap: Rows that are missing right before the first one.
@@ -33,17 +34,14 @@ class Samples:
     tick: int
     rate_hz: float
     tick_rate_hz: float
-    channels: tuple[str, ...]
+    names: tuple[str, ...]
     units: tuple[str, ...]
     values: np.ndarray
     gap: int = 0
 
-    def __len__(self) -> int:
-        return len(self.values)
-
-    def __getitem__(self, channel: str) -> np.ndarray:
-        """Values of one channel, shape (rows,)."""
-        return self.values[:, self.channels.index(channel)]
+    def __repr__(self) -> str:
+        missing = f"; {self.gap} missing before them)" if self.gap else ")"
+        return Columns.__repr__(self).removesuffix(")") + missing
 
     @property
     def times_s(self) -> np.ndarray:
@@ -141,7 +139,7 @@ class Pile:
 
 
 def _follows(one: Samples, other: Samples) -> bool:
-    same = one.channels == other.channels and one.rate_hz == other.rate_hz
+    same = one.names == other.names and one.rate_hz == other.rate_hz
     return same and other.gap == 0 and other.index == one.index + len(one)
 
 

@@ -14,14 +14,15 @@ import numpy as np
 from recorder import documents, schemas
 from recorder.recording_file import Message, RecordingFile
 from recorder.records import Chunk
-from recorder.samples import Samples, row_times_s
+from recorder.samples import row_times_s, samples_of
 from recorder.survey import OnBlock, Stream, Survey
-from rig.errors import InputError
+from rig.errors import InputError, UnknownNameError
+from rig.samples import Samples, joined
 from rig.wire import EDGES, EVENTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
 
 
 class Recording:
-    """A recording, read topic by topic from the disk; nothing but documents is kept in memory.
+    """A recording, read topic by topic from the disk; nothing but documents is kept in memory, and no file stays open.
 
     Attributes:
         parts: The files that it is read from, in order.
@@ -31,12 +32,17 @@ class Recording:
         metadata: Metadata records by name: `rig` (start), `end` (closing counts of the last file, only if complete).
 
     Example:
-        >>> recording = Recording.open("replays/sessions/hammer-5.2.mcap")
-        >>> forces = recording.samples("forces")
-        >>> forces.names, forces.rate_hz, len(forces.times_s)
-        (('P_N', 'P_S', 'P_E', 'P_W'), 5000.0, 3000)
-        >>> f"{forces.column('P_E')[0]:.0f} N", [event["event"] for event in recording.events]
+        >>> with Recording.open("replays/sessions/hammer-5.2.mcap") as recording:
+        ...     forces = recording.samples("forces")
+        ...     both = recording.samples("disk_x", "speed")  # without names: all there are
+        >>> recording
+        Recording(replays/sessions/hammer-5.2.mcap: scene hammer, 0 to 0.5998 s, completed; probes, forces, ...)
+        >>> forces
+        Samples(P_N, P_S, P_E, P_W [N]; 3000 rows at 5000 Hz, 0 to 0.5998 s)
+        >>> f"{forces['P_E'][0]:.0f} {forces.unit('P_E')}", [event["event"] for event in recording.events]
         ('3000 N', ['start', 'hammer', 'end'])
+        >>> f"{both.to_si()['disk_x'].max():.5f} m at {both['speed'].mean():.2f} {both.unit('speed')}"
+        '0.00156 m at 5.10 Hz'
     """
 
     def __init__(self, parts: tuple[RecordingFile, ...], surveys: tuple[Survey, ...] = ()) -> None:
@@ -71,6 +77,20 @@ class Recording:
             InputError: The file cannot be read, or is no recording.
         """
         return cls((RecordingFile(Path(path), salvage=salvage),))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass  # no file is open between two calls
+
+    def __repr__(self) -> str:
+        span = "no rows" if self.span_s is None else f"{self.span_s[0]:g} to {self.span_s[1]:g} s"
+        more = f" and {len(self.parts) - 1} more" if len(self.parts) > 1 else ""
+        return (
+            f"Recording({self.path}{more}: scene {self.scene.get('name')}, {span}, {self.end_reason}; "
+            f"{', '.join(self.table.groups)})"
+        )
 
     @property
     def chunks(self) -> tuple[Chunk, ...]:
@@ -156,28 +176,40 @@ class Recording:
         found = zip(names, self._surveyed(), strict=True)
         return tuple(name + text for name, survey in found for text in what(survey))
 
-    def samples(self, group: str) -> Samples:
-        """A sensor group in engineering units, in order of arrival.
+    def samples(self, *names: str) -> Samples:
+        """Sensors in engineering units, shape (n, channels).
 
         Args:
-            group: Name of a group of the channel table.
+            names: Channels and groups of the channel table; none: all groups that are in the recording. Those of one
+                group come in order of arrival. Several groups are joined row by row, in order of their numbers, where
+                all of them have one.
 
         Raises:
-            InputError: The recording has no such group, or the file is damaged.
+            InputError: The recording has no such channel or group, several groups do not have the same instants, or
+                the file is damaged.
         """
-        if group not in self.table.groups:
-            raise InputError("group", f"one of {', '.join(self.table.groups)}", group)
-        channels = self.table.groups[group].channels
-        found = Samples.of(
-            self.blocks(sensor_key(group)),
-            name=group,
-            names=tuple(channel.name for channel in channels),
-            units=tuple(channel.unit for channel in channels),
-            rate_hz=float(self.table.groups[group].rate_hz),
+        groups, homes = self.table.groups, {name: each.group for name, each in self.table.channels.items()}
+        for name in names:
+            if name not in groups and name not in homes:
+                raise UnknownNameError("samples", "a channel or a group of the recording", name, [*homes, *groups])
+        wanted = dict.fromkeys(name if name in groups else homes[name] for name in names)
+        whole = joined([self._group(name) for name in wanted or groups if names or sensor_key(name) in self.messages])
+        if all(name in groups for name in names):
+            return whole
+        return whole.only(*(each for name in names for each in (groups[name].names if name in groups else (name,))))
+
+    def _group(self, name: str) -> Samples:
+        group = self.table.groups[name]
+        found = samples_of(
+            self.blocks(sensor_key(name)),
+            name=name,
+            names=group.names,
+            units=tuple(channel.unit for channel in group.channels),
+            rate_hz=float(group.rate_hz),
         )
-        values = found.values
-        values *= np.array([channel.scale for channel in channels])
-        values += np.array([channel.offset for channel in channels])
+        values = found.values  # there may be gigabytes of them
+        values *= np.array([channel.scale for channel in group.channels])
+        values += np.array([channel.offset for channel in group.channels])
         return found
 
     def truth(self, table: str) -> Samples:
@@ -191,9 +223,9 @@ class Recording:
         """
         tables = self.catalogue.get("truth", {})
         if table not in tables:
-            raise InputError("truth", f"one of {', '.join(tables)}", table)
+            raise UnknownNameError("truth", "one of the recording's tables", table, tables)
         columns = tables[table]["columns"]
-        return Samples.of(
+        return samples_of(
             self.blocks(truth_key(table)),
             name=table,
             names=tuple(column["name"] for column in columns),

@@ -1,12 +1,22 @@
-"""A virtual rotor-stator test rig.
+"""A virtual rotor-stator test rig: motion, forces and sensors as arrays.
 
     import rig
-    scene = rig.load_scene("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
-    run = rig.simulate(scene)
-    run["normal_force"].max(), run.unit("normal_force")   # any state, force or energy of the model
-    run.samples["disk_x"], run.sample_times_s             # what the sensors saw
+    run = rig.simulate("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
+    run["disk_x"].max(), run.unit("disk_x")  # all that the model has, in SI
+    run.samples["disk_x"].max(), run.samples.unit("disk_x")  # what the sensors showed
+    run.samples.to_si()["disk_x"], run.times_s  # ... in SI, and when
 
-The same objects carry the commands of `rig`.
+`run.names` and `run.samples.names` list what there is; a name that is none
+raises a KeyError that tells the nearest. `rig.load_scene` checks a scene
+without running it, `rig.load_parameters` gives the numbers with their sources,
+and `rig.Simulation` goes on step by step. `rig.full_spectrum`, `rig.waterfall`,
+`rig.whirl_frequency` and `rig.synchronous` (1X of a run-up) make of samples
+what is plotted of a rotor.
+
+Recordings are opened by `recorder.reader.Recording`, whose samples are of the
+same kind, and written by `replays.recordings.export.write_run`; a running rig
+is read by `drivers.daq.Daq` and commanded by `drivers.console.Console`. The
+same objects carry the commands of `rig`.
 """
 
 from __future__ import annotations
@@ -14,29 +24,40 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rig.errors import InputError
+    from rig.errors import InputError, UnknownNameError
     from rig.offline import Run, simulate
-    from rig.parameters import load_parameters
+    from rig.orbit import full_spectrum, synchronous, waterfall, whirl_frequency
+    from rig.parameters import ParameterSet, load_parameters
+    from rig.samples import Samples
     from rig.scenes import Scene, load_scene
     from rig.simulation import Simulation
 
-__all__ = ["InputError", "Run", "Scene", "Simulation", "load_parameters", "load_scene", "simulate"]
+__all__ = [
+    "InputError", "ParameterSet", "Run", "Samples", "Scene", "Simulation", "UnknownNameError", "full_spectrum",
+    "load_parameters", "load_scene", "simulate", "synchronous", "waterfall", "whirl_frequency",
+]  # fmt: skip
 
 _HOMES = {
-    "InputError": "rig.errors",
-    "Run": "rig.offline",
-    "Scene": "rig.scenes",
-    "Simulation": "rig.simulation",
-    "load_parameters": "rig.parameters",
-    "load_scene": "rig.scenes",
-    "simulate": "rig.offline",
+    "errors": ("InputError", "UnknownNameError"),
+    "offline": ("Run", "simulate"),
+    "orbit": ("full_spectrum", "synchronous", "waterfall", "whirl_frequency"),
+    "parameters": ("ParameterSet", "load_parameters"),
+    "samples": ("Samples",),
+    "scenes": ("Scene", "load_scene"),
+    "simulation": ("Simulation",),
 }
 
+if not TYPE_CHECKING:  # a type checker knows all names by the imports above
 
-def __getattr__(name: str) -> Any:
-    # Loaded on first use: `rig --help` must not wait for compiled code.
-    if name not in _HOMES:
-        raise AttributeError(f"module 'rig' has no attribute {name!r}")
-    from importlib import import_module
+    def __getattr__(name: str) -> Any:
+        # Loaded on first use: `rig --help` must not wait for compiled code.
+        from importlib import import_module
 
-    return getattr(import_module(_HOMES[name]), name)
+        home = next((home for home, names in _HOMES.items() if name in names), None)
+        if home is None:
+            raise AttributeError(f"module 'rig' has no attribute {name!r}")
+        return getattr(import_module(f"rig.{home}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

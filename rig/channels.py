@@ -5,7 +5,6 @@ Everything outside the physics (wire, drivers, recorder, viewer, exports) knows 
 
 from __future__ import annotations
 
-import difflib
 import math
 import tomllib
 from collections.abc import Collection, Iterable
@@ -16,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
-from rig.errors import InputError
+from rig.errors import InputError, UnknownNameError
 from rig.outside import check, input_error, parse_toml
 
 TABLE = Path(__file__).with_name("channels.toml")
@@ -118,6 +117,12 @@ class ChannelTable(BaseModel):
 
     groups: dict[str, Group]
 
+    def __repr__(self) -> str:
+        groups = [f"{name}: {', '.join(group.names)}" for name, group in self.groups.items()]
+        return f"ChannelTable({'; '.join(groups)})"
+
+    __str__ = __repr__
+
     @model_validator(mode="after")
     def _names_once(self) -> ChannelTable:
         names = [channel.name for group in self.groups.values() for channel in group.channels]
@@ -188,10 +193,7 @@ def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:
     """
     for channel in channels:
         if channel.signal not in known:
-            close = difflib.get_close_matches(channel.signal, known, n=3) or list(known)
-            raise InputError(
-                f"channel {channel.name}.signal", f"one of the model's, such as {', '.join(close)}", channel.signal
-            )
+            raise UnknownNameError(f"channel {channel.name}.signal", "one of the model's", channel.signal, known)
 
 
 @cache

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rig.text import printable, shown
+from rig.text import nearest, printable, shown
 
 PART_SUFFIX = ".part"
 """What a file's name ends in while it is being written."""
 _LONGEST_LINE = 5000
+_MOST_NAMES = 12
 
 
 class InputError(ValueError):
@@ -19,6 +20,12 @@ class InputError(ValueError):
 
     The message always reads `FIELD must be MUST; instead received RECEIVED`, so that every command, service reply and
     notebook shows the same three facts. The command line turns it into one line and exit status 2.
+
+    Example:
+        >>> import rig
+        >>> rig.load_scene("hammer", {"duration_s": -1})
+        Traceback (most recent call last):
+        rig.errors.InputError: duration_s must be greater than 0; instead received -1
     """
 
     def __init__(self, field: str, must: str, received: object) -> None:
@@ -27,6 +34,29 @@ class InputError(ValueError):
         self.must = must
         self.received = received
         super().__init__(printable(f"{field} must be {must}; instead received {shown(received)}", _LONGEST_LINE))
+
+
+class UnknownNameError(InputError, KeyError):
+    """A name that nothing has; the message tells the nearest that there are, or all where none is near.
+
+    Example:
+        >>> import rig
+        >>> try:
+        ...     rig.simulate("hammer", duration_s=0.01).samples["disk_z"]
+        ... except KeyError as error:
+        ...     print(error)
+        name must be one of those that there are, such as disk_y, disk_x (15 in all); instead received 'disk_z'
+    """
+
+    def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:
+        """Name the field, what it must be, the name that is none, and those that there are."""
+        known = list(dict.fromkeys(known))
+        near = nearest(name, known)
+        shown = near or known[:_MOST_NAMES]
+        more = f" ({len(known)} in all)" if len(known) > len(shown) else ""
+        super().__init__(field, f"{must}, such as {', '.join(shown)}{more}" if shown else must, name)
+
+    __str__ = ValueError.__str__  # of a KeyError, it would be in quotes
 
 
 class RefusedError(InputError):

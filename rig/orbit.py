@@ -13,6 +13,7 @@ import numpy as np
 SPECTRUM_HZ = 200.0
 """Spectra are shown up to this frequency, to both sides: the rig whirls below 130 Hz."""
 _LAG_S = 1e-3
+_TURN_SAMPLES = 8
 
 
 def phase(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -116,6 +117,13 @@ def waterfall(
     Returns:
         Times of the windows' centres [s], shape (t,); frequencies [Hz], shape (f,); amplitudes in the unit of x, shape
         (t, f).
+
+    Example:
+        >>> times_s = np.arange(4000) / 2000.0
+        >>> angle = 2.0 * np.pi * 10.0 * times_s * times_s  # from standstill to 40 Hz, forward
+        >>> at_s, frequency, amplitude = waterfall(times_s, np.cos(angle), np.sin(angle), 2000.0)
+        >>> [f"{at:.2f} s: {frequency[row.argmax()]:.0f} Hz" for at, row in zip(at_s, amplitude)][::7]
+        ['0.25 s: 4 Hz', '0.95 s: 18 Hz', '1.65 s: 32 Hz']
     """
     size, hop = round(window_s * rate_hz), round(hop_s * rate_hz)
     starts = range(0, max(1, len(x) - size), hop)
@@ -124,6 +132,37 @@ def waterfall(
     near = np.abs(frequency) <= SPECTRUM_HZ
     centres = np.array([times_s[min(s + size // 2, len(x) - 1)] for s in starts])
     return centres, frequency[near], np.array([amplitude[near] for _, amplitude in spectra])
+
+
+def synchronous(times_s: np.ndarray, values: np.ndarray, edges_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What of a signal goes once around with the shaft, turn by turn: what a Bode plot of a run-up shows.
+
+    Args:
+        times_s: Times [s], ascending, shape (n,).
+        values: A signal, such as one probe, shape (n,).
+        edges_s: Keyphasor edges [s], ascending, shape (edges,).
+
+    Returns:
+        Speed of each turn between two edges [Hz], and as one complex number the signal's amplitude in it (`np.abs`, in
+        the unit of the values) with its phase from the edge on (`np.angle` [rad]; negative lags), each shape (turns,);
+        turns with fewer than 8 samples are left out.
+
+    Example:
+        >>> times_s = np.arange(4000) / 2000.0
+        >>> lags = 0.3 * np.cos(2.0 * np.pi * 8.0 * times_s - 0.5)
+        >>> speed_hz, vector = synchronous(times_s, lags, np.arange(0.0, 2.0, 0.125))
+        >>> f"{speed_hz[0]:.1f} Hz: {abs(vector[0]):.3f} at {np.angle(vector[0]):.3f} rad"
+        '8.0 Hz: 0.300 at -0.500 rad'
+    """
+    places = np.searchsorted(times_s, edges_s)
+    speeds, vectors = [], []
+    for first, last, begin_s, end_s in zip(places, places[1:], edges_s, edges_s[1:], strict=False):
+        if last - first >= _TURN_SAMPLES:
+            turns = (times_s[first:last] - begin_s) / (end_s - begin_s)
+            turn = values[first:last] - values[first:last].mean()
+            speeds.append(1.0 / (end_s - begin_s))
+            vectors.append(2.0 * np.mean(turn * np.exp(-2j * np.pi * turns)))
+    return np.array(speeds), np.array(vectors, dtype=complex)
 
 
 def _centred(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -21,8 +21,9 @@ from pydantic import (
     field_validator,
 )
 
-from rig.errors import InputError
+from rig.errors import InputError, UnknownNameError
 from rig.outside import check, read_toml
+from rig.text import nearest
 
 SETS = Path(__file__).with_name("sets")
 DEFAULT_SET = "corrected"
@@ -69,6 +70,17 @@ class ParameterSet:
         name: Name of the set, or the path of a user's file.
         title: One line on what it is.
         entries: Every parameter by its dotted key, in file order.
+
+    Example:
+        >>> import rig
+        >>> parameters = rig.load_parameters().override({"contact.friction": 0.3})
+        >>> parameters
+        ParameterSet(corrected: 50 parameters)
+        >>> f"{parameters['drive.top_speed']:.1f} rad/s", parameters.entries["drive.top_speed"].unit  # SI; its own unit
+        ('94.2 rad/s', 'Hz')
+        >>> parameters["contact.fricton"]
+        Traceback (most recent call last):
+        rig.errors.UnknownNameError: parameter must be one of the set, such as contact.friction, ...
     """
 
     def __init__(self, name: str, title: str, entries: dict[str, Parameter]) -> None:
@@ -82,18 +94,26 @@ class ParameterSet:
         """The value of a numeric parameter in SI.
 
         Raises:
-            KeyError: No such parameter.
+            UnknownNameError: No such parameter.
             TypeError: The value is a rule; the model works it out.
         """
-        entry = self.entries[key]
+        entry = self._entry(key)
         if isinstance(entry.value, str):
             raise TypeError(f"{key} is the rule {entry.value!r}; its number comes from the model")
         return entry.value * SI[entry.unit]
 
     def rule(self, key: str) -> str | None:
         """The name of the rule that gives the value, or None where it is a number."""
-        value = self.entries[key].value
+        value = self._entry(key).value
         return value if isinstance(value, str) else None
+
+    def _entry(self, key: str) -> Parameter:
+        if key not in self.entries:
+            raise UnknownNameError("parameter", "one of the set", key, self.entries)
+        return self.entries[key]
+
+    def __repr__(self) -> str:
+        return f"ParameterSet({self.name}: {len(self.entries)} parameters)"
 
     def override(self, changes: dict[str, Any], *, kind: Kind = "assumed", source: str = "override") -> ParameterSet:
         """The set with some values replaced, given in each parameter's own unit.
@@ -218,7 +238,5 @@ def _check(key: str, entry: Parameter) -> None:
 
 
 def _nearest(key: str, entries: dict[str, Parameter]) -> str:
-    import difflib
-
-    close = difflib.get_close_matches(key, entries, n=3, cutoff=0.3)
+    close = nearest(key, entries)
     return f"such as {', '.join(close)}" if close else "see `rig params`"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import tomllib
 from functools import cache
@@ -21,6 +20,7 @@ from rig.levels import ModelLevels
 from rig.outside import Written, check, parse_toml, read_toml, table_in
 from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
 from rig.pick import Pick, digest, equations_digest
+from rig.text import nearest
 
 SCENES = Path(__file__).with_name("scenes")
 _APART_S = 0.01
@@ -135,7 +135,19 @@ class SensorChoice(Written):
 
 
 class Scene(Written):
-    """One run: initial state, drive, timed commands, engine, sensors, seed, and the parameters it runs on."""
+    """One run: initial state, drive, timed commands, engine, sensors, seed, and the parameters it runs on.
+
+    Frozen, and checked when it is made; the fields and their units are those of a scene's file, such as `duration_s`.
+    `rig.load_scene` makes one of a name or a file, with other values where they are given.
+
+    Example:
+        >>> import rig
+        >>> scene = rig.load_scene("hammer", {"duration_s": 0.5})
+        >>> scene
+        Scene(hammer: 0.5 s at 6.2 Hz, 1 command; parameters corrected, engine split 25 us, seed 1)
+        >>> scene.commands[0].at_s, scene.commands[0].request.force_n, scene.sensors.rate_hz
+        (0.02, 100.0, 20000)
+    """
 
     name: str = "scene"
     title: str = ""
@@ -225,6 +237,17 @@ class Scene(Written):
                 raise InputError("fidelity", '"given" where model, engine, drive or sensors are chosen by hand', "auto")
         return self
 
+    def __repr__(self) -> str:
+        speeds = [speed for _, speed in self.drive.profile] or [self.drive.speed_hz]
+        speed = " to ".join(f"{each:g}" for each in dict.fromkeys((speeds[0], speeds[-1])))
+        commands = f"{len(self.commands)} command{'s' * (len(self.commands) != 1)}"
+        return (
+            f"Scene({self.name}: {self.duration_s:g} s at {speed} Hz, {commands}; parameters "
+            f"{self.parameters}, engine {self.engine.name} {self.engine.step_us} us, seed {self.seed})"
+        )
+
+    __str__ = __repr__
+
     @property
     def fidelity_line(self) -> str | None:
         """What a run says of a pick in force; None for a scene as given."""
@@ -259,6 +282,8 @@ def scene_path(name_or_path: str | Path) -> Path:
     Raises:
         InputError: There is none.
     """
+    if not isinstance(name_or_path, str | Path):
+        raise InputError("scene", "a name, or the path of a .toml file", name_or_path)
     path = SCENES / f"{name_or_path}.toml"
     if not path.is_file():
         path = Path(name_or_path)
@@ -367,8 +392,7 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
     for part in [*path, last]:
         known = getattr(fields, "model_fields", {})
         if part not in known:
-            keys = [*_scene_keys(), *load_parameters().entries]
-            close = difflib.get_close_matches(key, keys, n=3, cutoff=0.4)
+            close = nearest(key, [*_scene_keys(), *load_parameters().entries])
             raise InputError(
                 key, "a field of a scene or a parameter" + (f", such as {', '.join(close)}" if close else ""), value
             )

@@ -115,6 +115,13 @@ class Simulation:
         block_ticks: An advance must be a whole multiple of this.
         end_tick: Where the scene ends.
         row_ticks: Ticks between observed rows.
+
+    Example:
+        >>> import rig
+        >>> simulation = rig.Simulation(rig.load_scene("hammer"))
+        >>> frame = simulation.advance(100 * simulation.block_ticks)
+        >>> simulation, frame.samples["probes"].values.shape, frame.rows.shape  # ADC counts; the model's signals [SI]
+        (Simulation(hammer: at 0.05 of 2 s), (1000, 4), (2000, 66))
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -164,6 +171,9 @@ class Simulation:
         self._memory = np.zeros(MEMORY)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        return f"Simulation({self.scene.name}: at {self.tick / self.tick_rate_hz:g} of {self.scene.duration_s:g} s)"
 
     @cached_property
     def first_row(self) -> np.ndarray:

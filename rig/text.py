@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterable
 
 _MOST = 500
 """Longest value that is shown whole [characters]."""
@@ -25,6 +26,24 @@ def printable(text: str, most: int | None = None) -> str:
     if most is not None and len(text) > most:
         text = f"{text[: most - most // 3 - 3]}...{text[len(text) - most // 3 :]}"
     return text
+
+
+def nearest(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
+    """Names that one which is none could have been meant for, the nearest first; upper and lower case are alike.
+
+    Args:
+        name: What was given.
+        known: The names that there are.
+        most: How many at most.
+
+    Example:
+        >>> nearest("p_n", ["P_N", "P_S", "disk_x"], most=1)
+        ['P_N']
+    """
+    import difflib
+
+    folded = {each.casefold(): each for each in known}
+    return [folded[each] for each in difflib.get_close_matches(str(name)[:100].casefold(), folded, most, 0.5)]
 
 
 class _Shown(reprlib.Repr):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -96,7 +96,7 @@ class Block:
     index: int
     rate_hz: float
     tick_rate_hz: float
-    values: np.ndarray
+    values: np.ndarray = field(repr=False)
 
     @property
     def times_s(self) -> np.ndarray:

@@ -19,7 +19,7 @@ class Accelerometer(Sampler):
     def rms(samples: Samples) -> dict[str, float]:
         """Effective value of each channel [m/s^2 rms]."""
         values = np.sqrt(np.mean(samples.values**2, axis=0))
-        return dict(zip(samples.channels, map(float, values), strict=True))
+        return dict(zip(samples.names, map(float, values), strict=True))
 
 
 class AsyncAccelerometer(AsyncSampler[Accelerometer]):

@@ -20,7 +20,7 @@ class Force(Sampler):
         times = samples.times_s
         return {
             name: (float(samples.values[row, column]), float(times[row]))
-            for column, (name, row) in enumerate(zip(samples.channels, rows, strict=True))
+            for column, (name, row) in enumerate(zip(samples.names, rows, strict=True))
         }
 
 

@@ -294,7 +294,7 @@ class Sampler(Instrument):
             tick=rows.tick,
             rate_hz=rows.rate_hz,
             tick_rate_hz=rows.tick_rate_hz,
-            channels=group.names,
+            names=group.names,
             units=tuple(channel.unit for channel in group.channels),
             values=group.engineering(rows.counts),
         )

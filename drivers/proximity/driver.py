@@ -15,12 +15,12 @@ class Proximity(Sampler):
 
     def gap_volts(self, samples: Samples) -> dict[str, float]:
         """Mean output of each probe [V], as a voltmeter on the conditioner would show it when the probes are set up."""
-        channels = self.datasheet.group(samples.channels).channels
+        channels = self.datasheet.group(samples.names).channels
         return {row.name: row.bias_v + row.sensitivity_v * float(samples[row.name].mean()) for row in channels}
 
     def in_range(self, samples: Samples) -> dict[str, bool]:
         """Whether each probe stayed inside its linear range in all rows."""
-        channels = self.datasheet.group(samples.channels).channels
+        channels = self.datasheet.group(samples.names).channels
         inside = {}
         for row in channels:
             volts = row.bias_v + row.sensitivity_v * samples[row.name]

@@ -72,12 +72,9 @@ def open_source(url: str, *, wait_s: float = 3.0) -> Source:
     kind, _, rest = url.partition(":")
     if kind == "zenoh" and rest:
         from drivers.sources.rig import RigSource
-        from rig.transport.endpoint import parse_endpoint
-        from rig.transport.zenoh import ZenohClient
+        from rig.transport.zenoh import client_at
 
-        endpoint, query, folder = rest.partition("?tls=")
-        parse_endpoint(endpoint, field="zenoh")
-        client = ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)
+        client = client_at(rest, wait_s=wait_s)
         return RigSource(client, close=client.close)
     if kind == "can" and rest:
         from drivers.sources.can import CanSource

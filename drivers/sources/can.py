@@ -83,7 +83,7 @@ class Layout:
                         tick=round((index + first) * step * _TICK_RATE_HZ / rate_hz),
                         rate_hz=rate_hz / step / self._thinned,
                         tick_rate_hz=_TICK_RATE_HZ,
-                        channels=tuple(channel.name for channel in form.channels),
+                        names=tuple(channel.name for channel in form.channels),
                         units=tuple(channel.unit for channel in form.channels),
                         values=rows[first :: self._thinned],
                     )

@@ -84,7 +84,7 @@ class RigSource:
                     tick=block.tick,
                     rate_hz=block.rate_hz,
                     tick_rate_hz=block.tick_rate_hz,
-                    channels=group.names,
+                    names=group.names,
                     units=units,
                     values=group.engineering(block.values),
                 )

@@ -6,6 +6,7 @@ Tables have one row a sample: `time [s]`, every signal of the model as `truth.NA
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -21,6 +22,7 @@ from replays.recordings.formats.export import check_output
 from rig import wire
 from rig.errors import whole_file
 from rig.kernels.signals import ROW
+from rig.offline import frames
 from rig.simulation import Frame, Simulation
 
 SUFFIXES = (".mcap", ".parquet", ".csv")
@@ -57,6 +59,35 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
     return _TableRun(path, simulation, columnar.ParquetRows if path.suffix == ".parquet" else delimited.CsvRows)
 
 
+def write_run(
+    simulation: Simulation, path: Path, *, force: bool = False, progress: Callable[[float], None] = lambda part: None
+) -> None:
+    """Run a scene to its end as fast as it goes, into a file that grows with it; nothing is left behind on an error.
+
+    Args:
+        simulation: What is run, from where it is.
+        path: File that ends in .mcap (as `rig record` would have made it), .parquet or .csv.
+        force: Replace an existing file.
+        progress: Told the part done, 0 to 1.
+
+    Raises:
+        InputError: The destination cannot be used.
+        SimulationError: The state became non-finite.
+
+    Example:
+        >>> import rig, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "run.mcap"
+        ...     write_run(rig.Simulation(rig.load_scene("hammer", {"duration_s": 0.1})), path)
+        ...     path.stat().st_size > 100_000
+        True
+    """
+    with writer_for(path, simulation, force=force) as writer:
+        for frame in frames(simulation):
+            writer.write(frame)
+            progress(simulation.tick / (simulation.end_tick or simulation.tick))
+
+
 def table_columns(simulation: Simulation) -> list[str]:
     """Column headings of a table of a run."""
     channels = simulation.table.channels.values()
@@ -88,7 +119,9 @@ class _TableRun:
         self._background = Background()
 
     def __enter__(self) -> Self:
-        schema = columnar.float_schema(table_columns(self.simulation))
+        about = {"parameters": self.simulation.parameters_document(), "scene": self.simulation.scene_document()}
+        told = {f"{name}.json": json.dumps(document) for name, document in about.items()}  # where a format has a place
+        schema = columnar.float_schema(table_columns(self.simulation)).with_metadata(told)
         with ExitStack() as stack:
             self._writer = self._open_table(stack.enter_context(whole_file(self.path)), schema)
             stack.callback(self._writer.close)

@@ -32,14 +32,16 @@ def export(
 ) -> None:
     """Write a recording, or its parts as one, as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration.
 
-    CSV and WAV have no place for them: FILE.json stands beside them. CSV, Parquet and WAV hold one rate: channels of
-    several make as many files, or --rate-hz brings them to one.
+    Impacts, commands, notes, parameters and scene go with it: in MDF4 as events and attachments, in FILE.json beside
+    CSV and WAV; UFF58 leaves them out. CSV, Parquet and WAV hold one rate: channels of several make as many files, or
+    --rate-hz brings them to one.
     """
     from recorder.reader import join
     from replays.recordings.formats.export import check_output, merged
     from replays.recordings.formats.export import export as write
     from replays.recordings.formats.selection import select
     from rig.cli.progress import reporting
+    from rig.wire import EDGES
 
     if unit not in ("engineering", "volts", "counts"):
         raise InputError("--unit", "engineering, volts or counts", unit)
@@ -64,3 +66,6 @@ def export(
         for name, rate, rows, missing in made.tables:
             lost = f", {missing} missing" if missing else ""
             echo(f"  {name}: {rows} rows at {rate:g} Hz{lost}")
+        echo(f"  {made.documents}")
+    if EDGES in recording.streams:
+        echo("left out: the exact times of the keyphasor's edges (the channel keyphasor has the pulses)")

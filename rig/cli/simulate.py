@@ -26,13 +26,12 @@ def simulate(
     from rig.pacing import rare_collections
 
     with rare_collections():
-        from replays.recordings.export import check_run_output, writer_for
+        from replays.recordings.export import check_run_output, write_run
         from rig.scenes import load_scene
 
         check_run_output(output, force=force)
         loaded = load_scene(scene, scene_changes.overrides())
 
-        from rig.offline import frames
         from rig.simulation import Simulation
 
         simulation = Simulation(loaded)
@@ -40,11 +39,9 @@ def simulate(
             echo(loaded.fidelity_line, err=True)
         tell_of_compiling()
         simulation.warm_up()
-    with reporting() as reporter, writer_for(output, simulation, force=force) as writer:
+    with reporting() as reporter:
         begin = time.perf_counter()
-        for frame in frames(simulation):
-            writer.write(frame)
-            reporter.part(simulation.tick / (simulation.end_tick or simulation.tick), scene)
+        write_run(simulation, output, force=force, progress=lambda part: reporter.part(part, scene))
     seconds = simulation.tick / simulation.tick_rate_hz
     factor = seconds / (time.perf_counter() - begin)
     health = simulation.health()

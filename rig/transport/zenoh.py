@@ -488,3 +488,10 @@ class ZenohClient:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def client_at(address: str, *, wait_s: float) -> ZenohClient:
+    """A client of the rig at HOST:PORT, or HOST:PORT?tls=DIR with the keys of a role; errors as of `ZenohClient`."""
+    endpoint, query, folder = address.partition("?tls=")
+    parse_endpoint(endpoint, field="zenoh")
+    return ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)

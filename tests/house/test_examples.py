@@ -4,41 +4,73 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rig
+from drivers.console import Console
 from drivers.daq import Daq
 from recorder.reader import Recording
-from rig import contacts, magnets, orbit
+from rig import contacts, magnets
 
+ROOT = Path(__file__).parents[2]
 MODULES = (
+    "drivers.console",
     "drivers.daq",
     "recorder.reader",
+    "replays.recordings.export",
     "rig.contacts",
+    "rig.errors",
     "rig.magnets",
     "rig.offline",
     "rig.orbit",
     "rig.parameters",
+    "rig.samples",
     "rig.scenes",
+    "rig.simulation",
+    "rig.text",
 )
 CALLED = (
-    rig.simulate, rig.load_scene, rig.load_parameters, contacts.restitution_factor, contacts.returned_restitution,
+    *(getattr(rig, name) for name in rig.__all__), contacts.restitution_factor, contacts.returned_restitution,
     contacts.linear_damping_ratio, contacts.fit_power, contacts.free_impact, magnets.field_sum_force,
-    magnets.cylinder_force, magnets.pair_force, orbit.whirl_frequency, orbit.full_spectrum, Recording, Daq,
+    magnets.cylinder_force, magnets.pair_force, Recording, Daq, Console,
 )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_of_a_module(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(Path(__file__).parents[2])  # where the reference sessions are
+    monkeypatch.chdir(ROOT)  # where the reference sessions are
     said: list[str] = []
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     for example in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(name)):
         runner.run(example, out=said.append)
     assert runner.tries > 0
     assert runner.failures == 0, "".join(said)
+
+
+# Layout is matplotlib's own to mend.
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
+def test_the_notebook_plots_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import matplotlib
+
+    matplotlib.use("agg")
+    (tmp_path / "replays").symlink_to(ROOT / "replays")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["notebook.py", "page.png"])
+    rows = runpy.run_path(str(ROOT / "docs/notebook.py"))["axes"]
+    assert (tmp_path / "page.png").stat().st_size > 20_000
+    for row, whirl_hz in zip(rows, (-82.0, -69.0), strict=True):
+        orbit, spectrum, amplitude, phase = (ax.lines[0].get_xydata() for ax in row)
+        assert np.hypot(*orbit.T).max() == pytest.approx(1.55, abs=0.1)
+        assert spectrum[spectrum[:, 1].argmax(), 0] == pytest.approx(whirl_hz, abs=3.0)
+        assert [row[1].get_ylabel(), row[2].get_ylabel()] == ["[mm]", "1X of disk_x [mm]"]
+        free = amplitude[:, 1] < 1.0
+        assert (np.diff(amplitude[free], axis=0) > 0.0).all(), "it grows with the speed until it touches the ring"
+        assert phase[free, 1].max() - phase[free, 1].min() < 60.0
+    matplotlib.pyplot.close("all")
 
 
 @pytest.mark.parametrize("called", CALLED, ids=lambda called: called.__name__)

@@ -20,10 +20,9 @@ import pytest
 
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
-from replays.recordings.export import writer_for
+from replays.recordings.export import write_run
 from replays.recordings.identification import Identification, ask, identify
 from replays.recordings.sensitivity import value_of
-from rig.offline import frames
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 
@@ -32,9 +31,7 @@ KEYS = ("magnet.stiffness", "contact.friction", "contact.stiffness", "ring.offse
 
 def recorded(path: Path, scene: str, **changes: Any) -> Recording:
     simulation = Simulation(load_scene(scene, {key.replace("__", "."): value for key, value in changes.items()}))
-    with writer_for(path, simulation, force=True) as writer:
-        for frame in frames(simulation):
-            writer.write(frame)
+    write_run(simulation, path, force=True)
     return Recording.open(path)
 
 

@@ -76,7 +76,7 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
                             break
                     for each in rows:
                         assert (each.gap, each.rate_hz) == (0, 20_000.0)
-                        columns = [direct.channels.index(channel) for channel in each.channels]
+                        columns = [direct.names.index(name) for name in each.names]
                         same = each.values[direct.index - each.index :][: len(direct)]
                         np.testing.assert_array_equal(same, direct.values[:, columns][: len(same)])
                         assert len(same) == len(direct)

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from drivers import stream
 from drivers.can.gateway import Gateway
 from drivers.can.schedule import Schedule
 from drivers.can.signals import default_messages
+from drivers.console import Console
 from drivers.daq import Aligner, Daq
 from drivers.link import LinkTimeoutError
 from drivers.samples import Pile, Samples, StreamEndedError, follow
@@ -102,7 +104,7 @@ def test_rows_are_joined_by_number_and_columns_come_in_the_order_asked_for() -> 
     made = aligner()
     assert made.feed("a", part(0, 10, columns=2)) == []
     (first,) = made.feed("b", part(4, 4, name="b", columns=2))
-    assert first.channels == ("a1", "b1", "a0")
+    assert first.names == ("a1", "b1", "a0")
     assert (first.index, first.tick) == (4, 4000)
     np.testing.assert_array_equal(first.values[:, 2], np.arange(4, 8))
     np.testing.assert_array_equal(first.values[:, 0], first.values[:, 1])
@@ -177,10 +179,18 @@ def test_chosen_channels_come_aligned_in_engineering_units() -> None:
     with on_memory(channels=CHANNELS) as (rig, daq):
         rig.publish(*GROUPS, "drive", blocks=3)
         samples = daq.read(3 * BLOCK)
-        assert (samples.channels, samples.units) == (("P_W", "disk_x", "hammer"), ("N", "mm", "N"))
+        assert (samples.names, samples.units) == (("P_W", "disk_x", "hammer"), ("N", "mm", "N"))
         assert (samples.index, samples.gap, samples.rate_hz, daq.rate_hz) == (0, 0, 20_000.0, 20_000.0)
         np.testing.assert_allclose(samples.values, expected(0, 3 * BLOCK), rtol=0, atol=1e-9)
         np.testing.assert_array_equal(samples["disk_x"], samples.values[:, 1])
+        si = samples.to_si()
+        np.testing.assert_allclose(si["disk_x"], samples["disk_x"] * 1e-3, rtol=1e-15)
+        assert (samples.unit("disk_x"), si.unit("disk_x"), si.unit("P_W"), len(si)) == ("mm", "m", "N", 3 * BLOCK)
+        with pytest.raises(KeyError, match=r"name must be one of those that there are, such as disk_x"):
+            samples["disk_z"]
+        shown = f"Samples(P_W [N], disk_x [mm], hammer [N]; {len(samples)} rows at 20000 Hz, 0 to"
+        assert repr(samples).startswith(shown)
+        assert repr(replace(samples, gap=7)).endswith(" s; 7 missing before them)")
         # Nothing of this was lost or made up on the way.
         assert (daq.lost, daq.dropped, daq.unmatched) == (dict.fromkeys(GROUPS, 0), 0, 0)
 
@@ -304,7 +314,10 @@ def test_a_user_who_is_slow_loses_rows_that_are_counted_and_memory_stays() -> No
 
 def test_what_is_malformed_is_one_line() -> None:
     for options, message in [
-        ({"channels": ["P_N", "disk_z"]}, "channel must be one of disk_x, .*; instead received 'disk_z'"),
+        (
+            {"channels": ["P_N", "disk_z"]},
+            "channel must be one of the source's, such as disk_y, .*'disk_z'",
+        ),
         ({"channels": []}, "channels must be at least one, each once"),
         ({"channels": ["P_N", "P_N"]}, "channels must be at least one, each once"),
         ({"channels": ["P_N"], "rate_hz": 3000.0}, "rate_hz must be 20000 divided by a whole number"),
@@ -504,3 +517,16 @@ def test_example_force_peak(live: tuple[str, str], capsys: pytest.CaptureFixture
     peaks = main(live[1], seconds=0.3)
     assert set(peaks) == {"P_N", "P_S", "P_E", "P_W"}
     assert "P_N: " in capsys.readouterr().out
+
+
+@pytest.mark.wallclock
+def test_a_console_opens_at_a_url_as_a_daq_does() -> None:
+    endpoint = free_endpoint()
+    with ZenohServer(endpoint) as server:
+        server.answer(wire.STATUS, lambda _: wire.encode_document({"state": "running"}))
+        server.announce()
+        with Console.open(f"zenoh:{endpoint}", name="a test") as console:
+            assert console.status() == {"state": "running"}
+    for url in ("", "zenoh", "can:zenoh:can0", "zenoh:nowhere"):
+        with pytest.raises(InputError, match=r"must be .*; instead received"):
+            Console.open(url)

@@ -14,7 +14,7 @@ import pytest
 from recorder.reader import Recording
 from recorder.session import RecordingSession
 from replays.recordings.experiment import Experiment
-from replays.recordings.export import writer_for
+from replays.recordings.export import write_run
 from rig import wire
 from rig.errors import InputError
 from rig.offline import SentCommand, frames
@@ -29,9 +29,7 @@ _SMALL = {"sensors.truth_rate_hz": 500, "sensors.rate_hz": 5000}
 
 def _record(path: Path, scene: str, changes: dict[str, Any]) -> Recording:
     simulation = Simulation(load_scene(scene, {**_SMALL, **changes}))
-    with writer_for(path, simulation) as writer:
-        for frame in frames(simulation):
-            writer.write(frame)
+    write_run(simulation, path)
     return Recording.open(path)
 
 

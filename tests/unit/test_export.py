@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def expected(run: Run) -> np.ndarray:
-    return np.column_stack([run.times_s, run.signals, *run.samples.values()])
+    return np.column_stack([run.times_s, run.signals, run.samples.values])
 
 
 def test_headings_name_everything_with_its_unit(run: Run) -> None:
@@ -64,6 +65,8 @@ def test_parquet_is_the_run(folder: Path, run: Run) -> None:
 
     table = parquet.read_table(folder / "run.parquet")
     assert table.column_names == table_columns(run.simulation)
+    assert json.loads(table.schema.metadata[b"scene.json"])["scene"]["drive"]["speed_hz"] == 7.0
+    assert "contact.friction" in json.loads(table.schema.metadata[b"parameters.json"])["values"]
     values = np.column_stack([column.to_numpy() for column in table.columns])
     np.testing.assert_array_equal(values, expected(run))
 
@@ -77,7 +80,7 @@ def test_mcap_is_the_run(folder: Path, run: Run) -> None:
         samples = recording.samples(group.name)
         assert samples.names == group.names
         assert samples.units == tuple(channel.unit for channel in group.channels)
-        np.testing.assert_allclose(samples.times_s, run.sample_times_s, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(samples.times_s, run.samples.times_s, rtol=0, atol=1e-12)
         for name in group.names:
             np.testing.assert_array_equal(samples.column(name), run.samples[name])
     for name, columns in TRUTH.items():
@@ -109,8 +112,7 @@ def test_scene_of_a_recording_runs_again_to_the_same_bits(folder: Path, run: Run
     recording = Recording.open(folder / "run.mcap")
     again = simulate(parse_scene(recording.scene["scene"]))
     assert again.signals.tobytes() == run.signals.tobytes()
-    for name, counts in run.counts.items():
-        np.testing.assert_array_equal(again.counts[name], counts)
+    np.testing.assert_array_equal(again.counts.values, run.counts.values)
 
 
 def test_command_tells_what_it_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,16 +16,15 @@ import pytest
 from recorder.head import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from replays.recordings.export import writer_for
+from replays.recordings.export import write_run
 from replays.recordings.formats import clock
 from replays.recordings.formats.export import SUFFIXES, Written, export
 from replays.recordings.formats.selection import Selection, Unit, select
 from rig.cli.main import main
 from rig.errors import InputError
-from rig.offline import frames
 from rig.scenes import load_scene
 from rig.simulation import Simulation
-from rig.wire import Block, encode_block, sensor_key
+from rig.wire import EVENTS, Block, encode_block, encode_document, sensor_key
 
 DURATION_S = 0.12
 
@@ -34,9 +33,7 @@ DURATION_S = 0.12
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     path = tmp_path_factory.mktemp("formats") / "run.mcap"
     simulation = Simulation(load_scene("hammer", {"duration_s": DURATION_S, "seed": 7, "sensors.truth_rate_hz": 2000}))
-    with writer_for(path, simulation) as writer:
-        for frame in frames(simulation):
-            writer.write(frame)
+    write_run(simulation, path)
     return Recording.open(path)
 
 
@@ -68,6 +65,97 @@ def gappy(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Rec
     return Recording.open(path)
 
 
+@pytest.fixture(scope="module")
+def noted(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The probes of the same, with a command by hand and a note, as a rig tells them that runs."""
+    path = tmp_path_factory.mktemp("noted") / "noted.mcap"
+    told = [
+        *recording.events[:-1],
+        {"event": "command", "tick": 50_000, "time_s": 0.05, "id": 1, "command": "speed", "from": "a console",
+         "request": {"speed_hz": 5.2}},
+        {"event": "speed", "tick": 50_000, "time_s": 0.05, "speed_hz": 5.2},
+        {"event": "note", "tick": 70_000, "time_s": 0.07, "text": "bearing is wärm", "tags": ["look"]},
+        recording.events[-1],
+    ]  # fmt: skip
+    with RecordingWriter(
+        path, catalogue=recording.catalogue, parameters=recording.parameters, scene=recording.scene
+    ) as writer:
+        for _, payload in recording.payloads(sensor_key("probes")):
+            writer.write(sensor_key("probes"), payload, 0)
+        for event in told:
+            writer.write(EVENTS, encode_document(event), 0)
+    return Recording.open(path)
+
+
+HAPPENED = [
+    (0.0, "start", "start: scene hammer, seed 7, pace none"),
+    (0.02, "hammer", "hammer: force_n 100.0, duration_ms 5.0, direction x"),
+    (0.05, "speed", "speed: speed_hz 5.2, from a console"),
+    (0.07, "note", "note: bearing is wärm #look"),
+    (0.12, "end", "end: reason completed"),
+]
+
+
+def test_mdf_has_events_attachments_and_comments_that_a_person_reads(noted: Recording, tmp_path: Path) -> None:
+    from asammdf import MDF
+
+    path = tmp_path / "x.mf4"
+    written(noted, path)
+    with MDF(path) as mdf:
+        events: list[Any] = list(mdf.events)
+        assert [(round(event.value, 9), event.name, event.comment) for event in events] == HAPPENED
+        assert {(event.event_type, event.sync_type) for event in events} == {(6, 1)}, "markers in seconds"
+        attached = {str(block.file_name): mdf.extract_attachment(n)[0] for n, block in enumerate(mdf.attachments)}
+        assert json.loads(attached.pop("catalogue.json")) == noted.catalogue
+        assert json.loads(attached.pop("parameters.json")) == noted.parameters
+        assert json.loads(attached.pop("scene.json")) == noted.scene
+        assert not attached
+        about = str(mdf.header.description)
+        assert about.startswith("Virtual rotor-stator rig, scene hammer (Hammer during a stable run")
+        assert "{" not in about
+        assert (mdf.header.project, mdf.header.subject) == ("rotor-stator-rig", "hammer")
+        told = mdf.get("disk_x").comment
+        assert told.startswith("Disk displacement, horizontal (EAST +), from the ring's centre line; Eddy-current")
+        assert told.endswith("24 bits over +-20 V, to 5000 Hz; 3.94 V per mm, -10 V at 0; calibration assumed")
+
+
+def test_events_and_documents_go_where_a_format_has_a_place(noted: Recording, tmp_path: Path) -> None:
+    from nptdms import TdmsFile
+    from pyarrow import parquet
+
+    made = {}
+    for suffix in SUFFIXES:
+        _, (made[suffix],) = written(noted, tmp_path / f"x{suffix}", "probes")
+    told = TdmsFile.read_metadata(tmp_path / "x.tdms").properties
+    assert told["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in HAPPENED]
+    assert json.loads(told["scene.json"]) == noted.scene
+    metadata = parquet.read_schema(tmp_path / "x.parquet").metadata
+    assert json.loads(metadata[b"parameters.json"]) == noted.parameters
+    beside = json.loads((tmp_path / "x.csv.json").read_text())
+    for events in (json.loads(metadata[b"events"]), beside["events"]):
+        assert [(each["time_s"], each["event"]) for each in events] == [(time_s, name) for time_s, name, _ in HAPPENED]
+        assert (events[2]["from"], events[3]["text"]) == ("a console", "bearing is wärm")
+    assert (beside["documents"]["scene"], beside["documents"]["catalogue"]) == (noted.scene, noted.catalogue)
+    left_out = "5 events, catalogue, parameters and scene: left out, as UFF58 has no place for them"
+    assert made[".uff"].documents == left_out
+    assert made[".wav"].documents.endswith(": in x.wav.json")
+    short = select(noted, channels=["disk_x"], from_s=0.03, to_s=0.06)
+    assert [event.name for event in short.events] == ["speed"]
+
+
+@pytest.mark.parametrize("suffix", [".mf4", ".tdms", ".parquet", ".uff"])
+def test_an_export_with_events_is_imported_again(suffix: str, noted: Recording, tmp_path: Path) -> None:
+    path, mapping, again = (str(tmp_path / name) for name in (f"x{suffix}", "x.toml", "again.mcap"))
+    written(noted, Path(path), "probes")
+    for arguments in ([path, "--template", mapping], [path, "-m", mapping, "-o", again]):
+        with pytest.raises(SystemExit) as end:
+            main(["import", *arguments])
+        assert end.value.code == 0
+    found = Recording.open(again)
+    np.testing.assert_allclose(found.samples("probes").values, noted.samples("probes").values, rtol=0, atol=1e-6)
+    assert len(json.dumps(found.scene["import"]["files"])) < 3_000, "without the rig's documents"
+
+
 def written(
     recording: Recording, path: Path, *channels: str, unit: Unit = "engineering", truth: bool = False
 ) -> tuple[Selection, list[Written]]:
@@ -90,7 +178,7 @@ def test_mdf_by_asammdf(recording: Recording, tmp_path: Path) -> None:
         names = [group.channel_group.acq_name for group in groups]
         assert names[:5] == list(recording.table.groups)
         assert mdf.header.start_time.timestamp() == pytest.approx(recording.clock[0, 1], abs=1e-3)
-        assert json.loads(mdf.header.description)["seed"] == "7"
+        assert "seed 7" in str(mdf.header.description)
         for number, group in enumerate(recording.table.groups.values()):
             samples, counts = recording.samples(group.name), counts_of(recording, group.name)
             for c, channel in enumerate(group.channels):
@@ -154,6 +242,28 @@ def test_uff_by_the_columns_of_its_specification(recording: Recording, tmp_path:
     assert data == b""
 
 
+FREEDOMS = {
+    "disk_x": (1, 1), "disk_y": (1, 2), "ring_x": (2, 1), "ring_y": (2, 2), "P_N": (3, 2), "P_S": (4, -2),
+    "P_E": (5, 1), "P_W": (6, -1), "inner_x": (7, 1), "inner_y": (7, 2), "outer_x": (8, 1), "outer_y": (8, 2),
+    "speed": (9, 6), "keyphasor": (10, 0), "hammer": (1, 1),
+}  # fmt: skip
+"""Node and direction: x is 1, y is 2, against them is negative, turning about the shaft is 6."""
+
+
+def test_uff_nodes_do_not_depend_on_what_is_exported(recording: Recording, tmp_path: Path) -> None:
+    import pyuff
+
+    path = tmp_path / "x.uff"
+    written(recording, path, "outer_y", "truth.forces.P_W", "truth.forces.magnet_y", "truth.contact.normal_force")
+    heads: list[Any] = [pyuff.UFF(str(path)).read_sets(n, header_only=True) for n in range(4)]
+    found = {head["id1"]: (head["rsp_node"], head["rsp_dir"]) for head in heads}
+    assert found["outer_y"] == FREEDOMS["outer_y"]
+    assert found["truth.forces.P_W"] == FREEDOMS["P_W"]
+    assert found["truth.forces.magnet_y"][1] == 2
+    assert found["truth.contact.normal_force"][1] == 0
+    assert heads[0]["id5"] == "node 8: outer; direction 2: y, up; group=accelerations"
+
+
 def test_uff_by_pyuff(recording: Recording, tmp_path: Path) -> None:
     import pyuff
 
@@ -165,6 +275,9 @@ def test_uff_by_pyuff(recording: Recording, tmp_path: Path) -> None:
     for n, channel in enumerate(channels):
         found: Any = file.read_sets(n)
         assert (found["id1"], found["ordinate_axis_units_lab"]) == (channel.name, channel.unit)
+        assert (found["rsp_ent_name"], found["rsp_node"], found["rsp_dir"]) == (channel.name, *FREEDOMS[channel.name])
+        assert found["id5"].startswith(f"node {found['rsp_node']}: ")
+        assert (found["ref_node"], found["ref_dir"]) == (0, 0)
         np.testing.assert_array_equal(found["data"], recording.samples(channel.group).column(channel.name))
 
 

@@ -11,14 +11,13 @@ import pytest
 
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
-from replays.recordings.export import writer_for
+from replays.recordings.export import write_run
 from replays.recordings.identification import ask, identify
 from replays.recordings.identification.horizon import horizon
 from replays.recordings.identification.question import measured_noise
 from replays.recordings.identification.window import Window
 from rig.cli.main import main
 from rig.errors import InputError
-from rig.offline import frames
 from rig.parameters import load_parameters
 from rig.scenes import load_scene
 from rig.simulation import Simulation
@@ -29,9 +28,7 @@ from tests.commands import run as command
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "h.mcap"
     simulation = Simulation(load_scene("hammer", {"duration_s": 0.035, "contact.friction": 0.24}))
-    with writer_for(path, simulation) as writer:
-        for frame in frames(simulation):
-            writer.write(frame)
+    write_run(simulation, path)
     return path
 
 
@@ -193,9 +190,7 @@ def test_noise_is_measured_where_the_table_tells_none() -> None:
 def test_samples_that_begin_after_the_impacts_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "late.mcap"
     simulation = Simulation(load_scene("hammer", {"duration_s": 0.3}))
-    with writer_for(path, simulation) as writer:
-        for frame in frames(simulation):
-            writer.write(frame)
+    write_run(simulation, path)
     recording = Recording.open(path)
     question = ask(recording, Experiment.of(recording), ["contact.friction", "magnet.stiffness"], window=(0.25, 0.3))
     with pytest.raises(InputError, match="before the first contacts"):
@@ -206,9 +201,7 @@ def test_samples_that_begin_after_the_impacts_are_refused(tmp_path: Path) -> Non
 def quiet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("quiet") / "q.mcap"
     simulation = Simulation(load_scene("stable-run", {"duration_s": 0.5, "sensors.rate_hz": 2000}))
-    with writer_for(path, simulation) as writer:
-        for frame in frames(simulation):
-            writer.write(frame)
+    write_run(simulation, path)
     return path
 
 

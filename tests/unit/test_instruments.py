@@ -176,7 +176,7 @@ def test_the_same_engineering_values_come_over_every_link(bench: Bench) -> None:
             bench.rig.publish(group, blocks=2)
             samples = driver.read(2 * BLOCK)
             table = default_table().groups[group]
-            assert samples.channels == told.channels == table.names
+            assert samples.names == told.channels == table.names
             assert samples.units == tuple(channel.unit for channel in table.channels)
             assert (samples.index, samples.tick, samples.gap, samples.rate_hz) == (0, 0, 0, 20_000.0)
             np.testing.assert_allclose(samples.values, values_of(group, 0, 2 * BLOCK), rtol=0, atol=1e-9)
@@ -689,7 +689,7 @@ def test_probes_show_their_gap_voltage_and_whether_they_are_in_range(memory_benc
     assert probes.gap_volts(at_rest) == dict.fromkeys(("disk_x", "disk_y", "ring_x", "ring_y"), -10.0)
     # 7.87 V/mm from -10 V: the limit of -2 V is at 1.0165 mm.
     near = samples(probes, np.full((10, 4), 1.017))
-    assert probes.in_range(at_rest) == dict.fromkeys(at_rest.channels, True)
+    assert probes.in_range(at_rest) == dict.fromkeys(at_rest.names, True)
     assert probes.in_range(near) == {"disk_x": True, "disk_y": True, "ring_x": False, "ring_y": False}
 
 

@@ -51,7 +51,7 @@ def foreign_log(
     def sampled(name: str) -> np.ndarray:
         channel = run.table.channels[name]
         noise = channel.noise_v / abs(channel.sensitivity_v) * rng.standard_normal(len(there_s))
-        return CubicSpline(run.sample_times_s, run.samples[name])(there_s) + noise
+        return CubicSpline(run.times_s, run.samples[name])(there_s) + noise
 
     x, y = sampled("ring_x"), sampled("ring_y")
     columns = {

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import pydoc
 import textwrap
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import rig
-from rig.errors import InputError
+from rig.errors import InputError, UnknownNameError
 from rig.kernels.signals import ROW
 from rig.offline import Run, frames, simulate
 from rig.scenes import load_scene
@@ -24,8 +26,8 @@ def shown() -> dict[str, Any]:
     assert len(lines.strip().splitlines()) == 5
     space: dict[str, Any] = {}
     exec(compile(lines, "rig.__doc__", "exec"), space)
-    # The last two are expressions: evaluated as well.
-    space["shown"] = [eval(line, space) for line in lines.strip().splitlines()[3:]]
+    # The last three are expressions: evaluated as well.
+    space["shown"] = [eval(line, space) for line in lines.strip().splitlines()[2:]]
     return space
 
 
@@ -36,19 +38,30 @@ def run(shown: dict[str, Any]) -> Run:
 
 def test_the_lines_of_the_docstring_work(shown: dict[str, Any]) -> None:
     run = shown["run"]
-    (peak, unit), (disk_x, times_s) = shown["shown"]
-    assert (peak, unit) == (run["normal_force"].max(), "N")
-    assert 500.0 < peak < 20_000.0, "it was hit and touched the ring"
+    (true, true_unit), (seen, seen_unit), (disk_x, times_s) = shown["shown"]
+    assert (true_unit, seen_unit) == ("m", "mm")
+    assert true * 1e3 == pytest.approx(seen, abs=0.02)
+    assert 500.0 < run["normal_force"].max() < 20_000.0, "it was hit and touched the ring"
+    assert disk_x.max() == pytest.approx(true, abs=2e-5)
     assert disk_x.shape == times_s.shape == (40_000,)
-    assert shown["scene"].drive.speed_hz == 5.2
+    assert run.simulation.scene.drive.speed_hz == 5.2
     assert run.simulation.model.parameters["contact.friction"] == 0.3
 
 
 def test_everything_is_the_public_interface() -> None:
     for name in rig.__all__:
         assert getattr(rig, name).__name__ == name
+    assert set(rig.__all__) <= set(dir(rig))
+    assert not [name for name in dir(rig) if name.startswith("_") and not name.startswith("__")]
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        rig.nothing  # noqa: B018
+        rig.nothing  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_the_page_of_help_opens_with_what_to_do() -> None:
+    page = pydoc.plain(pydoc.render_doc(rig))
+    assert page.index('run = rig.simulate("hammer"') < page.index("CLASSES")
+    for name in rig.__all__:
+        assert f"class {name}(" in page or f"    {name}(" in page, name
 
 
 def test_signals_are_those_of_the_frames(run: Run) -> None:
@@ -84,21 +97,73 @@ def test_every_signal_has_a_column_and_a_unit(run: Run) -> None:
         np.testing.assert_array_equal(run[signal.name], run.signals[:, n])
         assert run.unit(signal.name) == signal.unit
     for name, channel in run.table.channels.items():
-        assert run.sample_unit(name) == channel.unit
+        assert run.samples.unit(name) == channel.unit
+        np.testing.assert_allclose(run.samples.to_si()[name], run.samples[name] * channel.si, rtol=1e-15)
+        assert run.samples.to_si().unit(name) == run.unit(channel.signal)
     # The same name on both sides: the model's in SI, the probe's in its own unit.
-    assert (run.unit("disk_x"), run.sample_unit("disk_x")) == ("m", "mm")
-    for wrong in ("nothing", "inner_x"):
-        with pytest.raises(KeyError):
-            run[wrong]
-        with pytest.raises(KeyError):
-            run.unit(wrong)
-    with pytest.raises(KeyError):
-        run.sample_unit("normal_force")
+    assert (run.unit("disk_x"), run.samples.unit("disk_x")) == ("m", "mm")
+    assert run.samples.to_si().to_si().units == run.samples.to_si().units
+
+
+def test_a_name_that_is_none_tells_the_nearest(run: Run) -> None:
+    parameters = run.simulation.model.parameters
+    for look_up, wrong, near in (
+        (run.__getitem__, "inner_x", "inner_ax"),
+        (run.unit, "normal_forze", "normal_force"),
+        (run.samples.__getitem__, "p_n", "P_N"),
+        (run.samples.unit, "disk_z", "disk_x"),
+        (run.counts.__getitem__, "hamer", "hammer"),
+        (parameters.__getitem__, "contact.fricton", "contact.friction"),
+    ):
+        with pytest.raises(KeyError) as caught:
+            look_up(wrong)
+        assert isinstance(caught.value, InputError)
+        assert near in str(caught.value)
+        assert repr(wrong) in str(caught.value)
+    for wrong in (0, None, "", "x" * 100_000):
+        with pytest.raises(UnknownNameError) as caught:
+            run[wrong]  # type: ignore[index]
+        assert len(str(caught.value)) < 2_000
+
+
+def test_what_is_shown_of_each_object_is_a_line(run: Run) -> None:
+    frame = Simulation(run.simulation.scene).advance(50_000)
+    assert len(repr(frame)) < 2_000
+    for each in (run, run.simulation, run.simulation.scene, run.simulation.model.parameters, run.table):
+        assert str(each) == repr(each)
+        assert repr(each).startswith(f"{type(each).__name__}(")
+        assert len(repr(each)) < 200
+    assert repr(run.samples).startswith("Samples(disk_x, disk_y, ring_x, ring_y [mm], P_N, ")
+    assert repr(run.samples).endswith("; 40000 rows at 20000 Hz, 0 to 1.99995 s)")
+    assert "\n" not in repr(run.samples)
+
+
+def test_samples_are_columns_like_those_of_a_table(run: Run) -> None:
+    assert len(run.samples) == len(run.times_s)
+    assert list(run.samples) == list(run.samples.keys()) == list(run.samples.names)
+    assert set(dict(run.samples)) == set(run.table.channels)
+    assert ("disk_x" in run.samples, "disk_z" in run.samples) == (True, False)
+    assert run.names == tuple(signal.name for signal in ROW)
+
+
+def test_a_scene_is_given_by_name_by_path_or_as_it_is(tmp_path: Path) -> None:
+    changes = {"drive.speed_hz": 5.2, "duration_s": 0.01, "sensors.rate_hz": 1_000}
+    path = tmp_path / "mine.toml"
+    path.write_text('duration_s = 0.5\n[[commands]]\nat_s = 0.02\ncommand = "hammer"\n')
+    by_name = simulate("hammer", changes)
+    loaded = simulate(load_scene("hammer"), changes)
+    assert by_name.signals.tobytes() == loaded.signals.tobytes()
+    assert simulate(path, changes).signals.tobytes() == by_name.signals.tobytes()
+    for wrong in ("hamer", None, by_name, {"drive.speed_hz": 5.2}):
+        with pytest.raises(InputError, match=r"^scene must be (one of .*hammer|a name)"):
+            simulate(wrong)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^drive\.sped_hz must be a field of a scene .* drive\.speed_hz"):
+        simulate("hammer", {"drive.sped_hz": 5.2})
 
 
 def test_times_are_those_of_the_samples(run: Run) -> None:
-    np.testing.assert_allclose(run.sample_times_s, np.arange(40_000) / 20_000, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(run.times_s, run.sample_times_s)
+    np.testing.assert_allclose(run.samples.times_s, np.arange(40_000) / 20_000, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(run.times_s, run.samples.times_s)
     # The probes see what the model says, at the same instants.
     before = run.times_s < 0.02
     np.testing.assert_allclose(run.samples["ring_x"][before], run["ring_x"][before] * 1e3, rtol=0, atol=2e-3)
@@ -150,7 +215,7 @@ def test_duration_is_rounded_up_to_a_whole_block() -> None:
 def test_only_the_sensors_that_are_on() -> None:
     run = simulate(load_scene("drop", {"sensors.groups": ["hammer"], "sensors.rate_hz": 1_000}), duration_s=0.1)
     assert list(run.samples) == ["hammer"]
-    assert run.sample_unit("hammer") == "N"
+    assert run.samples.unit("hammer") == "N"
     assert run.signals.shape == (100, len(ROW))
     assert len(run.samples["hammer"]) == 100
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from recorder.reader import Recording
 from recorder.writer import RecordingWriter
 from rig.channels import default_table
 from rig.errors import InputError
+from rig.samples import joined
 from rig.wire import CATALOGUE, EDGES, PARAMETERS, SCENE, STATUS, sensor_key, truth_key
 
 from .recorder_stream import TRUTH_COLUMNS, block_of, documents, stream
@@ -93,15 +95,54 @@ def test_streams_tell_their_extent(recording):
 @pytest.mark.parametrize(
     ("ask", "must"),
     [
-        (lambda recording: recording.samples("probe"), "group must be one of probes, forces"),
-        (lambda recording: recording.truth("energies"), "truth must be one of state, contact"),
-        (lambda recording: recording.samples("probes").column("disk"), "column must be one of disk_x"),
+        (
+            lambda recording: recording.samples("probe"),
+            "samples must be a channel or a group .*, such as probes",
+        ),
+        (
+            lambda recording: recording.truth("energies"),
+            "truth must be one of the recording's tables, such as state, contact",
+        ),
+        (
+            lambda recording: recording.samples("probes").column("disk"),
+            "name must be one of those .* such as disk_y",
+        ),
         (lambda recording: list(recording.blocks(STATUS)), "key must be a key of blocks"),
     ],
 )
 def test_what_is_not_there_is_refused(recording, ask, must):
     with pytest.raises(InputError, match=must):
         ask(recording)
+
+
+def test_groups_are_joined_where_all_have_a_row(recording):
+    with recording as opened:
+        both = opened.samples("forces", "probes")
+        whole = opened.samples()
+    assert both.names == ("P_N", "P_S", "P_E", "P_W", "disk_x", "disk_y", "ring_x", "ring_y")
+    probes, si = opened.samples("probes"), both.to_si()
+    np.testing.assert_array_equal(both["ring_y"], probes["ring_y"])
+    np.testing.assert_array_equal(both.times_s, probes.times_s)
+    np.testing.assert_allclose(si["ring_y"], probes["ring_y"] * 1e-3, rtol=1e-15)
+    assert (both.unit("ring_y"), si.unit("ring_y"), si.unit("P_N")) == ("mm", "m", "N")
+    assert whole.names == tuple(recording.table.channels)
+    few = opened.samples("ring_y", "P_N", "hammer")
+    assert (few.names, few.units) == (("ring_y", "P_N", "hammer"), ("mm", "N", "N"))
+    np.testing.assert_array_equal(few["ring_y"], probes["ring_y"])
+    for ask in (lambda: few.only("ring_z"), lambda: opened.samples("ring_z")):
+        with pytest.raises(KeyError, match="such as ring_y"):
+            ask()
+    shorter = replace(probes, index=probes.index[7:], times_s=probes.times_s[7:], values=probes.values[7:])
+    np.testing.assert_array_equal(joined([opened.samples("forces"), shorter]).index, shorter.index)
+    late = replace(probes, times_s=probes.times_s + 20e-6)
+    for parts in ([], [opened.samples("forces"), late]):
+        with pytest.raises(InputError, match=r"^groups must be sampled at the same instants"):
+            joined(parts)
+
+
+def test_a_recording_is_shown_in_a_line(recording):
+    assert repr(recording).startswith(f"Recording({recording.path}: scene hammer, 0 to 0.59995 s, ")
+    assert "\n" not in repr(recording)
 
 
 def test_a_group_without_blocks_is_empty(tmp_path):

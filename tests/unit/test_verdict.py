@@ -15,13 +15,12 @@ import pytest
 
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
-from replays.recordings.export import writer_for
+from replays.recordings.export import write_run
 from replays.recordings.picture import draw
 from replays.recordings.verdict import Verdict, hammer_time_s, judge
 from replays.recordings.whirl import parameter_si, whirl_figures
 from rig import wire
 from rig.errors import InputError
-from rig.offline import frames
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 
@@ -31,9 +30,7 @@ Change = Callable[[str, bytes], Iterable[bytes]]
 
 def simulated(path: Path, scene: str = "hammer", **changes: Any) -> Recording:
     simulation = Simulation(load_scene(scene, {key.replace("__", "."): value for key, value in changes.items()}))
-    with writer_for(path, simulation) as writer:
-        for frame in frames(simulation):
-            writer.write(frame)
+    write_run(simulation, path)
     return Recording.open(path)
 
 

@@ -147,7 +147,10 @@ def arrow_table(columns: Sequence[np.ndarray], schema: Any) -> Any:
 
 
 class ParquetWriter(export.FormatWriter):
-    """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata."""
+    """A Parquet file: `time [s]` and a column a channel, their calibration in the columns' metadata.
+
+    What happened, and the rig's documents, are metadata of the file.
+    """
 
     merged = True
     sparse = True
@@ -163,7 +166,9 @@ class ParquetWriter(export.FormatWriter):
         for column in table.columns:
             told = {key: str(value) for key, value in column.metadata.items()}
             fields.append(pyarrow.field(column.heading, _type(column, kind), metadata=told))
-        whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz})}
+        events = json.dumps([event.document for event in selection.events])
+        whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz}), "events": events}
+        whole |= selection.documents
         self._file = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:

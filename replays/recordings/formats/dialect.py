@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from replays.recordings.formats import unit as units
+from rig import units
 from rig.errors import InputError
 from rig.outside import open_file
 

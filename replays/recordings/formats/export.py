@@ -39,6 +39,8 @@ class FormatWriter:
     merged = False
     sparse = False
     sidecar = False
+    documents = "in the file"
+    """Where events, catalogue, parameters and scene are."""
     _file: Any
     """What the values go to; has `close`."""
 
@@ -66,11 +68,13 @@ class Written:
         path: The file.
         tables: Name, rate [Hz], rows and rows missing of each of its tables.
         columns: Number of columns in all.
+        documents: What became of events, catalogue, parameters and scene, in words.
     """
 
     path: Path
     tables: tuple[tuple[str, float, int, int], ...]
     columns: int
+    documents: str
 
 
 def check_output(path: Path, *, force: bool, suffixes: tuple[str, ...] = SUFFIXES) -> None:
@@ -158,7 +162,10 @@ def export(
                 text = json.dumps(part.sidecar(), indent=1, ensure_ascii=False)
                 stack.enter_context(whole_file(_beside(target))).write_text(text + "\n", encoding="utf-8")
             tables = tuple((t.name, t.rate_hz, t.rows, part.missing[t.name]) for t in part.tables)
-            written.append(Written(target, tables, sum(len(table.columns) for table in part.tables)))
+            events = f"{len(part.events)} event{'s' * (len(part.events) != 1)}, catalogue, parameters and scene"
+            where = f"in {_beside(target).name}" if kind.sidecar else kind.documents
+            columns = sum(len(table.columns) for table in part.tables)
+            written.append(Written(target, tables, columns, f"{events}: {where}"))
     return written
 
 
@@ -224,7 +231,7 @@ def resampled(selection: Selection, rate_hz: float, method: Method) -> Selection
     how = clock.FILTER if method == "polyphase" else "straight lines between samples"
     rates = ", ".join(f"{other:g}" for other in sorted({table.rate_hz for table in selection.tables}))
     return _Resampled(
-        recording=selection.recording, tables=(table,), unit=selection.unit,
-        notes={**selection.notes, "resampled": f"from {rates} Hz to {rate_hz:g} Hz: {how}"},
+        recording=selection.recording, tables=(table,), unit=selection.unit, from_s=selection.from_s,
+        to_s=selection.to_s, notes={**selection.notes, "resampled": f"from {rates} Hz to {rate_hz:g} Hz: {how}"},
         held=np.stack(parts, axis=1),
     )  # fmt: skip

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.formats import clock
-from replays.recordings.formats import unit as units
 from replays.recordings.formats.mapped import BITS, MappedSignal
 from replays.recordings.formats.mapping import Mapping
 from replays.recordings.formats.selection import NO_VOLTS
+from rig import units
 from rig.channels import Channel, ChannelTable, Group, default_table
 from rig.errors import InputError
 from rig.outside import check

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -12,11 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from replays.recordings.formats import clock
-from replays.recordings.formats import unit as units
 from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalName
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
+from rig import units
 from rig.channels import Channel, default_table
-from rig.errors import InputError
+from rig.errors import InputError, UnknownNameError
+from rig.text import nearest
 
 BITS = 32
 """Of the counts of an imported channel."""
@@ -98,10 +98,8 @@ class Log:
         if not inside:
             groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
             raise InputError(f"{where}.group", f"one of {', '.join(groups)}", wanted.group)
-        names = list(dict.fromkeys(entry.name for _, entry in inside))
-        close = difflib.get_close_matches(wanted.source, names, n=3, cutoff=0.4) or names[:12]
-        more = f" ({len(names)} in all)" if len(names) > len(close) else ""
-        raise InputError(f"{where}.source", f"a signal of the file, such as {', '.join(close)}{more}", wanted.source)
+        names = [entry.name for _, entry in inside]
+        raise UnknownNameError(f"{where}.source", "a signal of the file", wanted.source, names)
 
     def read(self, source: Source, entry: Entry, where: str) -> tuple[FileSignal, clock.Axis]:
         """A signal and its own time axis; nan where samples are missing from an even one.
@@ -144,7 +142,7 @@ class Log:
         target = default_table().channels.get(name)
         if target is None:
             if wanted.to is None or wanted.to_unit is None:
-                close = difflib.get_close_matches(name, list(default_table().channels), n=1)
+                close = nearest(name, default_table().channels, most=1)
                 hint = f" (such as {close[0]})" if close else ""
                 must = f"a channel of the rig{hint}, or given with `to` (a group) and `to_unit`"
                 raise InputError(where, must, name)

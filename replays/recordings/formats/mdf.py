@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.recordings.formats import export
-from replays.recordings.formats import unit as units
 from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz, library
+from rig import units
 
 if TYPE_CHECKING:
+    from replays.recordings.formats.history import ExportEvent
     from replays.recordings.formats.mapping import FileOptions
     from replays.recordings.formats.selection import ExportChunk, ExportTable, Selection
 
@@ -24,6 +25,8 @@ _TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
 """The text in a comment that is XML."""
 _SYNC_NONE, _SYNC_TIME = 0, 1
 """Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
+_MARKER, _BY_TOOL = 6, 2
+"""Type and cause of an event in MDF4."""
 _IDENTITY, _LINEAR = 0, 1
 """Types of the conversion of a channel in MDF4; no conversion is the identity, too."""
 
@@ -139,8 +142,23 @@ def _signal(mdf: Any, group: int, index: int) -> FileSignal:
     return FileSignal(values=values, scale=scale, offset=offset, times_s=times_s)
 
 
+def _event(event: ExportEvent) -> Any:
+    """A marker at a time, to the microsecond of the rig's clock, which holds for all groups."""
+    from asammdf.blocks.v4_blocks import EventBlock
+
+    block = EventBlock(
+        event_type=_MARKER, sync_type=_SYNC_TIME, cause=_BY_TOOL, flags=0, sync_base=round(event.time_s * 1e6),
+        sync_factor=1e-6,
+    )  # fmt: skip
+    block.name, block.comment = event.name, event.text
+    return block
+
+
 class MdfWriter(export.FormatWriter):
-    """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion."""
+    """An MDF 4.10 file: a channel group a sensor group, integer counts with a linear conversion.
+
+    What happened is events; the rig's documents are attached.
+    """
 
     sparse = True
 
@@ -154,6 +172,10 @@ class MdfWriter(export.FormatWriter):
             self._file = asammdf.MDF(version="4.10")
             self._file.header.start_time = selection.start
             self._file.header.description = selection.summary()
+            self._file.header.project, self._file.header.subject = "rotor-stator-rig", selection.metadata["scene"]
+            for name, text in selection.documents.items():
+                self._file.attach(text.encode(), file_name=name, comment="of the rig", mime="application/json")
+            self._file.events.extend(map(_event, selection.events))
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows; those that no stream has are left out."""
@@ -169,7 +191,8 @@ class MdfWriter(export.FormatWriter):
                 return
             signals = [
                 self._signal(
-                    samples=values, timestamps=times_s, name=column.name, unit=column.unit, comment=column.about(),
+                    samples=values, timestamps=times_s, name=column.name, unit=column.unit,
+                    comment=column.about(table.title),
                     conversion=None if column.linear is None else dict(zip("ab", column.linear, strict=True)),
                 )
                 for column, values in zip(table.columns, columns, strict=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -15,8 +14,10 @@ import numpy as np
 
 from recorder.reader import Recording
 from recorder.survey import Stream
+from replays.recordings.formats.history import ExportEvent, happenings
 from rig.channels import Channel
 from rig.errors import InputError
+from rig.text import nearest, printable
 from rig.wire import Block, sensor_key, truth_key
 
 Unit = Literal["engineering", "volts", "counts"]
@@ -73,9 +74,19 @@ class Column:
             }  # fmt: skip
         return about
 
-    def about(self) -> str:
-        """The same in a line, for formats that have a comment only."""
-        return json.dumps(self.metadata, ensure_ascii=False)
+    def about(self, sensor: str) -> str:
+        """What it is, by which sensor, and its calibration, in a line for a person.
+
+        Args:
+            sensor: What the group is.
+        """
+        texts = [self.label]
+        if (channel := self.source) is not None:
+            texts += [sensor, f"{channel.adc_bits} bits over +-{channel.adc_v:g} V, to {channel.bandwidth_hz:g} Hz"]
+            if channel.kind != NO_VOLTS:
+                texts.append(f"{channel.sensitivity_v:g} V per {channel.unit}, {channel.bias_v:g} V at 0")
+            texts.append(f"calibration {channel.kind}")
+        return "; ".join(text for text in texts if text)
 
 
 @dataclass(frozen=True)
@@ -147,12 +158,33 @@ class ExportTable:
 
 @dataclass(frozen=True)
 class Selection:
-    """What is exported of a recording."""
+    """What is exported of a recording.
+
+    Attributes:
+        recording: The recording.
+        tables: Its tables.
+        unit: What the sensors' values are given in.
+        from_s, to_s: Ends that were asked for, simulated time [s].
+        notes: What was done to the values.
+    """
 
     recording: Recording
     tables: tuple[ExportTable, ...]
     unit: Unit
+    from_s: float = -math.inf
+    to_s: float = math.inf
     notes: dict[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def events(self) -> tuple[ExportEvent, ...]:
+        """Impacts, commands and notes in the range, in order."""
+        return happenings(self.recording, self.from_s, self.to_s)
+
+    @property
+    def documents(self) -> dict[str, str]:
+        """The rig's catalogue, parameters and scene, by name, as the recording has them."""
+        names = ("catalogue.json", "parameters.json", "scene.json")
+        return {name: self.recording.attachments[name].decode() for name in names}
 
     @cached_property
     def start(self) -> datetime:
@@ -172,8 +204,15 @@ class Selection:
         }  # fmt: skip
 
     def summary(self) -> str:
-        """The same in a line."""
-        return json.dumps(self.metadata, ensure_ascii=False)
+        """The same for a person, line by line."""
+        about, scene = self.metadata, self.recording.scene.get("scene") or {}
+        title = f" ({printable(str(scene['title']))})" if scene.get("title") else ""
+        seed = f", seed {about['seed']}" if about["seed"] else ""
+        return "\n".join([
+            f"Virtual rotor-stator rig, scene {about['scene']}{title}, parameters {about['parameter_set']}{seed}",
+            f"Time 0 is {about['start']}; from the recording {about['recording']}; sensors in {about['values']} values",
+            *(f"{name}: {text}" for name, text in self.notes.items()),
+        ])  # fmt: skip
 
     def sidecar(self) -> dict[str, Any]:
         """All metadata as a document, for formats that have no place for it."""
@@ -182,7 +221,9 @@ class Selection:
              "columns": [column.metadata for column in table.columns]}
             for table in self.tables
         ]  # fmt: skip
-        return {**self.metadata, "tables": tables}
+        documents = {name.removesuffix(".json"): json.loads(text) for name, text in self.documents.items()}
+        events = [event.document for event in self.events]
+        return {**self.metadata, "tables": tables, "events": events, "documents": documents}
 
     @cached_property
     def missing(self) -> dict[str, int]:
@@ -319,7 +360,10 @@ def select(
         low, high = min((s.first_time_s for s in held), default=0.0), max((s.last_time_s for s in held), default=0.0)
         ends = [f"{word} {end:g} s" for word, end in (("from", from_s), ("to", to_s)) if end is not None]
         raise InputError("range", f"in the recording, {low:g} to {high:g} s", " ".join(ends) or "all of it")
-    return Selection(recording=recording, tables=tuple(_merge(alike) for alike in tables.values()), unit=unit)
+    return Selection(
+        recording=recording, tables=tuple(_merge(alike) for alike in tables.values()), unit=unit,
+        from_s=-math.inf if from_s is None else from_s, to_s=math.inf if to_s is None else to_s,
+    )  # fmt: skip
 
 
 def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> dict[str, list[int]]:
@@ -359,13 +403,13 @@ def _near(channel: str, groups: dict[str, list[str]], truths: dict[str, list[str
     prefix, _, rest = channel.partition(".")
     table, _, column = rest.partition(".")
     if prefix == "truth" and table in truths:
-        near = difflib.get_close_matches(column, truths[table], n=3)
+        near = nearest(column, truths[table])
         return f"truth.{table}.COLUMN with one of {', '.join(near or truths[table])}"
     if prefix == "truth":
         tables = ", ".join(f"truth.{name}" for name in truths)
         return f"one of {tables}" if truths else "one of the sensors: the recording has no truth"
     sensors = [*(name for group in groups.values() for name in group), *groups]
-    near = difflib.get_close_matches(channel, sensors, n=3)
+    near = nearest(channel, sensors)
     if near:
         return f"one of the recording's, such as {', '.join(near)}"
     return f"a channel of the recording, one of its groups ({', '.join(groups)}) or truth.TABLE"

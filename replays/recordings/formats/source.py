@@ -29,6 +29,8 @@ _READERS = {
 _FORMATS = {
     "mdf": "MDF", "tdms": "TDMS", "uff": "universal (UFF)", "delimited": "text", "columnar": "Parquet", "wav": "WAV",
 }  # fmt: skip
+_MOST_ABOUT = 2000
+"""Longest text that is taken over of what a file tells of itself [characters]; longer ones are documents."""
 _MOST_HZ = 1e9
 _MOST_S = 1e12
 
@@ -156,7 +158,8 @@ def open_source(path: Path, options: FileOptions) -> Source:
         for one, new in zip(entries, distinct, strict=True)
         if one.name != new.name
     ]
-    return replace(source, entries=distinct, read=read, remarks=(*source.remarks, *twice))
+    about = {key: text for key, text in source.about.items() if len(text) <= _MOST_ABOUT}
+    return replace(source, entries=distinct, read=read, about=about, remarks=(*source.remarks, *twice))
 
 
 @contextmanager

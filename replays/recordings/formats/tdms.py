@@ -114,7 +114,10 @@ def _signal(group: Any, name: str, start: Any) -> FileSignal:
 
 
 class TdmsWriter(export.FormatWriter):
-    """A TDMS file: a group a sensor group; counts with a linear scale, which LabVIEW applies on reading."""
+    """A TDMS file: a group a sensor group; counts with a linear scale, which LabVIEW applies on reading.
+
+    What happened, and the rig's documents, are properties of the file.
+    """
 
     def __init__(self, path: Path, selection: Selection) -> None:
         nptdms = library("npTDMS", "nptdms")
@@ -129,6 +132,8 @@ class TdmsWriter(export.FormatWriter):
         """Take rows; a missing one is nan, for the format has a start and a step and no times."""
         api, new = self._api, table.name not in self._described
         about = {key: value for key, value in self._selection.metadata.items() if value != ""}
+        about |= {"description": self._selection.summary(), **self._selection.documents}
+        about["events"] = "\n".join(f"{event.time_s:.6f} s  {event.text}" for event in self._selection.events)
         objects: list[Any] = [api.RootObject(about if not self._described else {})]
         objects.append(api.GroupObject(table.name, {"description": table.title} if new else {}))
         for c, column in enumerate(table.columns):

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from importlib.resources import files as files_of
 from pathlib import Path
 
-from replays.recordings.formats import unit as units
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import Entry, Source, open_source
+from rig import units
 from rig.channels import default_table
 
 CHECK = "PLEASE CHECK"
@@ -140,12 +139,8 @@ def _channel(entry: Entry, source: Source, taken: set[str], *, rig: set[str], se
 
 
 def label_of(entry: Entry) -> str:
-    """What the file says of a signal, in a few words; of a comment that is JSON, its label."""
-    text = entry.label
-    if text.lstrip().startswith("{"):
-        with suppress(ValueError):
-            text = str(json.loads(text).get("label", ""))
-    text = " ".join(text.split())
+    """What the file says of a signal, in a few words."""
+    text = " ".join(entry.label.split())
     return text if len(text) <= _LABEL else f"{text[: _LABEL - 3]}..."
 
 

@@ -9,18 +9,19 @@ from __future__ import annotations
 import re
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from replays.recordings.formats import export
-from replays.recordings.formats import unit as units
 from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, library
+from rig import units
 from rig.errors import InputError
 from rig.outside import open_file
 from rig.text import printable
 
 if TYPE_CHECKING:
+    from recorder.reader import Recording
     from replays.recordings.formats.mapping import FileOptions
     from replays.recordings.formats.selection import Column, ExportChunk, ExportTable, Selection
 
@@ -42,6 +43,13 @@ _ORDINATE = {
     "speed of rotation": (_GENERAL, 0, 0),
 }
 """Specific data type, and exponents of length and force, by what a unit measures (9: reaction force)."""
+_DIRECTIONS = {"x": 1, "y": 2, "z": 3, "E": 1, "W": -1, "N": 2, "S": -2}
+_ALONG = {
+    0: "none", 1: "x, EAST", -1: "-x, WEST", 2: "y, up", -2: "-y, down", 3: "z, along the shaft", 6: "about z",
+}  # fmt: skip
+_BLOWS = {"x": 1, "-x": -1, "y": 2, "-y": -2}
+_AXIS = re.compile(r"(\w+)_[av]?([xyz])")
+_SIDE = re.compile(r"\w+_([ENWS])")
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
@@ -111,15 +119,60 @@ def _start(texts: list[str]) -> datetime | None:
     return None
 
 
+class DegreeOfFreedom(NamedTuple):
+    """Where a channel measures, as universal files tell it.
+
+    Attributes:
+        node: Number of the place, from 1, in the order of the channel table.
+        direction: 1, 2, 3: along x (EAST), y (up), z (the shaft); negative: against it; 6: rotation about z; 0: none.
+        place: The place in words.
+    """
+
+    node: int
+    direction: int
+    place: str
+
+
+def degrees_of_freedom(recording: Recording) -> dict[str, DegreeOfFreedom]:
+    """Where each channel of a recording measures, by its name: the same, whichever of them are exported.
+
+    By the names of the channel table: `disk_x` is at the disk along x, `P_W` at a place of its own, against x. The
+    hammer hits the disk, along the direction of its blows if they have one of the axes in common.
+    """
+    blows = {str(event.get("direction")) for event in recording.events if event["event"] == "hammer"}
+    found: dict[str, tuple[str, int]] = {}
+    for channel in recording.table.channels.values():
+        found[channel.name] = _placed(channel.name, 6 if units.kind(channel.unit) == "speed of rotation" else 0)
+    if "hammer" in found:
+        found["hammer"] = ("disk", _BLOWS.get(blows.pop(), 0) if len(blows) == 1 else 0)
+    for table, about in recording.catalogue.get("truth", {}).items():
+        for column in about["columns"]:
+            found[f"truth.{table}.{column['name']}"] = _placed(column["name"], 0)
+    nodes = {place: number for number, place in enumerate(dict.fromkeys(place for place, _ in found.values()), 1)}
+    return {name: DegreeOfFreedom(nodes[place], direction, place) for name, (place, direction) in found.items()}
+
+
+def _placed(name: str, otherwise: int) -> tuple[str, int]:
+    """Place and direction by a name; one without an axis is a place of its own."""
+    if (side := _SIDE.fullmatch(name)) is not None:
+        return name, _DIRECTIONS[side[1]]
+    if (axis := _AXIS.fullmatch(name)) is not None:
+        return axis[1], _DIRECTIONS[axis[2]]
+    return name, otherwise
+
+
 class UffWriter(export.FormatWriter):
-    """A universal file: a binary dataset 58 a channel, in float64."""
+    """A universal file: a binary dataset 58 a channel, in float64, with the node and the direction that it measures."""
+
+    documents = "left out, as UFF58 has no place for them"
 
     def __init__(self, path: Path, selection: Selection) -> None:
         self._file = path.open("wb")
         self._at: dict[str, list[int]] = {}
+        freedoms = degrees_of_freedom(selection.recording)
         for table in selection.tables:
             for column in table.columns:
-                self._file.write(_header(table, column, selection))
+                self._file.write(_header(table, column, selection, freedoms[column.name]))
                 self._at.setdefault(table.name, []).append(self._file.tell())
                 self._file.seek(8 * table.rows, 1)
                 self._file.write(b"\n    -1\n")
@@ -131,21 +184,22 @@ class UffWriter(export.FormatWriter):
             self._file.write(table.exported(c, chunk).astype("<f8").tobytes())
 
 
-def _header(table: ExportTable, column: Column, selection: Selection) -> bytes:
+def _header(table: ExportTable, column: Column, selection: Selection, at: DegreeOfFreedom) -> bytes:
     kind, length, force = _ORDINATE.get(units.kind(column.unit), (_UNKNOWN, 0, 0))
     about = selection.metadata
     texts = (
         column.name,
         column.label or "NONE",
         selection.start.strftime("%d-%b-%y %H:%M:%S"),
-        f"rate_hz={table.rate_hz:.17g} scene={about['scene']} seed={about['seed']}",
-        f"parameters={about['parameter_set']} group={table.name}",
+        f"rate_hz={table.rate_hz:.17g} scene={about['scene']} seed={about['seed']} parameters={about['parameter_set']}",
+        f"node {at.node}: {at.place}; direction {at.direction}: {_ALONG[at.direction]}; group={table.name}",
     )
     lines = [
         f"{-1:6d}",
         f"{58:6d}b{1:6d}{2:6d}{11:12d}{8 * table.rows:12d}{0:6d}{0:6d}{0:12d}{0:12d}",
         *(f"{_ascii(text, 80):<80}" for text in texts),
-        f"{1:5d}{0:10d}{0:5d}{0:10d} {_ascii(column.name, 10):<10}{0:10d}{0:4d} {'NONE':<10}{0:10d}{0:4d}",
+        f"{1:5d}{0:10d}{0:5d}{0:10d} {_ascii(column.name, 10):<10}{at.node:10d}{at.direction:4d}"
+        f" {'NONE':<10}{0:10d}{0:4d}",
         f"{4:10d}{table.rows:10d}{1:10d}{table.first_s:13.5E}{1.0 / table.rate_hz:13.5E}{0.0:13.5E}",
         f"{_TIME:10d}{0:5d}{0:5d}{0:5d} {'Time':<20} {'s':<20}",
         f"{kind:10d}{length:5d}{force:5d}{0:5d} {_ascii(column.name, 20):<20} {_ascii(column.unit, 20):<20}",

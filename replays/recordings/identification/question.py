@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +20,7 @@ from rig.kernels.signals import COLUMN
 from rig.parameters import load_parameters
 from rig.scenes import Scene
 from rig.simulation import TICK_RATE_HZ
+from rig.text import nearest
 from rig.wire import sensor_key
 
 NOT_FITTED = ("keyphasor",)
@@ -308,13 +308,13 @@ def _check_key(experiment: Experiment, key: str) -> None:
     if len(key.split(".")) == 3 and key.split(".")[0] in COMMANDS:
         value_of(experiment, key)
         return
-    close = difflib.get_close_matches(key, own, n=3, cutoff=0.6)
+    close = nearest(key, own)
     must = "of a parameter, a number of the scene ("
     must += f"{', '.join(_SCENE_KEYS)}) or of a command (hammer.1.force_n)"
-    if close:
-        must += f", such as {', '.join(close)}"
-    elif key in parameters or key.split(".")[0] in Scene.model_fields:
+    if key in parameters or key.split(".")[0] in Scene.model_fields:
         must += ", all properties of the rig or of what was done to it and none of the simulation"
+    elif close:
+        must += f", such as {', '.join(close)}"
     raise InputError("fit", must, key)
 
 

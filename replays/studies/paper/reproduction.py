@@ -171,4 +171,4 @@ def _speed_numbers(found: dict[float, Outcome]) -> dict[str, float]:
 
 def spectra(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Full spectra of the disk's probes over time, as `rig.orbit.waterfall` gives them [mm]."""
-    return waterfall(run.sample_times_s, run.samples["disk_x"], run.samples["disk_y"], float(_RATE_HZ))
+    return waterfall(run.times_s, run.samples["disk_x"], run.samples["disk_y"], float(_RATE_HZ))

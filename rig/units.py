@@ -1,12 +1,12 @@
-"""Units that measuring systems write, each with what it measures and its size in SI."""
+"""Units that this rig and other measuring systems write, each with what it measures and its size in SI."""
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 
 from rig.errors import InputError
+from rig.text import nearest
 
 _TURN = 2.0 * math.pi
 _STANDARD_GRAVITY = 9.80665
@@ -33,6 +33,9 @@ _UNITS: dict[str, tuple[str, float]] = {
     "1": ("number", 1.0),
 }  # fmt: skip
 """Conversion factors are exact by definition (1 in = 25.4 mm, standard gravity, the international pound)."""
+
+_SI = {what: name for name, (what, size) in _UNITS.items() if size == 1.0}
+"""SI unit of what is measured."""
 
 _SPELLINGS = {
     "newton": "N", "newtons": "N", "volt": "V", "volts": "V", "inch": "in", "inches": "in", "mils": "mil", '"': "in",
@@ -67,6 +70,12 @@ def size_si(unit: str) -> float:
     return _UNITS.get(canonical(unit), ("", 1.0))[1]
 
 
+def in_si(unit: str) -> tuple[str, float]:
+    """The SI unit of what a unit measures, and one of the unit in it; one that is unknown stays as it is."""
+    what, size = _UNITS.get(canonical(unit), ("", 1.0))
+    return _SI.get(what, unit), size
+
+
 def factor(unit: str, target: str, *, field: str) -> float:
     """How many of `target` one of `unit` is.
 
@@ -85,7 +94,7 @@ def factor(unit: str, target: str, *, field: str) -> float:
         raise InputError(field, f"{target}, the unit of the channel, which has no conversion", unit)
     allowed = [name for name, (what, _) in _UNITS.items() if what == _UNITS[wanted][0]]
     if source not in _UNITS:
-        close = difflib.get_close_matches(source, allowed, n=1)
+        close = nearest(source, allowed, most=1)
         hint = f" (such as {close[0]})" if close else ""
         raise InputError(field, f"one of {', '.join(allowed)}, or V or mV with a sensitivity{hint}", unit)
     if _UNITS[source][0] != _UNITS[wanted][0]:
