@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import groupby
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Force
-from rig.cli.tables import echo, table_console
+from rig.cli.options import Force, Wide
+from rig.cli.tables import Table, echo, echo_document, new_table, table_console
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.text import Text
 
 app = typer.Typer()
 
@@ -18,6 +24,7 @@ def keys(
     context: typer.Context,
     *,
     markdown: Annotated[bool, typer.Option("--markdown", help="As the Markdown source of rig/KEYS.md.")] = False,
+    wide: Wide = False,
 ) -> None:
     """Show every key, message and unit of the rig's streams, and who may use them; or make certificates (`init`)."""
     if context.invoked_subcommand is not None:
@@ -25,11 +32,29 @@ def keys(
     from rig.interface import page
 
     if markdown:
-        echo(page(), nl=False)
+        echo_document(page())
         return
-    from rich.markdown import Markdown
+    console = table_console(wide=wide)
+    for part in _parts(page()):
+        console.print(part)
 
-    table_console(width=160).print(Markdown(page()))
+
+def _parts(page: str) -> Iterator[Table | Text | str]:
+    """What stands on a page of Markdown: its tables, its headings, and every other line as it is."""
+    from rich.text import Text
+
+    for kind, lines in groupby(page.splitlines(), key=lambda line: line[:1]):
+        if kind == "|":
+            bare = (line.replace("`", "").strip("|").split("|") for line in lines)
+            headings, _, *rows = ([cell.strip() for cell in cells] for cells in bare)
+            table = new_table("", *headings, wrapped=("what", "fields", "keys"), keys=1 + (headings[0] == "column"))
+            for row in rows:
+                table.add_row(*row)
+            yield table
+        elif kind == "#":
+            yield from (Text(line.lstrip("# "), "bold") for line in lines)
+        else:
+            yield from (line for line in lines if not line.startswith("```"))
 
 
 @app.command()

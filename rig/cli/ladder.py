@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.options import Changes, SceneChanges, SceneName
-from rig.cli.progress import reporting, tell_of_compiling
-from rig.cli.tables import echo, echo_json, new_table, table_console
+from rig.cli.progress import reporting
+from rig.cli.tables import Form, Table, echo, echo_json, new_table
 from rig.errors import whole_file
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import Console
 
 
 def ladder(
@@ -29,7 +29,6 @@ def ladder(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="For ladder.png, .svg and .json.")
     ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Everything measured, as a JSON document.")] = False,
     write: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Store the pick in this scene file, as [pick].")
     ] = None,
@@ -39,6 +38,7 @@ def ladder(
     changes: Changes = None,
     runs: Annotated[int, typer.Option(min=1, help="Timed runs of each candidate.")] = 3,
     budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
+    form: Form,
 ) -> None:
     """Go down the ladder of models: what does each level cost, what does it err by, what is good enough here?"""
     import json
@@ -55,8 +55,7 @@ def ladder(
     loaded = load_scene(scene, {**SceneChanges(changes=changes).overrides(), "fidelity": "given"})
     if write is not None:
         check_target(write, scene, loaded)
-    tell_of_compiling()
-    with reporting() as reporter:
+    with reporting(compiles=True) as reporter:
         found = search(
             loaded,
             tolerances,
@@ -74,18 +73,17 @@ def ladder(
             draft.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     if write is not None:
         write_pick(write, scene, pick_of(found))
-    if json_output:
+    if form.as_json:
         echo_json(document)
         return
-    _show(document)
+    _show(document, form.console())
     for path in paths:
         echo(f"written  {path}")
     if write is not None:
         echo(f'written  {write}: [pick], in force with fidelity = "auto" at the head of the file')
 
 
-def _show(document: dict[str, Any]) -> None:
-    console = table_console(width=160, highlight=False)
+def _show(document: dict[str, Any], console: Console) -> None:
     console.print(_levels_table(document))
     console.print()
     console.print(_engines_table(document))
@@ -124,7 +122,9 @@ def _levels_table(document: dict[str, Any]) -> Table:
     names = [entry["name"] for entry in document["quantities"]]
     table = new_table(
         f"Levels of the model in scene {document['scene']}: model error, each against the full model",
-        *("level", *(f">{name}" for name in names), ">ms a second", ">ns a step", "on", "", ""),
+        *("level", *(f">{name}" for name in names), ">ms a second", ">ns a step", "on", "verdict", "remark"),
+        wrapped=("level", "on", "remark"),
+        spare=("remark", "ns a step", "on"),
     )
     for step in document["steps"]:
         if step["stage"] not in ("full", "single", "together"):
@@ -146,7 +146,9 @@ def _engines_table(document: dict[str, Any]) -> Table:
     names = [entry["name"] for entry in document["quantities"]]
     table = new_table(
         "Engines and steps on the picked model: numerical error, total error",
-        *("engine", *(f">{name}" for name in names), ">ms a second", ">ns a step", "", ""),
+        *("engine", *(f">{name}" for name in names), ">ms a second", ">ns a step", "verdict", "remark"),
+        wrapped=("engine", "remark"),
+        spare=("remark", "ns a step"),
     )
     for step in document["steps"]:
         if step["stage"] not in ("engine", "verified"):
