@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from rig.cli.progress import reporting
-from rig.cli.tables import Form, echo_json, new_table
+from rig.cli.tables import Form, Table, echo_json, new_table
 
 
 def bench(
@@ -27,9 +27,29 @@ def bench(
     if form.as_json:
         echo_json(report)
         return
+    console = form.console()
+    console.print(cases_table(report, runs=runs))
+    if report["missing_peers"]:
+        console.print(f"not timed: {', '.join(report['missing_peers'])} (pip install 'rotor-stator-rig[peers]')")
+    known = report["reference"]
+    doubt = "" if known["error"] is None else f", which agree to {known['error']:.0e}"
+    console.print(f"error: RMS of 7 scaled states over 1 s against exact Coulomb by {known['of']}{doubt}")
+    for name, frame in (report["frame"] or {}).items():
+        console.print(
+            f"frame of 1 ms, {name}: median {frame['median_us']:.0f} us, 99.9 % {frame['p999_us']:.0f} us, "
+            f"worst of {frame['frames']}: {frame['worst_us']:.0f} us"
+        )
+    console.print(
+        f"kernels ready after {report['ready_s']:.1f} s ({'from the cache' if report['cached'] else 'compiled'})"
+    )
+
+
+def cases_table(report: dict[str, Any], *, runs: int) -> Table:
+    """What was timed, with its error and its goal."""
     table = new_table(
         f"times real time, {runs} runs",
         *("case", ">median", ">min", ">max", ">of the first", ">error", ">energy residual", ">goal", "reached"),
+        wrapped=["case"],
         spare=("min", "max", "of the first"),
     )
     for case in report["cases"]:
@@ -47,18 +67,4 @@ def bench(
             peer["name"], f"{peer['median']:.1f}", f"{peer['min']:.1f}", f"{peer['max']:.1f}", f"{peer['ratio']:.2f}",
             f"{peer['error']:.1e}", "", "", "",
         )  # fmt: skip
-    console = form.console()
-    console.print(table)
-    if report["missing_peers"]:
-        console.print(f"not timed: {', '.join(report['missing_peers'])} (pip install 'rotor-stator-rig[peers]')")
-    known = report["reference"]
-    doubt = "" if known["error"] is None else f", which agree to {known['error']:.0e}"
-    console.print(f"error: RMS of 7 scaled states over 1 s against exact Coulomb by {known['of']}{doubt}")
-    for name, frame in (report["frame"] or {}).items():
-        console.print(
-            f"frame of 1 ms, {name}: median {frame['median_us']:.0f} us, 99.9 % {frame['p999_us']:.0f} us, "
-            f"worst of {frame['frames']}: {frame['worst_us']:.0f} us"
-        )
-    console.print(
-        f"kernels ready after {report['ready_s']:.1f} s ({'from the cache' if report['cached'] else 'compiled'})"
-    )
+    return table

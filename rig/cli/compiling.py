@@ -22,29 +22,32 @@ class Compiling(Listener):
 
     def __init__(self, reporter: Reporter) -> None:
         self._reporter = reporter
-        self._depth = 0
-        self._spent_s = 0.0
-        self._begin_s = 0.0
-        self._name = ""
+        self._under_way: list[str] = []
+        """Modules of the functions, each on the way of the one before."""
+        self._told = False
+        self._spent_s, self._since_s = 0.0, 0.0
 
     def on_start(self, event: Any) -> None:
-        """A function begins to be compiled, maybe on the way of another one."""
-        if not self._depth:
-            self._begin_s = time.process_time()
-        self._depth += 1
-        spent_s = self._spent_s + time.process_time() - self._begin_s
-        module, first = event.data["dispatcher"].py_func.__module__, not self._name
-        if first or not module.startswith("numba."):
-            self._name = ".".join(module.split(".")[-2:])
-        text = f"compiling {self._name} ({spent_s:.0f} s of CPU; some {_ENGINE_S} s an engine)"
-        if first:
-            self._reporter.show(f"{text}, once on this machine", every_s=0.0)
-        else:
+        """A function begins to be compiled."""
+        now_s = time.process_time()
+        if not self._under_way:
+            self._since_s = now_s
+        self._under_way.append(event.data["dispatcher"].py_func.__module__)
+        ours = [module for module in self._under_way if module.startswith(("rig.", "drivers."))]
+        if not ours:
+            return
+        name, spent_s = ".".join(ours[-1].split(".")[-2:]), self._spent_s + now_s - self._since_s
+        text = f"compiling {name} ({spent_s:.0f} s of CPU; some {_ENGINE_S} s an engine)"
+        if self._told:
             self._reporter.show(text)
+        else:
+            self._reporter.show(f"{text}, once on this machine", every_s=0.0)
+        self._told = True
 
     def on_end(self, event: Any) -> None:
         """A function is compiled."""
-        self._depth -= 1
-        if not self._depth:
-            self._spent_s += time.process_time() - self._begin_s
-            self._reporter.show(self._reporter.doing)
+        self._under_way.pop()
+        if not self._under_way:
+            self._spent_s += time.process_time() - self._since_s
+            if self._reporter.bar is not None:
+                self._reporter.show(self._reporter.doing)

@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.tables import Table, echo, new_table, table_console
 
 if TYPE_CHECKING:
     import subprocess
@@ -55,6 +55,8 @@ def demo(
     _record_session(file, speed_hz=speed_hz, whirl_s=whirl_s, say=say)
 
     say("reading the recording")
+    from rich.text import Text
+
     from recorder.reader import Recording
     from replays.recordings.picture import draw
     from replays.recordings.verdict import judge
@@ -62,7 +64,10 @@ def demo(
     recording = Recording.open(file)
     verdict = judge(recording)
     draw(recording, picture)
-    _show(verdict)
+    console = table_console()
+    console.print(verdict_table(verdict))
+    if verdict.remark:
+        console.print(Text(verdict.remark, "yellow"))
     say(f"verdict: {'good' if verdict.good else 'NOT GOOD'}")
     echo(f"\nrecording   {file}\npicture     {picture}\nlook at it  rig view {file}   (or: rerun {file})")
     if not verdict.good:
@@ -171,15 +176,13 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _show(verdict: Verdict) -> None:
+def verdict_table(verdict: Verdict) -> Table:
+    """The lines of a verdict."""
     from rich.text import Text
 
     texts = ("quantity", "measured", "expected")
-    table = new_table("Verdict, from the recorded samples", *texts, "", wrapped=texts)
+    table = new_table("Verdict, from the recorded samples", *texts, "verdict", wrapped=texts)
     marks = {True: Text("good", "green"), False: Text("NOT GOOD", "bold red"), None: ""}
     for row in verdict.rows:
         table.add_row(row.quantity, row.measured, row.expected, marks[row.good])
-    console = table_console()
-    console.print(table)
-    if verdict.remark:
-        console.print(Text(verdict.remark, "yellow"))
+    return table

@@ -84,14 +84,14 @@ def ladder(
 
 
 def _show(document: dict[str, Any], console: Console) -> None:
-    console.print(_levels_table(document))
+    console.print(levels_table(document))
     console.print()
-    console.print(_engines_table(document))
+    console.print(engines_table(document))
     pick, names = document["pick"], [entry["name"] for entry in document["quantities"]]
     levels = ", ".join(f"{level} {pick[level]}" for level in ("magnet", "shaft", "stator", "contact", "friction"))
-    console.print(f"\npick: {levels}, drive {pick['drive']}, sensors {pick['sensors']}; {document['picked']['engine']}")
+    echo(f"\npick: {levels}, drive {pick['drive']}, sensors {pick['sensors']}; {document['picked']['engine']}")
     for entry in pick["quantities"]:
-        console.print(
+        echo(
             f"  {entry['quantity']} = {entry['value']} {entry['unit']} against {entry['reference']}: "
             f"model {entry['model_error']:.1e}, numerical {entry['numerical_error']:.1e}, "
             f"total {entry['total_error']:.1e} of {entry['tolerance']:g} allowed "
@@ -99,26 +99,27 @@ def _show(document: dict[str, Any], console: Console) -> None:
         )
     own = ", ".join(f"{entry['as_given_error']:.1e}" if entry["as_given_error"] is not None else "infinite"
                     for entry in document["quantities"])  # fmt: skip
-    console.print(
+    echo(
         f"  a simulated second takes {pick['wall_s'] * 1e3:.3g} ms with the picked sensors, "
         f"{pick['wall_given_s'] * 1e3:.3g} ms as the scene is given (errors {own} in {', '.join(names)}), "
         f"{pick['wall_full_s'] * 1e3:.3g} ms on the full model by {document['full']['engine']}"
     )
     if pick["sensors"] == "ideal":
-        console.print("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
-    console.print(
+        echo("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
+    echo(
         f"  reference: full model by {document['reference']['engine']}, its own error the distance to "
         f"{document['reference']['unlike']}; seed {pick['seed']}, {pick['date']}, rig {pick['rig']} {pick['commit']}"
     )
     if not document["all_engines_tried"]:
-        console.print("  the budget ended before every engine was tried")
+        echo("  the budget ended before every engine was tried")
 
 
 def _error(value: float | None) -> str:
     return "-" if value is None else f"{value:.1e}"
 
 
-def _levels_table(document: dict[str, Any]) -> Table:
+def levels_table(document: dict[str, Any]) -> Table:
+    """What each level of the model costs, and errs by."""
     names = [entry["name"] for entry in document["quantities"]]
     table = new_table(
         f"Levels of the model in scene {document['scene']}: model error, each against the full model",
@@ -142,7 +143,8 @@ def _levels_table(document: dict[str, Any]) -> Table:
     return table
 
 
-def _engines_table(document: dict[str, Any]) -> Table:
+def engines_table(document: dict[str, Any]) -> Table:
+    """The same of each engine and step, on the picked model."""
     names = [entry["name"] for entry in document["quantities"]]
     table = new_table(
         "Engines and steps on the picked model: numerical error, total error",

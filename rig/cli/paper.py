@@ -86,7 +86,7 @@ def _show(findings: Findings, console: Console) -> None:
     from replays.studies.paper.findings import JUDGED_BY, count
 
     headings = ("statement", "the paper", ">as-printed", ">corrected", "verdict")
-    table = new_table("the paper's statements, and ours", *headings, wrapped=("statement", "the paper", "verdict"))
+    table = new_table("the paper's statements, and ours", *headings, wrapped=("statement", "verdict"))
     colours = {"good": "green", "bad": "bold red", "open": "yellow", "plain": ""}
     lines = [*findings.lines, *findings.claims]
     for line in lines:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.progress import reporting
-from rig.cli.tables import Form, echo, echo_json, new_table
+from rig.cli.tables import Form, Table, echo, echo_json, new_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,29 +67,10 @@ def stability(
 
 
 def _show(cells: list[Cell], names: list[str], console: Console) -> None:
-    from rich.text import Text
-
-    from replays.studies.stability.trials import TRIALS
-
-    ours = [cell for cell in cells if cell.method in names]
-    table = new_table("trials by engine: measured", "trial", "case", *(f">{name}" for name in names), keys=2)
-    seen = ""
-    for trial, case in dict.fromkeys((cell.trial, cell.case) for cell in ours):
-        found = {cell.method: cell for cell in ours if (cell.trial, cell.case) == (trial, case)}
-        if trial != seen:
-            table.add_row(Text(f"{trial}: {TRIALS[trial].title}", "bold"))
-            seen = trial
-        table.add_row(trial, case, *(_text(found.get(name)) for name in names))
-    console.print(table)
-    others = [cell for cell in cells if cell.method not in names]
-    if others:
+    console.print(trials_table([cell for cell in cells if cell.method in names], names))
+    if others := [cell for cell in cells if cell.method not in names]:
         console.print()
-        title = "other people's solvers, where they are known to fail or to hold"
-        headings = ("trial", "case", "solver", ">measured", "because")
-        peers = new_table(title, *headings, wrapped=["because", "case"], keys=2)
-        for cell in others:
-            peers.add_row(cell.trial, cell.case, cell.method, _text(cell), cell.skipped or cell.because)
-        console.print(peers)
+        console.print(peers_table(others))
     console.print(
         "\n*: fails, as was expected by theory or by measurement (--json says why); !: does not do what was expected; "
         "in brackets: nothing is expected; all others hold, within their limits."
@@ -100,6 +81,33 @@ def _show(cells: list[Cell], names: list[str], console: Console) -> None:
                 f"! {cell.trial} {cell.case}, {cell.method}: {cell.value:.3g} {cell.unit}, limit {cell.limit:.3g}, "
                 f"expected to {'hold' if cell.expected else 'fail'}: {cell.because}"
             )
+
+
+def trials_table(cells: list[Cell], names: list[str]) -> Table:
+    """What each engine of these names did in each case."""
+    from rich.text import Text
+
+    from replays.studies.stability.trials import TRIALS
+
+    table = new_table("trials by engine: measured", "trial", "case", *(f">{name}" for name in names), keys=2)
+    seen = ""
+    for trial, case in dict.fromkeys((cell.trial, cell.case) for cell in cells):
+        found = {cell.method: cell for cell in cells if (cell.trial, cell.case) == (trial, case)}
+        if trial != seen:
+            table.add_row(Text(f"{trial}: {TRIALS[trial].title}", "bold"))
+            seen = trial
+        table.add_row(trial, case, *(_text(found.get(name)) for name in names))
+    return table
+
+
+def peers_table(cells: list[Cell]) -> Table:
+    """What other people's solvers did."""
+    title = "other people's solvers, where they are known to fail or to hold"
+    headings = ("trial", "case", "solver", ">measured", "because")
+    table = new_table(title, *headings, wrapped=("because", "case"), keys=2)
+    for cell in cells:
+        table.add_row(cell.trial, cell.case, cell.method, _text(cell), cell.skipped or cell.because)
+    return table
 
 
 def _text(cell: Cell | None) -> Text:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _ENDLESS = 1_000_000
 """Width of a pipe [characters]."""
 _GAP = 2
-_LEAST = 24
+_LEAST = 20
 """What a text is wrapped to, at the least [characters]."""
 _WORTH = 48
 """The same of one that can be left out: in fewer it is not worth its lines."""
@@ -96,7 +96,15 @@ def shown(document: Any) -> Any:
 
 
 class Table:
-    """A table without lines, of cells that are texts on one line; see `new_table`."""
+    """A table without lines, of cells that are texts on one line; see `new_table`.
+
+    Attributes:
+        title: The title.
+        headings: Of its columns.
+        wrapped, spare: Numbers of columns that may take several lines, and that can be left out, the first first.
+        keys: How many columns say what a row is of.
+        rows: Cells and style of each; one cell alone stands across all columns.
+    """
 
     def __init__(
         self, title: str, headings: Sequence[str], *, wrapped: Collection[int], spare: Sequence[int], keys: int
@@ -104,9 +112,8 @@ class Table:
         self.title = printable(title)
         self.headings = [printable(heading.removeprefix(">")) for heading in headings]
         self._right = [heading.startswith(">") for heading in headings]
-        self._wrapped, self._spare, self._keys = wrapped, spare, keys
+        self.wrapped, self.spare, self.keys = wrapped, spare, keys
         self.rows: list[tuple[list[Text], str]] = []
-        """Cells and style; one cell alone stands across all columns."""
 
     def add_row(self, *cells: str | Text, style: str = "") -> None:
         """Add a row: a cell for each column, or one across all of them."""
@@ -166,13 +173,13 @@ class Table:
     def _blocks(self, room: int) -> list[dict[int, int]]:
         """Widths by the number of their columns: of all, or without spare ones, or in blocks below each other."""
         columns = list(range(len(self.headings)))
-        for spare in (None, *self._spare):
+        for spare in (None, *self.spare):
             columns = [at for at in columns if at != spare]
             widths = self._widths(columns, room)
             if _total(widths) <= room:
                 return [widths]
-        keys, blocks = columns[: self._keys], [columns[: self._keys + 1]]
-        for at in columns[self._keys + 1 :]:
+        keys, blocks = columns[: self.keys], [columns[: self.keys + 1]]
+        for at in columns[self.keys + 1 :]:
             if _total(self._widths([*blocks[-1], at], room)) <= room:
                 blocks[-1].append(at)
             else:
@@ -187,14 +194,14 @@ class Table:
             words = _stacked(self.headings[at], 1)
             whole = max((cell.cell_len for cell in cells), default=1)
             wanted[at] = max(whole, len(self.headings[at]))
-            if at in self._wrapped:
+            if at in self.wrapped:
                 longest = max((len(word) for cell in cells for word in cell.plain.split()), default=1)
-                least = _WORTH if at in self._spare else _LEAST
+                least = _WORTH if at in self.spare else _LEAST
                 whole = longest if whole <= least else least
             # Names that are not ours may be of any length.
-            whole = min(whole, max(room // (self._keys + 1) - _GAP, 1))
+            whole = min(whole, max(room // (self.keys + 1) - _GAP, 1))
             widths[at] = max([whole, *map(len, words)])
-        roomy = {at: min(width, _WORTH) if at in self._wrapped else width for at, width in wanted.items()}
+        roomy = {at: min(width, _WORTH) if at in self.wrapped else width for at, width in wanted.items()}
         for better in (wanted, roomy):
             if _total(better) <= room:
                 widths = better
