@@ -183,7 +183,7 @@ def _slow_subscribers() -> list[str]:
         "    accept_replies=zenoh.ReplyKeyExpr.ANY,",
         ")",
         "samples = [reply.ok for reply in replies if reply.ok]",
-        "blocks = {each.source_info.source_sn: each.payload.to_bytes() for each in samples}",
+        "blocks = {one.source_info.source_sn: one.payload.to_bytes() for one in samples}",
         "```",
         "",
         "A number that is not among the replies is no longer kept. Ask for at most 200 messages at a time: while the "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -40,10 +41,13 @@ def keys(
 
 
 def _parts(page: str) -> Iterator[Table | Text | str]:
-    """What stands on a page of Markdown: its tables, its headings, and every other line as it is."""
+    """What stands on a page of Markdown: its tables, its headings, and every other line, such as code, as it is."""
     from rich.text import Text
 
-    for kind, lines in groupby(page.splitlines(), key=lambda line: line[:1]):
+    pieces = [piece.splitlines() for piece in re.split(r"^```.*\n", page, flags=re.MULTILINE)]
+    marked = [(number % 2 or line[:1], line) for number, piece in enumerate(pieces) for line in piece]
+    for kind, group in groupby(marked, key=lambda pair: pair[0]):
+        lines = [line for _, line in group]
         if kind == "|":
             bare = (line.replace("`", "").strip("|").split("|") for line in lines)
             headings, _, *rows = ([cell.strip() for cell in cells] for cells in bare)
@@ -54,7 +58,7 @@ def _parts(page: str) -> Iterator[Table | Text | str]:
         elif kind == "#":
             yield from (Text(line.lstrip("# "), "bold") for line in lines)
         else:
-            yield from (line for line in lines if not line.startswith("```"))
+            yield from lines
 
 
 @app.command()

@@ -197,7 +197,7 @@ class Table:
             if at in self.wrapped:
                 longest = max((len(word) for cell in cells for word in cell.plain.split()), default=1)
                 least = _WORTH if at in self.spare else _LEAST
-                whole = longest if whole <= least else least
+                whole = longest if whole <= least else max(longest, least)
             # Names that are not ours may be of any length.
             whole = min(whole, max(room // (self.keys + 1) - _GAP, 1))
             widths[at] = max([whole, *map(len, words)])
