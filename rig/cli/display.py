@@ -53,10 +53,10 @@ def _parts(status: dict[str, Any], words: Line) -> list[str]:
     counts = {
         "stalled links": status["congestion"].get("stalled_links", 0),
         "dropped": status["queue"]["dropped"],
-        "overruns": status["overruns"],
     }
     told = [f"{name} {count:.0f}" for name, count in counts.items() if count]
-    return [*words(status), *told, f"clients {len(status['clients'])}"]
+    overruns = [f"overruns {status['overruns']}"] if status["overruns"] else []
+    return [*words(status), *told, f"clients {len(status['clients'])}", *overruns]
 
 
 def fitted(parts: list[str], width: int, between: str = "  ") -> str:
@@ -77,7 +77,8 @@ def end_with(troubles: list[str]) -> None:
 def lateness(status: dict[str, Any]) -> str:
     """How late it was so far, in a few words."""
     late = status["lateness_ms"]
-    return f"late p99 {late['p99']:.2f} max {late['max']:.2f} ms"
+    p99, most = (f"{late[name]:.2f}" if late[name] < 10.0 else f"{late[name]:.0f}" for name in ("p99", "max"))
+    return f"late p99 {p99} max {most} ms"
 
 
 def all_lateness(summary: dict[str, Any]) -> str:

@@ -28,6 +28,7 @@ class Reporter:
     total: int | None = None
     done: int = 0
     doing: str = ""
+    _percent: bool = False
     _printed_s: float = field(default_factory=time.monotonic)
 
     def begin(self, total: int) -> None:
@@ -49,6 +50,7 @@ class Reporter:
         """So much of the whole is done, 0 to 1, of something without steps."""
         percent = int(100.0 * done)
         if self.total is None:
+            self._percent = True
             self.begin(100)
         if percent > self.done:
             self.done = percent - 1
@@ -61,7 +63,8 @@ class Reporter:
 
     def show(self, text: str, *, every_s: float = _EVERY_S) -> None:
         """A text for the live line, or for a line of its own if the last is so old [s]."""
-        line = f"{self.done} of {self.total}: {text}" if self.total else text
+        done = f"{self.done} %" if self._percent else f"{self.done} of {self.total}"
+        line = f"{done}: {text}" if self.total else text
         if self.bar is not None:
             most = self.bar.console.width - _CLOCK - (_BAR if self.total else 0)
             self.bar.update(self.task, description=printable(line, most), completed=self.done)
@@ -86,7 +89,10 @@ def reporting(*, live: bool = True, compiles: bool = False) -> Iterator[Reporter
 
         from rig.cli.compiling import Compiling
 
-        with install_listener("numba:compile", Compiling(reporter)):
+        compiling = Compiling(
+            lambda text: reporter.show(text, every_s=0.0), lambda text: reporter.show(text or reporter.doing)
+        )
+        with install_listener("numba:compile", compiling):
             yield reporter
 
 
