@@ -109,18 +109,21 @@ def _print(recording: Recording, document: dict[str, Any], console: Console) -> 
     rows.append(("checked", "every byte" + "".join(f" but {text}" for text in recording.unchecked)))
     if "health" in document:
         rows += _verdict(document)
-    console.print(facts("", rows))
+    if not streams:
+        rows.append(("messages", ", ".join(f"{key} {count}" for key, count in document["messages"].items())))
+    tables = [facts("", rows)]
     if len(document["parts"]) > 1:
-        _print_parts(console, document["parts"])
+        tables.append(_parts_table(document["parts"]))
     if streams:
-        _print_streams(console, streams)
-    else:
-        console.print("messages: " + ", ".join(f"{key} {count}" for key, count in document["messages"].items()))
-    _print_channels(console, recording, document.get("health"))
-    if "health" in document:
-        console.print(facts("", _health(document["health"]), doubt="yellow"))
+        tables.append(_streams_table(streams))
+    tables.append(_channels_table(recording, document.get("health")))
+    if "health" in document and (told := _health(document["health"])):
+        tables.append(facts("", told, doubt="yellow"))
     if document["events"]:
-        console.print(_events(document["events"]))
+        tables.append(events_table(document["events"]))
+    for table in tables:
+        console.print(table)
+        console.print()
     gaps = document["gaps"]
     console.print(f"gaps noted by the recorder: {len(gaps) or 'none'}")
     if gaps:
@@ -162,26 +165,26 @@ def _number(value: float | None, noise: float) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"  # no minus before a zero
 
 
-def _print_parts(console: Console, parts: list[dict[str, Any]]) -> None:
+def _parts_table(parts: list[dict[str, Any]]) -> Table:
     table = new_table("", "part", ">MB", ">from [s]", ">to [s]", "ended", wrapped=["ended"])
     for part in parts:
         end = part["end"]
         times = (f"{float(end[name]):.4f}" if name in end else "?" for name in ("first_time_s", "last_time_s"))
         table.add_row(Path(part["file"]).name, f"{part['size_bytes'] / 1e6:.1f}", *times, part["ended"])
-    console.print(table)
+    return table
 
 
-def _print_streams(console: Console, streams: dict[str, dict[str, Any]]) -> None:
+def _streams_table(streams: dict[str, dict[str, Any]]) -> Table:
     table = new_table("", "stream", ">blocks", ">rows", ">from [s]", ">to [s]", ">lost")
     for key, stream in streams.items():
         times = (f"{stream['first_time_s']:.4f}", f"{stream['last_time_s']:.4f}")
         counts = (str(stream["messages"]), str(stream["rows"]))
         lost = max(stream["lost"], stream["missing"])
         table.add_row(key, *counts, *times, str(lost), style="red" if lost else "")
-    console.print(table)
+    return table
 
 
-def _print_channels(console: Console, recording: Recording, health: dict[str, Any] | None) -> None:
+def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Table:
     from rig.wire import sensor_key
 
     found = {channel["name"]: channel for channel in (health or {}).get("channels", [])}
@@ -210,7 +213,7 @@ def _print_channels(console: Console, recording: Recording, health: dict[str, An
                 *(reach, f"{abs(channel.scale):.2g}", f"{group.rate_hz}", channel.label),
                 style="yellow" if findings else "",
             )
-    console.print(table)
+    return table
 
 
 def _health(health: dict[str, Any]) -> list[tuple[str, str]]:
@@ -232,7 +235,7 @@ def _health(health: dict[str, Any]) -> list[tuple[str, str]]:
     return rows + [("doubt", f"the rig warned: {text}") for text in health["warnings"]]
 
 
-def _events(events: list[dict[str, Any]]) -> Table:
+def events_table(events: list[dict[str, Any]]) -> Table:
     """What happened when; a command that took effect is told once, by its effect, with who sent it."""
     from recorder.schemas import event_text
 

@@ -17,7 +17,7 @@ from replays.studies.bench import CASES
 from replays.studies.stability.cell import Cell
 from rig.cli.bench import cases_table
 from rig.cli.display import fitted
-from rig.cli.info import describe
+from rig.cli.info import describe, events_table
 from rig.cli.stability import peers_table, trials_table
 from rig.cli.tables import facts, new_table
 from rig.engines import ENGINES
@@ -175,6 +175,22 @@ def test_info_tells_a_blow_once_and_how_far_it_has_read(capsys: pytest.CaptureFi
     assert 0.0 < told[0] <= told[-1] <= 1.0
     assert len(told) > 10
     assert sum("hammer: " in line for line in shown(capsys, "info", HAMMER).splitlines()) == 1
+
+
+def test_a_command_and_its_effect_are_told_once_and_what_had_none_is_told_too() -> None:
+    def command(tick: int, name: str, number: int, **request: float) -> dict[str, Any]:
+        taken = {"event": "command", "id": number, "command": name, "request": request, "from": f"me {number}"}
+        return {**taken, "tick": tick, "time_s": tick / 1e6}
+
+    effects = [{"event": "hammer", "tick": tick, "time_s": tick / 1e6, "force_n": 100.0} for tick in (5, 7)]
+    events = [command(5, "hammer", 1, force_n=100.0), effects[0], command(7, "hammer", 2, force_n=100.0), effects[1]]
+    events += [command(9, "stop", 3), {"event": "note", "text": "so", "tick": [], "time_s": None}]
+    table = events_table(events)
+    check_legible(table)
+    assert [cells[1].plain for cells, _ in table.rows] == [
+        "hammer: force_n 100.0, id 1, from me 1", "hammer: force_n 100.0, id 2, from me 2",
+        "command: id 3, command stop, from me 3", "note: so",
+    ]  # fmt: skip
 
 
 def test_compiling_is_told_as_long_as_it_lasts() -> None:
