@@ -7,6 +7,7 @@ not a proof: a rig whose houses ring at 50 Hz looks like one with mains hum.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from recorder.reader import Recording
 from recorder.samples import row_times_s
 from rig.channels import Channel, Group
-from rig.wire import EDGES, Block, sensor_key
+from rig.wire import EDGES, Block, schema_of, sensor_key
 
 WINDOW_S = 2.0
 """Length of a window; its spectrum resolves 0.5 Hz."""
@@ -253,8 +254,14 @@ def _limits(channel: Channel) -> tuple[float, float]:
     return max((low + margin_v) / channel.lsb_v, -full), min((high - margin_v) / channel.lsb_v, full - 1)
 
 
-def examine(recording: Recording) -> Health:
-    """Look at everything that a recording says of its own soundness, in one pass over its samples."""
+def examine(recording: Recording, progress: Callable[[float], None] = lambda _: None) -> Health:
+    """Look at everything that a recording says of its own soundness, in one pass over its samples.
+
+    Args:
+        recording: The recording.
+        progress: Told, block by block, which part of them was seen, 0 to 1.
+    """
+    blocks, seen = sum(count for key, count in recording.messages.items() if schema_of(key) is not None), 0
     noisy = _has_noise(recording.scene)
     watches = {
         sensor_key(name): _Watch(group, noisy=noisy)
@@ -266,6 +273,9 @@ def examine(recording: Recording) -> Health:
     edges: list[np.ndarray] = []
 
     def watch(key: str, block: Block) -> None:
+        nonlocal seen
+        seen += 1
+        progress(min(seen / max(blocks, 1), 1.0))
         if key == EDGES:
             edges.append(row_times_s(key, block))
             return

@@ -1,16 +1,69 @@
-"""Commands of `rig`, run in this process."""
+"""Commands of `rig`, run in this process; each table that one prints is held against a terminal and a pipe as well."""
 
 from __future__ import annotations
 
+import io
+import re
+from typing import Any
+
 import pytest
+from rich.cells import cell_len
+from rich.console import Console
 
 from rig.cli.main import main
+from rig.cli.tables import Table, table_console
+
+TERMINAL = 80
+
+
+def lines_of(table: Table, *, width: int | None = TERMINAL) -> list[str]:
+    """What a terminal of this width shows of a table, or what comes out of a pipe."""
+    console = Console(file=io.StringIO(), width=width or table_console(wide=True).width)
+    console.print(table, crop=False)
+    return console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+
+
+def check_legible(table: Table, *, width: int = TERMINAL) -> None:
+    """No cell is cut, no column vanishes unless it is said, and into a pipe a row is a line with all its cells."""
+    lines = lines_of(table, width=width)
+    assert max(map(cell_len, lines), default=0) <= width, lines
+    text = "\n".join(lines)
+    told = re.search(r"^without (.*): see --wide\Z", text, re.MULTILINE | re.DOTALL)
+    gone = set(" ".join(told[1].split()).split(", ")) if told else set()
+    assert gone <= {table.headings[at] for at in table.spare}
+    for at, heading in enumerate(table.headings):
+        cells = [cells[at].plain for cells, _ in table.rows if len(cells) == len(table.headings)]
+        if heading in gone:
+            continue
+        for word in re.split(r"[ -]+", heading):
+            assert word in text, f"{heading} is not there"
+        for cell in cells:
+            for part in cell.split() if at in table.wrapped else [cell]:
+                folded = cell_len(part) > width // (table.keys + 1) - 2
+                assert folded or part in text, f"{part!r} of {heading} is not whole"
+    headed, title = any(table.headings), bool(table.title)
+    rows = lines_of(table, width=None)[title:]
+    assert len(rows) == headed + len(table.rows)
+    for row, (cells, _) in zip(rows[headed:], table.rows, strict=True):
+        whole = [cell.plain.strip() or "-" for cell in cells]
+        assert row.split() == " ".join(whole).split()
+        assert re.split(r"\s{2,}", row.strip()) == whole or any("  " in cell for cell in whole)
 
 
 def run(*arguments: object) -> int:
     """The exit status of a command."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
+    shown, tables = Table.__rich_console__, []
+
+    def kept(table: Table, *about: Any) -> Any:
+        tables.append(table)
+        return shown(table, *about)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Table, "__rich_console__", kept)
+        with pytest.raises(SystemExit) as ended:
+            main([str(argument) for argument in arguments])
+    for table in tables:
+        check_legible(table)
     return int(ended.value.code or 0)
 
 

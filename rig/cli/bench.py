@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from rig.cli.options import Json
-from rig.cli.tables import echo, echo_json, new_table, table_console
+from rig.cli.progress import reporting
+from rig.cli.tables import Form, Table, echo_json, new_table
 
 
 def bench(
     *,
-    json_output: Json = False,
+    form: Form,
     runs: Annotated[int, typer.Option(min=1, max=100, help="Runs of each case.")] = 5,
     peers: Annotated[
         bool, typer.Option(help="Time CVODE and heyoka in the same rounds, where they are installed.")
@@ -22,34 +22,13 @@ def bench(
     """Measure simulated over processor time with the error beside it; medians of several runs, compile time apart."""
     from replays.studies.bench import measure
 
-    def progress(text: str) -> None:
-        echo(text, err=True)
-
-    report = measure(runs=runs, peers=peers, frames=frames, progress=progress)
-    if json_output:
+    with reporting(compiles=True, live=False) as reporter:  # a live line would take of the time that is measured
+        report = measure(runs=runs, peers=peers, frames=frames, progress=reporter.say)
+    if form.as_json:
         echo_json(report)
         return
-    table = new_table(
-        f"times real time, {runs} runs",
-        *("case", ">median", ">min", ">max", ">of the first", ">error", ">energy residual", ">goal"),
-    )
-    for case in report["cases"]:
-        goal = "" if case["goal"] is None else f"{case['goal']:g}"
-        if case["error_goal"] is not None:
-            goal += f" at {case['error_goal']:.1e}"
-        verdict = {True: "  yes", False: "  NO", None: ""}[case["reached"]]
-        table.add_row(
-            case["name"], f"{case['median']:.1f}", f"{case['min']:.1f}", f"{case['max']:.1f}", f"{case['ratio']:.2f}",
-            "" if case["error"] is None else f"{case['error']:.1e}", f"{case['residual_share']:.0e}",
-            goal.strip() + verdict,
-        )  # fmt: skip
-    for peer in report["peers"]:
-        table.add_row(
-            peer["name"], f"{peer['median']:.1f}", f"{peer['min']:.1f}", f"{peer['max']:.1f}", f"{peer['ratio']:.2f}",
-            f"{peer['error']:.1e}", "", "",
-        )  # fmt: skip
-    console = table_console()
-    console.print(table)
+    console = form.console()
+    console.print(cases_table(report, runs=runs))
     if report["missing_peers"]:
         console.print(f"not timed: {', '.join(report['missing_peers'])} (pip install 'rotor-stator-rig[peers]')")
     known = report["reference"]
@@ -63,3 +42,29 @@ def bench(
     console.print(
         f"kernels ready after {report['ready_s']:.1f} s ({'from the cache' if report['cached'] else 'compiled'})"
     )
+
+
+def cases_table(report: dict[str, Any], *, runs: int) -> Table:
+    """What was timed, with its error and its goal."""
+    table = new_table(
+        f"times real time, {runs} runs",
+        *("case", ">median", ">min", ">max", ">of the first", ">error", ">energy residual", ">goal", "reached"),
+        wrapped=["case"],
+        spare=("min", "max", "of the first"),
+    )
+    for case in report["cases"]:
+        goal = "" if case["goal"] is None else f"{case['goal']:g}"
+        if case["error_goal"] is not None:
+            goal += f" at {case['error_goal']:.1e}"
+        verdict = {True: "yes", False: "NO", None: ""}[case["reached"]]
+        table.add_row(
+            case["name"], f"{case['median']:.1f}", f"{case['min']:.1f}", f"{case['max']:.1f}", f"{case['ratio']:.2f}",
+            "" if case["error"] is None else f"{case['error']:.1e}", f"{case['residual_share']:.0e}",
+            goal.strip(), verdict,
+        )  # fmt: skip
+    for peer in report["peers"]:
+        table.add_row(
+            peer["name"], f"{peer['median']:.1f}", f"{peer['min']:.1f}", f"{peer['max']:.1f}", f"{peer['ratio']:.2f}",
+            f"{peer['error']:.1e}", "", "", "",
+        )  # fmt: skip
+    return table

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from rig.cli.progress import reporting
 from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
 
@@ -69,8 +70,9 @@ def hub(
         hubs = [Hub(model, name, server, acknowledge=acknowledge) for model, name in zip(models, channels, strict=True)]
         stopped = threading.Event()
         with stopping_on_signals(stopped.set):
-            for one in hubs:
-                stack.enter_context(one)
+            with reporting(compiles=True):
+                for one in hubs:
+                    stack.enter_context(one)
             buses = {one.channel: partial(HubBus, one) for one in hubs}
             outlets = stack.enter_context(CanOutlets(buses, rates, socketcand=socketcand, slcan=slcan))
             for line in outlets.lines():

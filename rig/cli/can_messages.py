@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rig.cli.can_output import CanMessages
-from rig.cli.tables import echo
+from rig.cli.tables import Form, echo, echo_document, echo_json, new_table
 from rig.errors import whole_file
 
 if TYPE_CHECKING:
@@ -27,37 +28,56 @@ def dbc(
     rig_table()
     _warn(*CanMessages(can_classic=True).plan())
     if out is None:
-        echo(text(), nl=False)
+        echo_document(text())
         return
     with whole_file(out) as draft:
         draft.write_text(text(), encoding="utf-8")
     echo(f"{out} written")
 
 
-def load(*, messages: CanMessages) -> None:
+def load(*, messages: CanMessages, form: Form) -> None:
     """Show every message of the rig with its period, share of the bus and longest response time."""
-    from rig.cli.tables import new_table, table_console
     from rig.scenes import rig_table
 
     rig_table()
     schedule, speed = messages.plan()
-    numbers = (">bytes", ">every, ms", ">frame, us", ">load, %", ">worst response, ms", ">in time")
-    table = new_table(f"CAN at {speed}, every frame at its longest", ">id", "message", "from", *numbers)
-    for message, row in schedule.response_times(speed):
-        table.add_row(
-            f"{message.identifier:#05x}",
-            message.name,
-            message.sender,
-            f"{message.length}{' FD' if message.fd else ''}",
-            f"{'' if message.periodic else '>= '}{1e3 * row.message.period_s:g}",
-            f"{1e6 * row.transmission_s:.1f}",
-            f"{100 * row.transmission_s / row.message.period_s:.2f}",
-            f"{1e3 * row.worst_s:.3f}",
-            "yes" if row.schedulable else "no",
-        )
-    console = table_console(width=120)
-    console.print(table)
-    console.print(f"load: at most {100 * schedule.load(speed):.1f} % of the bus")
+    messages_found = [
+        {
+            "id": message.identifier,
+            "message": message.name,
+            "from": message.sender,
+            "bytes": message.length,
+            "fd": message.fd,
+            "periodic": message.periodic,
+            "period_s": row.message.period_s,
+            "transmission_s": row.transmission_s,
+            "load": row.transmission_s / row.message.period_s,
+            "worst_response_s": row.worst_s if math.isfinite(row.worst_s) else None,
+            "in_time": row.schedulable,
+        }
+        for message, row in schedule.response_times(speed)
+    ]
+    if form.as_json:
+        echo_json({"speed": str(speed), "load": schedule.load(speed), "messages": messages_found})
+    else:
+        numbers = (">bytes", ">every [ms]", ">frame [us]", ">load [%]", ">worst response [ms]", ">in time")
+        table = new_table(f"CAN at {speed}, every frame at its longest", ">id", "message", "from", *numbers)
+        for row in messages_found:
+            worst_s = row["worst_response_s"]
+            table.add_row(
+                f"{row['id']:#05x}",
+                row["message"],
+                row["from"],
+                f"{row['bytes']}{' FD' if row['fd'] else ''}",
+                f"{'' if row['periodic'] else '>= '}{1e3 * row['period_s']:g}",
+                f"{1e6 * row['transmission_s']:.1f}",
+                f"{100 * row['load']:.2f}",
+                "inf" if worst_s is None else f"{1e3 * worst_s:.3f}",
+                "yes" if row["in_time"] else "no",
+            )
+        console = form.console()
+        console.print(table)
+        console.print(f"load: at most {100 * schedule.load(speed):.1f} % of the bus")
     _warn(schedule, speed)
 
 

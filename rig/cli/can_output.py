@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rig.cli.groups import panel
+from rig.cli.progress import reporting
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -137,7 +138,8 @@ class CanOutput:
 
     def __enter__(self) -> CanOutput:
         with ExitStack() as stack:
-            self._bus = stack.enter_context(self._open())
+            with reporting(compiles=True):
+                self._bus = stack.enter_context(self._open())
             stack.callback(self._memory.close)
             if self._outlet_settings["socketcand"] is not None or self._outlet_settings["slcan"]:
                 from rig.cli.can_outlets import CanOutlets

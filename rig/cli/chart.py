@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from rig.cli.progress import reporting, tell_of_compiling
-from rig.cli.tables import echo, table_console
+from rig.cli.progress import reporting
+from rig.cli.tables import echo
 
 
 def chart(
@@ -35,9 +35,7 @@ def chart(
     if quick and full:
         raise InputError("--quick, --full", "one of the two", "both")
     mode = "full" if full else "quick"
-    tell_of_compiling()
-    console = table_console(stderr=True)
-    with reporting() as reporter:
+    with reporting(compiles=True) as reporter:
         reporter.say("references")
         outcome = make_chart(
             output,
@@ -50,19 +48,15 @@ def chart(
             progress=Progress(begin=reporter.begin, step=reporter.step),
         )
     if outcome.missing:
-        console.print(
-            f"not installed: {', '.join(outcome.missing)} (pip install 'rotor-stator-rig[peers]'); charted without",
-            highlight=False,
-        )
+        missing = ", ".join(outcome.missing)
+        echo(f"not installed: {missing} (pip install 'rotor-stator-rig[peers]'); charted without", err=True)
     if outcome.outdated:
-        console.print(f"{outcome.outdated} points of other code were measured anew", highlight=False)
+        echo(f"{outcome.outdated} points of other code were measured anew", err=True)
     left = f", {outcome.left} left for want of time: run again to add them" if outcome.left else ""
-    console.print(
-        f"{outcome.measured} points measured, {outcome.resumed} kept, {outcome.failures} failures drawn{left}",
-        highlight=False,
-    )
+    counts = f"{outcome.measured} points measured, {outcome.resumed} kept, {outcome.failures} failures drawn"
+    echo(counts + left, err=True)
     for path in outcome.files:
         echo(str(path))
     if outcome.interrupted:
-        console.print("stopped; the same command goes on from here", highlight=False)
+        echo("stopped; the same command goes on from here", err=True)
         raise typer.Exit(130)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from rig.cli.tables import echo, echo_json
+from rig.cli.tables import Form, echo, echo_json
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Subject = TypeVar("Subject")
 
@@ -16,9 +19,9 @@ def answer(
     *,
     compare: Callable[[Subject], dict[str, Any]],
     draw: Callable[[Subject, Path], None],
-    show: Callable[[dict[str, Any]], None],
+    show: Callable[[dict[str, Any], Console], None],
     plot: Path | None,
-    as_json: bool,
+    form: Form,
 ) -> None:
     """Compare, draw where that is wanted, and tell.
 
@@ -28,14 +31,14 @@ def answer(
         draw: Makes the picture.
         show: Prints the document as tables.
         plot: File for the picture.
-        as_json: The document itself instead of tables.
+        form: As tables, or as the document itself.
     """
     if plot is not None:
         draw(subject, plot)
     document = compare(subject)
-    if as_json:
+    if form.as_json:
         echo_json(document)
         return
-    show(document)
+    show(document, form.console())
     if plot is not None:
         echo(f"\npicture  {plot}")

@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.tables import echo, table_console
+from rig.cli.tables import Table, echo, new_table, table_console
 
 if TYPE_CHECKING:
     import subprocess
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     Process = subprocess.Popen[bytes]
 
 _STABLE_S = 3.0
-_READY_S = 300.0
-"""How long the first start on a slow machine may compile [s]."""
+_READY_S = 60.0
+"""How long a service may take to start on a slow machine [s]."""
 _CLOSE_S = 60.0
 """How long service and recorder may take to close [s]."""
 
@@ -55,6 +55,8 @@ def demo(
     _record_session(file, speed_hz=speed_hz, whirl_s=whirl_s, say=say)
 
     say("reading the recording")
+    from rich.text import Text
+
     from recorder.reader import Recording
     from replays.recordings.picture import draw
     from replays.recordings.verdict import judge
@@ -62,7 +64,10 @@ def demo(
     recording = Recording.open(file)
     verdict = judge(recording)
     draw(recording, picture)
-    _show(verdict)
+    console = table_console()
+    console.print(verdict_table(verdict))
+    if verdict.remark:
+        console.print(Text(verdict.remark, "yellow"))
     say(f"verdict: {'good' if verdict.good else 'NOT GOOD'}")
     echo(f"\nrecording   {file}\npicture     {picture}\nlook at it  rig view {file}   (or: rerun {file})")
     if not verdict.good:
@@ -74,14 +79,17 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
     import time
 
     from drivers.console import Console
-    from rig.kernels import COMPILE_NOTICE, compiled_before
+    from rig.cli.progress import reporting
+    from rig.scenes import load_scene
+    from rig.simulation import Simulation
     from rig.transport.zenoh import ZenohClient
 
+    with reporting(compiles=True) as reporter:
+        reporter.say("loading the kernels")
+        Simulation(load_scene("stable-run")).warm_up()  # what has to be compiled is compiled where it is seen
     endpoint = f"127.0.0.1:{_free_port()}"
     with _processes(file.with_name("processes.log")) as start:
         say(f"starting the service: rig run stable-run --set drive.speed_hz={speed_hz:g} --listen {endpoint}")
-        if not compiled_before():
-            say(COMPILE_NOTICE)
         arguments = ("--set", f"drive.speed_hz={speed_hz}", "--duration-s", "3600", "--listen", endpoint)
         service = start("run", "stable-run", *arguments)
         _wait_until_up(endpoint, service)
@@ -168,14 +176,13 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _show(verdict: Verdict) -> None:
-    from rich.table import Table
+def verdict_table(verdict: Verdict) -> Table:
+    """The lines of a verdict."""
     from rich.text import Text
 
-    table = Table(title="Verdict, from the recorded samples", title_justify="left", header_style="bold")
-    for heading in ("quantity", "measured", "expected", ""):
-        table.add_column(heading)
+    texts = ("quantity", "measured", "expected")
+    table = new_table("Verdict, from the recorded samples", *texts, "verdict", wrapped=texts)
     marks = {True: Text("good", "green"), False: Text("NOT GOOD", "bold red"), None: ""}
     for row in verdict.rows:
         table.add_row(row.quantity, row.measured, row.expected, marks[row.good])
-    table_console(width=150).print(table)
+    return table

@@ -18,7 +18,7 @@ Line = Callable[[dict[str, Any]], list[str]]
 
 @contextmanager
 def showing(status: Status, words: Line) -> Iterator[None]:
-    """Show how it goes: on a terminal a live line, with a bar where the end is known, else a line every 5 s.
+    """Show how it goes: on a terminal one live line, else a line every 5 s.
 
     Args:
         status: Gives the status document.
@@ -37,28 +37,33 @@ def showing(status: Status, words: Line) -> Iterator[None]:
 
 
 def _show_live(status: Status, words: Line, done: threading.Event) -> None:
-    from rich.progress import BarColumn
-
-    now = status()
-    begin_s, end_s = now.get("replay", {}).get("from_s", 0.0), now["end_s"]
-    columns = [] if end_s is None else [BarColumn(24)]
-    with progress_bar(*columns, auto_refresh=False, transient=True) as bar:
-        task = bar.add_task("", total=None if end_s is None else max(end_s - begin_s, 1e-9))
+    with progress_bar(auto_refresh=False, transient=True) as bar:
+        task = bar.add_task("")
         while not done.wait(0.5):
-            now = status()
-            bar.update(task, completed=now["time_s"] - begin_s, description=_line(now, words), refresh=True)
+            bar.update(task, description=fitted(_parts(status(), words), bar.console.width), refresh=True)
 
 
 def _show_lines(status: Status, words: Line, done: threading.Event) -> None:
     while not done.wait(5.0):
-        echo(_line(status(), words), err=True)
+        echo("  ".join(_parts(status(), words)), err=True)
 
 
-def _line(status: dict[str, Any], words: Line) -> str:
-    parts = [*words(status), f"clients {len(status['clients'])}"]
-    if status["congestion"].get("stalled_links"):
-        parts.append(f"stalled links {status['congestion']['stalled_links']:.0f}")
-    return "  ".join(parts)
+def _parts(status: dict[str, Any], words: Line) -> list[str]:
+    """What to say, first what matters most; what should be none is only said where it is not."""
+    counts = {
+        "stalled links": status["congestion"].get("stalled_links", 0),
+        "dropped": status["queue"]["dropped"],
+    }
+    told = [f"{name} {count:.0f}" for name, count in counts.items() if count]
+    overruns = [f"overruns {status['overruns']}"] if status["overruns"] else []
+    return [*words(status), *told, f"clients {len(status['clients'])}", *overruns]
+
+
+def fitted(parts: list[str], width: int, between: str = "  ") -> str:
+    """The parts on one line, without those at the end that find no room."""
+    while len(between.join(parts)) > width and len(parts) > 1:
+        parts = parts[:-1]
+    return between.join(parts)
 
 
 def end_with(troubles: list[str]) -> None:
@@ -72,7 +77,8 @@ def end_with(troubles: list[str]) -> None:
 def lateness(status: dict[str, Any]) -> str:
     """How late it was so far, in a few words."""
     late = status["lateness_ms"]
-    return f"late p99 {late['p99']:.2f} max {late['max']:.2f} ms"
+    p99, most = (f"{late[name]:.2f}" if late[name] < 10.0 else f"{late[name]:.0f}" for name in ("p99", "max"))
+    return f"late p99 {p99} max {most} ms"
 
 
 def all_lateness(summary: dict[str, Any]) -> str:

@@ -13,7 +13,6 @@ from rig.cli.options import (
     Engine,
     Force,
     FromS,
-    Json,
     Parameters,
     RecordingFiles,
     ReportFile,
@@ -21,10 +20,12 @@ from rig.cli.options import (
     names_of,
     pairs,
 )
-from rig.cli.progress import reporting, tell_of_compiling
-from rig.cli.tables import echo, echo_json, new_table, table_console
+from rig.cli.progress import reporting
+from rig.cli.tables import Form, echo, echo_json, new_table
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from recorder.reader import Recording
     from replays.recordings.experiment import Experiment
     from replays.recordings.identification import Identification
@@ -140,7 +141,7 @@ def identify(
             "--exact", help="Of an imported log: take its clock, the shaft's angle and the impact as it tells them."
         ),
     ] = False,
-    json_output: Json = False,
+    form: Form,
     force: Force = False,
 ) -> None:
     """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell."""
@@ -157,17 +158,16 @@ def identify(
     recording = join(files)
     name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
     question, along = asked.question(recording, exact=exact)
-    tell_of_compiling()
-    with reporting() as reporter:
+    with reporting(compiles=True) as reporter:
         found = run(question, **asdict(search), progress=reporter.step)
     if output is not None:
         write_set(fitted_set(found, recording=name), output)
     if report is not None:
         report_of(found, recording=name).write(report)
-    if json_output:
+    if form.as_json:
         echo_json(identification_document(found, recording=name))
         return
-    _show(found, name)
+    _show(found, name, form.console())
     if along:
         echo(f"fitted along, as an imported log does not tell it exactly: {', '.join(along)}")
     if output is not None:
@@ -194,18 +194,14 @@ def _two(option: str, text: str, between: str) -> tuple[float, float]:
     return _number(option, first), _number(option, second)
 
 
-def _show(found: Identification, name: str) -> None:
-    from rich.text import Text
-
+def _show(found: Identification, name: str, console: Console) -> None:
     from replays.recordings.identification.summary import HEADINGS, cells, fit_line, spread_line, window_line
 
-    console = table_console(width=200, highlight=False)
     numbers = ("start", "result", "95 % interval")
     headings = (f">{heading}" if heading in numbers else heading for heading in HEADINGS)
-    table = new_table(f"{name}: what it tells", *headings)
+    table = new_table(f"{name}: what it tells", *headings, wrapped=HEADINGS[-1:])
     for finding in found.judgement.findings:
-        good = finding.standing == "identified"
-        table.add_row(*(Text(cell) for cell in cells(finding)), style=None if good else "yellow")
+        table.add_row(*cells(finding), style="" if finding.standing == "identified" else "yellow")
     console.print(table)
     keys = found.question.keys
     if len(keys) > 1:
@@ -215,7 +211,7 @@ def _show(found: Identification, name: str) -> None:
         console.print()
         console.print(table)
     console.print()
-    console.print(Text(window_line(found)))
-    console.print(Text(fit_line(found)))
+    console.print(window_line(found))
+    console.print(fit_line(found))
     if found.narrowed:
-        console.print(Text(spread_line(found)))
+        console.print(spread_line(found))

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.options import Force
-from rig.cli.tables import echo
+from rig.cli.tables import Form, echo, echo_json, new_table
 from rig.errors import InputError, check_not_among, whole_file
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from replays.recordings.formats.conversion import Conversion
 
 
@@ -34,6 +36,7 @@ def import_(
         ),
     ] = None,
     force: Force = False,
+    form: Form,
 ) -> None:
     """Turn logs of a real rig into a recording that `rig info`, `view`, `replay`, `validate` and `identify` read.
 
@@ -75,7 +78,10 @@ def import_(
             reporter.part(part, "writing")
 
         write_recording(conversion, output, force=force, progress=tell)
-    _tell(conversion, output)
+    if form.as_json:
+        echo_json(conversion.document)
+    else:
+        _tell(conversion, output, form.console())
 
 
 def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
@@ -97,20 +103,18 @@ _JITTER_US, _DRIFT_PPM, _DUST = 1e-3, 1e-2, 1e-6
 """Less than this is rounding: of time stamps, of clocks, and beside a channel's largest value."""
 
 
-def _tell(conversion: Conversion, output: Path) -> None:
-    from rig.cli.tables import new_table, table_console
-
-    console = table_console(width=100, highlight=False)
+def _tell(conversion: Conversion, output: Path, console: Console) -> None:
     size = output.stat().st_size / 1e6
     seconds = conversion.end_tick / 1e6
     console.print(f"{output}: {len(conversion.channels)} channels, {seconds:.6g} s, {size:.1f} MB, from "
-                  f"{conversion.start.isoformat()}", soft_wrap=True)  # fmt: skip
+                  f"{conversion.start.isoformat()}")  # fmt: skip
     columns = _columns(conversion)
     words = ("channel", "source", "value", "unit")
-    table = new_table("", *(heading if heading in words else f">{heading}" for heading in columns), whole=words)
+    headings = (heading if heading in words else f">{heading}" for heading in columns)
+    table = new_table("", *headings, wrapped=("source", "value"), spare=("clock [ppm]", "jitter [us]"))
     for row, channel in zip(zip(*columns.values(), strict=True), conversion.channels, strict=True):
         trouble = channel.missing or channel.overrange
-        table.add_row(*row, style="yellow" if trouble else None)
+        table.add_row(*row, style="yellow" if trouble else "")
     console.print(table)
     for line in _in_common(conversion):
         console.print(line)
@@ -134,8 +138,8 @@ def _columns(conversion: Conversion) -> dict[str, list[str]]:
         "unit": ["" if channel.unit == "1" else channel.unit for channel in channels],
         "missing": [f"{channel.missing or ''}" for channel in channels],
         "overrange": [f"{channel.overrange or ''}" for channel in channels],
-        "jitter, us": [f"{c.jitter_us:.2g}" if c.jitter_us >= _JITTER_US else "" for c in channels],
-        "clock, ppm": [f"{c.drift_ppm:+.2g}" if abs(c.drift_ppm) >= _DRIFT_PPM else "" for c in channels],
+        "jitter [us]": [f"{c.jitter_us:.2g}" if c.jitter_us >= _JITTER_US else "" for c in channels],
+        "clock [ppm]": [f"{c.drift_ppm:+.2g}" if abs(c.drift_ppm) >= _DRIFT_PPM else "" for c in channels],
     }
     return {heading: cells for heading, cells in columns.items() if any(cells)}
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import Json, RecordingFiles
-from rig.cli.tables import echo, new_table, shown
+from rig.cli.options import RecordingFiles
+from rig.cli.progress import reporting
+from rig.cli.tables import Form, Table, echo_json, facts, new_table, shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,21 +26,25 @@ def info(
     files: RecordingFiles,
     *,
     quick: Annotated[bool, typer.Option("--quick", help="Without reading the samples.")] = False,
-    as_json: Json = False,
+    form: Form,
 ) -> None:
     """Show contents, calibration, gaps, health, events, notes and end of a recording; of several files as of one."""
     from recorder.reader import join
 
-    recording = join(files)
-    document = describe(recording, quick=quick)
-    if as_json:
-        echo(json.dumps(document, indent=1))
+    with reporting() as reporter:
+        reporter.show("opening")
+        recording = join(files)
+        document = describe(recording, quick=quick, progress=lambda part: reporter.part(part, "reading the samples"))
+    if form.as_json:
+        echo_json(document)
     else:
-        _print(recording, shown(document))
+        _print(recording, shown(document), form.console())
 
 
-def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
-    """Everything that the command shows, as a JSON document."""
+def describe(
+    recording: Recording, *, quick: bool, progress: Callable[[float], None] = lambda _: None
+) -> dict[str, Any]:
+    """Everything that the command shows, as a JSON document; `progress` is told which part of the samples was read."""
     from dataclasses import asdict
 
     from recorder.health import examine
@@ -70,19 +75,13 @@ def describe(recording: Recording, *, quick: bool) -> dict[str, Any]:
         "events": recording.events,
     }
     if not quick:
-        health = asdict(examine(recording))  # the one pass in which the streams are counted, too
+        health = asdict(examine(recording, progress))  # the one pass in which the streams are counted, too
         document["streams"] = {key: asdict(stream) for key, stream in recording.streams.items()}
         document["health"] = health
     return _without_nan(document)
 
 
-def _print(recording: Recording, document: dict[str, Any]) -> None:
-    from rich.text import Text
-
-    from recorder.schemas import event_text
-    from rig.cli.tables import table_console
-
-    console = table_console(highlight=False)
+def _print(recording: Recording, document: dict[str, Any], console: Console) -> None:
     size_mb = sum(part["size_bytes"] for part in document["parts"]) / 1e6
     state = "complete" if document["complete"] else "not complete"
     file = document["parts"][0]["file"]
@@ -110,27 +109,29 @@ def _print(recording: Recording, document: dict[str, Any]) -> None:
     rows.append(("checked", "every byte" + "".join(f" but {text}" for text in recording.unchecked)))
     if "health" in document:
         rows += _verdict(document)
-    for name, value in rows:
-        console.print(Text.assemble((f"{name:10}", "bold"), value), soft_wrap=True)
+    if not streams:
+        rows.append(("messages", ", ".join(f"{key} {count}" for key, count in document["messages"].items())))
+    tables = [facts("", rows)]
     if len(document["parts"]) > 1:
-        _print_parts(console, document["parts"])
+        tables.append(_parts_table(document["parts"]))
     if streams:
-        _print_streams(console, streams)
-    else:
-        console.print("messages: " + ", ".join(f"{key} {count}" for key, count in document["messages"].items()))
-    _print_channels(console, recording, document.get("health"))
-    if "health" in document:
-        _print_health(console, document["health"])
-    for event in document["events"]:
-        time_s = event.get("time_s")
-        stamp = f"{time_s:9.4f} s  " if isinstance(time_s, float | int) else " " * 13
-        style = "bold" if event.get("event") == "note" else ""
-        console.print(Text(stamp + event_text(event)[1], style=style), soft_wrap=True)
+        tables.append(_streams_table(streams))
+    tables.append(_channels_table(recording, document.get("health")))
+    if "health" in document and (told := _health(document["health"])):
+        tables.append(facts("", told, doubt="yellow"))
+    if document["events"]:
+        tables.append(events_table(document["events"]))
+    for table in tables:
+        console.print(table)
+        console.print()
     gaps = document["gaps"]
     console.print(f"gaps noted by the recorder: {len(gaps) or 'none'}")
-    for gap in gaps[:_MOST_GAPS]:
-        what = f"{gap['size']} messages" if gap["index"] < 0 else f"{gap['size']} rows from {gap['index']} on"
-        console.print(f"  {gap['time_s']:9.4f} s  {gap['key']}: {what}", soft_wrap=True)
+    if gaps:
+        table = new_table("", ">time [s]", "stream", ">missing", "")
+        for gap in gaps[:_MOST_GAPS]:
+            what = "messages" if gap["index"] < 0 else f"rows from {gap['index']} on"
+            table.add_row(f"{gap['time_s']:.4f}", gap["key"], str(gap["size"]), what)
+        console.print(table)
     if len(gaps) > _MOST_GAPS:
         console.print(f"  and {len(gaps) - _MOST_GAPS} more")
 
@@ -164,31 +165,36 @@ def _number(value: float | None, noise: float) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"  # no minus before a zero
 
 
-def _print_parts(console: Console, parts: list[dict[str, Any]]) -> None:
-    table = new_table("", "part", "MB", "from, s", "to, s", "ended")
+def _parts_table(parts: list[dict[str, Any]]) -> Table:
+    table = new_table("", "part", ">MB", ">from [s]", ">to [s]", "ended", wrapped=["ended"])
     for part in parts:
         end = part["end"]
         times = (f"{float(end[name]):.4f}" if name in end else "?" for name in ("first_time_s", "last_time_s"))
         table.add_row(Path(part["file"]).name, f"{part['size_bytes'] / 1e6:.1f}", *times, part["ended"])
-    console.print(table)
+    return table
 
 
-def _print_streams(console: Console, streams: dict[str, dict[str, Any]]) -> None:
-    table = new_table("", "stream", ">blocks", ">rows", ">from, s", ">to, s", ">lost")
+def _streams_table(streams: dict[str, dict[str, Any]]) -> Table:
+    table = new_table("", "stream", ">blocks", ">rows", ">from [s]", ">to [s]", ">lost")
     for key, stream in streams.items():
         times = (f"{stream['first_time_s']:.4f}", f"{stream['last_time_s']:.4f}")
         counts = (str(stream["messages"]), str(stream["rows"]))
         lost = max(stream["lost"], stream["missing"])
-        table.add_row(key, *counts, *times, str(lost), style="red" if lost else None)
-    console.print(table)
+        table.add_row(key, *counts, *times, str(lost), style="red" if lost else "")
+    return table
 
 
-def _print_channels(console: Console, recording: Recording, health: dict[str, Any] | None) -> None:
+def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Table:
     from rig.wire import sensor_key
 
     found = {channel["name"]: channel for channel in (health or {}).get("channels", [])}
-    more = (">mean", ">low", ">high", ">noise", ">calibrated", "health") if found else ("label",)
-    table = new_table("", "channel", "unit", "range", "step", "rate", *more)
+    seen_of = (">mean", ">low", ">high", ">noise", ">calibrated", "health") if found else ()
+    table = new_table(
+        "",
+        *("channel", "unit", *seen_of, "range", ">step", ">rate [Hz]", "label"),
+        wrapped=("health", "label"),
+        spare=("label", "rate [Hz]", "step", "range", "calibrated") if found else (),
+    )
     for group in recording.table.groups.values():
         if sensor_key(group.name) not in recording.messages:
             continue
@@ -196,45 +202,59 @@ def _print_channels(console: Console, recording: Recording, health: dict[str, An
             ends = sorted((volts - channel.bias_v) / channel.sensitivity_v for volts in channel.range_v)
             # Of an imported channel, the ends of its counts are no range.
             known = not channel.kind.startswith("imported") or channel.range_v != (-channel.adc_v, channel.adc_v)
-            row = [
-                shown(channel.name),
-                shown(channel.unit),
-                f"{ends[0]:.4g} to {ends[1]:.4g}" if known else "not known",
-                f"{abs(channel.scale):.2g}",
-                f"{group.rate_hz} Hz",
-            ]
-            seen = found.get(shown(channel.name))
-            if seen is None:
-                table.add_row(*row, *([""] * 5 if found else []), "" if found else shown(channel.label))
-                continue
-            numbers = [_number(seen[name], seen["noise"] or channel.scale) for name in ("mean", "low", "high")]
-            numbers += [f"{seen[name]:.2g}" if seen[name] is not None else "" for name in ("noise", "noise_calibrated")]
+            reach = f"{ends[0]:.4g} to {ends[1]:.4g}" if known else "not known"
+            seen = found.get(shown(channel.name), {})
+            numbers = [_number(seen.get(name), seen.get("noise") or channel.scale) for name in ("mean", "low", "high")]
+            noise = ("" if seen.get(name) is None else f"{seen[name]:.2g}" for name in ("noise", "noise_calibrated"))
+            findings = seen.get("findings", [])
+            verdict = "; ".join(findings) or ("good" if seen else "")
             table.add_row(
-                *row, *numbers, "; ".join(seen["findings"]) or "good", style="yellow" if seen["findings"] else None
+                *(channel.name, channel.unit, *((*numbers, *noise, verdict) if found else ())),
+                *(reach, f"{abs(channel.scale):.2g}", f"{group.rate_hz}", channel.label),
+                style="yellow" if findings else "",
             )
-    console.print(table)
+    return table
 
 
-def _print_health(console: Console, health: dict[str, Any]) -> None:
-    from rich.text import Text
-
-    lines = []
+def _health(health: dict[str, Any]) -> list[tuple[str, str]]:
+    """The clock, and what is in doubt on the whole."""
+    rows = []
     if health["pace"] is not None:
         real_time = abs(health["pace_ppm"]) < 1e4
         ppm = f"{health['pace_ppm']:+.1f} ppm (known to {health['pace_error_ppm']:.1f})"
         pace = f"real time {ppm}" if real_time else f"x{health['pace']:.4g} real time"
         strays = f", without {health['strays']:.1%} strays" if health["strays"] else ""
         jitter = f"jitter {health['jitter_ms']:.2f} ms rms, {health['jitter_max_ms']:.2f} ms at most{strays}"
-        lines.append(f"{pace}, {jitter}")
+        rows.append(("clock", f"{pace}, {jitter}"))
     status = health["status"]
     late = status.get("lateness_ms") or {}
     figures = [f"{name} {late[name]:.3f}" for name in ("p50", "p99", "max") if isinstance(late.get(name), float | int)]
     if figures:
-        lines.append(f"the rig's lateness in ms: {', '.join(figures)}; overruns {status.get('overruns', '?')}")
-    for line in lines:
-        console.print(Text.assemble((f"{'clock':10}", "bold"), line), soft_wrap=True)
-    for text in [*health["findings"], *(f"the rig warned: {text}" for text in health["warnings"])]:
-        console.print(Text.assemble((f"{'doubt':10}", "bold yellow"), text), soft_wrap=True)
+        rows.append(("lateness", f"the rig's, in ms: {', '.join(figures)}; overruns {status.get('overruns', '?')}"))
+    rows += [("doubt", text) for text in health["findings"]]
+    return rows + [("doubt", f"the rig warned: {text}") for text in health["warnings"]]
+
+
+def events_table(events: list[dict[str, Any]]) -> Table:
+    """What happened when; a command that took effect is told once, by its effect, with who sent it."""
+    from recorder.schemas import event_text
+
+    def of(event: dict[str, Any], name: str) -> tuple[str, str]:
+        return str(event.get("tick")), str(event.get(name))
+
+    effects = {of(event, "event") for event in events}
+    taken: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    table = new_table("", ">time [s]", "event", wrapped=["event"])
+    for event in events:
+        if event.get("event") == "command" and of(event, "command") in effects:
+            taken.setdefault(of(event, "command"), []).append(event)
+            continue
+        if commands := taken.get(of(event, "event")):
+            event = event | {name: value for name, value in commands.pop(0).items() if name in ("id", "from")}
+        time_s = event.get("time_s")
+        stamp = f"{time_s:.4f}" if isinstance(time_s, float | int) else ""
+        table.add_row(stamp, event_text(event)[1], style="bold" if event.get("event") == "note" else "")
+    return table
 
 
 def _without_nan(value: Any) -> Any:

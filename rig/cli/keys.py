@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import re
+from itertools import groupby
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Force
-from rig.cli.tables import echo, table_console
+from rig.cli.options import Force, Wide
+from rig.cli.tables import Table, echo, echo_document, new_table, table_console
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rich.text import Text
 
 app = typer.Typer()
 
@@ -18,6 +25,7 @@ def keys(
     context: typer.Context,
     *,
     markdown: Annotated[bool, typer.Option("--markdown", help="As the Markdown source of rig/KEYS.md.")] = False,
+    wide: Wide = False,
 ) -> None:
     """Show every key, message and unit of the rig's streams, and who may use them; or make certificates (`init`)."""
     if context.invoked_subcommand is not None:
@@ -25,11 +33,32 @@ def keys(
     from rig.interface import page
 
     if markdown:
-        echo(page(), nl=False)
+        echo_document(page())
         return
-    from rich.markdown import Markdown
+    console = table_console(wide=wide)
+    for part in _parts(page()):
+        console.print(part)
 
-    table_console(width=160).print(Markdown(page()))
+
+def _parts(page: str) -> Iterator[Table | Text | str]:
+    """What stands on a page of Markdown: its tables, its headings, and every other line, such as code, as it is."""
+    from rich.text import Text
+
+    pieces = [piece.splitlines() for piece in re.split(r"^```.*\n", page, flags=re.MULTILINE)]
+    marked = [(number % 2 or line[:1], line) for number, piece in enumerate(pieces) for line in piece]
+    for kind, group in groupby(marked, key=lambda pair: pair[0]):
+        lines = [line for _, line in group]
+        if kind == "|":
+            bare = (line.replace("`", "").strip("|").split("|") for line in lines)
+            headings, _, *rows = ([cell.strip() for cell in cells] for cells in bare)
+            table = new_table("", *headings, wrapped=("what", "fields", "keys"), keys=1 + (headings[0] == "column"))
+            for row in rows:
+                table.add_row(*row)
+            yield table
+        elif kind == "#":
+            yield from (Text(line.lstrip("# "), "bold") for line in lines)
+        else:
+            yield from lines
 
 
 @app.command()

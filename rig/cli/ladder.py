@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.options import Changes, SceneChanges, SceneName
-from rig.cli.progress import reporting, tell_of_compiling
-from rig.cli.tables import echo, echo_json, new_table, table_console
+from rig.cli.progress import reporting
+from rig.cli.tables import Form, Table, echo, echo_json, new_table
 from rig.errors import whole_file
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import Console
 
 
 def ladder(
@@ -29,7 +29,6 @@ def ladder(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="For ladder.png, .svg and .json.")
     ] = None,
-    json_output: Annotated[bool, typer.Option("--json", help="Everything measured, as a JSON document.")] = False,
     write: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Store the pick in this scene file, as [pick].")
     ] = None,
@@ -39,6 +38,7 @@ def ladder(
     changes: Changes = None,
     runs: Annotated[int, typer.Option(min=1, help="Timed runs of each candidate.")] = 3,
     budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
+    form: Form,
 ) -> None:
     """Go down the ladder of models: what does each level cost, what does it err by, what is good enough here?"""
     import json
@@ -55,8 +55,7 @@ def ladder(
     loaded = load_scene(scene, {**SceneChanges(changes=changes).overrides(), "fidelity": "given"})
     if write is not None:
         check_target(write, scene, loaded)
-    tell_of_compiling()
-    with reporting() as reporter:
+    with reporting(compiles=True) as reporter:
         found = search(
             loaded,
             tolerances,
@@ -74,26 +73,25 @@ def ladder(
             draft.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     if write is not None:
         write_pick(write, scene, pick_of(found))
-    if json_output:
+    if form.as_json:
         echo_json(document)
         return
-    _show(document)
+    _show(document, form.console())
     for path in paths:
         echo(f"written  {path}")
     if write is not None:
         echo(f'written  {write}: [pick], in force with fidelity = "auto" at the head of the file')
 
 
-def _show(document: dict[str, Any]) -> None:
-    console = table_console(width=160, highlight=False)
-    console.print(_levels_table(document))
+def _show(document: dict[str, Any], console: Console) -> None:
+    console.print(levels_table(document))
     console.print()
-    console.print(_engines_table(document))
+    console.print(engines_table(document))
     pick, names = document["pick"], [entry["name"] for entry in document["quantities"]]
     levels = ", ".join(f"{level} {pick[level]}" for level in ("magnet", "shaft", "stator", "contact", "friction"))
-    console.print(f"\npick: {levels}, drive {pick['drive']}, sensors {pick['sensors']}; {document['picked']['engine']}")
+    echo(f"\npick: {levels}, drive {pick['drive']}, sensors {pick['sensors']}; {document['picked']['engine']}")
     for entry in pick["quantities"]:
-        console.print(
+        echo(
             f"  {entry['quantity']} = {entry['value']} {entry['unit']} against {entry['reference']}: "
             f"model {entry['model_error']:.1e}, numerical {entry['numerical_error']:.1e}, "
             f"total {entry['total_error']:.1e} of {entry['tolerance']:g} allowed "
@@ -101,30 +99,33 @@ def _show(document: dict[str, Any]) -> None:
         )
     own = ", ".join(f"{entry['as_given_error']:.1e}" if entry["as_given_error"] is not None else "infinite"
                     for entry in document["quantities"])  # fmt: skip
-    console.print(
+    echo(
         f"  a simulated second takes {pick['wall_s'] * 1e3:.3g} ms with the picked sensors, "
         f"{pick['wall_given_s'] * 1e3:.3g} ms as the scene is given (errors {own} in {', '.join(names)}), "
         f"{pick['wall_full_s'] * 1e3:.3g} ms on the full model by {document['full']['engine']}"
     )
     if pick["sensors"] == "ideal":
-        console.print("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
-    console.print(
+        echo("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
+    echo(
         f"  reference: full model by {document['reference']['engine']}, its own error the distance to "
         f"{document['reference']['unlike']}; seed {pick['seed']}, {pick['date']}, rig {pick['rig']} {pick['commit']}"
     )
     if not document["all_engines_tried"]:
-        console.print("  the budget ended before every engine was tried")
+        echo("  the budget ended before every engine was tried")
 
 
 def _error(value: float | None) -> str:
     return "-" if value is None else f"{value:.1e}"
 
 
-def _levels_table(document: dict[str, Any]) -> Table:
+def levels_table(document: dict[str, Any]) -> Table:
+    """What each level of the model costs, and errs by."""
     names = [entry["name"] for entry in document["quantities"]]
     table = new_table(
         f"Levels of the model in scene {document['scene']}: model error, each against the full model",
-        *("level", *(f">{name}" for name in names), ">ms a second", ">ns a step", "on", "", ""),
+        *("level", *(f">{name}" for name in names), ">ms a second", ">ns a step", "on", "verdict", "remark"),
+        wrapped=("level", "on", "remark"),
+        spare=("remark", "ns a step", "on"),
     )
     for step in document["steps"]:
         if step["stage"] not in ("full", "single", "together"):
@@ -142,11 +143,14 @@ def _levels_table(document: dict[str, Any]) -> Table:
     return table
 
 
-def _engines_table(document: dict[str, Any]) -> Table:
+def engines_table(document: dict[str, Any]) -> Table:
+    """The same of each engine and step, on the picked model."""
     names = [entry["name"] for entry in document["quantities"]]
     table = new_table(
         "Engines and steps on the picked model: numerical error, total error",
-        *("engine", *(f">{name}" for name in names), ">ms a second", ">ns a step", "", ""),
+        *("engine", *(f">{name}" for name in names), ">ms a second", ">ns a step", "verdict", "remark"),
+        wrapped=("engine", "remark"),
+        spare=("remark", "ns a step"),
     )
     for step in document["steps"]:
         if step["stage"] not in ("engine", "verified"):

@@ -23,6 +23,7 @@ Parameters = Annotated[str | None, typer.Option(metavar="SET", help="Parameter s
 Engine = Annotated[str | None, typer.Option(help="Integration method.")]
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")]
 Json = Annotated[bool, typer.Option("--json", help="As a JSON document.")]
+Wide = Annotated[bool, typer.Option("--wide", help="Every column, and a row on one line, as into a pipe.")]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap), finished or cut off.")]
 _RECORDING_FILES = typer.Argument(
     metavar="FILE...", help="A recording (.mcap), finished or cut off, or its parts in any order."

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.folder import check_folder
-from rig.cli.options import Force, Json
-from rig.cli.progress import reporting, tell_of_compiling
-from rig.cli.tables import echo, echo_json, new_table, table_console
+from rig.cli.options import Force
+from rig.cli.progress import reporting
+from rig.cli.tables import Form, echo, echo_json, new_table
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from replays.studies.paper.findings import Findings
 
 
@@ -29,7 +31,7 @@ def paper(
     ] = False,
     processes: Annotated[int, typer.Option(min=1, max=64, help="Processes at a time.")] = 2,
     force: Force = False,
-    json_output: Json = False,
+    form: Form,
 ) -> None:
     """Make the paper's figures, tables and claims again, as printed and corrected, each with a verdict."""
     from replays.report import check_report
@@ -40,8 +42,7 @@ def paper(
         check_report(output, force=force)
     if pictures is not None:
         check_folder(pictures, field="--pictures")
-    tell_of_compiling()
-    with reporting() as reporter:
+    with reporting(compiles=True) as reporter:
         reporter.begin(steps(quick=quick))
         findings = find(quick=quick, processes=processes, progress=reporter.step)
         if output is not None:
@@ -51,10 +52,10 @@ def paper(
         if pictures is not None:
             pictures.mkdir(exist_ok=True)
             drawn = draw_pictures(findings, pictures)
-    if json_output:
+    if form.as_json:
         echo_json(summary(findings))
         return
-    _show(findings)
+    _show(findings, form.console())
     for path in drawn:
         echo(f"picture  {path}")
     if output is not None:
@@ -79,21 +80,20 @@ def summary(findings: Findings) -> dict[str, object]:
     }
 
 
-def _show(findings: Findings) -> None:
+def _show(findings: Findings, console: Console) -> None:
     from rich.text import Text
 
     from replays.studies.paper.findings import JUDGED_BY, count
 
     headings = ("statement", "the paper", ">as-printed", ">corrected", "verdict")
-    table = new_table("the paper's statements, and ours", *headings)
+    table = new_table("the paper's statements, and ours", *headings, wrapped=("statement", "verdict"))
     colours = {"good": "green", "bad": "bold red", "open": "yellow", "plain": ""}
     lines = [*findings.lines, *findings.claims]
     for line in lines:
         row = line.row()
         says, _, paper_says, printed, corrected, _ = row.cells
         verdict = " / ".join(dict.fromkeys(line.verdicts.values()))  # in the order of the columns, one if they agree
-        table.add_row(Text(says), Text(paper_says), printed, corrected, Text(verdict, style=colours[row.mark]))
-    console = table_console(width=100, highlight=False)
+        table.add_row(says, paper_says, printed, corrected, Text(verdict, colours[row.mark]))
     console.print(table)
     counts = count(lines)
     console.print(f"corrected: {counts['agrees']} agree, {counts['differs']} differ, {counts['cannot be judged']} "

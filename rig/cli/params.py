@@ -4,33 +4,36 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rig.cli.options import Changes, Json, SceneChanges, SetName
-from rig.cli.tables import echo_json, new_table, table_console
+from rig.cli.options import Changes, SceneChanges, SetName
+from rig.cli.tables import Form, echo_json, new_table
 
 if TYPE_CHECKING:
     from rig.parameters import ParameterSet
 
 
-def params(name: SetName = "corrected", *, changes: Changes = None, json_output: Json = False) -> None:
+def params(name: SetName = "corrected", *, changes: Changes = None, form: Form) -> None:
     """Show a parameter set: value, unit, source and kind of each; what is assumed is marked."""
     from rig.model import build_model, describe
     from rig.parameters import set_names
 
     document = describe(build_model(changed_parameters(name, changes)))
-    if json_output:
+    if form.as_json:
         echo_json(document)
         return
-    headings = ("parameter", "symbol", ">value", "unit", "kind", "source")
-    table = new_table(f"{document['set']}: {document['title']}", *headings, whole=("parameter", "unit", "kind"))
+    table = new_table(
+        f"{document['set']}: {document['title']}",
+        *("parameter", ">value", "unit", "kind", "by rule", "symbol", "source"),
+        wrapped=["source"],
+        spare=("source", "symbol", "by rule"),
+    )
     for key, entry in document["values"].items():
-        value = entry["value"]
-        shown = f"{value} = {entry['resolved']:.6g}" if isinstance(value, str) else f"{value:g}"
+        rule = entry["value"] if isinstance(entry["value"], str) else ""
+        value = f"{entry['resolved']:.5g}" if rule else f"{entry['value']:g}"
         assumed = entry["kind"] == "assumed"
         kind = "ASSUMED" if assumed else entry["kind"]
-        table.add_row(
-            key, entry["symbol"], shown, entry["unit"], kind, entry["source"], style="yellow" if assumed else None
-        )
-    console = table_console()
+        row = (key, value, entry["unit"], kind, rule, entry["symbol"], entry["source"])
+        table.add_row(*row, style="yellow" if assumed else "")
+    console = form.console()
     console.print(table)
     derived = document["derived"]
     errors = {(error["model"], error["against"]): error for error in derived["magnet_errors"]}
@@ -42,15 +45,13 @@ def params(name: SetName = "corrected", *, changes: Changes = None, json_output:
         f"{fit['over_reach']:.1%} over {derived['magnet_reach_mm']:.3g} mm and {fit['over_travel']:.1%} where the ring "
         f"lets the shaft go, and exact cylinders as stiff within {shape['over_reach']:.0%} and "
         f"{shape['over_travel']:.0%} (see `rig magnets`)",
-        highlight=False,
     )
     if derived["contact_fit_error"]:
         console.print(
             f"K and n stand for the contact's stiffness law within {derived['contact_fit_error']:.1%} of its force "
             "(see `rig laws`)",
-            highlight=False,
         )
-    console.print(f"sets: {', '.join(set_names())}", highlight=False)
+    console.print(f"sets: {', '.join(set_names())}")
 
 
 def changed_parameters(name: str, changes: list[str] | None, also: dict[str, Any] | None = None) -> ParameterSet:

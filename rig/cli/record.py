@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.connection import Connection
+from rig.cli.display import fitted
 from rig.cli.groups import panel
 from rig.cli.options import Force
 from rig.cli.tables import echo, plain, table_console
 from rig.errors import InputError
+from rig.text import printable
 
 if TYPE_CHECKING:
     from recorder.room import Limits
@@ -43,6 +45,8 @@ class Again(StrEnum):
 _PRE_S, _POST_S = 0.5, 2.0
 _LINK_S = 1.0
 """Time that the connection to a rig that is there may take [s]."""
+_SPINNER = 2
+"""Columns of the sign that something goes on, with the blank behind it."""
 
 
 @dataclass(frozen=True)
@@ -221,20 +225,23 @@ def run_session(session: RecordingSession) -> Summary:
         told = len(lines)
 
     before = {number: signal.signal(number, stop) for number in ends}
-    console = table_console(stderr=True, highlight=False)
-    told = 0
+    console = table_console(stderr=True)
+    told, name = 0, f"recording {printable(session.path.name, 30)}"
     try:
-        with console.status(plain(f"recording {session.path}: waiting for the rig")) as status:
+        with console.status(plain(f"{name}: waiting for the rig")) as status:
 
             def show(progress: Progress) -> None:
                 remark(progress.remarks)
                 lost = f"{progress.lost} lost"
-                files = f", {progress.files} files finished" if progress.files else ""
-                backlog = f", {progress.backlog_bytes / 1e6:.1f} MB wait" if progress.backlog_bytes > 1e6 else ""
-                line = plain(
-                    f"recording {session.path}: {progress.time_s:.1f} s, {progress.rows} samples, {lost}, "
-                    f"{progress.size_bytes / 1e6:.1f} MB{files}{backlog}"
-                )
+                parts = [
+                    f"{name}: {progress.time_s:.1f} s",
+                    lost,
+                    f"{progress.size_bytes / 1e6:.1f} MB",
+                    *([f"{progress.backlog_bytes / 1e6:.1f} MB wait"] if progress.backlog_bytes > 1e6 else []),
+                    *([f"{progress.files} files finished"] if progress.files else []),
+                    f"{progress.rows} samples",
+                ]
+                line = plain(fitted(parts, console.width - _SPINNER, ", "))
                 line.highlight_words([lost] if progress.lost else [], "red")
                 status.update(line)
 

@@ -180,7 +180,7 @@ def _words(status: dict[str, Any]) -> list[str]:
         pace = "paused" if play["paused"] else f"x{play['achieved_rate']:.4f}"
     if play["behind_s"]:
         pace += f" of x{play['rate']:g}, behind by {play['behind_s']:.1f} s"
-    words = [f"{status['time_s']:9.2f} of {status['end_s']:.2f} s", pace, lateness(status)]
+    words = [f"{status['time_s']:7.2f} of {status['end_s']:.2f} s", pace, lateness(status)]
     if play["passes"] != 1:
         words.append(f"pass {play['pass']}" + (f" of {play['passes']}" if play["passes"] else ""))
     return words

@@ -11,6 +11,7 @@ from rig.cli.can_output import CanOptions
 from rig.cli.connection import Serving, serve
 from rig.cli.display import all_lateness, lateness
 from rig.cli.options import SceneChanges, SceneName
+from rig.cli.progress import reporting
 from rig.cli.tables import echo
 from rig.errors import InputError
 
@@ -48,7 +49,6 @@ def run(
     from rig.pacing import rare_collections
 
     with rare_collections():
-        from rig.kernels import COMPILE_NOTICE, compiled_before
         from rig.scenes import load_scene
         from rig.service import Service
         from rig.simulation import Simulation
@@ -61,10 +61,10 @@ def run(
         bus = can.output()
         simulation = Simulation(loaded)
         block_ticks = _block_ticks(block_ms, simulation)
-        notice = "preparing" if compiled_before() else COMPILE_NOTICE
-        echo(f"rig: scene {scene}, {pace}; {notice}", err=True)
+        echo(f"rig: scene {scene}, {pace}; preparing", err=True)
         # Before anybody can connect: whoever does is answered at once.
-        simulation.warm_up()
+        with reporting(compiles=True):
+            simulation.warm_up()
 
     def make(server: Server) -> Service:
         service = Service(simulation, server, _clock(pace), block_ticks=block_ticks)
@@ -94,15 +94,10 @@ def _clock(pace: Pace) -> Clock:
 
 
 def _words(status: dict[str, Any]) -> list[str]:
-    spin_hz = status["spin_hz"]
-    return [
-        f"{status['time_s']:9.2f} s",
-        *([] if spin_hz is None else [f"spin {spin_hz:.2f} Hz"]),
-        f"x{status['real_time_factor']:.4f}",
-        lateness(status),
-        f"overruns {status['overruns']}",
-        f"dropped {status['queue']['dropped']}",
-    ]
+    end_s, spin_hz = status["end_s"], status["spin_hz"]
+    end = "" if end_s is None else f" of {end_s:g}"
+    spin = [] if spin_hz is None else [f"spin {spin_hz:.2f} Hz"]
+    return [f"{status['time_s']:7.2f}{end} s", *spin, f"x{status['real_time_factor']:.4f}", lateness(status)]
 
 
 def _print_summary(summary: dict[str, Any]) -> None:

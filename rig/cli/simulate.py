@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.options import Force, SceneChanges, SceneName
-from rig.cli.progress import reporting, tell_of_compiling
+from rig.cli.progress import reporting
 from rig.cli.tables import echo
 
 
@@ -37,8 +37,8 @@ def simulate(
         simulation = Simulation(loaded)
         if loaded.fidelity_line:
             echo(loaded.fidelity_line, err=True)
-        tell_of_compiling()
-        simulation.warm_up()
+        with reporting(compiles=True):
+            simulation.warm_up()
     with reporting() as reporter:
         begin = time.perf_counter()
         write_run(simulation, output, force=force, progress=lambda part: reporter.part(part, scene))

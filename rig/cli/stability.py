@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Json
 from rig.cli.progress import reporting
-from rig.cli.tables import echo, echo_json, new_table, table_console
+from rig.cli.tables import Form, Table, echo, echo_json, new_table
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.text import Text
 
     from replays.studies.stability.cell import Cell
@@ -33,7 +33,7 @@ def stability(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Draw the maps as well, as PNG and SVG.")
     ] = None,
-    json_output: Json = False,
+    form: Form,
 ) -> None:
     """Test where integration methods fail; exit status 1 if any does not do what theory expects."""
     from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
@@ -41,7 +41,7 @@ def stability(
     trials, names = chosen_trials(only), chosen_engines(engines)
     cells: list[Cell] = []
     pictures: list[Path] = []
-    with reporting() as reporter:
+    with reporting(compiles=True) as reporter:
         for cell in run_trials(trials, names, quick=not full):
             cells.append(cell)
             reporter.step(f"{cell.trial} {cell.case}, {cell.method}")
@@ -51,7 +51,7 @@ def stability(
             reporter.say("pictures")
             pictures = draw_all(output, names, quick=not full)
     wrong = [cell for cell in cells if not cell.agrees]
-    if json_output:
+    if form.as_json:
         document = {
             "cells": [cell.document() for cell in cells],
             "disagree": len(wrong),
@@ -59,65 +59,67 @@ def stability(
         }
         echo_json(document)
     else:
-        _show(cells, names)
+        _show(cells, names, form.console())
         for path in pictures:
             echo(f"picture  {path}")
     if wrong:
         raise typer.Exit(1)
 
 
-def _show(cells: list[Cell], names: list[str]) -> None:
-    from rich.text import Text
-
-    from replays.studies.stability.trials import TRIALS
-
-    console = table_console()
-    ours = [cell for cell in cells if cell.method in names]
-    headings = ("trial", "case", *(f">{name}" for name in names))
-    table = new_table("trials by engine: measured, and whether that holds", *headings, whole=("trial",))
-    rows = dict.fromkeys((cell.trial, cell.case) for cell in ours)
-    seen = ""
-    for trial, case in rows:
-        found = {cell.method: cell for cell in ours if (cell.trial, cell.case) == (trial, case)}
-        if trial != seen:
-            table.add_row(Text(trial, style="bold"), Text(TRIALS[trial].title, style="bold"))
-            seen = trial
-        table.add_row("", Text(f"  {case}"), *(_text(found.get(name)) for name in names))
-    console.print(table)
-    others = [cell for cell in cells if cell.method not in names]
-    if others:
-        headings = ("trial", "case", "solver", "measured", "because")
-        peers = new_table("\nother people's solvers, where they are known to fail or to hold", *headings)
-        for cell in others:
-            peers.add_row(cell.trial, Text(cell.case), cell.method, _text(cell), Text(cell.skipped or cell.because))
-        console.print(peers)
+def _show(cells: list[Cell], names: list[str], console: Console) -> None:
+    console.print(trials_table([cell for cell in cells if cell.method in names], names))
+    if others := [cell for cell in cells if cell.method not in names]:
+        console.print()
+        console.print(peers_table(others))
     console.print(
-        "\nholds: within its limit. fails*: as was expected, by theory or by measurement (--json says why). "
-        "Those marked ! do not do what was expected; a bare "
-        "number has no expectation.",
-        highlight=False,
+        "\n*: fails, as was expected by theory or by measurement (--json says why); !: does not do what was expected; "
+        "in brackets: nothing is expected; all others hold, within their limits."
     )
     for cell in cells:
         if not cell.agrees:
             console.print(
                 f"! {cell.trial} {cell.case}, {cell.method}: {cell.value:.3g} {cell.unit}, limit {cell.limit:.3g}, "
-                f"expected to {'hold' if cell.expected else 'fail'}: {cell.because}",
-                highlight=False,
+                f"expected to {'hold' if cell.expected else 'fail'}: {cell.because}"
             )
+
+
+def trials_table(cells: list[Cell], names: list[str]) -> Table:
+    """What each engine of these names did in each case."""
+    from rich.text import Text
+
+    from replays.studies.stability.trials import TRIALS
+
+    table = new_table("trials by engine: measured", "trial", "case", *(f">{name}" for name in names), keys=2)
+    seen = ""
+    for trial, case in dict.fromkeys((cell.trial, cell.case) for cell in cells):
+        found = {cell.method: cell for cell in cells if (cell.trial, cell.case) == (trial, case)}
+        if trial != seen:
+            table.add_row(Text(f"{trial}: {TRIALS[trial].title}", "bold"))
+            seen = trial
+        table.add_row(trial, case, *(_text(found.get(name)) for name in names))
+    return table
+
+
+def peers_table(cells: list[Cell]) -> Table:
+    """What other people's solvers did."""
+    title = "other people's solvers, where they are known to fail or to hold"
+    headings = ("trial", "case", "solver", ">measured", "because")
+    table = new_table(title, *headings, wrapped=("because", "case"), keys=2)
+    for cell in cells:
+        table.add_row(cell.trial, cell.case, cell.method, _text(cell), cell.skipped or cell.because)
+    return table
 
 
 def _text(cell: Cell | None) -> Text:
     from rich.text import Text
 
     if cell is None:
-        return Text("-", style="dim")
+        return Text("-", "dim")
     if cell.skipped:
-        return Text("skipped", style="dim")
-    value = f"{cell.value:.1e}" if math.isfinite(cell.value) else str(cell.value)
-    if cell.value == 0.0:
-        value = "0"
+        return Text("skipped", "dim")
+    value = f"{cell.value:.1e}" if cell.value and math.isfinite(cell.value) else f"{cell.value:g}"
     if cell.expected is None:
-        return Text(value + "        ")
+        return Text(f"({value})")
     if not cell.agrees:
-        return Text(f"{value} {'holds!' if cell.holds else 'FAILS!'} ", style="bold red")
-    return Text(f"{value} holds " if cell.holds else f"{value} fails*", style="" if cell.holds else "dim")
+        return Text(f"{value}!", "bold red")
+    return Text(value) if cell.holds else Text(f"{value}*", "dim")

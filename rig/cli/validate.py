@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rig.cli.options import Changes, Engine, Force, Json, RecordingFiles, ReportFile, SceneChanges
-from rig.cli.progress import reporting, tell_of_compiling
-from rig.cli.tables import echo, echo_json, new_table, shown, table_console
+from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges
+from rig.cli.progress import reporting
+from rig.cli.tables import Form, Table, echo, echo_json, new_table, shown
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import Console
 
     from replays.recordings.validation import Validation
     from replays.recordings.validation.attribution import Explained, Explanation
@@ -39,7 +39,7 @@ def validate(
     ] = False,
     report: ReportFile = None,
     force: Force = False,
-    json_output: Json = False,
+    form: Form,
 ) -> None:
     """Do a recording again and hold it against the model: bit by bit, then by declared criteria.
 
@@ -57,26 +57,24 @@ def validate(
     given = SceneChanges(changes=changes, engine=engine).overrides()
     overrides = {key: read_value(value) for key, value in given.items()}
     recording = join(files)
-    tell_of_compiling()
-    with reporting() as reporter:
+    with reporting(compiles=True) as reporter:
         found = hold(recording, criteria=rules, changes=overrides, declared=declared, step=reporter.step)
         if report is not None:
             from replays.recordings.validation.report import make_report
 
             reporter.step("report")
             make_report(found).write(report)
-    if json_output:
+    if form.as_json:
         echo_json(found.document())
     else:
-        _show(found)
+        _show(found, form.console())
         if report is not None:
             echo(f"report  {report}")
     if not found.good:
         raise typer.Exit(1)
 
 
-def _show(found: Validation) -> None:
-    console = table_console(width=160, highlight=False)
+def _show(found: Validation, console: Console) -> None:
     changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
     console.print(shown(f"{found.title}, scene {found.scene}") + (f", validated with {changed}" if changed else ""))
     console.print(found.verdict_line)
@@ -142,7 +140,8 @@ def _counts(one: Explanation) -> bool:
 
 def _explanations(explained: Explained) -> Table:
     headings = ("kind", "what", "change", ">explains", ">left", ">seen to", "verdict")
-    table = new_table("What explains the difference, each candidate alone", *headings)
+    title = "What explains the difference, each candidate alone"
+    table = new_table(title, *headings, wrapped=["change"], spare=("kind", "seen to"))
     for one in [one for one in explained.ranked if _counts(one)][:12]:
         told = "named" if one.name in explained.best else ""
         row = (one.kind, one.name, one.change, f"{one.explained:.2%}", f"{one.left:.3g}", f"{one.to_s:.3f} s", told)

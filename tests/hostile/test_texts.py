@@ -327,10 +327,9 @@ def test_a_status_and_a_validation_print_them_too(name: str, capsys: pytest.Capt
             pass
         with tables.progress_bar() as bar:
             bar.add_task(text.replace("\n", " "), total=1)
-        table = tables.new_table(text.replace("\n", " "))
-        table.add_column(text.replace("\n", " "))
+        table = tables.new_table(text.replace("\n", " "), text.replace("\n", " "))
         table.add_row(text.replace("\n", " "))
-        tables.table_console(width=400).print(table, text.replace("\n", " "))
+        tables.table_console().print(table, text.replace("\n", " "))
     printed = capsys.readouterr()
     printed_safely(printed.out + printed.err)
 

@@ -15,11 +15,13 @@ from replays.studies.ladder.document import ladder_document, pick_of
 from replays.studies.ladder.pick import with_pick, write_pick
 from replays.studies.ladder.quantity import QUANTITIES, Trace, parse_quantities
 from replays.studies.ladder.search import LEVELS, Ladder, search
+from rig.cli.ladder import engines_table, levels_table
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.scenes import Scene, load_scene
 from rig.simulation import Simulation
+from tests.commands import check_legible
 
 SCENE = """# my own scene
 title = "mine"   # a comment
@@ -208,6 +210,14 @@ def test_changed_equations_and_choices_by_hand_are_refused(found: Ladder, path: 
     with pytest.raises(InputError, match=r"where engine\.name is chosen by hand"):
         load_scene(path, {"engine.name": "rk4"})
     load_scene(path, {"seed": 7})  # of the sensors' noise: no part of the physics
+
+
+def test_tables_are_legible(found: Ladder) -> None:
+    document = ladder_document(found)
+    document["steps"][0]["note"] = "a remark of many words " * 9
+    for table in (levels_table(document), engines_table(document)):
+        assert len(table.rows) > 3
+        check_legible(table)
 
 
 def test_no_pick_is_one_line(capsys: pytest.CaptureFixture[str], path: Path, tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_tables_show_what_the_document_holds(capsys: pytest.CaptureFixture[str])
     assert "K [kN/m]" in text
     assert "8 magnets of 16.9 mm: number and length are assumed" in text
     assert "no measured force is known to us" in text
-    chain = next(line for line in lines if line.startswith(" cylinder map") and "exact cylinders" in line)
+    chain = next(line for line in lines if line.startswith("cylinder map") and "exact cylinders" in line)
     assert float(chain.split()[-1].rstrip("%")) < 0.2
 
 

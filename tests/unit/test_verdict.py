@@ -20,9 +20,11 @@ from replays.recordings.picture import draw
 from replays.recordings.verdict import Verdict, hammer_time_s, judge
 from replays.recordings.whirl import parameter_si, whirl_figures
 from rig import wire
+from rig.cli.demo import verdict_table
 from rig.errors import InputError
 from rig.scenes import load_scene
 from rig.simulation import Simulation
+from tests.commands import check_legible
 
 Change = Callable[[str, bytes], Iterable[bytes]]
 """Payloads to write for one payload of a key: none, itself, others."""
@@ -180,11 +182,16 @@ def status(**changes: Any) -> bytes:
     return wire.encode_document(document | changes)
 
 
+LATE = {"p50": 0.1, "p99": 10.5, "max": 30.0}
+
+
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
         ({}, set()),
-        ({"lateness_ms": {"p50": 0.1, "p99": 10.5, "max": 30.0}}, {"lateness p50 / p99 / max"}),
+        ({"lateness_ms": LATE}, set()),
+        ({"lateness_ms": LATE, "real_time_factor": 0.9}, set()),
+        ({"lateness_ms": LATE, "real_time_factor": 1.1}, {"real-time factor"}),
         ({"real_time_factor": 0.99}, {"real-time factor"}),
         ({"energy": {"residual_j": 1e-3, "dissipated_j": 0.5}}, {"energy residual"}),
     ],
@@ -195,6 +202,9 @@ def test_what_the_rig_said_of_itself_counts(
     verdict = judge(rewritten(good, tmp_path / "status.mcap", status=status(**changes)))
     assert bad(verdict) == expected
     assert len(verdict.rows) == len(judge(good).rows) + 3
+    # A machine that is busy says nothing of the rig, but is told of.
+    assert ("busy" in verdict.remark) == ("lateness_ms" in changes)
+    check_legible(verdict_table(verdict))
 
 
 def test_a_recording_without_a_hammer_pulse_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,233 @@
+"""Tables and lines: whole on a terminal of 80 columns, and one line a row into a pipe."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rig.cli
+from replays.studies.bench import CASES
+from replays.studies.stability.cell import Cell
+from rig.cli.bench import cases_table
+from rig.cli.display import fitted
+from rig.cli.info import describe, events_table
+from rig.cli.stability import peers_table, trials_table
+from rig.cli.tables import facts, new_table
+from rig.engines import ENGINES
+from tests.commands import check_legible, lines_of, said, shown
+
+SESSIONS = Path(__file__).parents[2] / "replays" / "sessions"
+HAMMER = SESSIONS / "hammer-6.2.mcap"
+
+COMMANDS = [
+    ["scenes"],
+    *(["params", name] for name in ("corrected", "as-printed", "dtu-2019")),
+    ["laws"],
+    ["magnets"],
+    ["keys"],
+    ["can", "load"],
+    ["can", "load", "--can-fd"],
+    ["info", HAMMER],
+    ["info", HAMMER, "--quick"],
+    ["info", SESSIONS / "partial-rub.mcap"],
+]
+
+
+@pytest.mark.parametrize("arguments", COMMANDS, ids=lambda arguments: " ".join(map(str, arguments[:2])))
+def test_command_prints_tables_that_are_legible(arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    printed = shown(capsys, *arguments)
+    assert len(printed.splitlines()) > 4
+    assert not any(mark in printed for mark in "…│┃─━\x1b")
+    if arguments != ["keys"]:
+        json.loads(shown(capsys, *arguments, "--json"))
+
+
+def test_width_of_the_terminal_is_nothing_to_a_pipe(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    printed = []
+    for columns in ("30", "80", "500"):
+        monkeypatch.setenv("COLUMNS", columns)
+        printed.append(shown(capsys, "params"))
+    assert printed[0] == printed[1] == printed[2]
+    assert shown(capsys, "params", "--wide") == printed[0]
+    (row,) = [line.split() for line in printed[0].splitlines() if line.startswith("contact.friction ")]
+    assert row[1:3] == ["0.25", "1"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
+def test_a_real_terminal_shows_whole_values() -> None:
+    import fcntl
+    import pty
+    import struct
+    import termios
+
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    environment |= {"TERM": "xterm", "NO_COLOR": "1"}
+    command = [sys.executable, "-m", "rig.cli.main", "scenes"]
+    subprocess.run(command, stdout=theirs, stderr=theirs, stdin=theirs, env=environment, check=True, timeout=120)
+    os.close(theirs)
+    text = b""
+    try:
+        while block := os.read(ours, 65536):
+            text += block
+    except OSError:  # how Linux ends a terminal that nobody writes to any more
+        pass
+    os.close(ours)
+    plain = [line.rstrip() for line in text.decode().replace("\x1b[1m", "").replace("\x1b[0m", "").splitlines()]
+    assert plain == lines_of_scenes()
+
+
+def lines_of_scenes() -> list[str]:
+    from rig.scenes import load_scene, scene_names
+
+    table = new_table("", "scene", ">seconds", "what happens", wrapped=["what happens"])
+    for name in scene_names():
+        table.add_row(name, f"{load_scene(name).duration_s:g}", load_scene(name).title)
+    return lines_of(table)
+
+
+def test_trials_are_legible() -> None:
+    values = (0.0, -1.2345e-07, 1.6e240, float("inf"), float("nan"))
+    cells = [
+        Cell(trial, f"case {number} of a long name", engine, value, "m", 1e-3, expected, "because of what is known")
+        for trial in ("T1", "T12")
+        for engine in ENGINES
+        for number, value in enumerate(values)
+        for expected in (True, False, None)[number % 3 : number % 3 + 1]
+    ]
+    cells[3] = cells[3]._replace(skipped="not now")
+    for table in (trials_table(cells, list(ENGINES)), peers_table(cells)):
+        for width in (60, 80, 100, 200):
+            check_legible(table, width=width)
+        text = "\n".join(lines_of(table, width=80))
+        assert "1.6e+240" in text
+        assert "skipped" in text
+    assert not any("without" in line for line in lines_of(trials_table(cells, list(ENGINES))))
+
+
+def test_timed_cases_are_legible() -> None:
+    row = {"median": 12345.67, "min": 0.1, "max": 99999.9, "ratio": 0.05, "error": 1.2e-11, "residual_share": -1e-9}
+    cases = [{**row, "name": case.name, "goal": 300.0, "error_goal": 2e-3, "reached": False} for case in CASES]
+    table = cases_table({"cases": cases, "peers": [{**row, "name": "scipy-dop853 1e-10"}]}, runs=5)
+    check_legible(table)
+    assert all(any(name in line for line in lines_of(table)) for name in ("12345.7", "300 at 2.0e-03", "NO"))
+
+
+@pytest.mark.parametrize("width", [50, 79, 80, 120, 300])
+def test_any_table_is_legible(width: int) -> None:
+    table = new_table("a title", "name", "unit", *(f">quantity {n} [kN/m^1.5]" for n in range(9)), "said", "source",
+                      wrapped=("said", "source"), spare=("source", "unit"), keys=1)  # fmt: skip
+    for n in range(5):
+        numbers = (f"{-(10.0**k):.4e}" for k in range(9))
+        table.add_row(f"name_{n}", "m/s^2", *numbers, "words " * 20 * n, "somebody, some Journal 12 (1999) 345")
+    table.add_row("all of them")
+    check_legible(table, width=width)
+    told = [line for line in lines_of(table, width=width) if line.startswith("without ")]
+    assert told == ([] if width == 300 else ["without unit, source: see --wide"])
+
+
+def test_what_is_too_long_for_any_terminal_is_folded_and_not_cut() -> None:
+    table, name = new_table("", "name", ">value"), "x" * 150
+    table.add_row(name, "1.25")
+    lines = lines_of(table)
+    assert max(map(len, lines)) <= 80
+    assert "".join(line.split()[0] for line in lines[1:]) == name
+    assert "1.25" in lines[1]
+
+
+def test_rows_must_fit_their_headings() -> None:
+    with pytest.raises(ValueError, match="a row must be 1 or 2 cells"):
+        new_table("", "a", "b").add_row("1", "2", "3")
+
+
+def test_facts_have_no_heading() -> None:
+    table = facts("rig", [("a", "b " * 60), ("longer", "c")])
+    lines = lines_of(table)
+    assert lines[0] == "rig"
+    assert lines[1].startswith("a       b b")
+    assert lines[-1] == "longer  c"
+    check_legible(table)
+
+
+def test_a_status_line_is_one_line_of_whole_parts() -> None:
+    parts = ["  599.99 of 600 s", "late p99 0.12 max 123.45 ms", "clients 2"]
+    assert fitted(parts, 80) == "  599.99 of 600 s  late p99 0.12 max 123.45 ms  clients 2"
+    assert fitted(parts, 50) == "  599.99 of 600 s  late p99 0.12 max 123.45 ms"
+    assert fitted(parts, 5) == parts[0]
+
+
+def test_info_tells_a_blow_once_and_how_far_it_has_read(capsys: pytest.CaptureFixture[str]) -> None:
+    from recorder.reader import Recording
+
+    told: list[float] = []
+    describe(Recording.open(HAMMER), quick=False, progress=told.append)
+    assert told == sorted(told)
+    assert 0.0 < told[0] <= told[-1] <= 1.0
+    assert len(told) > 10
+    assert sum("hammer: " in line for line in shown(capsys, "info", HAMMER).splitlines()) == 1
+
+
+def test_a_command_and_its_effect_are_told_once_and_what_had_none_is_told_too() -> None:
+    def command(tick: int, name: str, number: int, **request: float) -> dict[str, Any]:
+        taken = {"event": "command", "id": number, "command": name, "request": request, "from": f"me {number}"}
+        return {**taken, "tick": tick, "time_s": tick / 1e6}
+
+    effects = [{"event": "hammer", "tick": tick, "time_s": tick / 1e6, "force_n": 100.0} for tick in (5, 7)]
+    events = [command(5, "hammer", 1, force_n=100.0), effects[0], command(7, "hammer", 2, force_n=100.0), effects[1]]
+    events += [command(9, "stop", 3), {"event": "note", "text": "so", "tick": [], "time_s": None}]
+    table = events_table(events)
+    check_legible(table)
+    assert [cells[1].plain for cells, _ in table.rows] == [
+        "hammer: force_n 100.0, id 1, from me 1", "hammer: force_n 100.0, id 2, from me 2",
+        "command: id 3, command stop, from me 3", "note: so",
+    ]  # fmt: skip
+
+
+def test_compiling_is_told_as_long_as_it_lasts() -> None:
+    from types import SimpleNamespace
+
+    from rig.cli.compiling import Compiling
+
+    begun: list[str] = []
+    told: list[str] = []
+    listener = Compiling(begun.append, told.append)
+
+    def event(module: str) -> Any:
+        return SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=SimpleNamespace(__module__=module))})
+
+    for modules in (["peers.cvode"], ["rig.engines.split.method", "numba.np.arrayobj"], ["rig.kernels.contact"]):
+        for module in modules:
+            listener.on_start(event(module))
+        for module in modules:
+            listener.on_end(event(module))
+    assert [text.partition(" (")[0] for text in told] == ["compiling split.method", "", "compiling kernels.contact", ""]
+    (first,) = begun
+    assert first.startswith("compiling split.method (0 s of CPU; ")
+    assert first.endswith("), once on this machine")
+
+
+def test_every_command_with_tables_has_the_same_options(capsys: pytest.CaptureFixture[str]) -> None:
+    """What prints a table takes --wide, and --json but for a page and what is made of two processes."""
+    found = set()
+    for path in sorted(Path(next(iter(rig.cli.__path__))).glob("*.py")):
+        calls = {ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)}
+        if path.stem != "tables" and calls & {"new_table", "facts"}:
+            found.add(path.stem)
+    commands = {
+        name: ["can", "load"] if name == "can_messages" else [name.rstrip("_")] for name in sorted(found - {"demo"})
+    }
+    assert len(commands) >= 14
+    for name, command in commands.items():
+        _, usage, _ = said(capsys, *command, "--help")
+        assert "--wide" in usage, name
+        assert ("--json" in usage) == (name != "keys"), name
