@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
@@ -105,7 +106,7 @@ class Store:
         schema = pa.schema([(name, pa.string() if name in _TEXT else pa.float64()) for name in COLUMNS])
         table = pa.table(
             {
-                name: [row[name] if name in _TEXT or row[name] is None else float(row[name]) for row in rows]
+                name: [row[name] if name in _TEXT or row[name] is None else _digits(row[name]) for row in rows]
                 for name in COLUMNS
             },
             schema=schema,
@@ -114,6 +115,28 @@ class Store:
         pyarrow.parquet.write_table(table, paths[0])
         pyarrow.csv.write_csv(table, paths[1])
         return paths
+
+
+def _digits(value: float) -> float:
+    # What follows is no evidence, and half of the file.
+    return float(f"{value:.6g}")
+
+
+def read_table(folder: Path, stem: str = "chart") -> list[Row]:
+    """The points of a table that a making of a chart has left in a folder.
+
+    Raises:
+        InputError: There is none, or it is no such table.
+    """
+    path = folder / f"{stem}.csv"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [
+                {name: row[name] if name in _TEXT else float(row[name]) if row[name] else None for name in COLUMNS}
+                for row in csv.DictReader(file)
+            ]
+    except (OSError, KeyError, ValueError, TypeError, csv.Error):
+        raise InputError("output", f"a folder with {path.name} of an earlier chart", str(folder)) from None
 
 
 def stamp() -> dict[str, str]:
