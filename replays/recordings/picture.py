@@ -11,7 +11,7 @@ import numpy as np
 from recorder.reader import Recording
 from replays.recordings.verdict import hammer_time_s
 from replays.recordings.whirl import parameter_si, reactions, whirl_figures
-from replays.report.canvas import BLACK, BLUE, GREEN, RED, draw_band, house_style, new_figure, save
+from replays.report.canvas import BLACK, BLUE, GREEN, RED, draw_signals, house_style, new_figure, save
 from rig.orbit import SPECTRUM_HZ, full_spectrum, waterfall
 
 _BEFORE, _IMPACTS, _WHIRL = GREEN, RED, BLUE
@@ -45,16 +45,19 @@ def draw(recording: Recording, path: Path) -> None:
 
     ax = axes[1, 0]
     kept = (drive.times_s >= hammer_s - 0.5) & (drive.times_s < hammer_s + 2.5)
-    ax.plot(drive.times_s[kept], drive.column("speed")[kept], color=BLACK, lw=0.7)
+    draw_signals(ax, drive.times_s[kept], (drive.column("speed")[kept], BLACK, ""))
     ax.axvline(hammer_s, color="0.5", lw=0.9, ls=":", label="hammer")
     ax.set(title="Spin, around the hammer", xlabel="time [s]", ylabel="spin speed [Hz]")
     ax.legend(loc="lower right")
 
     pairs = reactions(forces)
     settled = (end_s - 0.05, end_s)
+    # The houses ring at some kilohertz: of more time a panel would show a block.
+    largest = np.abs(pairs).max(axis=0)
+    onset_s = float(forces.times_s[int(np.argmax((largest > 0.1 * largest.max()) & (forces.times_s > hammer_s)))])
     for ax, window, title in (
         (axes[1, 1], whole, "Reactions"),
-        (axes[1, 2], impacts, "Reactions, first impacts"),
+        (axes[1, 2], (onset_s - 0.002, onset_s + 0.018), "Reactions, first impacts"),
         (axes[2, 0], settled, "Reactions, settled whirl"),
     ):
         _draw_pair(ax, forces.times_s, pairs, window, ("E − W", "N − S"))
@@ -108,8 +111,7 @@ def _draw_pair(
 ) -> None:
     """Two signals at right angles to each other, over a part of the time."""
     kept = (times_s >= window[0]) & (times_s < window[1])
-    for values, colour, name in zip(pair, (_X, _Y), names, strict=True):
-        draw_band(ax, times_s[kept], values[kept], colour=colour, label=name)
+    draw_signals(ax, times_s[kept], (pair[0][kept], _X, names[0]), (pair[1][kept], _Y, names[1]))
     ax.set(xlabel="time [s]", xlim=window)
     low, high = ax.get_ylim()
     ax.set_ylim(low, high + 0.2 * (high - low))

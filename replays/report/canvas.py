@@ -28,8 +28,8 @@ WIDTH = 10.0
 """Of every figure [inch]: where a page shows it at 850 pixels, letters of 9.5 points are 11 pixels high."""
 DPI = 140
 """Dots an inch of a PNG: sharp where a page shows it smaller, or a screen has two dots a pixel."""
-_BANDS = 240
-"""Stretches of time of which a band shows the extremes."""
+_PERIODS, _STRETCHES = 80, 240
+"""A signal of so many periods is drawn as a band, which shows the extremes of at most so many stretches of time."""
 _SALT = "rotor-stator-rig"
 """What the names inside an SVG are made of, beside what they name."""
 _STYLE: dict[str, Any] = {
@@ -92,30 +92,36 @@ def new_figure(
     return figure
 
 
-def draw_band(axes: Any, times: np.ndarray, values: np.ndarray, *, colour: str, label: str = "") -> None:
-    """A signal of any length: its mean as a line in the band from its least to its largest, or the line alone.
+def draw_signals(axes: Any, times: np.ndarray, *signals: tuple[np.ndarray, str, str]) -> None:
+    """Signals of any length: as lines, or each as its mean in the band from its least to its largest.
 
-    A line through more points than a panel has room for is a solid block, in which nothing is seen. A band that swings
-    about its mean is as faint as it needs to be for a second one to show through.
+    A line with more periods than a panel has room for is a solid block, in which nothing is seen. Bands are faint, so
+    that a second one shows through.
 
     Args:
         axes: Where to.
         times: Shape (n,).
-        values: Shape (n,).
-        colour: Of both.
-        label: For the legend.
+        signals: Values, shape (n,), colour and name of each.
     """
-    every = len(times) // _BANDS
-    if every < 4:
-        axes.plot(times, values, color=colour, lw=1.0, label=label)
-        return
-    whole = len(times) // every * every
-    folded = values[:whole].reshape(-1, every)
-    middle, low, high = times[:whole].reshape(-1, every).mean(axis=1), folded.min(axis=1), folded.max(axis=1)
-    axes.fill_between(middle, low, high, color=colour, alpha=0.13, lw=0)
-    for edge in (low, high):
-        axes.plot(middle, edge, color=colour, lw=0.7, alpha=0.8)
-    axes.plot(middle, folded.mean(axis=1), color=colour, lw=1.4, label=label)
+    periods = max(np.count_nonzero(np.diff(values > values.mean())) // 2 for values, _, _ in signals)
+    # A stretch holds two periods, else the band would show where they are cut.
+    stretches = min(_STRETCHES, periods // 2)
+    whole = len(times) // max(1, stretches) * stretches
+    for values, colour, label in signals:
+        if periods < _PERIODS or len(times) < 4 * stretches:
+            axes.plot(times, values, color=colour, lw=1.0, label=label)
+            continue
+        folded, middle = values[:whole].reshape(stretches, -1), times[:whole].reshape(stretches, -1).mean(axis=1)
+        low, high = folded.min(axis=1), folded.max(axis=1)
+        axes.fill_between(middle, low, high, color=colour, alpha=0.13, lw=0)
+        for edge in (low, high):
+            axes.plot(middle, edge, color=colour, lw=0.7, alpha=0.8)
+        axes.plot(middle, folded.mean(axis=1), color=colour, lw=1.4, label=label)
+
+
+def label_of(name: str, unit: str) -> str:
+    """What stands along the axis of a channel."""
+    return f"{name} [{unit.replace('^2', '²')}]"
 
 
 def legend_below(figure: Figure, *panels: Any, columns: int = 4) -> None:

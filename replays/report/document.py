@@ -18,7 +18,7 @@ SUFFIXES = (".html", ".pdf")
 
 Mark = Literal["good", "bad", "open", "plain"]
 """What a row of a table says: as it must be, not so, undecided, or nothing to be judged."""
-_NUMBER = re.compile(r"[<>~±+-]*\d")
+_NUMBER = re.compile(r"[<>≤≥~±+− -]*\d")
 _WORD = re.compile(r"[^\W\d_]{4}")
 _CODE = re.compile(r"`([^`]+)`")
 

@@ -178,9 +178,9 @@ def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) ->
     for axes in (wanted, difference):
         axes.axvline(restitution, color="0.5", lw=0.9, ls=":")
         axes.set(xlabel="restitution asked for, e [1]", xlim=(0, 1))
-    difference.annotate(
-        f"asked for here: {restitution:g}", (restitution, -0.06), xytext=(-4, 5), textcoords="offset points",
-        ha="right", va="bottom", rotation=90, color="0.4", bbox={"fc": "white", "ec": "none", "pad": 1},
+    wanted.annotate(
+        f"asked for here: {restitution:g}", (restitution, 0.0), xytext=(-4, 5), textcoords="offset points",
+        ha="right", va="bottom", rotation=90, color="0.4",
     )  # fmt: skip
     wanted.set(title="Restitution that each damping law returns", ylabel="restitution returned [1]", ylim=(0, 1.02))
     wanted.legend(**_UNDER, title="from the top down at 0.5")
@@ -199,7 +199,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
         ({"color": BLACK, "lw": 3.4}, {"color": SKY, "ls": (0, (5, 4))}, {"color": RED}),
         strict=True,
     ):
-        axes.semilogx(speeds, values, **{"lw": 1.8, "label": name, **style})
+        axes.semilogx(speeds, values, **{"lw": 1.8, "label": name.replace("v0", "v₀"), **style})
     low = max(0.0, min(min(values) for values in curves.values()) - 0.02)
     for place, text in (
         (floor, f"limit of v₀, {floor:g} m/s"),
