@@ -24,8 +24,9 @@ _CODE = re.compile(r"`([^`]+)`")
 
 
 def fragments(text: str) -> list[tuple[str, bool]]:
-    """Pieces of a text, each with whether it is code, which stands between backticks."""
-    return [(piece, bool(n % 2)) for n, piece in enumerate(_CODE.split(text)) if piece]
+    """Pieces of a text as they are set, each with whether it is code, which stands between backticks."""
+    pieces = enumerate(_CODE.split(text))
+    return [(piece if n % 2 else piece.replace("m/s^2", "m/s²"), bool(n % 2)) for n, piece in pieces if piece]
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ def report_of(found: Identification, *, recording: str, origin: Mapping[str, str
     """
     question, judgement = found.question, found.judgement
     told = "; ".join(
-        f"{finding.unknown.key} {finding.value:.6g} {cells(finding)[3]} {cells(finding)[4]}".rstrip()
+        " ".join((finding.unknown.key, *cells(finding)[2:5])).rstrip()
         if finding.standing == "identified"
         else f"{finding.unknown.key}: {finding.words}"
         for finding in judgement.findings

@@ -13,7 +13,7 @@ Row = dict[str, Any]
 
 # Peers stand in quiet tones by family, behind the strong colours of our engines.
 _FAMILIES = {"heyoka": ("#111111", "*"), "SUNDIALS": ("#6e6e6e", "s"), "scipy": ("#a98a66", "o"),
-             "MuJoCo": ("#5b4a8a", "X")}  # fmt: skip
+             "MuJoCo": ("#a08cc0", "X")}  # fmt: skip
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)), (0, (2.5, 1)), (0, (8, 3)),
                             (0, (1, 3)), (0, (9, 2, 3, 2)))  # fmt: skip
 FAILURES = {

@@ -103,11 +103,6 @@ def _draw_levels(axes: Any, ladder: Ladder, levels: list[Step], name: str, *, na
     axes.set_title(f"{name.replace('_', ' ').capitalize()}:\nmodel error of each level")
 
 
-def _shown(label: str) -> str:
-    """An engine and its step as a person writes them."""
-    return label.replace(" us", " µs")
-
-
 def _row_label(step: Step) -> str:
     if step.stage == "together":
         return "all that pass, together"
@@ -123,7 +118,7 @@ def _draw_work(axes: Any, levels: list[Step]) -> None:
         axes.barh(row, wall, height=0.6, color=traits(cost.candidate.engine).colour, zorder=2)
         axes.plot([cost.spread_s[0] * 1e3, cost.spread_s[1] * 1e3], [row, row], color="0.2", lw=1.4, zorder=3)
         axes.annotate(
-            f"{wall:.3g}  ({_shown(cost.candidate.label)})", (max(wall, cost.spread_s[1] * 1e3), row), xytext=(4, 0),
+            f"{wall:.3g}  ({cost.candidate.label})", (max(wall, cost.spread_s[1] * 1e3), row), xytext=(4, 0),
             textcoords="offset points", va="center", fontsize=9,
         )  # fmt: skip
     walls = [wall * 1e3 for step in levels if step.cost for wall in step.cost.spread_s]
@@ -160,7 +155,7 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, first: bool) -> None:
     axes.plot(
         _placed(errors.total[name], low, high), chosen.measured.wall_s * 1e3, marker="*", ms=18,
         color=traits(picked.candidate.engine).colour, mec=BLACK, ls="none", zorder=4,
-        label=f"pick: {_shown(picked.candidate.label)}",
+        label=f"pick: {picked.candidate.label}",
     )  # fmt: skip
     axes.plot([], [], color="0.3", marker="o", mfc="white", ls=":", label="numerical error alone")
     axes.plot([], [], color="0.3", marker="o", label="total error")
@@ -183,7 +178,7 @@ def _write_evidence(axes: Any, ladder: Ladder) -> None:
     picked, errors = ladder.picked, ladder.picked_errors
     axes.axis("off")
     levels = ", ".join(f"{level} {choice}" for level, choice in picked.candidate.model.items())
-    lines = textwrap.wrap(f"{levels}, sensors {ladder.sensors}; {_shown(picked.candidate.label)}", 40)
+    lines = textwrap.wrap(f"{levels}, sensors {ladder.sensors}; {picked.candidate.label}", 40)
     for name, tolerance in ladder.tolerances.items():
         value, reference = picked.values[name], ladder.reference.values[name]
         plain = isinstance(value, str) or isinstance(reference, str)
@@ -205,9 +200,9 @@ def _caption(ladder: Ladder) -> str:
     pick, given, full = (run.wall_s * 1e3 for run in (ladder.picked, ladder.given, ladder.full))
     text = (
         f"Times are medians without sensors, lines from least to largest; with sensors the pick takes {pick:.3g} ms, the "
-        f"scene as given {given:.3g} ms, the full model {full:.3g} ms by {_shown(ladder.full.candidate.label)}. Errors of {names} against the full model by "
-        f"{_shown(ladder.reference.candidate.label)}, whose own error is its distance to "
-        f"{_shown(ladder.unlike.candidate.label)}. * not picked: stands in for another, or spares nothing. Seed "
+        f"scene as given {given:.3g} ms, the full model {full:.3g} ms by {ladder.full.candidate.label}. Errors of {names} against the full model by "
+        f"{ladder.reference.candidate.label}, whose own error is its distance to "
+        f"{ladder.unlike.candidate.label}. * not picked: stands in for another, or spares nothing. Seed "
         f"{ladder.scene.seed}; {len(ladder.steps)} candidates tried in {ladder.spent_s:.0f} s"
         f"{'' if ladder.complete else ' (budget spent)'}; {python_line()}."
     )

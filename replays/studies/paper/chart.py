@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from textwrap import shorten
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from replays.report.canvas import BLACK, BLUE, ORANGE, RED, house_style, new_figure
+from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, house_style, legend_below, new_figure
 from replays.studies.paper.condition import (
     Start,
     Threshold,
@@ -23,6 +24,11 @@ from rig.kernels.constants import Constants
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from replays.studies.paper.findings import Line
+
+_FAR = 0.6
+"""How far outside what is allowed a value is still drawn at its place, in parts of the allowed range."""
 
 
 @house_style()
@@ -59,6 +65,37 @@ def draw_conditions(
     scan.set(xlabel="friction µ [1]", ylabel="pulse of 5 ms at 6.2 Hz", ylim=(-0.6, len(starts) - 0.4),
              title="What becomes of a pulse")  # fmt: skip
     scan.legend(loc="upper center", bbox_to_anchor=(0.45, -0.13), ncols=2)
+    return figure
+
+
+@house_style()
+def draw_verdicts(lines: list[Line]) -> Figure:
+    """Where ours lies within what the paper allows, for every statement on how large something is."""
+    judged = [line for line in lines if 0.0 < line.statement.low < line.statement.high < 20.0 * line.statement.low]
+    figure = new_figure(0.27 * len(judged) + 1.5, "How large the paper has it, and ours")
+    axes = figure.subplots()
+    axes.axvspan(0.0, 1.0, color="0.92", lw=0)
+    looks = {"as-printed": ("s", "white"), "corrected": ("o", None)}
+    for row, line in enumerate(judged):
+        low, high = line.statement.low, line.statement.high
+        for name, value in line.values.items():
+            marker, fill = looks[name]
+            colour = GREEN if line.verdicts[name] == "agrees" else RED
+            place = (value - low) / (high - low) if math.isfinite(value) else math.inf
+            # What is farther off stands at the edge.
+            shown = min(max(place, -_FAR), 1.0 + _FAR)
+            axes.plot(shown, row, marker if shown == place else "<" if place < 0.0 else ">", color=colour,
+                      mfc=fill or colour, ms=7, mew=1.6)  # fmt: skip
+    for name, (marker, fill) in looks.items():
+        axes.plot([], [], marker, color=BLACK, mfc=fill or BLACK, ms=7, mew=1.6, ls="none", label=name)
+    for colour, label in ((GREEN, "agrees"), (RED, "differs (triangle: farther off)")):
+        axes.plot([], [], color=colour, lw=5, label=label)
+    axes.set_yticks(range(len(judged)), [shorten(line.statement.says, 60, placeholder=" …") for line in judged])
+    axes.set(
+        xlim=(-1.15 * _FAR, 1.0 + 1.15 * _FAR), ylim=(len(judged) - 0.4, -0.6),
+        xlabel="place between the least (0) and the largest (1)\nthat the paper allows [1]",
+    )  # fmt: skip
+    legend_below(figure)
     return figure
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from replays.report import Report
 from replays.report.canvas import save
 from replays.studies.paper import condition, figure, question
-from replays.studies.paper.chart import draw_conditions, draw_law
+from replays.studies.paper.chart import draw_conditions, draw_law, draw_verdicts
 from replays.studies.paper.claim import (
     BANDWIDTHS_HZ,
     LAWS,
@@ -106,6 +106,7 @@ def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
 
 
 _PICTURES: dict[str, Callable[[Findings], Figure]] = {
+    "verdicts": lambda findings: draw_verdicts([*findings.lines, *findings.claims]),
     "magnets": lambda findings: figure.draw_magnets(findings.found["corrected"]),
     "drop": lambda findings: figure.draw_drop(findings.found),
     "hammer": lambda findings: figure.draw_hammer(findings.found),
