@@ -30,16 +30,20 @@ def draw(recording: Recording, path: Path) -> None:
     hammer_s = hammer_time_s(recording)
     end_s = float(probes.times_s[-1])
     figures = whirl_figures(recording, max(hammer_s + 0.5, end_s - 2.0), end_s)
+    scene, parameters = recording.scene["name"], recording.parameters["set"]
     figure = new_figure(
         9.6,
-        f"Scene {recording.scene['name']}, parameters {recording.parameters['set']}, hammer at {hammer_s:.2f} s: backward"
-        f" whirl\nat {abs(figures.frequency_hz):.2f} Hz while it spins at {figures.spin_hz:.3f} Hz, read off the recording",
+        f"Scene {scene}, parameters {parameters}, hammer at {hammer_s:.2f} s:\nwhirl "
+        f"at {figures.frequency_hz:.2f} Hz, spin at {figures.spin_hz:.3f} Hz, read off the recording",
     )
     axes = figure.subplots(3, 3)
     impacts, whole = (hammer_s - 0.01, hammer_s + 0.12), (float(probes.times_s[0]), end_s)
     _draw_orbit(axes[0, 0], recording, hammer_s, end_s)
     disk = (probes.column("disk_x"), probes.column("disk_y"))
-    for ax, window, title in ((axes[0, 1], whole, "Displacement"), (axes[0, 2], impacts, "Displacement, first impacts")):
+    for ax, window, title in (
+        (axes[0, 1], whole, "Displacement"),
+        (axes[0, 2], impacts, "Displacement, first impacts"),
+    ):
         _draw_pair(ax, probes.times_s, disk, window, ("x", "y"))
         ax.set(title=title, ylabel="displacement at the disk [mm]")
 
@@ -107,7 +111,11 @@ def _draw_orbit(ax: Any, recording: Recording, hammer_s: float, end_s: float) ->
 
 
 def _draw_pair(
-    ax: Any, times_s: np.ndarray, pair: tuple[np.ndarray, np.ndarray], window: tuple[float, float], names: tuple[str, str]
+    ax: Any,
+    times_s: np.ndarray,
+    pair: tuple[np.ndarray, np.ndarray],
+    window: tuple[float, float],
+    names: tuple[str, str],
 ) -> None:
     """Two signals at right angles to each other, over a part of the time."""
     kept = (times_s >= window[0]) & (times_s < window[1])

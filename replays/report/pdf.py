@@ -108,7 +108,10 @@ def _table(pdf: FPDF, table: Table) -> None:
             line = grid.row()
             for n, cell in enumerate(row.cells):
                 last = n == len(row.cells) - 1
-                line.cell("".join(piece for piece, _ in fragments(cell)), style=FontFace(color=_MARKS[row.mark] if last else _INK))
+                line.cell(
+                    "".join(piece for piece, _ in fragments(cell)),
+                    style=FontFace(color=_MARKS[row.mark] if last else _INK),
+                )
 
 
 def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:

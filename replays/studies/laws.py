@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, check_suffix, house_style, new_figure, save
+from replays.report.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    check_suffix,
+    house_style,
+    new_figure,
+    save,
+)
 from rig.contacts import (
     DAMPING,
     KELVIN_VOIGT,
@@ -155,7 +167,8 @@ def draw(parameters: ParameterSet, path: Path) -> None:
     normal_law(parameters)
     figure = new_figure(
         10.6,
-        f"Normal contact laws in free impacts without friction\n(parameters: {parameters.name}; not validated on a rig)",
+        "Normal contact laws in free impacts without friction\n"
+        f"(parameters: {parameters.name}; not validated on a rig)",
     )
     (wanted, difference), (speed, stiffness) = figure.subplots(2, 2)
     _draw_restitution(wanted, difference, parameters)

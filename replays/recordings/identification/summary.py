@@ -11,7 +11,19 @@ import numpy as np
 from replays.recordings.identification.fit import Identification
 from replays.recordings.identification.judgement import Finding
 from replays.report import Mark, Report, Row
-from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, house_style, label_of, legend_below, new_figure
+from replays.report.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    house_style,
+    label_of,
+    legend_below,
+    new_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -90,10 +102,13 @@ def report_of(found: Identification, *, recording: str, origin: Mapping[str, str
     )
     good = judgement.fits and all(finding.standing == "identified" for finding in judgement.findings)
     report = Report(
-        f"Identification from {recording}", f"{told}. {fit_line(found)}.", origin=origin, mark="good" if good else "open"
+        f"Identification from {recording}",
+        f"{told}. {fit_line(found)}.",
+        origin=origin,
+        mark="good" if good else "open",
     )
-    report.picture(growth(found), "95 % intervals over the end of the window, in parts of each value's scale; right, how "
-                   "the values hang together.")  # fmt: skip
+    report.picture(growth(found), "95 % intervals over the end of the window, in parts of each value's scale; right, "
+                   "how the values hang together.")  # fmt: skip
     report.text(f"W{window_line(found)[1:]}.")
     if found.narrowed:
         report.text(f"The {spread_line(found)}.")
@@ -189,7 +204,9 @@ def growth(found: Identification) -> Figure:
     left.set_prop_cycle(color=[BLUE, RED, GREEN, PINK, ORANGE, SKY, BLACK], marker=list("osD^vhP"))
     for place, unknown in enumerate(found.question.unknowns):
         left.semilogy(ends, [stage.half_widths[place] / unknown.scale for stage in found.stages], label=unknown.key)
-    left.set(title="How the intervals shrink", xlabel="end of the window [s]", ylabel="half of the 95 % interval / scale [1]")
+    left.set(
+        title="How the intervals shrink", xlabel="end of the window [s]", ylabel="half of the 95 % interval / scale [1]"
+    )
     image = right.imshow(found.judgement.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
     # Names once, at the side: below the picture long ones would run off it.
     right.set_xticks(range(len(keys)), [str(place + 1) for place in range(len(keys))])

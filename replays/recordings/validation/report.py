@@ -240,7 +240,9 @@ def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, floa
             left.set_ylabel(label_of(channel.name, channel.unit))
             for axes, (why, begin, end) in zip(row, (whole, window, window), strict=True):
                 if begin < found.window_s[1] < end - 1e-6:
-                    axes.axvline(found.window_s[1], color="0.4", lw=1.0, ls=":", label="end of the comparison by sample")
+                    axes.axvline(
+                        found.window_s[1], color="0.4", lw=1.0, ls=":", label="end of the comparison by sample"
+                    )
                 if end > begin:
                     axes.set_xlim(begin, end)
                 axes.tick_params(labelbottom=c == n - 1)

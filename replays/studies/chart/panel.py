@@ -92,7 +92,7 @@ def _failures(axes: Any, points: list[Row], all_rows: list[Row]) -> None:
             va="center", fontsize=9, fontweight="bold", zorder=9, gid=f"failure-{row['method']}-{row['rung']}",
             clip_on=False,
         )  # fmt: skip
-    axes.text(math.sqrt(_RIGHT * _EDGE), 0.992, "failed", transform=axes.get_xaxis_transform(), ha="center", va="top",
+    axes.text(math.sqrt(_RIGHT * _EDGE), 1.0, "failed", transform=axes.get_xaxis_transform(), ha="center", va="bottom",
               fontsize=9, color="#a06060")  # fmt: skip
 
 
@@ -110,8 +110,9 @@ def _limits(axes: Any, rows: list[Row]) -> None:
     for row in rows:
         if row["case"] == "floor" and row["error"] and _LEFT < row["error"] < _RIGHT:
             axes.axvline(row["error"], color="#8a6fae", lw=1.0, ls=(0, (4, 3)), zorder=2)
-            axes.text(row["error"], 0.06, row["rung"].replace("v_s", "vₛ"), rotation=90, transform=axes.get_xaxis_transform(),
-                      fontsize=9, color="#6d5490", ha="right", va="bottom")  # fmt: skip
+            label = row["rung"].replace("v_s", "vₛ")
+            axes.text(row["error"], 0.06, label, rotation=90, transform=axes.get_xaxis_transform(), fontsize=9,
+                      color="#6d5490", ha="right", va="bottom")  # fmt: skip
 
 
 def mark_better(axes: Any) -> None:

@@ -113,7 +113,7 @@ class Store:
         )
         paths = [self.folder / f"{self.stem}.parquet", self.folder / f"{self.stem}.csv"]
         pyarrow.parquet.write_table(table, paths[0])
-        pyarrow.csv.write_csv(table, paths[1])
+        pyarrow.csv.write_csv(table, paths[1], pyarrow.csv.WriteOptions(quoting_style="needed"))
         return paths
 
 

@@ -199,8 +199,9 @@ def _caption(ladder: Ladder) -> str:
     names = ", ".join(name.replace("_", " ") for name in ladder.tolerances)
     pick, given, full = (run.wall_s * 1e3 for run in (ladder.picked, ladder.given, ladder.full))
     text = (
-        f"Times are medians without sensors, lines from least to largest; with sensors the pick takes {pick:.3g} ms, the "
-        f"scene as given {given:.3g} ms, the full model {full:.3g} ms by {ladder.full.candidate.label}. Errors of {names} against the full model by "
+        "Times are medians without sensors, lines from least to largest; with sensors the pick takes "
+        f"{pick:.3g} ms, the scene as given {given:.3g} ms, the full model {full:.3g} ms by "
+        f"{ladder.full.candidate.label}. Errors of {names} against the full model by "
         f"{ladder.reference.candidate.label}, whose own error is its distance to "
         f"{ladder.unlike.candidate.label}. * not picked: stands in for another, or spares nothing. Seed "
         f"{ladder.scene.seed}; {len(ladder.steps)} candidates tried in {ladder.spent_s:.0f} s"

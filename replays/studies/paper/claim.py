@@ -176,7 +176,7 @@ def _draw_bars(axes: Any, widest: list[Bar], level: float) -> None:
         if not there:
             continue
         # A little width for a bar that does not move at all.
-        axes.barh(row, max(bar.width, 0.002 * room), left=min(there), height=0.62, color=COLOURS[bar.kind])
+        axes.barh(row, max(bar.width, 0.05 * room), left=min(there), height=0.62, color=COLOURS[bar.kind])
         for end, (fill, _) in zip((bar.values[0], bar.values[-1]), _ENDS, strict=True):
             if bar.kind != "other reading" and math.isfinite(end):
                 axes.plot(end, row, "o", color=BLACK, mfc=fill, ms=6.5)

@@ -131,9 +131,7 @@ def draw_pictures(findings: Findings, folder: Path) -> list[Path]:
         OSError: The disk refused.
     """
     drawn = {name: _PICTURES[name](findings) for name in ("tornado", "conditions", "drop")}
-    return [
-        path for name, each in drawn.items() for path in save(each, folder / f"paper-{name}.png")
-    ]
+    return [path for name, each in drawn.items() for path in save(each, folder / f"paper-{name}.png")]
 
 
 def _numbers(findings: Findings) -> dict[str, Any]:

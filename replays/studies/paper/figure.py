@@ -81,7 +81,9 @@ def draw_magnets(one: Reproduction) -> Figure:
                     label="force [N]")  # fmt: skip
     line = panels[2]
     along = map_force(axis, np.zeros_like(axis), model.constants.magnet)[:, 0]
-    line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label=f"map, {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)")
+    line.plot(
+        axis * 1e3, along, color=BLUE, lw=2.2, label=f"map, {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
+    )
     line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="linear spring")
     _axis_lines(line, -40.0, 40.0)
     line.set(title="Through the centre", xlabel="x [mm]", ylabel="force along x [N]", xlim=(-10, 10), ylim=(-46, 46))
@@ -126,7 +128,9 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         _axis_lines(house, -100.0, 100.0)
         for axes in (force, house):
             axes.set(xlabel="time, first impacts [ms]", xlim=first_impacts(run["penetration"], t))
-    _name_first(columns, "y in the ring [mm]", "y [mm]", "SOUTH reaction [N]", "acceleration of the\ninner house [m/s²]")
+    _name_first(
+        columns, "y in the ring [mm]", "y [mm]", "SOUTH reaction [N]", "acceleration of the\ninner house [m/s²]"
+    )
     legend_below(figure, columns=5)
     return figure
 

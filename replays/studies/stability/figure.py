@@ -32,7 +32,9 @@ def draw_all(folder: Path, engines: list[str], *, quick: bool) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     files: list[Path] = []
     for name, draw in (("map", draw_map), ("ladders", draw_ladders), ("whirl", draw_whirl)):
-        files += save(draw(engines, quick=quick), *(folder / f"stability-{name}{suffix}" for suffix in (".png", ".svg")))
+        files += save(
+            draw(engines, quick=quick), *(folder / f"stability-{name}{suffix}" for suffix in (".png", ".svg"))
+        )
     return files
 
 
