@@ -32,7 +32,7 @@ _PERIODS, _STRETCHES = 80, 240
 """A signal of so many periods is drawn as a band, which shows the extremes of at most so many stretches of time."""
 _SALT = "rotor-stator-rig"
 """What the names inside an SVG are made of, beside what they name."""
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
     "figure.titlesize": 12.5,

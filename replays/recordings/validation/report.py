@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -204,6 +204,7 @@ def _overview(found: Validation) -> Figure:
     begin = min(float(part.times_s[0]) for part in found.parts.values())
     end = max(float(part.times_s[-1]) for part in found.parts.values())
     edges, row = np.linspace(begin, end, _STRETCHES + 1), 0
+    image: Any = None
     for part in found.parts.values():
         squares = ((part.values - _foretold(found, part)) / part.floor) ** 2
         place = np.clip(np.digitize(part.times_s, edges) - 1, 0, _STRETCHES - 1)

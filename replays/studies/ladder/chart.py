@@ -117,8 +117,9 @@ def _draw_work(axes: Any, levels: list[Step]) -> None:
         wall = cost.wall_s * 1e3
         axes.barh(row, wall, height=0.6, color=traits(cost.candidate.engine).colour, zorder=2)
         axes.plot([cost.spread_s[0] * 1e3, cost.spread_s[1] * 1e3], [row, row], color="0.2", lw=1.4, zorder=3)
+        told = f"{float(f'{wall:.3g}'):g}  ({cost.candidate.label})"
         axes.annotate(
-            f"{wall:.3g}  ({cost.candidate.label})", (max(wall, cost.spread_s[1] * 1e3), row), xytext=(4, 0),
+            told, (max(wall, cost.spread_s[1] * 1e3), row), xytext=(4, 0),
             textcoords="offset points", va="center", fontsize=9,
         )  # fmt: skip
     walls = [wall * 1e3 for step in levels if step.cost for wall in step.cost.spread_s]

@@ -72,6 +72,7 @@ def draw_magnets(one: Reproduction) -> Figure:
     panels = figure.subplots(1, 3)
     # The map holds to 10 mm from the centre; the corners of the square are farther out.
     inside = np.hypot(x, y) <= FIG_7_M
+    filled: Any = None
     for axes, component, name in zip(panels[:2], force.T, ("x", "y"), strict=True):
         shown = np.where(inside, component, np.nan).reshape(81, 81)
         filled = axes.contourf(axis * 1e3, axis * 1e3, shown, levels=np.linspace(-40, 40, 17), cmap="RdBu_r",
@@ -176,6 +177,7 @@ def draw_hammer(found: dict[str, Reproduction]) -> Figure:
 def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
     """Figure 14: full spectrum over time."""
     figure, columns = _columns(found, "Fig. 14: full spectrum of the disk's probes over time", 4.6)
+    mesh: Any = None
     for one, (axes,) in columns:
         times, frequencies, amplitude = spectra(one.whirl)
         level = 20.0 * np.log10(np.maximum(amplitude, 1e-5))
