@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from recorder.reader import Recording
 
 given: list[str] = []
 """Arguments of the command under way, as `rig.cli.app` was given them."""
@@ -26,7 +29,7 @@ def origin(**subject: object) -> dict[str, str]:
     }
 
 
-def of_recording(name: str, recording: Any) -> dict[str, str]:
+def of_recording(name: str, recording: Recording) -> dict[str, str]:
     """The same of a recording: its file, scene, parameter set and seed, as far as it tells them."""
     scene, parameters = recording.scene, recording.parameters
     return origin(file=name, scene=scene.get("name"), parameter_set=parameters.get("set"), seed=scene.get("seed"))
