@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.verdict import hammer_time_s
 from replays.recordings.whirl import parameter_si, reactions, whirl_figures
-from replays.report.canvas import new_figure, save
+from replays.report.canvas import BLACK, BLUE, GREEN, RED, draw_signals, house_style, new_figure, save
 from rig.orbit import SPECTRUM_HZ, full_spectrum, waterfall
 
-_BEFORE, _IMPACTS, _WHIRL = "#4c9f70", "#d1495b", "#30638e"
+_BEFORE, _IMPACTS, _WHIRL = GREEN, RED, BLUE
+_X, _Y = BLUE, RED
+_FREQUENCY = "frequency [Hz]\n← backward      forward →"
 
 
+@house_style()
 def draw(recording: Recording, path: Path) -> None:
     """Draw the picture and write it as PNG or SVG.
 
@@ -28,15 +32,63 @@ def draw(recording: Recording, path: Path) -> None:
     figures = whirl_figures(recording, max(hammer_s + 0.5, end_s - 2.0), end_s)
     scene, parameters = recording.scene["name"], recording.parameters["set"]
     figure = new_figure(
-        (15.0, 10.0),
-        f"Virtual rotor-stator rig: scene {scene}, parameters {parameters}, hammer at {hammer_s:.2f} s; "
-        f"whirl {figures.frequency_hz:.2f} Hz at {figures.spin_hz:.3f} Hz spin (from the recorded samples)",
-        title_size=13,
+        9.6,
+        f"Scene {scene}, parameters {parameters}, hammer at {hammer_s:.2f} s:\nwhirl "
+        f"at {figures.frequency_hz:.2f} Hz, spin at {figures.spin_hz:.3f} Hz, read off the recording",
     )
-    axes = figure.subplots(3, 3, width_ratios=[1, 1, 1])
+    axes = figure.subplots(3, 3)
+    impacts, whole = (hammer_s - 0.01, hammer_s + 0.12), (float(probes.times_s[0]), end_s)
+    _draw_orbit(axes[0, 0], recording, hammer_s, end_s)
+    disk = (probes.column("disk_x"), probes.column("disk_y"))
+    for ax, window, title in (
+        (axes[0, 1], whole, "Displacement"),
+        (axes[0, 2], impacts, "Displacement, first impacts"),
+    ):
+        _draw_pair(ax, probes.times_s, disk, window, ("x", "y"))
+        ax.set(title=title, ylabel="displacement at the disk [mm]")
 
-    # Orbit of the disk within the clearance, as Fig. 12 a.
-    ax = axes[0, 0]
+    ax = axes[1, 0]
+    kept = (drive.times_s >= hammer_s - 0.5) & (drive.times_s < hammer_s + 2.5)
+    draw_signals(ax, drive.times_s[kept], (drive.column("speed")[kept], BLACK, ""))
+    ax.axvline(hammer_s, color="0.5", lw=0.9, ls=":", label="hammer")
+    ax.set(title="Spin, around the hammer", xlabel="time [s]", ylabel="spin speed [Hz]")
+    ax.legend(loc="lower right")
+
+    pairs = reactions(forces)
+    settled = (end_s - 0.05, end_s)
+    # The houses ring at some kilohertz: of more time a panel would show a block.
+    largest = np.abs(pairs).max(axis=0)
+    onset_s = float(forces.times_s[int(np.argmax((largest > 0.1 * largest.max()) & (forces.times_s > hammer_s)))])
+    for ax, window, title in (
+        (axes[1, 1], whole, "Reactions"),
+        (axes[1, 2], (onset_s - 0.002, onset_s + 0.018), "Reactions, first impacts"),
+        (axes[2, 0], settled, "Reactions, settled whirl"),
+    ):
+        _draw_pair(ax, forces.times_s, pairs, window, ("E − W", "N − S"))
+        ax.set(title=title, ylabel="force [N]")
+
+    ax = axes[2, 1]
+    kept = probes.times_s >= end_s - 2.0
+    frequency, amplitude = full_spectrum(disk[0][kept], disk[1][kept], probes.rate_hz)
+    near = np.abs(frequency) <= SPECTRUM_HZ
+    ax.axvline(figures.law_hz, color=RED, ls=":", lw=1.4, label=f"−Ω Rₛ/(r₀ + δ)\n= −{abs(figures.law_hz):.1f} Hz")
+    ax.semilogy(frequency[near], np.maximum(amplitude[near], 1e-5), color=BLUE, lw=0.9)
+    ax.set(title="Full spectrum, settled whirl", xlabel=_FREQUENCY, ylabel="amplitude [mm]", ylim=(1e-5, 10.0))
+    ax.legend(loc="upper right")
+
+    ax = axes[2, 2]
+    times, frequency, amplitude = waterfall(probes.times_s, *disk, probes.rate_hz)
+    level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
+    mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
+    figure.colorbar(mesh, ax=ax, label="level [dB re 1 µm]", pad=0.02)
+    ax.axhline(hammer_s, color="w", lw=0.9, ls=":")
+    ax.set(title="Full-spectrum waterfall", xlabel=_FREQUENCY, ylabel="time [s]")
+    save(figure, path)
+
+
+def _draw_orbit(ax: Any, recording: Recording, hammer_s: float, end_s: float) -> None:
+    """Orbit of the disk within the clearance, as Fig. 12 a."""
+    probes = recording.samples("probes")
     circle = 2 * math.pi * np.linspace(0, 1, 361)
     reach = (
         parameter_si(recording, "ring.clearance")
@@ -44,64 +96,31 @@ def draw(recording: Recording, path: Path) -> None:
         / parameter_si(recording, "shaft.arm_ring")
         * 1e3
     )
-    ax.plot(reach * np.cos(circle), reach * np.sin(circle), "k--", lw=1, label="clearance at rest")
+    ax.plot(reach * np.cos(circle), reach * np.sin(circle), color=BLACK, ls="--", lw=1, label="clearance")
     for label, color, low, high in (
+        ("before", _BEFORE, hammer_s - 0.5, hammer_s),
         ("impacts", _IMPACTS, hammer_s, hammer_s + 0.06),
         ("whirl", _WHIRL, end_s - 0.2, end_s),
-        ("before", _BEFORE, hammer_s - 0.5, hammer_s),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
-        ax.plot(probes.column("disk_x")[kept], probes.column("disk_y")[kept], color=color, lw=0.8, label=label)
+        ax.plot(probes.column("disk_x")[kept], probes.column("disk_y")[kept], color=color, lw=1.0, label=label)
     ax.set(title="Orbit at the disk", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), fontsize=8)
+    # Above the orbit, where nothing is.
+    ax.set_ylim(top=1.75 * ax.get_ylim()[1])
+    ax.legend(loc="upper center", ncols=2, handlelength=1.2, columnspacing=1.0)
 
-    # Displacement, whole run and first impacts.
-    for ax, low, high, title in (
-        (axes[0, 1], probes.times_s[0], end_s, "Displacement at the disk"),
-        (axes[0, 2], hammer_s - 0.01, hammer_s + 0.12, "First impacts"),
-    ):
-        kept = (probes.times_s >= low) & (probes.times_s < high)
-        # Over the whole run a whirl is a band: both must show through.
-        width, opacity = (0.5, 0.5) if high == end_s else (1.0, 1.0)
-        for name, color in (("disk_x", _WHIRL), ("disk_y", _IMPACTS)):
-            ax.plot(probes.times_s[kept], probes.column(name)[kept], color=color, lw=width, alpha=opacity, label=name)
-        ax.set(title=title, xlabel="time [s]", ylabel="[mm]", xlim=(low, high))
-        ax.legend(loc="lower right", fontsize=8)
 
-    ax = axes[1, 0]
-    ax.plot(drive.times_s[::20], drive.column("speed")[::20], color=_WHIRL, lw=0.8)
-    ax.axvline(hammer_s, color="0.5", lw=0.8, ls=":")
-    ax.set(title="Spin speed", xlabel="time [s]", ylabel="[Hz]", xlim=(drive.times_s[0], end_s))
-    ax.set_ylim(bottom=0, top=1.1 * float(drive.column("speed").max()))
-
-    pair_x, pair_y = reactions(forces)
-    for ax, low, high, title in (
-        (axes[1, 1], forces.times_s[0], end_s, "Reactions"),
-        (axes[1, 2], hammer_s - 0.01, hammer_s + 0.12, "Reactions, first impacts"),
-        (axes[2, 0], end_s - 0.05, end_s, "Reactions, settled whirl"),
-    ):
-        kept = (forces.times_s >= low) & (forces.times_s < high)
-        width, opacity = (0.5, 0.5) if title == "Reactions" else (1.0, 1.0)
-        ax.plot(forces.times_s[kept], pair_x[kept], color=_WHIRL, lw=width, alpha=opacity, label="E - W")
-        ax.plot(forces.times_s[kept], pair_y[kept], color=_IMPACTS, lw=width, alpha=opacity, label="N - S")
-        ax.set(title=title, xlabel="time [s]", ylabel="[N]", xlim=(low, high))
-        ax.legend(loc="lower right", fontsize=8)
-
-    ax = axes[2, 1]
-    kept = probes.times_s >= end_s - 2.0
-    disk_x, disk_y = probes.column("disk_x"), probes.column("disk_y")
-    frequency, amplitude = full_spectrum(disk_x[kept], disk_y[kept], probes.rate_hz)
-    near = np.abs(frequency) <= SPECTRUM_HZ
-    ax.semilogy(frequency[near], np.maximum(amplitude[near], 1e-5), color=_WHIRL, lw=0.8)
-    ax.axvline(figures.law_hz, color="0.4", ls=":", lw=1, label=f"-spin R_S/(r0+delta) = {figures.law_hz:.1f} Hz")
-    ax.set(title="Full spectrum, settled whirl", xlabel="backward  -  frequency [Hz]  -  forward", ylabel="[mm]")
-    ax.legend(loc="upper right", fontsize=8)
-
-    ax = axes[2, 2]
-    times, frequency, amplitude = waterfall(probes.times_s, disk_x, disk_y, probes.rate_hz)
-    level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
-    mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
-    figure.colorbar(mesh, ax=ax, label="[dB re 1 µm]")
-    ax.axhline(hammer_s, color="w", lw=0.8, ls=":")
-    ax.set(title="Full-spectrum waterfall", xlabel="backward  -  frequency [Hz]  -  forward", ylabel="time [s]")
-    save(figure, path)
+def _draw_pair(
+    ax: Any,
+    times_s: np.ndarray,
+    pair: tuple[np.ndarray, np.ndarray],
+    window: tuple[float, float],
+    names: tuple[str, str],
+) -> None:
+    """Two signals at right angles to each other, over a part of the time."""
+    kept = (times_s >= window[0]) & (times_s < window[1])
+    draw_signals(ax, times_s[kept], (pair[0][kept], _X, names[0]), (pair[1][kept], _Y, names[1]))
+    ax.set(xlabel="time [s]", xlim=window)
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + 0.2 * (high - low))
+    ax.legend(loc="upper center", ncols=2)

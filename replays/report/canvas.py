@@ -1,10 +1,18 @@
-"""Where pictures are drawn: figures without a window, files that are whole or not there, one palette."""
+"""Where pictures are drawn: figures without a window, files that are whole or not there, one style and one palette.
+
+All figures are as wide as a page shows them, so that one size of letters reads the same in all. A drawing is a function
+under `@house_style()`, which sets matplotlib's defaults while it runs and leaves the caller's own as they were.
+"""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from rig.errors import InputError, whole_file
 
@@ -16,40 +24,112 @@ BLACK, ORANGE, SKY, GREEN, BLUE, RED, PINK = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
 
+WIDTH = 10.0
+"""Of every figure [inch]: where a page shows it at 850 pixels, letters of 9.5 points are 11 pixels high."""
+DPI = 140
+"""Dots an inch of a PNG: sharp where a page shows it smaller, or a screen has two dots a pixel."""
+_PERIODS, _STRETCHES = 80, 240
+"""A signal of so many periods is drawn as a band, which shows the extremes of at most so many stretches of time."""
 _SALT = "rotor-stator-rig"
 """What the names inside an SVG are made of, beside what they name."""
+_STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "figure.titlesize": 12.5,
+    "figure.titleweight": "bold",
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 10,
+    "axes.edgecolor": "0.45",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "xtick.labelsize": 9.5,
+    "ytick.labelsize": 9.5,
+    "xtick.color": "0.45",
+    "ytick.color": "0.45",
+    "xtick.labelcolor": "0.15",
+    "ytick.labelcolor": "0.15",
+    "legend.fontsize": 9.5,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    "legend.columnspacing": 1.4,
+    "svg.fonttype": "none",
+    "svg.hashsalt": _SALT,
+}
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Matplotlib's defaults for every figure, as a block or as a decorator of what draws."""
+    import matplotlib
+
+    with matplotlib.rc_context(_STYLE):
+        yield
 
 
 def new_figure(
-    size: tuple[float, float] | None = None,
-    title: str = "",
-    *,
-    title_size: float = 14,
-    layout: Literal["constrained"] | None = "constrained",
+    height: float | None = None, title: str = "", *, layout: Literal["constrained"] | None = "constrained"
 ) -> Figure:
-    """A figure of its own, without pyplot and its windows.
+    """A figure of its own, without pyplot and its windows, as wide as all are.
 
     Args:
-        size: Width and height [inch]; None where the drawing sets them later.
+        height: [inch]; None where the drawing sets it later.
         title: Above all panels.
-        title_size: Of its letters [pt].
         layout: None where the drawing places its panels itself.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, layout=layout)
+    figure = Figure(figsize=None if height is None else (WIDTH, height), layout=layout)
     FigureCanvasAgg(figure)
     if title:
-        figure.suptitle(title, fontsize=title_size)
+        figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
-def draw_grid(*panels: Any) -> None:
-    """Thin grey lines behind all that is drawn."""
-    for axes in panels:
-        axes.grid(visible=True, color="0.9", lw=0.6)
-        axes.set_axisbelow(True)
+def draw_signals(axes: Any, times: np.ndarray, *signals: tuple[np.ndarray, str, str]) -> None:
+    """Signals of any length: as lines, or each as its mean in the band from its least to its largest.
+
+    A line with more periods than a panel has room for is a solid block, in which nothing is seen. Bands are faint, so
+    that a second one shows through.
+
+    Args:
+        axes: Where to.
+        times: Shape (n,).
+        signals: Values, shape (n,), colour and name of each.
+    """
+    periods = max(np.count_nonzero(np.diff(values > values.mean())) // 2 for values, _, _ in signals)
+    # A stretch holds two periods, else the band would show where they are cut.
+    stretches = min(_STRETCHES, periods // 2)
+    whole = len(times) // max(1, stretches) * stretches
+    for values, colour, label in signals:
+        if periods < _PERIODS or len(times) < 4 * stretches:
+            axes.plot(times, values, color=colour, lw=1.0, label=label)
+            continue
+        folded, middle = values[:whole].reshape(stretches, -1), times[:whole].reshape(stretches, -1).mean(axis=1)
+        low, high = folded.min(axis=1), folded.max(axis=1)
+        axes.fill_between(middle, low, high, color=colour, alpha=0.13, lw=0)
+        for edge in (low, high):
+            axes.plot(middle, edge, color=colour, lw=0.7, alpha=0.8)
+        axes.plot(middle, folded.mean(axis=1), color=colour, lw=1.4, label=label)
+
+
+def label_of(name: str, unit: str) -> str:
+    """What stands along the axis of a channel."""
+    return f"{name} [{unit.replace('^2', '²')}]"
+
+
+def legend_below(figure: Figure, *panels: Any, columns: int = 4) -> None:
+    """One legend for some panels, or all, under the figure, where it hides no data; each name once."""
+    found = {}
+    for axes in panels or figure.axes:
+        found |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns)
 
 
 def check_suffix(path: Path, *, field: str = "picture") -> None:
@@ -66,15 +146,12 @@ def check_suffix(path: Path, *, field: str = "picture") -> None:
         raise InputError(field, "a .png or .svg file", str(path))
 
 
-def save(figure: Figure, *paths: Path, dpi: int = 110, colours: int | None = None) -> list[Path]:
+def save(figure: Figure, *paths: Path) -> list[Path]:
     """Write a figure to files that are whole or not there: the same numbers give the same bytes.
 
     Args:
         figure: The figure.
         paths: Each .png or .svg.
-        dpi: Dots an inch of a PNG, and of pixels inside an SVG.
-        colours: Colours of a PNG, at most 256; None for all. With 256 a line drawing looks the same in a third of the
-            size.
 
     Returns:
         The files.
@@ -86,33 +163,33 @@ def save(figure: Figure, *paths: Path, dpi: int = 110, colours: int | None = Non
     for path in paths:
         check_suffix(path)
     for path in paths:
-        _write(path, _svg(figure, dpi) if path.suffix == ".svg" else _png(figure, dpi, colours))
+        data = _svg(figure) if path.suffix == ".svg" else png(figure)
+        with whole_file(path) as draft:
+            draft.write_bytes(data)
     return list(paths)
 
 
-def _svg(figure: Figure, dpi: int) -> bytes:
-    import matplotlib
+def png(figure: Figure, *, dpi: int = DPI) -> bytes:
+    """A figure as PNG with a palette: a line drawing looks the same in a third of the size.
 
-    buffer = io.BytesIO()
-    # Without a date and with fixed names, the same numbers give the same file.
-    with matplotlib.rc_context({"svg.hashsalt": _SALT}):
-        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None})
-    return buffer.getvalue()
-
-
-def _png(figure: Figure, dpi: int, colours: int | None) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    if colours is None:
-        return buffer.getvalue()
+    Args:
+        figure: The figure.
+        dpi: Dots an inch.
+    """
     from PIL import Image
 
-    small = io.BytesIO()
+    buffer, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
     with Image.open(buffer) as image:
-        image.convert("RGB").quantize(colours, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
+        # Chosen in this way, faint tints stay as they are, and the steps of a colour scale are too small to be seen.
+        few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE)
+        few.save(small, format="png", optimize=True)
     return small.getvalue()
 
 
-def _write(path: Path, data: bytes) -> None:
-    with whole_file(path) as draft:
-        draft.write_bytes(data)
+@house_style()
+def _svg(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    # Without a date and with fixed names, the same numbers give the same file.
+    figure.savefig(buffer, format="svg", dpi=DPI, metadata={"Date": None})
+    return buffer.getvalue()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from replays.report.canvas import DPI, png
 from rig.errors import InputError, check_new_file, whole_file
 
 if TYPE_CHECKING:
@@ -17,6 +18,15 @@ SUFFIXES = (".html", ".pdf")
 
 Mark = Literal["good", "bad", "open", "plain"]
 """What a row of a table says: as it must be, not so, undecided, or nothing to be judged."""
+_NUMBER = re.compile(r"[<>≤≥~±+− -]*\d")
+_WORD = re.compile(r"[^\W\d_]{4}")
+_CODE = re.compile(r"`([^`]+)`")
+
+
+def fragments(text: str) -> list[tuple[str, bool]]:
+    """Pieces of a text as they are set, each with whether it is code, which stands between backticks."""
+    pieces = enumerate(_CODE.split(text))
+    return [(piece if n % 2 else piece.replace("m/s^2", "m/s²"), bool(n % 2)) for n, piece in pieces if piece]
 
 
 @dataclass(frozen=True)
@@ -50,6 +60,16 @@ class Table:
     rows: tuple[Row, ...]
     caption: str = ""
 
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Whether each column holds numbers, with or without units, and what stands where there is none."""
+        columns = [[row.cells[n] for row in self.rows] for n in range(len(self.headings))]
+        return tuple(
+            any(map(_NUMBER.match, cells))
+            and all(len(cell) < 5 or (_NUMBER.match(cell) and not _WORD.search(cell)) for cell in cells)
+            for cells in columns
+        )
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -73,12 +93,18 @@ class Report:
     Attributes:
         title: Its title.
         lead: What it is and what comes out of it, in a sentence or two.
+        origin: What it is made of and by, each by name: file, command, version, date.
+        mark: Whether what comes out is as it must be.
         parts: What has been added, in order.
     """
 
-    def __init__(self, title: str, lead: str = "") -> None:
+    def __init__(
+        self, title: str, lead: str = "", *, origin: Mapping[str, str] | None = None, mark: Mark = "plain"
+    ) -> None:
         self.title = title
         self.lead = lead
+        self.origin = dict(origin or {})
+        self.mark: Mark = mark
         self.parts: list[ReportPart] = []
 
     def heading(self, text: str, *, level: int = 1) -> None:
@@ -106,11 +132,9 @@ class Report:
                 raise ValueError(f"row must have {len(headings)} cells; instead received {row.cells}")
         self.parts.append(Table(tuple(headings), whole, caption))
 
-    def picture(self, figure: Figure, caption: str, *, dpi: int = 110) -> None:
+    def picture(self, figure: Figure, caption: str, *, dpi: int = DPI) -> None:
         """Add a figure of matplotlib as a picture."""
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=dpi)
-        self.parts.append(Picture(buffer.getvalue(), caption))
+        self.parts.append(Picture(png(figure, dpi=dpi), caption))
 
     def write(self, path: Path) -> None:
         """Write the report to a file that is whole or not there; the same report gives the same bytes.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import jinja2
+    from markupsafe import Markup
 
     from replays.report.document import Report
 
@@ -18,7 +19,23 @@ def render(report: Report) -> bytes:
     from replays.report.document import Heading
 
     contents = [(number, part) for number, part in enumerate(report.parts) if isinstance(part, Heading)]
-    return _template().render(report=report, contents=contents, kind=lambda part: type(part).__name__).encode()
+    # What comes before the first heading is read before the contents: what comes out of it, and its picture.
+    first = contents[0][0] if contents else None
+    page = _template().render(
+        report=report, contents=contents, contents_at=first, kind=lambda part: type(part).__name__
+    )
+    return page.encode()
+
+
+def _marked(text: str) -> Markup:
+    """A text as markup: what stands between backticks is code, all else is said as it is."""
+    from markupsafe import Markup, escape
+
+    from replays.report.document import fragments
+
+    return Markup("").join(
+        Markup("<code>{}</code>").format(piece) if code else escape(piece) for piece, code in fragments(text)
+    )
 
 
 @cache
@@ -33,4 +50,5 @@ def _template() -> jinja2.Template:
         keep_trailing_newline=True,
     )
     environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
+    environment.filters["marked"] = _marked
     return environment.from_string(files("replays.report").joinpath("page.html").read_text(encoding="utf-8"))

@@ -8,21 +8,21 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from replays.report.document import Heading, Paragraph, Picture, Report, ReportPart, Table
+from replays.report.document import Heading, Paragraph, Picture, Report, ReportPart, Table, fragments
 
 if TYPE_CHECKING:
     from fpdf import FPDF
 
 _INK, _SOFT = (26, 26, 26), (102, 102, 102)
 _MARKS = {"good": (0, 121, 79), "bad": (179, 38, 30), "open": (154, 103, 0), "plain": _INK}
-_FONT = "DejaVu"
-_CELL_SIZE = 7.5
+_FONT, _CODE = "DejaVu", "DejaVuMono"
+_CELL_SIZE, _APART = 7.5, 2.5
+"""Size of a cell's letters [pt], and room behind them [mm]."""
 
 
 def render(report: Report) -> bytes:
     """The report as a PDF document, A4."""
     from fpdf import FPDF
-    from fpdf.enums import XPos, YPos
     from matplotlib import get_data_path
 
     class _Pages(FPDF):
@@ -39,19 +39,27 @@ def render(report: Report) -> bytes:
     fonts = Path(get_data_path()) / "fonts" / "ttf"  # the built-in fonts of PDF have no Greek
     pdf.add_font(_FONT, fname=fonts / "DejaVuSans.ttf")
     pdf.add_font(_FONT, style="B", fname=fonts / "DejaVuSans-Bold.ttf")
+    pdf.add_font(_CODE, fname=fonts / "DejaVuSansMono.ttf")
+    pdf.add_font(_CODE, style="B", fname=fonts / "DejaVuSansMono-Bold.ttf")
     pdf.set_margins(18, 16)
     pdf.set_auto_page_break(True, margin=16)
     pdf.add_page()
 
-    def write(text: str, *, size: float, bold: bool = False, colour: tuple[int, int, int] = _INK) -> None:
-        pdf.set_font(_FONT, style="B" if bold else "", size=size)
+    def write(
+        text: str, *, size: float, bold: bool = False, colour: tuple[int, int, int] = _INK, below: float = 1.5
+    ) -> None:
         pdf.set_text_color(*colour)
-        pdf.multi_cell(0, size * 0.5, text, new_x=XPos.LMARGIN, new_y=YPos.NEXT, align="L")
-        pdf.ln(1.5)
+        for piece, code in fragments(text):
+            pdf.set_font(_CODE if code else _FONT, style="B" if bold else "", size=0.93 * size if code else size)
+            pdf.write(size * 0.5, piece)
+        pdf.ln(size * 0.5 + below)
 
     write(report.title, size=16, bold=True)
     if report.lead:
-        write(report.lead, size=10, colour=_SOFT)
+        write(report.lead, size=10, bold=report.mark == "bad", colour=_MARKS[report.mark])
+    for name, value in report.origin.items():
+        write(f"{name}: {value}", size=7.5, colour=_SOFT, below=0.0)
+    pdf.ln(1.5)
     for number, part in enumerate(report.parts):
         if isinstance(part, Heading):
             pdf.ln(3)
@@ -89,18 +97,21 @@ def _table(pdf: FPDF, table: Table) -> None:
         col_widths=widths,
         width=min(sum(widths), pdf.epw),  # a sum that is the page's width may be rounded above it
         align="L",
-        text_align="L",
+        text_align=tuple("RIGHT" if numeric else "LEFT" for numeric in table.numeric),
         line_height=4,
         borders_layout="HORIZONTAL_LINES",
         headings_style=FontFace(emphasis="BOLD"),
-        padding=0.6,
+        padding=(0.6, _APART, 0.6, 0.6),
     ) as grid:
         grid.row(table.headings)
         for row in table.rows:
             line = grid.row()
             for n, cell in enumerate(row.cells):
                 last = n == len(row.cells) - 1
-                line.cell(cell, style=FontFace(color=_MARKS[row.mark] if last else _INK))
+                line.cell(
+                    "".join(piece for piece, _ in fragments(cell)),
+                    style=FontFace(color=_MARKS[row.mark] if last else _INK),
+                )
 
 
 def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:
@@ -113,8 +124,8 @@ def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:
             pdf.set_font(_FONT, style=style, size=_CELL_SIZE)
             lines = max([lines, *map(pdf.get_string_width, texts)])
             words = max([words, *(pdf.get_string_width(word) for text in texts for word in text.split())])
-        natural.append(lines + 3.0)
-        least.append(words + 3.0)
+        natural.append(lines + 2.4 + _APART)
+        least.append(words + 2.4 + _APART)
     pdf.set_font(_FONT, size=_CELL_SIZE)
     spare = pdf.epw - sum(least)
     wanted = sum(natural) - sum(least)

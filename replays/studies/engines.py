@@ -101,7 +101,7 @@ _ROWS = {
         oscillator_limit=VERLET_LIMIT, damping_limit=2.0, allowance=20.0, coarse_bounce=(False, f"{_FEW_STEPS}35"),
     ),
     "semi-implicit-euler": Traits(
-        "#9a8600", "<", quick=_fixed(50, 10, 5),
+        "#4000b0", "<", quick=_fixed(50, 10, 5),
         oscillator_limit=VERLET_LIMIT, damping_limit=2.0, allowance=100.0, coarse_bounce=(False, f"{_FEW_STEPS}1"),
     ),
     "rosenbrock": Traits(PINK, "P", oscillator_limit=math.inf, coarse_bounce=_SHORTENS),

@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, check_suffix, draw_grid, new_figure, save
+from replays.report.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    check_suffix,
+    house_style,
+    new_figure,
+    save,
+)
 from rig.contacts import (
     DAMPING,
     KELVIN_VOIGT,
@@ -59,6 +71,8 @@ _STYLES: dict[str, tuple[str, Any]] = {
 }
 _OTHER = ("#882255", (0, (3, 1)))
 """Of a law that has no style of its own."""
+_UNDER: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.47, -0.13), "ncols": 2}
+"""Where a legend hides no curve."""
 
 
 def compare(parameters: ParameterSet) -> dict[str, Any]:
@@ -142,6 +156,7 @@ def over_speed(parameters: ParameterSet, speeds: list[float]) -> dict[str, list[
     }
 
 
+@house_style()
 def draw(parameters: ParameterSet, path: Path) -> None:
     """Draw returned against wanted restitution, their difference, the same over speed, and the stiffness laws.
 
@@ -151,15 +166,15 @@ def draw(parameters: ParameterSet, path: Path) -> None:
     check_suffix(path, field="--plot")
     normal_law(parameters)
     figure = new_figure(
-        (14.0, 11.5),
-        f"Normal contact laws in free impacts without friction (parameters: {parameters.name}; not validated on a rig)",
+        10.6,
+        "Normal contact laws in free impacts without friction\n"
+        f"(parameters: {parameters.name}; not validated on a rig)",
     )
     (wanted, difference), (speed, stiffness) = figure.subplots(2, 2)
     _draw_restitution(wanted, difference, parameters)
     _draw_speed(speed, parameters)
     _draw_stiffness(stiffness, parameters)
-    draw_grid(wanted, difference, speed, stiffness)
-    save(figure, path, dpi=120)
+    save(figure, path)
 
 
 def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) -> None:
@@ -176,14 +191,14 @@ def _draw_restitution(wanted: Any, difference: Any, parameters: ParameterSet) ->
     for axes in (wanted, difference):
         axes.axvline(restitution, color="0.5", lw=0.9, ls=":")
         axes.set(xlabel="restitution asked for, e [1]", xlim=(0, 1))
-    difference.annotate(
-        f"asked for here: {restitution:g}", (restitution, -0.06), xytext=(-4, 5), textcoords="offset points",
-        ha="right", va="bottom", rotation=90, color="0.4", fontsize=9, bbox={"fc": "white", "ec": "none", "pad": 1},
+    wanted.annotate(
+        f"asked for here: {restitution:g}", (restitution, 0.0), xytext=(-4, 5), textcoords="offset points",
+        ha="right", va="bottom", rotation=90, color="0.4",
     )  # fmt: skip
     wanted.set(title="Restitution that each damping law returns", ylabel="restitution returned [1]", ylim=(0, 1.02))
-    wanted.legend(loc="lower right", fontsize=9, title="from the top down at 0.5")
+    wanted.legend(**_UNDER, title="from the top down at 0.5")
     difference.set(
-        title="The same less what was asked for, close up", ylabel="returned - asked for [1]", ylim=(-0.06, 0.06)
+        title="The same less what was asked for, close up", ylabel="returned − asked for [1]", ylim=(-0.06, 0.06)
     )
 
 
@@ -197,7 +212,7 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
         ({"color": BLACK, "lw": 3.4}, {"color": SKY, "ls": (0, (5, 4))}, {"color": RED}),
         strict=True,
     ):
-        axes.semilogx(speeds, values, **{"lw": 1.8, "label": name, **style})
+        axes.semilogx(speeds, values, **{"lw": 1.8, "label": name.replace("v0", "v₀"), **style})
     low = max(0.0, min(min(values) for values in curves.values()) - 0.02)
     for place, text in (
         (floor, f"limit of v₀, {floor:g} m/s"),
@@ -206,13 +221,13 @@ def _draw_speed(axes: Any, parameters: ParameterSet) -> None:
         axes.axvline(place, color="0.5", lw=0.9, ls=":")
         axes.annotate(
             text, (place, low), xytext=(4, 5), textcoords="offset points", ha="left", va="bottom", rotation=90,
-            color="0.4", fontsize=9,
+            color="0.4",
         )  # fmt: skip
     axes.set(
         title=f"Restitution returned over speed, {restitution:g} asked for", xlabel="approach speed [m/s]",
         ylabel="restitution returned [1]", xlim=SPEEDS, ylim=(low, 1.01),
     )  # fmt: skip
-    axes.legend(loc="upper right", fontsize=9)
+    axes.legend(**_UNDER)
 
 
 def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
@@ -239,7 +254,7 @@ def _draw_stiffness(axes: Any, parameters: ParameterSet) -> None:
         title=f"Stiffness laws, ring {pair.width * 1e3:g} mm wide (assumed)", xlabel="penetration [µm]",
         ylabel="force / penetration [N/µm]", xlim=(0.3, 30), ylim=(2, 700),
     )  # fmt: skip
-    axes.legend(loc="lower right", fontsize=9, ncols=2)
+    axes.legend(**_UNDER)
 
 
 def _resolved(

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, check_suffix, draw_grid, new_figure, save
+from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, check_suffix, house_style, new_figure, save
 from rig.magnets import (
     MagnetGeometry,
     MagnetMap,
@@ -103,6 +103,7 @@ def compare(model: Model) -> dict[str, Any]:
     }
 
 
+@house_style()
 def draw(model: Model, path: Path) -> None:
     """Draw force over displacement with these magnets and at the stiffness used, the errors, and the ripple.
 
@@ -112,8 +113,8 @@ def draw(model: Model, path: Path) -> None:
     check_suffix(path, field="--plot")
     geometry = model.magnets
     figure = new_figure(
-        (14.0, 11.0),
-        f"Magnet models (parameters: {model.parameters.name}; {geometry.number} magnets of "
+        10.6,
+        f"Magnet models (parameters: {model.parameters.name};\n{geometry.number} magnets of "
         f"{geometry.length * 1e3:g} mm are assumed; not validated on a rig)",
     )
     (magnets, scaled), (errors, ripple) = figure.subplots(2, 2)
@@ -121,8 +122,7 @@ def draw(model: Model, path: Path) -> None:
     _draw_same_stiffness(scaled, model)
     _draw_errors(errors, model)
     _draw_ripple(ripple, model)
-    draw_grid(magnets, scaled, errors, ripple)
-    save(figure, path, dpi=120)
+    save(figure, path)
 
 
 _STYLES: dict[str, dict[str, Any]] = {
@@ -134,6 +134,8 @@ _STYLES: dict[str, dict[str, Any]] = {
 }
 _OTHER = {"color": "#882255", "lw": 1.6}
 """Of a model that has no style of its own."""
+_UNDER: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.47, -0.13)}
+"""Where a legend hides no curve."""
 
 
 def _draw_same_magnets(axes: Any, model: Model) -> None:
@@ -149,11 +151,11 @@ def _draw_same_magnets(axes: Any, model: Model) -> None:
             axes.fill_between(line * 1e3, toward, between, color=style["color"], alpha=0.25, lw=0)
     axes.fill_between([], [], [], color="0.5", alpha=0.25, lw=0, label="between magnet and gap")
     axes.set(
-        title="With the same magnets (Fig. 7's axes: -40 to 40 N over -10 to 10 mm)",
+        title="With the same magnets (axes as in Fig. 7)",
         xlabel="displacement toward a magnet [mm]", ylabel="force along the displacement [N]",
         xlim=(line[0] * 1e3, line[-1] * 1e3),
     )  # fmt: skip
-    axes.legend(loc="upper right", fontsize=9)
+    axes.legend(**_UNDER)
 
 
 def _draw_same_stiffness(axes: Any, model: Model) -> None:
@@ -165,11 +167,11 @@ def _draw_same_stiffness(axes: Any, model: Model) -> None:
         force = -_inward(each.force, geometry, line, 0.0) * used / each.stiffness
         axes.plot(line * 1e3, force, label=each.name, **_STYLES.get(each.name, _OTHER))
     axes.set(
-        title=f"At the same stiffness at the centre, the rig's {used / 1e3:.3g} kN/m",
+        title=f"At the rig's stiffness at the centre, {used / 1e3:.3g} kN/m",
         xlabel="displacement toward a magnet [mm]", ylabel="force along the displacement [N]",
         xlim=(line[0] * 1e3, line[-1] * 1e3),
     )  # fmt: skip
-    axes.legend(loc="upper right", fontsize=9)
+    axes.legend(**_UNDER, ncols=2)
 
 
 def _draw_errors(axes: Any, model: Model) -> None:
@@ -193,13 +195,13 @@ def _draw_errors(axes: Any, model: Model) -> None:
         scale = models[better].stiffness / models[name].stiffness if same_stiffness else 1.0
         difference = np.linalg.norm(forces[name] * scale - forces[better], axis=-1).max(axis=0)
         size = np.linalg.norm(forces[better], axis=-1).max(axis=0)
-        label = f"{name} - {better}" + (", same stiffness" if same_stiffness else ", same magnets")
+        label = f"{name} − {better}" + (", same stiffness" if same_stiffness else ", same magnets")
         axes.semilogy(radii * 1e3, difference / size, color=color, ls=dash, lw=2.0, label=label)
     axes.set(
-        title="Deviation from the better model, largest over all directions", xlabel="radius [mm]",
+        title="Deviation from the better model, largest direction", xlabel="radius [mm]",
         ylabel="deviation / force there [1]", xlim=(0.0, geometry.reach * 1e3), ylim=(1e-8, 1e1),
     )  # fmt: skip
-    axes.legend(loc="lower right", fontsize=9)
+    axes.legend(**_UNDER)
 
 
 def _draw_ripple(axes: Any, model: Model) -> None:
@@ -224,10 +226,10 @@ def _draw_ripple(axes: Any, model: Model) -> None:
     axes.plot([], [], color="0.3", lw=1.6, ls=(0, (1, 1.2)), label="far-field sum, same radii")
     axes.set(
         title="Ripple of the force over the direction", xlabel="direction from a magnet [°]",
-        ylabel="force / mean over directions - 1 [1]", xlim=(0.0, float(np.degrees(angle[-1]))),
-        ylim=(-1.1 * peak, 1.5 * peak),
+        ylabel="force / mean over directions − 1 [1]", xlim=(0.0, float(np.degrees(angle[-1]))),
+        ylim=(-1.1 * peak, 1.1 * peak),
     )  # fmt: skip
-    axes.legend(loc="upper center", fontsize=9, ncols=2)
+    axes.legend(**_UNDER, ncols=2)
 
 
 def _shade_travel(axes: Any, model: Model, *, both: bool = False) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from rig.cli import can, can_messages, keys
+from rig.cli import can, can_messages, keys, origin
 from rig.cli.groups import grouped
 from rig.errors import DiskError, InputError, SimulationError
 from rig.text import printable
@@ -71,6 +71,7 @@ app.add_typer(can.app, name="can", rich_help_panel="The rig as a service")
 
 def start(arguments: list[str] | None = None) -> None:
     """Run the command and end the process with its exit status."""
+    origin.given[:] = sys.argv[1:] if arguments is None else arguments
     try:
         code = app(args=arguments, standalone_mode=False)
     except InputError as error:

@@ -27,13 +27,18 @@ def chart(
     ] = None,
     no_peers: Annotated[bool, typer.Option("--no-peers", help="Our engines only.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Start over instead of going on where a run ended.")] = False,
+    draw: Annotated[bool, typer.Option("--draw", help="Draw chart.csv of the folder again; measure nothing.")] = False,
 ) -> None:
     """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
-    from replays.studies.chart.session import Progress, make_chart
+    from replays.studies.chart.session import Progress, draw_again, make_chart
     from rig.errors import InputError
 
     if quick and full:
         raise InputError("--quick, --full", "one of the two", "both")
+    if draw:
+        for path in draw_again(output, only=only, panels=panel).files:
+            echo(str(path))
+        return
     mode = "full" if full else "quick"
     with reporting(compiles=True) as reporter:
         reporter.say("references")

@@ -20,6 +20,7 @@ from rig.cli.options import (
     names_of,
     pairs,
 )
+from rig.cli.origin import of_recording
 from rig.cli.progress import reporting
 from rig.cli.tables import Form, echo, echo_json, new_table
 
@@ -163,7 +164,7 @@ def identify(
     if output is not None:
         write_set(fitted_set(found, recording=name), output)
     if report is not None:
-        report_of(found, recording=name).write(report)
+        report_of(found, recording=name, origin=of_recording(name, recording)).write(report)
     if form.as_json:
         echo_json(identification_document(found, recording=name))
         return

@@ -9,6 +9,7 @@ import typer
 
 from rig.cli.folder import check_folder
 from rig.cli.options import Force
+from rig.cli.origin import origin
 from rig.cli.progress import reporting
 from rig.cli.tables import Form, echo, echo_json, new_table
 
@@ -47,7 +48,8 @@ def paper(
         findings = find(quick=quick, processes=processes, progress=reporter.step)
         if output is not None:
             reporter.say("report")
-            write_up(findings, quick=quick).write(output)
+            sets = f"as-printed, corrected; {'few, short' if quick else 'all'} runs"
+            write_up(findings, quick=quick, origin=origin(parameter_sets=sets)).write(output)
         drawn = []
         if pictures is not None:
             pictures.mkdir(exist_ok=True)

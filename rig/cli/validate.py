@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.options import Changes, Engine, Force, RecordingFiles, ReportFile, SceneChanges
+from rig.cli.origin import of_recording
 from rig.cli.progress import reporting
 from rig.cli.tables import Form, Table, echo, echo_json, new_table, shown
 
@@ -63,7 +64,7 @@ def validate(
             from replays.recordings.validation.report import make_report
 
             reporter.step("report")
-            make_report(found).write(report)
+            make_report(found, origin=of_recording(found.title, recording)).write(report)
     if form.as_json:
         echo_json(found.document())
     else:
@@ -129,7 +130,7 @@ def _truth(found: Validation) -> Table:
 def _statistics(found: Validation) -> Table:
     table = new_table("Phases", "phase", "quantity", ">recorded", ">predicted", ">limit", "verdict")
     for one in found.statistics:
-        limit = "" if one.limit is None else f"+- {one.limit:.2g}"
+        limit = "" if one.limit is None else f"± {one.limit:.2g}"
         table.add_row(one.phase, one.title, f"{one.recorded:.6g}", f"{one.foretold:.6g}", limit, _SAID[one.good])
     return table
 

@@ -39,7 +39,11 @@ def test_a_failure_ends_in_1_and_a_report_names_the_cause(
     assert "contact.restitution +2.27 %" in lines[2]
     page = report.read_text(encoding="utf-8")
     assert "Contact.restitution" in page or "contact.restitution +2.27 %" in page
-    assert page.count("data:image/png") == 6  # five groups, orbits and spectra
+    assert page.count("data:image/png") == 7  # all at a glance, five groups, orbits and spectra
+    assert page.index("FAILS") < page.index("data:image/png") < page.index("<table>")
+    head = page[: page.index("data:image/png")]
+    for told in (recording.name, "--set contact.restitution=0.88", "corrected", "<dt>seed</dt>", "<dt>made</dt>"):
+        assert told in head
     assert 'src="http' not in page
     assert page.index("Criteria that fail") < page.index("What explains the difference") < page.index(">Bits<")
 

@@ -7,17 +7,19 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
-from replays.report.canvas import check_suffix, new_figure, save
+from replays.report.canvas import DPI, WIDTH, check_suffix, draw_signals, house_style, new_figure, save
 from rig.errors import DiskError, InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@house_style()
 def lines() -> Figure:
-    figure = new_figure((3.0, 2.0), "a title")
+    figure = new_figure(2.0, "a title")
     figure.subplots().plot([0.0, 1.0], [0.0, 1.0], label="straight")
     figure.axes[0].legend()
     return figure
@@ -33,30 +35,44 @@ def test_same_drawing_gives_same_bytes(tmp_path: Path, suffix: str, head: bytes)
     assert b"dc:date" not in files[0].read_bytes()
 
 
-def test_size_title_and_dots_are_as_asked(tmp_path: Path) -> None:
+def test_pictures_are_as_wide_as_all_with_a_palette(tmp_path: Path) -> None:
     from PIL import Image
 
-    figure = new_figure((3.0, 2.0), "a title", title_size=9)
+    figure = lines()
     assert figure.get_suptitle() == "a title"
-    save(figure, tmp_path / "picture.png", dpi=50)
+    save(figure, tmp_path / "picture.png")
     with Image.open(tmp_path / "picture.png") as image:
-        assert image.size == (150, 100)
-
-
-def test_few_colours_make_a_palette_of_at_most_so_many(tmp_path: Path) -> None:
-    from PIL import Image
-
-    many, few = tmp_path / "many.png", tmp_path / "few.png"
-    save(lines(), many)
-    save(lines(), few, colours=16)
-    with Image.open(few) as image:
+        assert image.size == (WIDTH * DPI, 2 * DPI)
         assert image.mode == "P"
         colours = image.getcolors()
         assert colours is not None
-        assert 2 <= len(colours) <= 16
-    with Image.open(many) as image:
-        assert image.mode == "RGBA"
-    assert few.stat().st_size < many.stat().st_size
+        assert 2 <= len(colours) <= 256
+
+
+def test_the_style_is_left_behind() -> None:
+    import matplotlib
+
+    before = matplotlib.rcParams["axes.grid"]
+    with house_style():
+        assert matplotlib.rcParams["axes.grid"] is not before
+    assert matplotlib.rcParams["axes.grid"] is before
+
+
+def test_a_signal_of_many_periods_is_its_mean_in_a_band() -> None:
+    times = np.linspace(0.0, 1.0, 20_001)
+    few, many = (0.5 + np.sin(2.0 * np.pi * hz * times) for hz in (10.0, 500.0))
+    axes = new_figure(2.0).subplots()
+    draw_signals(axes, times, (few, "k", "few"))
+    assert len(axes.lines) == 1
+    assert len(axes.collections) == 0
+    axes = new_figure(2.0).subplots()
+    draw_signals(axes, times, (few, "k", "few"), (many, "r", "many"))
+    assert len(axes.collections) == 2, "of two that share a panel none hides the other"
+    low, high, mean = (np.asarray(line.get_ydata()) for line in axes.lines[3:])
+    assert low == pytest.approx(-0.5, abs=0.02)
+    assert high == pytest.approx(1.5, abs=0.02)
+    assert mean == pytest.approx(0.5, abs=0.05)
+    assert list(axes.get_legend_handles_labels()[1]) == ["few", "many"]
 
 
 def test_disk_that_fills_up_leaves_the_former_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

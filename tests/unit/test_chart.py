@@ -252,6 +252,13 @@ def test_a_small_chart_end_to_end_resumes_and_says_what_is_missing(
     for path in second.files:
         assert path.stat().st_size > 500
     assert "eers left out on request" in (tmp_path / "out" / "chart.svg").read_text(encoding="utf-8")
+    pictures = [path for path in second.files if path.suffix in (".png", ".svg")]
+    for path in pictures:
+        path.unlink()
+    with pytest.raises(SystemExit) as end:
+        main(["chart", "--draw", "-o", str(tmp_path / "out")])
+    assert end.value.code == 0
+    assert all(path.is_file() for path in pictures), "drawn again from the table alone"
     monkeypatch.setattr(session, "missing_peers", lambda: ["heyoka"])
     assert chart().missing == []
 
@@ -274,6 +281,7 @@ def test_without_peers_there_is_still_a_reference() -> None:
         (["--panel", "memory", "--only", "drop"], "panel must be one that has the phase drop"),
         (["--quick", "--full"], "must be one of the two"),
         (["--peers"], "No such option"),
+        (["--draw"], "output must be a folder with chart.csv of an earlier chart"),
     ],
 )
 def test_wrong_input_ends_in_one_line(

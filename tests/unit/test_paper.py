@@ -202,8 +202,9 @@ def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: P
         "When it whirls, and how fast",
         "What is assumed here",
     ]
-    assert sum(isinstance(part, Picture) for part in report.parts) == 12
-    for before, after in zip(report.parts, report.parts[1:], strict=False):
+    assert sum(isinstance(part, Picture) for part in report.parts) == 13
+    assert isinstance(report.parts[0], Picture), "a picture before any table"
+    for before, after in zip(report.parts[1:], report.parts[2:], strict=False):
         if isinstance(before, Picture):
             assert isinstance(after, Table), before.caption
     for table in (part for part in report.parts if isinstance(part, Table)):

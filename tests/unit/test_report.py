@@ -22,7 +22,7 @@ def _report() -> Report:
         [Row(("whirl", "83.1 Hz", "agrees"), "good"), ("force", "553 N", "told")],
         caption="At 6.2 Hz",
     )
-    figure = new_figure((4.0, 2.0))
+    figure = new_figure(2.0)
     figure.subplots().plot([0.0, 1.0])
     report.picture(figure, "A line")
     return report
@@ -63,6 +63,23 @@ def test_html_is_one_file_that_needs_nothing_beside_it(tmp_path: Path) -> None:
     for text in ("Validation of <b>a & b</b>.mcap", "At 6.2 Hz", "83.1 Hz", "told", "A line", "μ = 0.25"):
         assert text in page.text
     assert page.tags.count("img") == 1
+
+
+def test_numbers_stand_right_code_as_code_and_the_origin_in_the_head(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    report = Report("Fit", "NOT GOOD.", origin={"command": "`rig identify <a>.mcap`", "made": "2026-01-01"}, mark="bad")
+    rows = [("a", "1.5", "within ±2", "-", "1"), ("b", "-2e-05 m/s^2", "3", "≤ 0.2 N", "see `rest`")]
+    report.table(("name", "value", "words", "limit", "note"), rows, caption="`left` is what remains")
+    report.write(path)
+    page = path.read_text(encoding="utf-8")
+    assert report.parts[0].numeric == (False, True, False, True, False)  # pyright: ignore[reportAttributeAccessIssue]
+    assert '<td class="number">-2e-05 m/s²</td>' in page
+    assert page.count('class="number"') == 2 * (1 + len(rows))
+    assert "<caption><code>left</code> is what remains</caption>" in page
+    assert '<td class="verdict">see <code>rest</code></td>' in page
+    assert "<dt>command</dt><dd><code>rig identify &lt;a&gt;.mcap</code></dd>" in page
+    assert page.index('<p class="lead bad">NOT GOOD.</p>') < page.index("<dt>made</dt><dd>2026-01-01</dd>")
+    assert "`" not in page
 
 
 @pytest.mark.parametrize("name", ["report.html", "report.pdf"])

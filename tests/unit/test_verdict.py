@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import re
 import struct
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -19,6 +20,7 @@ from replays.recordings.export import write_run
 from replays.recordings.picture import draw
 from replays.recordings.verdict import Verdict, hammer_time_s, judge
 from replays.recordings.whirl import parameter_si, whirl_figures
+from replays.report.canvas import DPI, WIDTH
 from rig import wire
 from rig.cli.demo import verdict_table
 from rig.errors import InputError
@@ -250,11 +252,12 @@ def test_picture_is_drawn(good: Recording, tmp_path: Path, monkeypatch: pytest.M
     draw(good, path)
     data = path.read_bytes()
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    assert struct.unpack(">II", data[16:24]) == (1650, 1100)
-    assert len(data) > 100_000
+    assert struct.unpack(">I", data[16:20]) == (WIDTH * DPI,)
+    assert len(data) > 50_000
     assert imread(path)[..., :3].std() > 0.1
-    panels = [panel for panel in drawn[0].axes if panel.get_title()]
+    panels = [panel for panel in drawn[0].axes if panel.get_title("left")]
     assert len(panels) == 9
     for panel in panels:
-        assert panel.has_data(), panel.get_title()
-        assert "[" in panel.get_xlabel() + panel.get_ylabel() or "frequency" in panel.get_xlabel()
+        assert panel.has_data(), panel.get_title("left")
+        for label in (panel.get_xlabel(), panel.get_ylabel()):
+            assert re.match(r"\w[\w ]* \[", label), "a quantity, with its unit"

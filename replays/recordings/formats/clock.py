@@ -232,7 +232,7 @@ def shift_by_edges(
         stretch, offset = np.polyfit(b - middle, a, 1)
         residual = float(np.abs(a - offset - stretch * (b - middle)).max())
         offset = float(offset - stretch * middle)
-        how = f"{len(a)} common edges, clock {1e6 * (stretch - 1.0):+.2f} ppm, worst edge {residual * 1e6:.2f} us off"
+        how = f"{len(a)} common edges, clock {1e6 * (stretch - 1.0):+.2f} ppm, worst edge {residual * 1e6:.2f} µs off"
     else:
         stretch, offset = 1.0, float(a[0] - b[0])
         how = f"first edges ({len(a)} and {len(b)} in all)"

@@ -112,7 +112,7 @@ def _group_rate(name: str, entries: Sequence[MappedSignal], mapping: Mapping) ->
     for entry in entries:
         axis = entry.axis
         if axis.times_s is not None and method != "linear":
-            rms, largest = (f"{1e6 * value:.3g} us" for value in axis.jitter_s)
+            rms, largest = (f"{1e6 * value:.3g} µs" for value in axis.jitter_s)
             must = (
                 f'"linear" (or time.stamps = "line", or time.rate_hz), as the time stamps of {entry.entry.name} lie '
                 f"up to {largest} (rms {rms}) off even ones of {axis.rate_hz:.6g} Hz"
@@ -307,7 +307,7 @@ def _imported(entry: MappedSignal, channel: Channel, rule: str, rate_hz: int) ->
     source = f"(source {'-' if entry.bias > 0.0 else '+'} {abs(entry.bias):.6g})" if entry.bias else "source"
     ratio = "" if unit == channel.unit else f" {channel.unit} per {unit}".replace(" 1 per", " per")
     gain = f"{entry.gain:.9g}{ratio} * " if ratio or entry.gain != 1.0 else ""
-    delay = f", {-entry.mapping.delay_us:+g} us" if entry.mapping.delay_us else ""
+    delay = f", {-entry.mapping.delay_us:+g} µs" if entry.mapping.delay_us else ""
     drift = (entry.axis.rate_hz / rate_hz - 1.0) * 1e6 if entry.axis.rows and whole_rate(entry.axis) == rate_hz else 0.0
     return ImportedChannel(
         name=entry.name, unit=channel.unit,

@@ -61,14 +61,14 @@ class Fitted:
     def line(self) -> str:
         """In words."""
         if self.key == "clock.offset_s":
-            return f"time: shifted by {self.value * 1e6:+.1f} +-{1.0e6 * self.half_width:.2g} us, fitted"
+            return f"time: shifted by {self.value * 1e6:+.1f} ±{1.0e6 * self.half_width:.2g} µs, fitted"
         if self.key == _PULSE:
             late = 1e6 * (self.value - self.start)
-            return f"time: hammer pulse shifted by {late:+.1f} +-{1e6 * self.half_width:.2g} us, fitted"
+            return f"time: hammer pulse shifted by {late:+.1f} ±{1e6 * self.half_width:.2g} µs, fitted"
         if self.key == "clock.rate_ppm":
-            return f"clock: {self.value:+.1f} +-{self.half_width:.2g} ppm fast, fitted"
+            return f"clock: {self.value:+.1f} ±{self.half_width:.2g} ppm fast, fitted"
         change = self.value - self.start
-        return f"{self.key}: {self.value:.6g} +-{self.half_width:.2g}, fitted ({change:+.2g} on what the log tells)"
+        return f"{self.key}: {self.value:.6g} ±{self.half_width:.2g}, fitted ({change:+.2g} on what the log tells)"
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,19 @@ import numpy as np
 from replays.recordings.identification.fit import Identification
 from replays.recordings.identification.judgement import Finding
 from replays.report import Mark, Report, Row
-from replays.report.canvas import BLUE, ORANGE, RED, draw_grid, new_figure
+from replays.report.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    house_style,
+    label_of,
+    legend_below,
+    new_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,6 +31,8 @@ if TYPE_CHECKING:
 HEADINGS = ("key", "start", "result", "95 % interval", "unit", "what the recording tells")
 _MARKS: dict[str, Mark] = {"identified": "good", "not seen": "open", "only together": "open", "at its bound": "bad"}
 _MOST_PANELS = 16
+_WRITTEN = 6
+"""Values up to which each correlation is written into its square."""
 _KICK = 0.02
 """An impact begins where the samples bend by this part of the most they bend, ..."""
 _QUIET = 50.0
@@ -33,7 +48,7 @@ def cells(finding: Finding) -> tuple[str, ...]:
         return (unknown.key, start, "-", "-", unit, finding.words)
     digits = max(3, 2 + math.ceil(math.log10(max(abs(finding.value), 1e-30) / finding.half_width)))
     return (
-        unknown.key, start, f"{finding.value:.{min(digits, 12)}g}", f"+-{finding.half_width:.2g}", unit, finding.words
+        unknown.key, start, f"{finding.value:.{min(digits, 12)}g}", f"±{finding.half_width:.2g}", unit, finding.words
     )  # fmt: skip
 
 
@@ -70,10 +85,31 @@ def fit_line(found: Identification) -> str:
     return line
 
 
-def report_of(found: Identification, *, recording: str) -> Report:
-    """The report of a fit."""
+def report_of(found: Identification, *, recording: str, origin: Mapping[str, str] | None = None) -> Report:
+    """The report of a fit.
+
+    Args:
+        found: The fit.
+        recording: Its name.
+        origin: What the report is made by, each by name.
+    """
     question, judgement = found.question, found.judgement
-    report = Report(f"Identification from {recording}", f"{fit_line(found)}. {window_line(found)}.")
+    told = "; ".join(
+        " ".join((finding.unknown.key, *cells(finding)[2:5])).rstrip()
+        if finding.standing == "identified"
+        else f"{finding.unknown.key}: {finding.words}"
+        for finding in judgement.findings
+    )
+    good = judgement.fits and all(finding.standing == "identified" for finding in judgement.findings)
+    report = Report(
+        f"Identification from {recording}",
+        f"{told}. {fit_line(found)}.",
+        origin=origin,
+        mark="good" if good else "open",
+    )
+    report.picture(growth(found), "95 % intervals over the end of the window, in parts of each value's scale; right, "
+                   "how the values hang together.")  # fmt: skip
+    report.text(f"W{window_line(found)[1:]}.")
     if found.narrowed:
         report.text(f"The {spread_line(found)}.")
     report.heading("Values")
@@ -81,7 +117,7 @@ def report_of(found: Identification, *, recording: str) -> Report:
     report.table(HEADINGS, rows, caption="Intervals of 95 %, of each value by itself, by the slopes at the optimum.")
     report.text(
         "The intervals hold for this model and engine "
-        f"({question.experiment.scene.engine.name}, {question.experiment.scene.engine.step_us} us) with all other "
+        f"({question.experiment.scene.engine.name}, {question.experiment.scene.engine.step_us} µs) with all other "
         "parameters as they stand in the set, many of which are assumed, and for sensors as the channel table says: an "
         "error of those is not in them."
     )
@@ -116,20 +152,17 @@ def report_of(found: Identification, *, recording: str) -> Report:
         [
             (
                 f"{stage.end_s:.4f}", f"{stage.chi2:.3g}",
-                *(f"{value:.6g} +-{half:.1g}" for value, half in zip(stage.values, stage.half_widths, strict=True)),
+                *(f"{value:.6g} ±{half:.1g}" for value, half in zip(stage.values, stage.half_widths, strict=True)),
                 stage.why,
             )
             for stage in found.stages
         ],
         caption="Values are held loosely to the start here: an interval as wide as the start's own says nothing.",
     )  # fmt: skip
-    report.picture(
-        growth(found),
-        "95 % intervals over the end of the window, in parts of each value's scale; correlation of what is identified.",
-    )
     return report
 
 
+@house_style()
 def overlay(found: Identification) -> Figure:
     """Samples, fit and residuals of the channels."""
     observation, window = found.question.observation, found.window
@@ -137,20 +170,18 @@ def overlay(found: Identification) -> Figure:
     residuals = window.residuals(found.z)
     moved = np.argsort(-np.ptp(predicted / observation.noise, axis=0), kind="stable")[:_MOST_PANELS]
     shown = sorted(int(place) for place in moved)
-    figure = new_figure((12.0, 1.5 * len(shown) + 0.6))
+    figure = new_figure(1.35 * len(shown) + 0.8)
     panels = figure.subplots(len(shown), 2, squeeze=False, sharex=True)
     times_s = observation.times_s[: window.rows]
     panels[0][0].set_xlim(_shown_from_s(times_s, predicted / observation.noise), times_s[-1])
     for (left, right), place in zip(panels, shown, strict=True):
-        left.plot(times_s, observation.values[: window.rows, place], ".", color=ORANGE, ms=2.5, label="recorded")
-        left.plot(times_s, predicted[:, place], color=BLUE, lw=0.9, label="fitted")
-        left.set_ylabel(f"{observation.names[place]} [{observation.units[place]}]")
-        right.plot(times_s, residuals[:, place], ".", color=RED, ms=1.5)
-        right.set_ylabel("residual / noise")
-        draw_grid(left, right)
-    panels[0][0].legend(loc="best", fontsize=8)
+        left.plot(times_s, observation.values[: window.rows, place], "o", color=ORANGE, ms=3.5, label="recorded")
+        left.plot(times_s, predicted[:, place], color=BLUE, lw=1.1, label="fitted")
+        left.set_ylabel(label_of(observation.names[place], observation.units[place]).replace(" ", "\n"))
+        right.plot(times_s, residuals[:, place], ".", color=RED, ms=3.5, label="residual over noise [1]")
     for axes in panels[-1]:
         axes.set_xlabel("simulated time [s]")
+    legend_below(figure, *panels[0])
     return figure
 
 
@@ -163,23 +194,28 @@ def _shown_from_s(times_s: np.ndarray, predicted: np.ndarray) -> float:
     return max(float(times_s[0]), first_s - 0.15 * (float(times_s[-1]) - first_s))
 
 
+@house_style()
 def growth(found: Identification) -> Figure:
     """How the intervals shrank as the window grew, and how the values hang together in the end."""
     keys = found.question.keys
-    figure = new_figure((12.0, 4.2))
+    figure = new_figure(4.6)
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     ends = [stage.end_s for stage in found.stages]
+    left.set_prop_cycle(color=[BLUE, RED, GREEN, PINK, ORANGE, SKY, BLACK], marker=list("osD^vhP"))
     for place, unknown in enumerate(found.question.unknowns):
-        left.semilogy(
-            ends, [stage.half_widths[place] / unknown.scale for stage in found.stages], "o-", ms=3, label=unknown.key
-        )
-    left.set_xlabel("end of the window [s]")
-    left.set_ylabel("half of the 95 % interval / scale")
-    left.legend(fontsize=8)
-    draw_grid(left)
+        left.semilogy(ends, [stage.half_widths[place] / unknown.scale for stage in found.stages], label=unknown.key)
+    left.set(
+        title="How the intervals shrink", xlabel="end of the window [s]", ylabel="half of the 95 % interval / scale [1]"
+    )
     image = right.imshow(found.judgement.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
     # Names once, at the side: below the picture long ones would run off it.
-    right.set_xticks(range(len(keys)), [str(place + 1) for place in range(len(keys))], fontsize=8)
-    right.set_yticks(range(len(keys)), [f"{key}  {place + 1}" for place, key in enumerate(keys)], fontsize=8)
-    figure.colorbar(image, ax=right, label="correlation")
+    right.set_xticks(range(len(keys)), [str(place + 1) for place in range(len(keys))])
+    right.set_yticks(range(len(keys)), [f"{key}  {place + 1}" for place, key in enumerate(keys)])
+    right.grid(visible=False)
+    right.set_title("How they hang together")
+    for row, place in np.argwhere(np.isfinite(found.judgement.correlation)) if len(keys) <= _WRITTEN else ():
+        value = found.judgement.correlation[row, place]
+        right.text(place, row, f"{value:+.2f}", ha="center", va="center", color="white" if abs(value) > 0.6 else BLACK)
+    figure.colorbar(image, ax=right, label="correlation [1]", shrink=0.8)
+    legend_below(figure, left)
     return figure

@@ -157,7 +157,7 @@ class Clock:
             done = fit(self.residuals, self._slopes, np.array([start_s, 0.0][: 1 + rates]), rounds=8, gain=1e-5)
             assert done is not None
             shift, rate = [*done.values.tolist(), 0.0][:2]
-            change, value, unit = f"{shift * 1e6:+.1f} us", shift, "s"
+            change, value, unit = f"{shift * 1e6:+.1f} µs", shift, "s"
             if rates:
                 change, value, unit = f"{change} and {rate * 1e6:+.1f} ppm", rate * 1e6, "ppm"
             explained = 1.0 - excess(done.residuals) / before

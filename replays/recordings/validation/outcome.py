@@ -158,14 +158,14 @@ class Validation:
             if one.good is False and one.broken is not None:
                 measure, value, limit = one.broken
                 criterion = f"{one.channel}, residual over noise: {measure}"
-                found.append(Failure(criterion, f"{value:.3g}", one.alone(measure), f"at most {limit:.3g}"))
+                found.append(Failure(criterion, f"{value:.3g}", one.alone(measure), f"≤ {limit:.3g}"))
         for one in self.truth:
             if not one.good:
                 criterion = f"truth {one.table}.{one.column}, part that it is off"
-                found.append(Failure(criterion, f"{one.relative:.2g}", "0", f"at most {one.limit:.2g}"))
+                found.append(Failure(criterion, f"{one.relative:.2g}", "0", f"≤ {one.limit:.2g}"))
         for one in self.statistics:
             if one.good is False and one.limit is not None:
-                limit = f"+- {one.limit:.2g}"
+                limit = f"± {one.limit:.2g}"
                 found.append(Failure(f"{one.phase}, {one.title}", f"{one.recorded:.5g}", f"{one.foretold:.5g}", limit))
         return found
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,24 +12,36 @@ from replays.recordings.prediction import Measured
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
 from replays.report import Mark, Report, Row
-from replays.report.canvas import BLUE, ORANGE, RED, draw_grid, new_figure
+from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, legend_below, new_figure
 from rig.orbit import full_spectrum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_POINTS = 6000
-"""Points of a line; of more, each is the extremes of a few."""
+_STRETCHES = 160
+"""Stretches of time of which the first picture shows how far recorded and predicted are apart."""
 _BEFORE_S, _AFTER_S = 5e-3, 60e-3
 """A closer look begins and ends so long before and behind what is of interest."""
 _MARKS: dict[bool | None, Mark] = {True: "good", False: "bad", None: "plain"}
 _WORDS = {True: "good", False: "fails", None: "not asked"}
 
 
-def make_report(found: Validation) -> Report:
-    """All of a validation as a report."""
-    report = Report(f"Validation of {found.title}", f"{_sentence(found.verdict_line)}.")
+def make_report(found: Validation, *, origin: Mapping[str, str] | None = None) -> Report:
+    """All of a validation as a report.
+
+    Args:
+        found: The validation.
+        origin: What the report is made by, each by name.
+    """
+    report = Report(
+        f"Validation of {found.title}", f"{_sentence(found.verdict_line)}.", origin=origin, mark=_MARKS[found.good]
+    )
+    if found.parts and found.nominal is not None:
+        report.picture(
+            _overview(found),
+            "How far recorded and predicted are apart, over the noise of each channel: 1 is noise alone.",
+        )
     _conclusion(report, found)
     _bits(report, found)
     _trajectory(report, found)
@@ -56,7 +69,7 @@ def _conclusion(report: Report, found: Validation) -> None:
         report.table(
             ("criterion", "recorded", "predicted", "limit", "verdict"),
             [Row((f.criterion, f.recorded, f.foretold, f.limit, "fails"), "bad") for f in found.failures],
-            caption="Of a residual the first measure beyond its limit; +- is the largest difference.",
+            caption="Of a residual the first measure beyond its limit; ± is the largest difference.",
         )
     if one is None or not one.ranked:
         return
@@ -127,7 +140,7 @@ def _phases(report: Report, found: Validation) -> None:
         ("phase", "quantity", "recorded", "predicted", "spread", "limit", "verdict"),
         [
             Row((s.phase, s.title, f"{s.recorded:.6g}", f"{s.foretold:.6g}", f"{s.spread:.2g}",
-                 "" if s.limit is None else f"+- {s.limit:.2g}", _WORDS[s.good]), _MARKS[s.good])
+                 "" if s.limit is None else f"± {s.limit:.2g}", _WORDS[s.good]), _MARKS[s.good])
             for s in found.statistics
         ],
         caption="Predicted is the median, spread the standard deviation over perturbed re-simulations with noise; "
@@ -143,7 +156,6 @@ def _phases(report: Report, found: Validation) -> None:
 
 def _about(found: Validation) -> list[Row]:
     rows = [
-        Row(("recording", found.title)),
         Row(("scene", found.scene)),
         Row(("criteria", found.criteria)),
         Row(("phases", "; ".join(f"{p.name} {p.from_s:.3f} to {p.to_s:.3f} s" for p in found.phases))),
@@ -181,32 +193,65 @@ def _zooms(found: Validation) -> list[tuple[str, float, float]]:
     return [(why, begin, min(end, last_s)) for why, begin, end in zooms if begin < last_s]
 
 
+@house_style()
+def _overview(found: Validation) -> Figure:
+    """Residual over noise of every channel over the whole time."""
+    from matplotlib.colors import LogNorm
+
+    names = [channel.name for part in found.parts.values() for channel in part.channels]
+    figure = new_figure(0.24 * len(names) + 1.2)
+    axes = figure.subplots()
+    begin = min(float(part.times_s[0]) for part in found.parts.values())
+    end = max(float(part.times_s[-1]) for part in found.parts.values())
+    edges, row = np.linspace(begin, end, _STRETCHES + 1), 0
+    image: Any = None
+    for part in found.parts.values():
+        squares = ((part.values - _foretold(found, part)) / part.floor) ** 2
+        place = np.clip(np.digitize(part.times_s, edges) - 1, 0, _STRETCHES - 1)
+        rows = np.bincount(place, minlength=_STRETCHES)
+        for c in range(len(part.channels)):
+            sums = np.bincount(place, np.nan_to_num(squares[:, c]), _STRETCHES)
+            rms = np.sqrt(np.divide(sums, rows, out=np.full(_STRETCHES, np.nan), where=rows > 0))
+            image = axes.pcolormesh(edges, [row - 0.5, row + 0.5], np.maximum(rms, 0.1)[None], cmap="cividis_r",
+                                    norm=LogNorm(1.0, 1e3), rasterized=True)  # fmt: skip
+            row += 1
+    for window_s in found.window_s:
+        axes.axvline(window_s, color="black", lw=1.2, ls=":")
+    axes.set_yticks(range(len(names)), names)
+    axes.set(xlabel="time [s]   (dotted: begin and end of the sample by sample comparison)", ylim=(row - 0.5, -0.5))
+    figure.colorbar(image, ax=axes, label="RMS of residual over noise [1]", extend="both", pad=0.02)
+    return figure
+
+
+@house_style()
 def _group(found: Validation, part: Measured, zooms: list[tuple[str, float, float]]) -> Figure:
     """Overlay of every channel of a group as a whole; overlay and residual of each closer look."""
-    n, columns = len(part.channels), 1 + 2 * max(1, len(zooms))
-    figure = new_figure((5.0 * columns, 1.9 * n + 0.6), layout="constrained")
-    panels = figure.subplots(n, columns, squeeze=False, sharex="col")
+    whole = ("the whole", float(part.times_s[0]), float(part.times_s[-1]))
+    n, looks = len(part.channels), len(zooms or [whole])
+    figure = new_figure((1.25 * n + 0.9) * looks + 0.3)
+    # Each closer look has rows of its own, so that a panel stays wide enough to be read.
+    panels = figure.subplots(n * looks, 3, squeeze=False, sharex=False)
     values = _foretold(found, part)
-    whole = ("", float(part.times_s[0]), float(part.times_s[-1]))
-    for c, channel in enumerate(part.channels):
-        _overlay(panels[c][0], part, values, c, whole)
-        panels[c][0].set_ylabel(channel.name if channel.unit == "1" else f"{channel.name} [{channel.unit}]")
-        for k, window in enumerate(zooms or [whole]):
-            left, right = panels[c][1 + 2 * k : 3 + 2 * k]
-            _overlay(left, part, values, c, window)
+    for look, window in enumerate(zooms or [whole]):
+        for c, channel in enumerate(part.channels):
+            left, middle, right = row = panels[look * n + c]
+            _overlay(left, part, values, c, whole)
+            _overlay(middle, part, values, c, window)
             _residual(right, part, values, c, window)
-    for column, axes in enumerate(panels[0]):
-        _, begin, end = whole if column == 0 or not zooms else zooms[(column - 1) // 2]
-        if begin < found.window_s[1] < end - 1e-6:
-            for row in panels[:, column]:
-                row.axvline(found.window_s[1], color="0.6", lw=0.8, ls=":")
-            axes.set_title("dotted: end of the sample by sample comparison", fontsize=9)
-        if end > begin:
-            axes.set_xlim(begin, end)
-    panels[0][0].legend(loc="upper right", fontsize=8)
-    draw_grid(*panels.ravel())
-    for axes in panels[-1]:
-        axes.set_xlabel("time [s]")
+            left.set_ylabel(label_of(channel.name, channel.unit))
+            for axes, (why, begin, end) in zip(row, (whole, window, window), strict=True):
+                if begin < found.window_s[1] < end - 1e-6:
+                    axes.axvline(
+                        found.window_s[1], color="0.4", lw=1.0, ls=":", label="end of the comparison by sample"
+                    )
+                if end > begin:
+                    axes.set_xlim(begin, end)
+                axes.tick_params(labelbottom=c == n - 1)
+                if c == 0:
+                    axes.set_title("Residual" if axes is right else _sentence(why.partition(",")[0]))
+                if c == n - 1:
+                    axes.set_xlabel("time [s]")
+    legend_below(figure)
     return figure
 
 
@@ -218,31 +263,19 @@ def _rows(part: Measured, window: tuple[str, float, float]) -> slice:
 
 def _overlay(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tuple[str, float, float]) -> None:
     rows = _rows(part, window)
-    times = part.times_s[rows]
-    axes.plot(*_thin(times, part.values[rows, c]), color=BLUE, lw=1.0, label="recorded")
-    axes.plot(*_thin(times, values[rows, c]), color=ORANGE, lw=0.8, ls="--", label="predicted")
+    recorded, predicted = (part.values[rows, c], BLUE, "recorded"), (values[rows, c], ORANGE, "predicted")
+    draw_signals(axes, part.times_s[rows], recorded, predicted)
 
 
 def _residual(axes: Axes, part: Measured, values: np.ndarray, c: int, window: tuple[str, float, float]) -> None:
     rows = _rows(part, window)
     off = (part.values[rows, c] - values[rows, c]) / part.floor[c]
-    axes.plot(*_thin(part.times_s[rows], off), color=RED, lw=0.7)
-    axes.set_ylabel("residual / noise")
+    draw_signals(axes, part.times_s[rows], (off, RED, "residual over noise [1]"))
 
 
-def _thin(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line that looks the same with fewer points: lowest and highest of every few."""
-    every = len(times) // (_POINTS // 2)
-    if every < 2:
-        return times, values
-    whole = len(times) // every * every
-    folded = values[:whole].reshape(-1, every)
-    ends = np.column_stack([folded.min(axis=1), folded.max(axis=1)]).ravel()
-    return np.repeat(times[:whole:every], 2), ends
-
-
+@house_style()
 def _orbits(found: Validation, pairs: list[tuple[str, str]]) -> Figure:
-    figure = new_figure((10.0, 4.2 * len(pairs)))
+    figure = new_figure(4.2 * len(pairs) + 0.4)
     panels = figure.subplots(len(pairs), 2, squeeze=False)
     for (left, right), pair in zip(panels, pairs, strict=True):
         part = next(part for part in found.parts.values() if pair[0] in part.names)
@@ -254,15 +287,11 @@ def _orbits(found: Validation, pairs: list[tuple[str, str]]) -> Figure:
         for signal, colour, label, style in zip(
             signals, (BLUE, ORANGE), ("recorded", "predicted"), ("-", "--"), strict=True
         ):
-            left.plot(signal.real, signal.imag, style, color=colour, lw=0.5, label=label, rasterized=True)
+            left.plot(signal.real, signal.imag, style, color=colour, lw=0.8, label=label, rasterized=True)
             frequency, amplitude = full_spectrum(signal.real, signal.imag, rate)
             shown = np.abs(frequency) < 250.0
-            right.semilogy(frequency[shown], amplitude[shown] + 1e-12, style, color=colour, lw=0.8)
-        left.set_aspect("equal")
-        left.set_xlabel(f"{pair[0]} [mm]")
-        left.set_ylabel(f"{pair[1]} [mm]")
-        left.legend(loc="upper right", fontsize=8)
-        right.set_xlabel("frequency [Hz], negative is backward")
-        right.set_ylabel("amplitude [mm]")
-        draw_grid(left, right)
+            right.semilogy(frequency[shown], np.maximum(amplitude[shown], 1e-6), style, color=colour, lw=1.0)
+        left.set(title="Orbit", xlabel=f"{pair[0]} [mm]", ylabel=f"{pair[1]} [mm]", aspect="equal")
+        right.set(title="Full spectrum", xlabel="frequency [Hz], negative is backward", ylabel="amplitude [mm]")
+    legend_below(figure, panels[0][0])
     return figure

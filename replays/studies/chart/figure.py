@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.report.canvas import new_figure, save
+from replays.report.canvas import WIDTH, house_style, new_figure, save
 from replays.studies.chart.look import ALARM, INK, QUIET, Row, draw_legend, look
 from replays.studies.chart.methods import OURS
 from replays.studies.chart.panel import (
@@ -18,7 +18,6 @@ from replays.studies.chart.panel import (
     draw_frames,
     draw_profile,
     draw_work,
-    dress,
     label_lines,
     mark_better,
     window,
@@ -27,6 +26,7 @@ from replays.studies.chart.phases import MEMORY_CASES, PHASES, RUB, SMOOTHING
 from replays.studies.chart.profile import TARGET
 
 
+@house_style()
 def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note: str = "") -> list[Path]:
     """Draw every panel that has points, as PNG and SVG.
 
@@ -40,20 +40,6 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
     Returns:
         The files.
     """
-    import matplotlib as mpl
-
-    style: Any = {
-        "font.size": 11,
-        "font.family": "DejaVu Sans",
-        "axes.edgecolor": "#888888",
-        "axes.labelcolor": INK,
-        "axes.titlesize": 12,
-        "axes.titleweight": "bold",
-        "axes.titlelocation": "left",
-        "xtick.color": "#555555",
-        "ytick.color": "#555555",
-        "svg.fonttype": "none",
-    }
     makers: dict[str, tuple[str, Callable[[Any, list[Row]], str]]] = {
         "chart": ("exact", _hero),
         "chart-exact": ("exact", _exact),
@@ -68,11 +54,10 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
         points = [row for row in rows if row["panel"] == panel]
         if panel not in panels or not any(row["family"] != "reference" for row in points):
             continue
-        with mpl.rc_context(style):
-            figure = new_figure(layout=None)
-            said = make(figure, rows)
-            _caption(figure, rows, said, command, note)
-            files += save(figure, folder / f"{stem}.png", folder / f"{stem}.svg", colours=256)
+        figure = new_figure(layout=None)
+        said = make(figure, rows)
+        _caption(figure, rows, said, command, note)
+        files += save(figure, folder / f"{stem}.png", folder / f"{stem}.svg")
     return files
 
 
@@ -84,14 +69,18 @@ def _caption(figure: Any, rows: list[Row], said: str, command: str, note: str) -
         f"commit {last['commit'] or 'unknown'}, {last['date']}."
     )
     text = f"{text} {note[:1].upper()}{note[1:]}." if note else text
-    width, height = figure.get_size_inches()
-    figure.text(0.012, 0.12 / height, "\n".join(textwrap.wrap(text, int(width * 12.6))), fontsize=8.5, color=QUIET,
-                va="bottom", linespacing=1.35)  # fmt: skip
+    figure.text(0.01, 0.1 / figure.get_size_inches()[1], "\n".join(textwrap.wrap(text, 152)), fontsize=9, color=QUIET,
+                va="bottom", linespacing=1.3)  # fmt: skip
 
 
-def _say(figure: Any, height: float, title: str) -> None:
-    """The title of a whole figure, at a part of its height."""
-    figure.text(0.012, height, title, fontsize=17, fontweight="bold", color=INK)
+def _grid(figure: Any, height: float, title: str, *, down: int = 1, across: int = 2, left: float = 0.7) -> Any:
+    """Panels under the figure's title and above its caption, with a column for the legend; lengths in inches."""
+    figure.set_size_inches(WIDTH, height)
+    figure.text(0.01, 1.0 - 0.38 / height, title, fontsize=13, fontweight="bold", color=INK)
+    return figure.add_gridspec(
+        down, across + 1, left=left / WIDTH, right=0.995, top=1.0 - 0.95 / height, bottom=1.5 / height,
+        width_ratios=(*[1.0] * across, 1.42 / across), wspace=0.21, hspace=0.36,
+    )  # fmt: skip
 
 
 _HOW = (
@@ -112,28 +101,25 @@ def _phases(rows: list[Row], panel: str) -> list[str]:
 
 
 def _hero(figure: Any, rows: list[Row]) -> str:
-    figure.set_size_inches(17.0, 9.6)
     phases = _phases(rows, "exact")
     phase = "whirl" if "whirl" in phases else phases[-1]
     chosen = _select(rows, "exact", phase)
-    grid = figure.add_gridspec(
-        2, 3, left=0.055, right=0.99, top=0.885, bottom=0.165, width_ratios=(1.9, 0.66, 1.02), wspace=0.12, hspace=0.36
-    )
-    figure.text(0.012, 0.955, "Rotor-stator contact: how fast, and how true", fontsize=19, fontweight="bold",
-                color=INK)  # fmt: skip
-    figure.text(0.012, 0.925, f"Hammer to rolling whirl, exact Coulomb friction ({PHASES[phase].title}). Upper left is "
-                "better." if phase == "whirl" else PHASES[phase].title, fontsize=12, color=QUIET)  # fmt: skip
-    axes = figure.add_subplot(grid[:, 0])
-    window(axes, chosen, rows, title="speed against total error")
+    grid = _grid(figure, 11.2, "Rotor-stator contact with Coulomb friction: how fast, and how true", down=2, across=1)
+    grid.set_width_ratios((1.0, 0.4))
+    grid.set_height_ratios((1.0, 0.47))
+    grid.update(hspace=0.22)
+    axes = figure.add_subplot(grid[0, 0])
+    window(axes, chosen, rows, title=f"Speed against total error: {PHASES[phase].title}")
     mark_better(axes)
     label_lines(axes, chosen, rows)
-    draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[:, 1]), smoothed=True)
-    draw_energy(figure.add_subplot(grid[0, 2]), chosen, rows)
-    lower = figure.add_subplot(grid[1, 2])
+    draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 1]), smoothed=True)
+    below = grid[1, :].subgridspec(1, 2, wspace=0.21)
+    draw_energy(figure.add_subplot(below[0, 0]), chosen, rows)
+    right = figure.add_subplot(below[0, 1])
     if any(row["panel"] == "profile" for row in rows):
-        draw_profile(lower, rows)
+        draw_profile(right, rows)
     else:
-        draw_frames(lower, chosen, rows)
+        draw_frames(right, chosen, rows)
     return _HOW
 
 
@@ -142,7 +128,7 @@ def _exact(figure: Any, rows: list[Row]) -> str:
 
 
 def _smoothed(figure: Any, rows: list[Row]) -> str:
-    title = f"The smoothed law alone, v_s = {SMOOTHING * 1e3:g} mm/s"
+    title = f"The smoothed law alone, vₛ = {SMOOTHING * 1e3:g} mm/s"
     return _windows(figure, rows, "smoothed", title) + (
         " All against the smoothed reference; split takes exact Coulomb only. What smoothing itself costs is on the "
         "exact charts."
@@ -151,17 +137,8 @@ def _smoothed(figure: Any, rows: list[Row]) -> str:
 
 def _windows(figure: Any, rows: list[Row], panel: str, title: str, *, smoothed: bool = False) -> str:
     phases = _phases(rows, panel)
-    down = 2 if len(phases) > 2 else 1
-    across = math.ceil(len(phases) / down)
-    width = max(4.4 + 6.1 * across, 12.6)
-    height = 2.5 + 4.9 * down + (0.9 if down == 1 else 0.0)
-    figure.set_size_inches(width, height)
-    bottom = 1.7 if down == 1 else 1.35
-    grid = figure.add_gridspec(
-        down, across + 1, left=0.85 / width, right=0.995, top=1.0 - 1.0 / height, bottom=bottom / height,
-        width_ratios=(*[1.0] * across, 0.56), wspace=0.14, hspace=0.3,
-    )  # fmt: skip
-    _say(figure, 1.0 - 0.48 / height, title)
+    down, across = math.ceil(len(phases) / 2), min(2, len(phases))
+    grid = _grid(figure, 3.1 + 3.6 * down + (1.2 if down == 1 else 0.0), title, down=down, across=across)
     for i, phase in enumerate(phases):
         axes = figure.add_subplot(grid[i // across, i % across])
         window(axes, _select(rows, panel, phase), rows, title=PHASES[phase].title)
@@ -174,26 +151,24 @@ def _windows(figure: Any, rows: list[Row], panel: str, title: str, *, smoothed: 
 
 def _memory(figure: Any, rows: list[Row]) -> str:
     phase = _phases(rows, "memory")[0]
-    figure.set_size_inches(16.6, 8.0)
-    grid = figure.add_gridspec(1, 3, left=0.045, right=0.995, top=0.86, bottom=0.18, width_ratios=(1, 1, 0.52),
-                               wspace=0.15)  # fmt: skip
-    _say(figure, 0.935, f"Memory of the impact speed ({PHASES[phase].title})")
-    titles = ("Lankarani-Nikravesh: v0 is latched at each onset", "the same without memory (c = 0)")
+    grid = _grid(figure, 7.6, f"Memory of the impact speed ({PHASES[phase].title})")
+    titles = ("v₀ latched at each onset\n(Lankarani-Nikravesh)", "The same without memory\n(c = 0)")
     for i, case in enumerate(MEMORY_CASES):
         axes = figure.add_subplot(grid[0, i])
         window(axes, _select(rows, "memory", phase, (case,)), rows, title=titles[i])
         mark_better(axes)
+        if i:
+            axes.set_ylabel("")
     draw_legend(figure, rows, ("memory",), figure.add_subplot(grid[0, 2]))
     return _HOW + (
-        " Friction is left out here, so that every method runs. 'No events': v0 is latched at a step's end, not where "
+        " Friction is left out here, so that every method runs. 'No events': v₀ is latched at a step's end, not where "
         "the contact begins."
     )
 
 
 def _profile_figure(figure: Any, rows: list[Row]) -> str:
-    figure.set_size_inches(12.6, 7.2)
-    grid = figure.add_gridspec(1, 2, left=0.065, right=0.995, top=0.85, bottom=0.2, width_ratios=(1, 0.4), wspace=0.06)
-    _say(figure, 0.93, "Not one hero scene: random pulses, speeds, friction and restitution")
+    grid = _grid(figure, 6.8, "Random pulses, speeds, friction and restitution", across=1)
+    grid.set_width_ratios((1.0, 0.4))
     chaotic = draw_profile(figure.add_subplot(grid[0, 0]), rows)
     draw_legend(figure, rows, ("profile",), figure.add_subplot(grid[0, 1]), failures=False)
     chaos = f" {chaotic} draws without a sharp reference (chaotic) are left out for all." if chaotic else ""
@@ -207,10 +182,8 @@ def _work(figure: Any, rows: list[Row]) -> str:
     phases = _phases(rows, "exact")
     phase = "whirl" if "whirl" in phases else phases[-1]
     chosen = _select(rows, "exact", phase)
-    figure.set_size_inches(16.6, 7.2)
-    grid = figure.add_gridspec(1, 3, left=0.05, right=0.995, top=0.85, bottom=0.2, width_ratios=(1, 1, 0.52),
-                               wspace=0.17)  # fmt: skip
-    _say(figure, 0.93, f"Work and frames, exact Coulomb friction ({PHASES[phase].title})")
+    grid = _grid(figure, 7.0, f"Work and frames, exact Coulomb friction ({PHASES[phase].title})")
+    grid.update(wspace=0.3)
     draw_work(figure.add_subplot(grid[0, 0]), chosen, rows)
     draw_frames(figure.add_subplot(grid[0, 1]), chosen, rows)
     draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 2]), failures=False)
@@ -226,16 +199,15 @@ def _rub(figure: Any, rows: list[Row]) -> str:
     order = list(dict.fromkeys(row["method"] for row in points))
     points.sort(key=lambda row: (order.index(row["method"]), -(row["tolerance"] or row["step_us"] or 0.0)))
     n = len(points)
-    height = 2.9 + 0.34 * n
-    figure.set_size_inches(13.5, height)
-    grid = figure.add_gridspec(1, 4, left=0.195, right=0.985, top=1.0 - 0.85 / height, bottom=1.55 / height, wspace=0.1)
-    _say(figure, 1.0 - 0.5 / height, "Chaotic partial rub: trajectories part, statistics stay")
+    grid = _grid(figure, 3.0 + 0.34 * n, "Chaotic partial rub: trajectories part, statistics stay", across=3, left=2.4)
+    grid.set_width_ratios((1.0, 1.0, 1.0, 1.0))
+    grid.update(wspace=0.14)
     good = [row for row in points if row["rms_force"] is not None]
     # The tightest setting of an unlike code is what the others are held against.
     unlike = [row for row in good if row["family"] != OURS] or good
     tight = min(unlike, key=lambda row: row["tolerance"] or math.inf) if unlike else None
-    columns = (("contact_fraction", "share of time in contact [%]", 100.0), ("rms_force", "RMS elastic force [N]", 1.0),
-               ("impacts_per_s", "impacts a second [1/s]", 1.0))  # fmt: skip
+    columns = (("contact_fraction", "time in contact\n[%]", 100.0), ("rms_force", "RMS elastic force\n[N]", 1.0),
+               ("impacts_per_s", "impacts a second\n[1/s]", 1.0))  # fmt: skip
     y = np.arange(n)[::-1]
     names = [f"{row['title']}, {row['rung'].replace(' us', ' µs')}" for row in points]
     for i, (name, label, scale) in enumerate(columns):
@@ -251,7 +223,6 @@ def _rub(figure: Any, rows: list[Row]) -> str:
             bar = np.array([[row[name] - row[f"{name}_low"]], [row[f"{name}_high"] - row[name]]]) * scale
             axes.errorbar(row[name] * scale, place, xerr=bar.clip(0.0), fmt=style["marker"], color=style["color"],
                           ms=style["ms"], elinewidth=0.55 * style["lw"] + 0.5, mec="white", mew=0.6)  # fmt: skip
-        dress(axes, "")
         axes.set(xlabel=label, ylim=(-0.7, n - 0.3), yticks=y)
         axes.set_yticklabels(names if i == 0 else [])
         axes.margins(x=0.15)
@@ -259,10 +230,9 @@ def _rub(figure: Any, rows: list[Row]) -> str:
     for place, row in zip(y, points, strict=True):
         axes.barh(place, row["speed"] or 0.0, color=look(row, rows)["color"], height=0.55, zorder=2)
         axes.text((row["speed"] or 0.0) * 1.08, place, f"{row['speed'] or 0.0:.3g}", va="center", fontsize=9, color=INK)
-    dress(axes, "")
-    axes.set(xscale="log", xlabel="times real time [s/s]", ylim=(-0.7, n - 0.3), yticks=y)
+    axes.set(xscale="log", xlabel="times real time\n[s/s]", ylim=(-0.7, n - 0.3), yticks=y)
     axes.set_yticklabels([])
-    axes.set_xlim(right=axes.get_xlim()[1] * 2.5)
+    axes.set_xlim(right=axes.get_xlim()[1] * 6.0)
     against = f"{tight['title']}, {tight['rung']}" if tight is not None else "none"
     return (
         f"Ring moved sideways by 0.8 mm, unbalance 0.3 mm, 12 Hz, {points[0]['simulated_s']:g} s: two runs that begin "

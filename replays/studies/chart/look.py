@@ -13,8 +13,9 @@ Row = dict[str, Any]
 
 # Peers stand in quiet tones by family, behind the strong colours of our engines.
 _FAMILIES = {"heyoka": ("#111111", "*"), "SUNDIALS": ("#6e6e6e", "s"), "scipy": ("#a98a66", "o"),
-             "MuJoCo": ("#5b4a8a", "X")}  # fmt: skip
-_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)), (0, (2.5, 1)), (0, (8, 3)))
+             "MuJoCo": ("#a08cc0", "X")}  # fmt: skip
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (1.4, 1.2)), (0, (6, 1.5, 1.4, 1.5)), (0, (2.5, 1)), (0, (8, 3)),
+                            (0, (1, 3)), (0, (9, 2, 3, 2)))  # fmt: skip
 FAILURES = {
     "branch": ("B", "another branch of motion"),
     "nan": ("N", "not finite"),
@@ -30,13 +31,13 @@ def look(row: Row, rows: list[Row]) -> dict[str, Any]:
     """Line and marker of a method: bold in its own colour if ours, thin in its family's if not."""
     if row["family"] == OURS:
         own, main = traits(row["method"]), row["method"] == next(iter(ENGINES))
-        width, size, order = (3.6, 8.5, 8) if main else (2.4, 7.0, 7)
+        width, size, order = (3.0, 7.5, 8) if main else (1.9, 6.0, 7)
         return {"color": own.colour, "marker": own.marker, "ls": "-", "lw": width, "ms": size, "mec": "white",
                 "mew": 0.9, "zorder": order}  # fmt: skip
     color, marker = _FAMILIES.get(row["family"], ("#999999", "d"))
     family = list(dict.fromkeys(other["method"] for other in rows if other["family"] == row["family"]))
     dash = _DASHES[family.index(row["method"]) % len(_DASHES)]
-    return {"color": color, "marker": marker, "ls": dash, "lw": 1.2, "ms": 8.0 if marker == "*" else 4.5, "mec": color,
+    return {"color": color, "marker": marker, "ls": dash, "lw": 1.0, "ms": 7.5 if marker == "*" else 4.0, "mec": color,
             "mew": 0.5, "zorder": 5 if marker == "*" else 4}  # fmt: skip
 
 
@@ -74,10 +75,9 @@ def draw_legend(
             for kind, (letter, text) in FAILURES.items()
             if kind in failed
         ]
-    size = 10.0 if len(entries) < 26 else 8.8
     legend = place.legend(
-        [entry[0] for entry in entries], [entry[1] for entry in entries], loc="upper left", frameon=False,
-        fontsize=size, handlelength=2.9, labelspacing=0.042 * size, borderaxespad=0.0,
+        [entry[0] for entry in entries], [entry[1] for entry in entries], loc="upper left", fontsize=9,
+        handlelength=2.2, labelspacing=0.35, borderaxespad=0.0, bbox_to_anchor=(-0.15, 1.0),
     )  # fmt: skip
     for text in legend.get_texts():
         if text.get_text() in {*headings.values(), *order, "failures"}:

@@ -69,9 +69,8 @@ def window(axes: Any, rows: list[Row], all_rows: list[Row], *, title: str) -> No
     _failures(axes, points, all_rows)
     _reference_bar(axes, rows)
     _limits(axes, rows)
-    dress(axes, title)
-    ticks = [10.0**n for n in range(-9, 1)]
-    axes.set_xticks(ticks)
+    axes.set_title(title)
+    axes.set_xticks([10.0**n for n in range(-8, 1, 2)])
     axes.minorticks_off()
     axes.set(xlabel=_ERROR, ylabel=_SPEED)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -93,7 +92,7 @@ def _failures(axes: Any, points: list[Row], all_rows: list[Row]) -> None:
             va="center", fontsize=9, fontweight="bold", zorder=9, gid=f"failure-{row['method']}-{row['rung']}",
             clip_on=False,
         )  # fmt: skip
-    axes.text(math.sqrt(_RIGHT * _EDGE), 0.992, "failed", transform=axes.get_xaxis_transform(), ha="center", va="top",
+    axes.text(math.sqrt(_RIGHT * _EDGE), 1.0, "failed", transform=axes.get_xaxis_transform(), ha="center", va="bottom",
               fontsize=9, color="#a06060")  # fmt: skip
 
 
@@ -102,8 +101,8 @@ def _reference_bar(axes: Any, rows: list[Row]) -> None:
     if not bars:
         return
     axes.axvspan(_LEFT, max(max(bars), 1.3 * _LEFT), color="#e4ebf2", zorder=0, lw=0)
-    axes.text(max(max(bars), 1.3 * _LEFT) * 1.15, 0.012, f"reference's own error {max(bars):.0e}".replace("e-0", "e-"),
-              transform=axes.get_xaxis_transform(), fontsize=8, color="#6b7f93", va="bottom")  # fmt: skip
+    axes.text(max(max(bars), 1.3 * _LEFT) * 1.15, 0.012, f"reference ±{max(bars):.0e}".replace("e-0", "e-"),
+              transform=axes.get_xaxis_transform(), fontsize=9, color="#56687a", va="bottom")  # fmt: skip
 
 
 def _limits(axes: Any, rows: list[Row]) -> None:
@@ -111,18 +110,19 @@ def _limits(axes: Any, rows: list[Row]) -> None:
     for row in rows:
         if row["case"] == "floor" and row["error"] and _LEFT < row["error"] < _RIGHT:
             axes.axvline(row["error"], color="#8a6fae", lw=1.0, ls=(0, (4, 3)), zorder=2)
-            axes.text(row["error"], 0.06, f"{row['rung']}", rotation=90, transform=axes.get_xaxis_transform(),
-                      fontsize=8.5, color="#6d5490", ha="right", va="bottom")  # fmt: skip
+            label = row["rung"].replace("v_s", "vₛ")
+            axes.text(row["error"], 0.06, label, rotation=90, transform=axes.get_xaxis_transform(), fontsize=9,
+                      color="#6d5490", ha="right", va="bottom")  # fmt: skip
 
 
 def mark_better(axes: Any) -> None:
     """An arrow to the upper left."""
-    x, y = 0.055, 0.955
+    x, y = 0.045, 0.97
     axes.annotate(
-        "", (x, y), (x + 0.075, y - 0.1), xycoords="axes fraction",
+        "", (x, y), (x + 0.06, y - 0.07), xycoords="axes fraction",
         arrowprops={"arrowstyle": "-|>", "lw": 2.2, "color": "#3a3a3a"},
     )  # fmt: skip
-    axes.text(x + 0.085, y - 0.1, "better", transform=axes.transAxes, ha="left", va="center", fontsize=11,
+    axes.text(x + 0.07, y - 0.07, "better", transform=axes.transAxes, ha="left", va="center", fontsize=10,
               fontstyle="italic", color="#3a3a3a")  # fmt: skip
 
 
@@ -152,17 +152,9 @@ def label_lines(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
             _inside(error) * (1.3 if outside else 1.0),
             place[1] * (1.1 if outside else 1.0),
             name if outside else f"{name}  ",
-            color=color, fontsize=12, fontweight="bold", ha="left" if outside else "right",
+            color=color, fontsize=11, fontweight="bold", ha="left" if outside else "right",
             va="bottom" if outside else "center", zorder=10,
         )  # fmt: skip
-
-
-def dress(axes: Any, title: str) -> None:
-    """Grid, open frame and title, the same on every panel."""
-    axes.grid(True, color="#ececec", lw=0.8, zorder=0)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.set_title(title)
 
 
 def _lines(rows: list[Row], *needed: str, ours: bool) -> Iterator[list[Row]]:
@@ -185,11 +177,11 @@ def draw_energy(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
         axes.plot(x, [row["speed"] for row in line], **look(line[0], all_rows))
     axes.set_xlim(min(0.3 * least, 1e-4), 0.1)
     axes.axvline(1e-3, color=ALARM, lw=1.0, ls=(0, (4, 3)))
-    axes.text(1e-3, 0.02, " alarm", transform=axes.get_xaxis_transform(), color=ALARM, fontsize=8.5, va="bottom")
+    axes.text(1e-3, 0.02, " alarm", transform=axes.get_xaxis_transform(), color=ALARM, fontsize=9, va="bottom")
     axes.set(xlabel="energy residual over energy dissipated [1]", ylabel=_SPEED)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.minorticks_off()
-    dress(axes, "energy ledger: needs no reference")
+    axes.set_title("Energy ledger: needs no reference")
 
 
 def draw_frames(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
@@ -202,7 +194,7 @@ def draw_frames(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
     axes.set(xlim=(_LEFT, _RIGHT), ylim=(10.0, max(2.0 * slowest, 2e3)))
     axes.axhline(1e3, color=ALARM, lw=1.0, ls=(0, (4, 3)))
     axes.set(xlabel=_ERROR, ylabel="worst 1 ms frame [µs]")
-    dress(axes, "worst frame of 1 ms: lower left is better")
+    axes.set_title("Worst frame of 1 ms:\nlower left is better")
 
 
 def draw_work(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
@@ -212,7 +204,7 @@ def draw_work(axes: Any, rows: list[Row], all_rows: list[Row]) -> None:
         evaluations = [row["evaluations"] / row["simulated_s"] for row in line]
         axes.plot([_placed(row) for row in line], evaluations, **look(line[0], all_rows))
     axes.set(xlabel=_ERROR, ylabel="evaluations a simulated second [1/s]")
-    dress(axes, "evaluations of the equations: lower left is better")
+    axes.set_title("Evaluations of the equations:\nlower left is better")
 
 
 def draw_profile(axes: Any, rows: list[Row]) -> int:
@@ -232,5 +224,5 @@ def draw_profile(axes: Any, rows: list[Row]) -> int:
     axes.set(xlim=(1.0, top), ylim=(0.0, 102.0), xlabel="processor time over that of the best [1]",
              ylabel=f"scenes within {TARGET:g} [%]")  # fmt: skip
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    dress(axes, f"performance profile, {scenes} random scenes")
+    axes.set_title(f"Performance profile, {scenes} random scenes")
     return len({row["phase"] for row in points}) - scenes

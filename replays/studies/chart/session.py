@@ -23,10 +23,11 @@ from replays.studies.chart.phases import (
     problem_of,
     select,
 )
-from replays.studies.chart.store import Row, Store
+from replays.studies.chart.store import Row, Store, read_table
 from replays.studies.peers import PEERS, Setting
 from replays.studies.peers.problem import Problem, scaled_error
 from replays.studies.peers.reference import Reference, find_reference
+from rig.errors import InputError
 
 TOTAL_S = {"quick": 95.0, "full": 3300.0}
 """Wall time for all points, compile time apart [s]; what does not fit is left to the next run."""
@@ -118,6 +119,23 @@ def make_chart(
             note += f"{'; ' if note else ''}{outcome.left} points not measured for want of time: run again to add them"
         outcome.files = store.write(mode) + draw(rows, folder, chosen, command=command, note=note)
     return outcome
+
+
+def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | None = None) -> Outcome:
+    """Draw the table of an earlier chart once more, and measure nothing.
+
+    Raises:
+        InputError: Wrong choice, or no such table in the folder.
+    """
+    from replays.studies.chart.figure import draw
+
+    chosen, _ = select(only, panels)
+    rows = read_table(folder)
+    if not rows:
+        raise InputError("output", "a folder with points in chart.csv", str(folder))
+    command = "rig chart --full" if rows[0]["mode"] == "full" else "rig chart"
+    files = draw(rows, folder, chosen, command=command)
+    return Outcome(files=files, resumed=len(rows), failures=sum(bool(row["failure"]) for row in rows))
 
 
 def own_reference(problem: Problem) -> Reference | None:

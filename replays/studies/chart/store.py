@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
@@ -105,15 +106,37 @@ class Store:
         schema = pa.schema([(name, pa.string() if name in _TEXT else pa.float64()) for name in COLUMNS])
         table = pa.table(
             {
-                name: [row[name] if name in _TEXT or row[name] is None else float(row[name]) for row in rows]
+                name: [row[name] if name in _TEXT or row[name] is None else _digits(row[name]) for row in rows]
                 for name in COLUMNS
             },
             schema=schema,
         )
         paths = [self.folder / f"{self.stem}.parquet", self.folder / f"{self.stem}.csv"]
         pyarrow.parquet.write_table(table, paths[0])
-        pyarrow.csv.write_csv(table, paths[1])
+        pyarrow.csv.write_csv(table, paths[1], pyarrow.csv.WriteOptions(quoting_style="needed"))
         return paths
+
+
+def _digits(value: float) -> float:
+    # What follows is no evidence, and half of the file.
+    return float(f"{value:.6g}")
+
+
+def read_table(folder: Path, stem: str = "chart") -> list[Row]:
+    """The points of a table that a making of a chart has left in a folder.
+
+    Raises:
+        InputError: There is none, or it is no such table.
+    """
+    path = folder / f"{stem}.csv"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [
+                {name: row[name] if name in _TEXT else float(row[name]) if row[name] else None for name in COLUMNS}
+                for row in csv.DictReader(file)
+            ]
+    except (OSError, KeyError, ValueError, TypeError, csv.Error):
+        raise InputError("output", f"a folder with {path.name} of an earlier chart", str(folder)) from None
 
 
 def stamp() -> dict[str, str]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from textwrap import shorten
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from replays.report.canvas import BLACK, BLUE, ORANGE, RED, draw_grid, new_figure
+from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, house_style, legend_below, new_figure
 from replays.studies.paper.condition import (
     Start,
     Threshold,
@@ -24,12 +25,18 @@ from rig.kernels.constants import Constants
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from replays.studies.paper.findings import Line
 
+_FAR = 0.6
+"""How far outside what is allowed a value is still drawn at its place, in parts of the allowed range."""
+
+
+@house_style()
 def draw_conditions(
     slowest: list[Threshold], least: list[Threshold], starts: list[Start], constants: Constants
 ) -> Figure:
     """Thresholds in the plane of friction and whirl frequency, and what becomes of a pulse over friction."""
-    figure = new_figure((13.0, 4.8), "Bartha's second condition (eq. 43), its sign put right", title_size=12)
+    figure = new_figure(5.8, "Bartha's second condition (eq. 43), its sign put right")
     plane, scan = figure.subplots(1, 2)
     own = oscillator(constants)
     mu = np.geomspace(3e-3, 0.6, 200)
@@ -41,10 +48,10 @@ def draw_conditions(
     plane.plot([t.bare for t in least], spins, "D", color=BLUE, ms=7, mfc="none", mew=1.8,
                label="keeps whirling from here on (bare rig)")  # fmt: skip
     plane.plot([t.full for t in least], spins, "D", color=BLUE, ms=6, label="the same, full rig")
-    plane.axhline(own.natural / (2 * math.pi), color="0.5", ls=":", lw=1.2, label="ω_n on the magnets (eq. 42)")
+    plane.axhline(own.natural / (2 * math.pi), color="0.5", ls=":", lw=1.2, label="ωₙ on the magnets (eq. 42)")
     plane.plot(constants.contact.friction, 83.7, "*", color=ORANGE, ms=13, label="the paper: µ = 0.25, 83.7 Hz")
-    plane.set(xlabel="friction µ", ylabel="|whirl frequency| [Hz]", ylim=(6, 300))
-    plane.legend(fontsize=8, loc="lower left")
+    plane.set(xlabel="friction µ [1]", ylabel="|whirl frequency| [Hz]", ylim=(6, 300), title="What keeps up a whirl")
+    plane.legend(loc="upper center", bbox_to_anchor=(0.45, -0.13))
     shown = set()
     for row, start in enumerate(starts):
         for kind, (colour, mark) in enumerate(STYLES):
@@ -52,33 +59,63 @@ def draw_conditions(
             label = NAMES[kind] if len(there) and kind not in shown else None
             if len(there):
                 shown.add(kind)
-            scan.plot(there, [row] * len(there), mark, color=colour, ms=6.5, mec="0.35", mew=0.7, label=label)
+            scan.plot(there, [row] * len(there), mark, color=colour, ms=5.5, mec="0.35", mew=0.7, label=label)
     scan.axvline(constants.contact.friction, color="0.5", ls=":", lw=1.2, label="the paper's µ")
     scan.set_yticks(range(len(starts)), [f"{start.force_n:g} N" for start in starts])
-    scan.set(xlabel="friction µ", ylabel="pulse of 5 ms at 6.2 Hz", ylim=(-0.6, len(starts) + 0.2),
-             title="what becomes of a pulse")  # fmt: skip
-    scan.legend(fontsize=8, loc="upper right", ncols=3)
-    draw_grid(plane, scan)
+    scan.set(xlabel="friction µ [1]", ylabel="pulse of 5 ms at 6.2 Hz", ylim=(-0.6, len(starts) - 0.4),
+             title="What becomes of a pulse")  # fmt: skip
+    scan.legend(loc="upper center", bbox_to_anchor=(0.45, -0.13), ncols=2)
     return figure
 
 
+@house_style()
+def draw_verdicts(lines: list[Line]) -> Figure:
+    """Where ours lies within what the paper allows, for every statement on how large something is."""
+    judged = [line for line in lines if 0.0 < line.statement.low < line.statement.high < 20.0 * line.statement.low]
+    figure = new_figure(0.27 * len(judged) + 1.5, "How large the paper has it, and ours")
+    axes = figure.subplots()
+    axes.axvspan(0.0, 1.0, color="0.92", lw=0)
+    looks = {"as-printed": ("s", "white"), "corrected": ("o", None)}
+    for row, line in enumerate(judged):
+        low, high = line.statement.low, line.statement.high
+        for name, value in line.values.items():
+            marker, fill = looks[name]
+            colour = GREEN if line.verdicts[name] == "agrees" else RED
+            place = (value - low) / (high - low) if math.isfinite(value) else math.inf
+            # What is farther off stands at the edge.
+            shown = min(max(place, -_FAR), 1.0 + _FAR)
+            axes.plot(shown, row, marker if shown == place else "<" if place < 0.0 else ">", color=colour,
+                      mfc=fill or colour, ms=7, mew=1.6)  # fmt: skip
+    for name, (marker, fill) in looks.items():
+        axes.plot([], [], marker, color=BLACK, mfc=fill or BLACK, ms=7, mew=1.6, ls="none", label=name)
+    for colour, label in ((GREEN, "agrees"), (RED, "differs (triangle: farther off)")):
+        axes.plot([], [], color=colour, lw=5, label=label)
+    axes.set_yticks(range(len(judged)), [shorten(line.statement.says, 60, placeholder=" …") for line in judged])
+    axes.set(
+        xlim=(-1.15 * _FAR, 1.0 + 1.15 * _FAR), ylim=(len(judged) - 0.4, -0.6),
+        xlabel="place between the least (0) and the largest (1)\nthat the paper allows [1]",
+    )  # fmt: skip
+    legend_below(figure)
+    return figure
+
+
+@house_style()
 def draw_law(sweep: dict[float, Outcome]) -> Figure:
     """Whirl frequency over spin, simulated and by closed form, and its error."""
-    figure = new_figure((13.0, 4.2), "Whirl frequency over spin", title_size=12)
+    figure = new_figure(5.0, "Whirl frequency over spin")
     whirl, error = figure.subplots(1, 2)
     speeds = np.array(list(sweep))
     fine = np.linspace(min(speeds), max(speeds), 60)
-    whirl.plot(fine, [law_hz(float(s))[1] for s in fine], color="0.6", lw=1.2, ls="--", label="rigid, -Ω R_S / r₀")
-    whirl.plot(fine, [law_hz(float(s))[0] for s in fine], color=BLACK, lw=1.6, label="-Ω R_S / (r₀ + δ)")
+    whirl.plot(fine, [law_hz(float(s))[1] for s in fine], color="0.6", lw=1.2, ls="--", label="rigid, −Ω Rₛ/r₀")
+    whirl.plot(fine, [law_hz(float(s))[0] for s in fine], color=BLACK, lw=1.6, label="−Ω Rₛ/(r₀ + δ)")
     whirl.plot(speeds, [r.whirl_hz for r in sweep.values()], "o", color=RED, mfc="none", mew=1.8, label="simulated")
     whirl.plot(6.2, -83.7, "*", color=ORANGE, ms=13, label="the paper, Fig. 14")
     whirl.set(xlabel="spin [Hz]", ylabel="whirl frequency [Hz]")
     errors = [100 * law_error(result, speed) for speed, result in sweep.items()]
     rigid = [100 * (result.whirl_hz / law_hz(speed)[1] - 1) for speed, result in sweep.items()]
-    error.plot(speeds, errors, "o-", color=RED, label="against -Ω R_S / (r₀ + δ)")
+    error.plot(speeds, errors, "o-", color=RED, label="against −Ω Rₛ/(r₀ + δ)")
     error.plot(speeds, rigid, "s--", color="0.6", label="against the rigid ring")
     error.set(xlabel="spin [Hz]", ylabel="error [%]")
     for axes in (whirl, error):
-        axes.legend(fontsize=8)
-    draw_grid(whirl, error)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.45, -0.15))
     return figure

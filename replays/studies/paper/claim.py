@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.report.canvas import BLUE, GREEN, ORANGE, RED, SKY, draw_grid, new_figure
+from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, house_style, legend_below, new_figure
 from replays.studies.paper.pulse import BANDWIDTH, Outcome, Pulse
 from replays.studies.paper.spread import column, free_values, one_at_a_time, phases, rank_correlation
 from rig.parameters import load_parameters
@@ -103,6 +103,9 @@ class Bar:
         return max(there) - min(there) if there else 0.0
 
 
+_MOST_BARS = 16
+_ENDS = (("white", "low end, or as printed"), (BLACK, "high end, or put right"))
+"""Fill of the mark at either end of a line, and what the end is."""
 COLOURS = {"assumed value": ORANGE, "correction": BLUE, "house": GREEN, "other reading": SKY}
 
 
@@ -133,74 +136,62 @@ def toward_measured(found: list[Bar]) -> list[Bar]:
     return [bar for bar in found if any(value <= MEASURED_N for value in bar.values)]
 
 
+@house_style()
 def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
     """What each change makes of the force in whirl and of the highest reaction."""
-    figure = new_figure(
-        (14.0, 8.6), "What moves the force: one change at a time (ranges of assumed values are assumed)", title_size=12
-    )
-    panels = figure.subplots(1, 2)
+    from matplotlib.patches import Patch
+
+    figure = new_figure(11.6, "What moves the force: one change at a time (ranges of assumed values are assumed)")
+    panels = figure.subplots(2, 1)
     shown = {
-        "reaction_x_n": ("E - W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
-        "peak_x_n": ("highest E - W in the impacts, median of the phases [N]", 5000.0, "end of the simulated axis"),
+        "reaction_x_n": ("E − W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
+        "peak_x_n": ("highest E − W in the impacts, median of the phases [N]", 5000.0, "end of the simulated axis"),
     }
     for axes, (quantity, (label, level, text)) in zip(panels, shown.items(), strict=True):
-        widest = bars(results, quantity)[:20][::-1]
-        for row, bar in enumerate(widest):
-            there = [value for value in bar.values if math.isfinite(value)]
-            if not there:
-                continue
-            # A little width for a bar that does not move at all.
-            axes.barh(row, max(bar.width, 0.5), left=min(there), height=0.62, color=COLOURS[bar.kind])
-            for end, mark in ((bar.values[0], "<"), (bar.values[-1], ">")):
-                if bar.kind != "other reading" and math.isfinite(end):
-                    axes.plot(end, row, marker="|" if mark == "<" else "o", color="0.2", ms=5, mew=1.6)
-        axes.set_yticks(range(len(widest)), [bar.name for bar in widest], fontsize=8.5)
+        _draw_bars(axes, bars(results, quantity)[:_MOST_BARS][::-1], level)
         values = column(spread, quantity)
         values = values[np.isfinite(values)]
         if len(values):
             low, middle, high = np.percentile(values, [5, 50, 95])
-            axes.axvspan(
-                low,
-                high,
-                color="0.93",
-                zorder=0,
-                label=f"all assumed values at once: {low:.0f} to {high:.0f} N (5-95 %)",
-            )
+            told = f"all assumed values at once:\n{low:.0f} to {high:.0f} N (5 to 95 %)"
+            axes.axvspan(low, high, color="0.93", zorder=0, label=told)
             axes.axvline(middle, color="0.6", lw=1.0, zorder=0)
-        axes.axvline(median(results["base corrected"], quantity), color="black", lw=1.0, label="corrected")
-        axes.axvline(median(results["base as-printed"], quantity), color=BLUE, lw=1.0, ls=":", label="as-printed")
-        axes.axvline(level, color=RED, lw=1.2, ls=(0, (4, 3)), label=f"{text}, {level:g} N")
+        axes.axvline(median(results["base corrected"], quantity), color=BLACK, lw=1.2, label="corrected")
+        axes.axvline(median(results["base as-printed"], quantity), color=BLUE, lw=1.4, ls=":", label="as-printed")
+        axes.axvline(level, color=RED, lw=1.4, ls=(0, (4, 3)), label=f"{text}, {level:g} N")
         axes.set(xlabel=label)
-        ends = [level, *(value for bar in widest for value in bar.values if math.isfinite(value))]
-        room = 0.05 * (max(ends) - min(ends))
-        axes.set_xlim(min(ends) - room, max(ends) + room)
-        draw_grid(axes)
-        # Below the picture, where it hides nothing.
-        axes.legend(fontsize=7.5, loc="upper center", bbox_to_anchor=(0.3, -0.08), ncols=2, frameon=False)
-    from matplotlib.patches import Patch
-
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     handles: list[Any] = [Patch(color=colour, label=kind) for kind, colour in COLOURS.items()]
-    handles += _end_marks()
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=9, frameon=False)
+    handles += [panels[0].plot([], [], "o", color=BLACK, mfc=fill, ms=6.5, label=label)[0] for fill, label in _ENDS]
+    figure.legend(handles=handles, loc="outside lower center", ncols=6)
     return figure
 
 
-def _end_marks() -> list[Any]:
-    from matplotlib.lines import Line2D
+def _draw_bars(axes: Any, widest: list[Bar], level: float) -> None:
+    """The lines of a tornado, with the ends that a change leads from and to."""
+    ends = [level, *(value for bar in widest for value in bar.values if math.isfinite(value))]
+    room = 0.05 * (max(ends) - min(ends))
+    for row, bar in enumerate(widest):
+        there = [value for value in bar.values if math.isfinite(value)]
+        if not there:
+            continue
+        # A little width for a bar that does not move at all.
+        axes.barh(row, max(bar.width, 0.05 * room), left=min(there), height=0.62, color=COLOURS[bar.kind])
+        for end, (fill, _) in zip((bar.values[0], bar.values[-1]), _ENDS, strict=True):
+            if bar.kind != "other reading" and math.isfinite(end):
+                axes.plot(end, row, "o", color=BLACK, mfc=fill, ms=6.5)
+    axes.set_yticks(range(len(widest)), [bar.name for bar in widest])
+    axes.set(xlim=(min(ends) - room, max(ends) + room), ylim=(-0.7, len(widest) - 0.3))
 
-    return [
-        Line2D([], [], color="0.2", marker="|", ls="none", label="low end, or as printed"),
-        Line2D([], [], color="0.2", marker="o", ls="none", ms=5, label="high end, or put right"),
-    ]
 
-
+@house_style()
 def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
     """Distributions with all assumed values spread at once, and what each value has to do with them."""
-    figure = new_figure((14.0, 4.6), f"All assumed values at once: Latin hypercube, {len(spread)} runs", title_size=12)
-    panels = figure.subplots(1, 4, width_ratios=(1, 1, 1, 1.15))
+    figure = new_figure(8.4, f"All assumed values at once: Latin hypercube, {len(spread)} runs")
+    panels = figure.subplots(2, 2).ravel()
     shown = {
-        "reaction_x_n": ("E - W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
-        "peak_x_n": ("highest E - W [N]", None, ""),
+        "reaction_x_n": ("E − W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
+        "peak_x_n": ("highest E − W [N]", None, ""),
         "whirl_hz": ("whirl frequency [Hz]", -83.7, "the paper, Fig. 14"),
     }
     for axes, (name, (label, paper, text)) in zip(panels[:3], shown.items(), strict=True):
@@ -210,44 +201,42 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
             values = values[[result.whirls for result in spread if math.isfinite(getattr(result, name))]]
         axes.hist(values, bins=30, color=SKY)
         if paper is not None:
-            axes.axvline(paper, color=RED, ls=(0, (4, 3)), lw=1.2, label=f"{text}, {paper:g}")
-            axes.legend(fontsize=8)
-        axes.set(xlabel=label, ylabel="runs")
+            axes.axvline(paper, color=RED, ls=(0, (4, 3)), lw=1.4)
+            axes.set_title(f"dashed: {text}, {paper:g}".replace("-", "−"), color=RED, fontweight="normal")
+        axes.set(xlabel=label, ylabel="runs [1]")
     entries = free_values()
     force = rank_correlation(parts, column(spread, "reaction_x_n"))
     peak = rank_correlation(parts, column(spread, "peak_x_n"))
     rows = np.arange(len(entries))
-    panels[3].barh(rows + 0.2, np.nan_to_num(force), height=0.38, color=BLUE, label="force in whirl")
-    panels[3].barh(rows - 0.2, np.nan_to_num(peak), height=0.38, color=ORANGE, label="highest force")
-    panels[3].set_yticks(rows, [entry.key for entry in entries], fontsize=7.5)
+    panels[3].barh(rows - 0.2, np.nan_to_num(force), height=0.38, color=BLUE, label="force in whirl")
+    panels[3].barh(rows + 0.2, np.nan_to_num(peak), height=0.38, color=ORANGE, label="highest force")
+    panels[3].set_yticks(rows, [entry.key for entry in entries])
     panels[3].invert_yaxis()
-    panels[3].set(xlabel="rank correlation", xlim=(-1.05, 1.05))
-    panels[3].legend(fontsize=8, loc="lower left")
-    draw_grid(*panels)
+    panels[3].set(xlabel="rank correlation [1]", xlim=(-1.05, 1.05))
+    legend_below(figure)
     return figure
 
 
+@house_style()
 def draw_mobility(results: Results) -> Figure:
     """Peak force, impacts, time to roll and whirl force over the stiffness of the houses' supports."""
-    figure = new_figure(
-        (14.0, 4.0), "Mobility of the houses: stiffness and damping of all supports scaled", title_size=12
-    )
-    panels = figure.subplots(1, 4)
+    figure = new_figure(7.2, "Mobility of the houses: stiffness and damping of all supports scaled")
+    panels = figure.subplots(2, 2, sharex=True)
     shown = {
         "peak_normal_n": "highest normal force [N]",
-        "contacts": "impacts until it whirls",
+        "contacts": "impacts until it whirls [1]",
         "roll_s": "from the pulse until it rolls [s]",
-        "reaction_x_n": "E - W amplitude in whirl [N]",
+        "reaction_x_n": "E − W amplitude in whirl [N]",
     }
-    for axes, (name, label) in zip(panels, shown.items(), strict=True):
+    for axes, (name, label) in zip(panels.ravel(), shown.items(), strict=True):
         for scale in SCALES:
             values = column(results[f"mobility {scale:g}"], name)
-            axes.semilogx([scale] * len(values), values, "o", color=SKY, ms=4)
+            axes.semilogx([scale] * len(values), values, "o", color=SKY, ms=4.5, label="each phase of the turn")
         middle = [median(results[f"mobility {scale:g}"], name) for scale in SCALES]
-        axes.semilogx(SCALES, middle, color=BLUE, lw=1.6, label="median of the phases")
-        axes.axhline(median(results["alternative house rigid"], name), color="0.5", ls=":", lw=1.4, label="rigid")
-        axes.set(xlabel="support over the corrected one", ylabel=label)
-        axes.margins(y=0.25)
-        axes.legend(fontsize=8, loc="upper left")
-    draw_grid(*panels)
+        axes.semilogx(SCALES, middle, color=BLUE, lw=1.8, label="median of the phases")
+        axes.axhline(median(results["alternative house rigid"], name), color="0.4", ls=":", lw=1.6, label="rigid")
+        axes.set(ylabel=label)
+    for axes in panels[-1]:
+        axes.set_xlabel("support over the corrected one [1]")
+    legend_below(figure)
     return figure

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ import numpy as np
 from replays.report import Report
 from replays.report.canvas import save
 from replays.studies.paper import condition, figure, question
-from replays.studies.paper.chart import draw_conditions, draw_law
+from replays.studies.paper.chart import draw_conditions, draw_law, draw_verdicts
 from replays.studies.paper.claim import (
     BANDWIDTHS_HZ,
     LAWS,
@@ -40,13 +40,19 @@ from rig.parameters import load_parameters
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PLACED = re.compile(r"\[(?P<kind>table|picture|verdicts) (?P<name>[^],]+)(, (?P<dpi>\d+) dpi)?\] ?(?P<caption>.*)")
+_PLACED = re.compile(r"\[(?P<kind>table|picture|verdicts) (?P<name>[^],]+)\] ?(?P<caption>.*)")
 _CELLS = " | "
 """Between the cells of a table in the text."""
 
 
-def write_up(findings: Findings, *, quick: bool) -> Report:
-    """The report of what was found."""
+def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | None = None) -> Report:
+    """The report of what was found.
+
+    Args:
+        findings: What was found.
+        quick: Whether in few, short runs.
+        origin: What the report is made by, each by name.
+    """
     import jinja2
 
     environment = jinja2.Environment(
@@ -58,7 +64,7 @@ def write_up(findings: Findings, *, quick: bool) -> Report:
     )
     text = template.render(quick=quick, **_numbers(findings))
     title, lead, *blocks = re.split(r"\n\s*\n", text.strip())
-    report = Report(_joined(title), _joined(lead))
+    report = Report(_joined(title), _joined(lead), origin=origin)
     for block in blocks:
         words = _joined(block)
         placed = _PLACED.fullmatch(words)
@@ -91,8 +97,7 @@ def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
     """Put a picture, a table, or the summary's lines on some quantities once more, where the text names it."""
     name, caption = placed["name"], placed["caption"]
     if placed["kind"] == "picture":
-        dpi = {"dpi": int(placed["dpi"])} if placed["dpi"] else {}
-        report.picture(_PICTURES[name](findings), caption, **dpi)
+        report.picture(_PICTURES[name](findings), caption)
     elif placed["kind"] == "verdicts":
         lines = [*findings.lines, *findings.claims]
         report.table(*summary([line for line in lines if line.statement.quantity.startswith(tuple(name.split()))]))
@@ -101,6 +106,7 @@ def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
 
 
 _PICTURES: dict[str, Callable[[Findings], Figure]] = {
+    "verdicts": lambda findings: draw_verdicts([*findings.lines, *findings.claims]),
     "magnets": lambda findings: figure.draw_magnets(findings.found["corrected"]),
     "drop": lambda findings: figure.draw_drop(findings.found),
     "hammer": lambda findings: figure.draw_hammer(findings.found),
@@ -125,9 +131,7 @@ def draw_pictures(findings: Findings, folder: Path) -> list[Path]:
         OSError: The disk refused.
     """
     drawn = {name: _PICTURES[name](findings) for name in ("tornado", "conditions", "drop")}
-    return [
-        path for name, each in drawn.items() for path in save(each, folder / f"paper-{name}.png", dpi=80, colours=256)
-    ]
+    return [path for name, each in drawn.items() for path in save(each, folder / f"paper-{name}.png")]
 
 
 def _numbers(findings: Findings) -> dict[str, Any]:

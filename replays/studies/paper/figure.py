@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, draw_grid, new_figure
+from replays.report.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    draw_signals,
+    house_style,
+    legend_below,
+    new_figure,
+)
 from replays.studies.paper.reproduction import FIG_7_M, PULSE_S, SPEEDS_HZ, Reproduction, spectra
 from rig.magnets import map_force
 
@@ -32,33 +44,51 @@ def _since_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
     return (times_s - times_s[int(rises[0]) if len(rises) else 0]) * 1e3
 
 
+def _columns(
+    found: dict[str, Reproduction], title: str, height: float, *, heights: tuple[float, ...] = (1.0,)
+) -> tuple[Figure, list[tuple[Reproduction, Any]]]:
+    """A column of panels for each parameter set, on the same scales, so that the two can be told apart."""
+    figure = new_figure(height, title)
+    panels = figure.subplots(len(heights), len(found), squeeze=False, sharey="row", height_ratios=heights)
+    for one, axes in zip(found.values(), panels[0], strict=True):
+        axes.set_title(one.parameters)
+    return figure, list(zip(found.values(), panels.T, strict=True))
+
+
+def _name_first(columns: list[tuple[Reproduction, Any]], *labels: str) -> None:
+    """Labels of the vertical axes, at the first column."""
+    for axes, label in zip(columns[0][1], labels, strict=True):
+        axes.set_ylabel(label)
+
+
+@house_style()
 def draw_magnets(one: Reproduction) -> Figure:
     """Figure 7: both components over the plane, and the line through the centre."""
     model = one.whirl.simulation.model
     axis = np.linspace(-FIG_7_M, FIG_7_M, 81)
     x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
     force = map_force(x, y, model.constants.magnet)
-    figure = new_figure(
-        (13.0, 4.2), "Fig. 7: force of the magnets on the shaft (both sets have the same)", title_size=12
-    )
+    figure = new_figure(4.2, "Fig. 7: force of the magnets on the shaft (the same in both sets)")
     panels = figure.subplots(1, 3)
     # The map holds to 10 mm from the centre; the corners of the square are farther out.
     inside = np.hypot(x, y) <= FIG_7_M
+    filled: Any = None
     for axes, component, name in zip(panels[:2], force.T, ("x", "y"), strict=True):
         shown = np.where(inside, component, np.nan).reshape(81, 81)
         filled = axes.contourf(axis * 1e3, axis * 1e3, shown, levels=np.linspace(-40, 40, 17), cmap="RdBu_r",
                                extend="both")  # fmt: skip
-        axes.set(title=f"$F_{{mag,{name}}}$ [N]", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-        figure.colorbar(filled, ax=axes, shrink=0.85, ticks=[-40, -20, 0, 20, 40])
+        axes.set(title=f"Force along {name}", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    figure.colorbar(filled, ax=panels[:2], orientation="horizontal", shrink=0.6, ticks=[-40, -20, 0, 20, 40],
+                    label="force [N]")  # fmt: skip
     line = panels[2]
     along = map_force(axis, np.zeros_like(axis), model.constants.magnet)[:, 0]
-    label = f"map at $K_{{mag}}$ = {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
-    line.plot(axis * 1e3, along, color=BLUE, lw=2.2, label=label)
-    line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="spring $K_{mag}$")
+    line.plot(
+        axis * 1e3, along, color=BLUE, lw=2.2, label=f"map, {model.constants.magnet.stiffness / 1e3:g} kN/m (assumed)"
+    )
+    line.plot(axis * 1e3, -model.constants.magnet.stiffness * axis, color=ORANGE, lw=1.4, label="linear spring")
     _axis_lines(line, -40.0, 40.0)
-    line.set(title="through the centre", xlabel="x [mm]", ylabel="$F_{mag,x}$ [N]", xlim=(-10, 10), ylim=(-46, 46))
-    line.legend(fontsize=8, loc="lower left")
-    draw_grid(line)
+    line.set(title="Through the centre", xlabel="x [mm]", ylabel="force along x [N]", xlim=(-10, 10), ylim=(-46, 46))
+    line.legend(loc="upper center", bbox_to_anchor=(0.45, -0.24))
     return figure
 
 
@@ -74,42 +104,35 @@ def first_impacts(penetration: np.ndarray, times_ms: np.ndarray) -> tuple[float,
     return start - 1.0, start + _IMPACTS_MS
 
 
+@house_style()
 def draw_drop(found: dict[str, Reproduction]) -> Figure:
     """Figure 10 (and 11): trajectory, y(t), SOUTH reaction, inner house."""
-    figure = new_figure(
-        (14.0, 7.2), "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", title_size=12
+    figure, columns = _columns(
+        found, "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", 11.4, heights=(1.25, 1, 1, 1)
     )
-    panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in enumerate(found.values()):
+    for one, (path, height, force, house) in columns:
         run, t = one.drop, one.drop.times_s * 1e3
-        path, height, force, house = panels[row]
-        path.plot(run["ring_x"] * 1e3, run["ring_y"] * 1e3, color=BLUE, lw=1.2)
         angle = np.linspace(0, 2 * math.pi, 181)
         r0 = run.simulation.model.constants.contact.clearance * 1e3
-        path.plot(r0 * np.cos(angle), r0 * np.sin(angle), color="0.6", lw=1.0, label="$r_0$ (assumed)")
-        path.set(xlabel="x in the ring [mm]", ylabel=f"{one.parameters}\ny in the ring [mm]", aspect="equal",
-                 xlim=(-1.3, 1.3), ylim=(-1.3, 1.3))  # fmt: skip
+        path.plot(r0 * np.cos(angle), r0 * np.sin(angle), color="0.6", lw=1.0, label="clearance r₀ (assumed)")
+        path.plot(run["ring_x"] * 1e3, run["ring_y"] * 1e3, color=BLUE, lw=1.6)
+        path.set(xlabel="x in the ring [mm]", aspect="equal", xlim=(-1.3, 1.3), ylim=(-1.3, 1.3))
         _axis_lines(path, -1.0, 1.0)
-        height.plot(t, run["ring_y"] * 1e3, color=BLUE, lw=1.2, label="in the ring")
-        height.plot(t, run["disk_y"] * 1e3, color=SKY, lw=1.0, label="at the probes")
+        height.plot(t, run["ring_y"] * 1e3, color=BLUE, lw=1.6, label="shaft in the ring, truth")
+        height.plot(t, run["disk_y"] * 1e3, color=SKY, lw=1.2, label="at the probes")
         _axis_lines(height, -1.0, 1.0)
-        height.set(ylabel="y [mm]", ylim=(-1.9, 2.9))
-        force.plot(t, run.samples["P_S"] - run.samples["P_N"], color=RED, lw=0.8, label="transducers")
-        force.plot(t, run["P_S"] - run["P_N"], color=BLACK, lw=0.5, label="truth")
-        _axis_lines(force, 0.0, 100.0, text="the paper's axis, 0 to 100 N")
-        force.set(ylabel="SOUTH reaction P_S - P_N [N]")
-        force.margins(y=0.35)
-        house.plot(t, run["inner_ay"], color=BLACK, lw=0.5)
-        _axis_lines(house, -100.0, 100.0, text="the paper's axis, ±100")
-        house.set(ylabel="inner house [m/s²]")
-        house.margins(y=0.35)
         height.set(xlabel="time [ms]", xlim=(0, 200))
-        first = first_impacts(run["penetration"], t)
+        force.plot(t, run["P_S"] - run["P_N"], color=BLUE, lw=1.6)
+        force.plot(t, run.samples["P_S"] - run.samples["P_N"], color=RED, lw=0.8, label="transducers")
+        _axis_lines(force, 0.0, 100.0)
+        house.plot(t, run["inner_ay"], color=BLUE, lw=1.2)
+        _axis_lines(house, -100.0, 100.0)
         for axes in (force, house):
-            axes.set(xlabel="time, first impacts [ms]", xlim=first)
-        for axes in panels[row]:
-            axes.legend(fontsize=7.5, loc="upper right")
-        draw_grid(*panels[row])
+            axes.set(xlabel="time, first impacts [ms]", xlim=first_impacts(run["penetration"], t))
+    _name_first(
+        columns, "y in the ring [mm]", "y [mm]", "SOUTH reaction [N]", "acceleration of the\ninner house [m/s²]"
+    )
+    legend_below(figure, columns=5)
     return figure
 
 
@@ -123,112 +146,110 @@ def _phases(one: Reproduction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return t < PULSE_S, (t >= PULSE_S) & (t <= lasting), t > lasting
 
 
+@house_style()
 def draw_hammer(found: dict[str, Reproduction]) -> Figure:
     """Figure 12: orbit, spin, x(t), y(t)."""
-    figure = new_figure((14.0, 7.2), "Fig. 12: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", title_size=12)
-    panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in enumerate(found.values()):
+    figure, columns = _columns(
+        found, "Fig. 12: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", 11.4, heights=(1.5, 0.9, 1, 1)
+    )
+    for one, (orbit, spin, across, up) in columns:
         run, t = one.whirl, one.whirl.times_s
-        orbit, spin, across, up = panels[row]
         for part, colour, name in zip(
             _phases(one), (_BEFORE, _IMPACTS, _SETTLED), ("before", "impacts", "whirl"), strict=True
         ):
             kept = np.flatnonzero(part)[-2000:] if name == "whirl" else np.flatnonzero(part)
-            orbit.plot(run["ring_x"][kept] * 1e3, run["ring_y"][kept] * 1e3, color=colour, lw=0.9, label=name)
+            orbit.plot(run["ring_x"][kept] * 1e3, run["ring_y"][kept] * 1e3, color=colour, lw=1.1, label=name)
             for axes, column in ((across, "disk_x"), (up, "disk_y")):
-                axes.plot(t[part], run.samples[column][part], color=colour, lw=0.5)
-        orbit.set(xlabel="x in the ring [mm]", ylabel=f"{one.parameters}\ny in the ring [mm]", aspect="equal",
-                  xlim=(-1.3, 1.3), ylim=(-1.3, 1.75))  # fmt: skip
+                draw_signals(axes, t[part], (run.samples[column][part], colour, ""))
+        orbit.set(xlabel="x in the ring [mm]", aspect="equal", xlim=(-1.3, 1.3), ylim=(-1.3, 1.3))
         _axis_lines(orbit, -1.0, 1.0)
-        orbit.legend(fontsize=7.5, loc="upper center", ncols=2)
-        spin.plot(t, run["spin_rate"] / (2 * math.pi), color=BLACK, lw=1.0)
-        spin.set(ylabel="spin [Hz]", ylim=(0, 7))
-        for axes, name in ((across, "x"), (up, "y")):
+        draw_signals(spin, t, (run["spin_rate"] / (2 * math.pi), BLACK, ""))
+        for axes in (across, up):
             _axis_lines(axes, -2.0, 2.0)
-            axes.set(ylabel=f"{name} at the probes [mm]", ylim=(-2.6, 2.6))
-            axes.legend(fontsize=7.5, loc="upper right")
         for axes in (spin, across, up):
             axes.set(xlabel="time [s]")
-        draw_grid(*panels[row])
+    _name_first(columns, "y in the ring [mm]", "spin [Hz]", "x at the probes [mm]", "y at the probes [mm]")
+    legend_below(figure, columns=5)
     return figure
 
 
+@house_style()
 def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
     """Figure 14: full spectrum over time."""
-    figure = new_figure((13.0, 4.6), "Fig. 14: full spectrum of the disk's probes over time", title_size=12)
-    panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for one, axes in zip(found.values(), panels, strict=True):
+    figure, columns = _columns(found, "Fig. 14: full spectrum of the disk's probes over time", 4.6)
+    mesh: Any = None
+    for one, (axes,) in columns:
         times, frequencies, amplitude = spectra(one.whirl)
         level = 20.0 * np.log10(np.maximum(amplitude, 1e-5))
         mesh = axes.pcolormesh(times, frequencies, level.T, cmap="magma", vmin=-80, vmax=5, shading="nearest",
                                rasterized=True)  # fmt: skip
         axes.axhline(-83.7, color="white", lw=0.8, ls=(0, (4, 3)))
-        axes.annotate("the paper: 83.7 Hz, backward", (times[0], -83.7), xytext=(4, -12), textcoords="offset points",
-                      color="white", fontsize=9)  # fmt: skip
-        axes.set(title=one.parameters, xlabel="time [s]", ylabel="frequency, forward + [Hz]", ylim=(-150, 150))
-        figure.colorbar(mesh, ax=axes, label="amplitude [dB of 1 mm]")
+        axes.annotate("the paper: 83.7 Hz, backward", (times[0], -83.7), xytext=(4, -13), textcoords="offset points",
+                      color="white")  # fmt: skip
+        axes.set(xlabel="time [s]", ylim=(-150, 150))
+    _name_first(columns, "frequency [Hz]\n← backward      forward →")
+    figure.colorbar(mesh, ax=[column[0] for _, column in columns], label="amplitude [dB re 1 mm]", pad=0.02)
     return figure
 
 
+@house_style()
 def draw_reactions(found: dict[str, Reproduction]) -> Figure:
     """Figure 15: horizontal and vertical reactions, the impacts and the whirl on scales of their own."""
-    figure = new_figure((14.0, 7.2), "Fig. 15: reactions, the difference of opposed transducers", title_size=12)
-    panels = figure.subplots(len(found), 4, squeeze=False)
-    for row, one in enumerate(found.values()):
+    figure, columns = _columns(
+        found, "Fig. 15: reactions, the difference of opposed transducers", 11.0, heights=(1, 1, 1, 1)
+    )
+    for one, panels in columns:
         run, t = one.whirl, one.whirl.times_s
-        for place, (a, b, name) in enumerate((("P_E", "P_W", "E - W"), ("P_N", "P_S", "N - S"))):
+        last = t > t[-1] - 0.05
+        for place, (a, b) in enumerate((("P_E", "P_W"), ("P_N", "P_S"))):
             truth, sensed = run[a] - run[b], run.samples[a] - run.samples[b]
-            whole, settled = panels[row][place], panels[row][2 + place]
-            whole.plot(t, truth, color=BLUE, lw=0.4)
-            _axis_lines(whole, -5000.0, 5000.0, text="the paper's axis, simulated")
-            whole.set(xlabel="time [s]", ylim=(-6200, 6800), ylabel=f"{name} [N]")
-            if place == 0:
-                whole.set_ylabel(f"{one.parameters}\n{name} [N]")
-            last = t > t[-1] - 0.05
-            settled.plot(t[last], truth[last], color=BLUE, lw=1.6, label="truth")
-            settled.plot(t[last], sensed[last], color=RED, lw=0.7, label="transducers")
-            _axis_lines(settled, -500.0, 500.0, text="the paper's axis, measured")
-            settled.set(xlabel="time [s]", ylim=(-720, 1050), ylabel=f"{name}, whirl [N]")
-            for axes in (whole, settled):
-                axes.legend(fontsize=7.5, loc="upper right")
-        draw_grid(*panels[row])
+            whole, settled = panels[place], panels[2 + place]
+            draw_signals(whole, t, (truth, BLUE, ""))
+            _axis_lines(whole, -5000.0, 5000.0, text="the paper's axis: simulated above, measured below")
+            whole.set(xlabel="time [s]")
+            settled.plot(t[last], truth[last], color=BLUE, lw=1.8, label="truth")
+            settled.plot(t[last], sensed[last], color=RED, lw=0.9, label="transducers")
+            _axis_lines(settled, -500.0, 500.0, text="the paper's axis: simulated above, measured below")
+            settled.set(xlabel="time, settled whirl [s]")
+    _name_first(columns, "E − W [N]", "N − S [N]", "E − W [N]", "N − S [N]")
+    legend_below(figure)
     return figure
 
 
+@house_style()
 def draw_east(found: dict[str, Reproduction]) -> Figure:
     """Figure 16: EAST in full annular whirl, over a turn and a half."""
-    figure = new_figure((13.0, 4.2), "Fig. 16: EAST in full annular whirl", title_size=12)
-    panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for one, axes in zip(found.values(), panels, strict=True):
+    figure, columns = _columns(found, "Fig. 16: EAST in full annular whirl", 4.9)
+    for one, (axes,) in columns:
         run = one.whirl
         last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.030)
         pair = (run["P_E"] - run["P_W"])[last]
         t = _since_rise_ms(run.times_s[last], pair)
         preload = run.simulation.model.constants.house.preload
-        axes.plot(t, pair, color=BLUE, lw=2.0, label="E - W, truth")
-        axes.plot(t, (run.samples["P_E"] - run.samples["P_W"])[last], color=RED, lw=0.8, label="E - W, transducers")
-        axes.plot(t, run["P_E"][last] - preload, color=GREEN, lw=1.4, label="EAST alone, less its preload")
-        axes.plot(t, run["normal_force"][last], color="0.3", lw=1.0, ls=":", label="normal force in the contact")
+        axes.plot(t, pair, color=BLUE, lw=2.0, label="E − W, truth")
+        axes.plot(t, (run.samples["P_E"] - run.samples["P_W"])[last], color=RED, lw=0.9, label="E − W, transducers")
+        axes.plot(t, run["P_E"][last] - preload, color=GREEN, lw=1.5, label="EAST alone, less its preload")
+        axes.plot(t, run["normal_force"][last], color="0.3", lw=1.2, ls=":", label="normal force in the contact")
         _axis_lines(axes, 0.0, 900.0, text="the paper's axis, simulated and measured")
-        axes.axhline(500.0, color=PINK, lw=1.2, ls=(0, (1, 2)), zorder=1, label="end of Fig. 15's axis, measured")
-        axes.set(title=one.parameters, xlabel="time [ms]", ylabel="force [N]", xlim=(0, 12), ylim=(-650, 1450))
-        axes.legend(fontsize=7.5, loc="upper right", ncols=2)
-    draw_grid(*panels)
+        axes.axhline(500.0, color=PINK, lw=1.4, ls=(0, (1, 2)), zorder=1, label="end of Fig. 15's axis, measured")
+        axes.set(xlabel="time [ms]", xlim=(0, 12))
+    _name_first(columns, "force [N]")
+    legend_below(figure, columns=3)
     return figure
 
 
+@house_style()
 def draw_speeds(found: dict[str, Reproduction]) -> Figure:
     """Figure 17: EAST at four speeds."""
-    figure = new_figure((13.0, 4.2), "Fig. 17: EAST (E - W) in full annular whirl at four speeds", title_size=12)
-    panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for one, axes in zip(found.values(), panels, strict=True):
+    figure, columns = _columns(found, "Fig. 17: EAST (E − W) in full annular whirl at four speeds", 4.6)
+    for one, (axes,) in columns:
         for speed, colour in zip(SPEEDS_HZ, (SKY, GREEN, ORANGE, PINK), strict=True):
             run = one.speeds[speed]
             pair = run["P_E"] - run["P_W"]
             last = np.flatnonzero(run.times_s > run.times_s[-1] - 0.08)
             t = _since_rise_ms(run.times_s[last], pair[last])
-            axes.plot(t, pair[last], color=colour, lw=1.6, label=f"{speed:g} Hz")
-        axes.set(title=one.parameters, xlabel="time [ms]", ylabel="E - W [N]", xlim=(0, 24), ylim=(-650, 850))
-        axes.legend(fontsize=8, loc="upper right", ncols=4)
-    draw_grid(*panels)
+            axes.plot(t, pair[last], color=colour, lw=1.8, label=f"{speed:g} Hz")
+        axes.set(xlabel="time [ms]", xlim=(0, 24))
+    _name_first(columns, "E − W [N]")
+    legend_below(figure)
     return figure
