@@ -34,8 +34,8 @@ def rare_collections() -> Iterator[None]:
 def short_collections() -> Iterator[None]:
     """Keep what the start has left behind out of garbage collections while a paced run lasts.
 
-    It is never garbage, and walking it took 5 to 8 ms of a full collection. A process that has frozen its own start stays
-    as it is.
+    It is never garbage, and walking it took 5 to 8 ms of a full collection. Where a process has frozen its own start
+    before, that stays as it is.
     """
     if gc.get_freeze_count():
         yield
