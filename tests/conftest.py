@@ -1,8 +1,8 @@
 """How the tests are shared out where several run at once (`-n`), and what many of them use.
 
-Tests that read the clock or start processes wait most of their time, and some of them would disturb each other: the
-modules marked so as a whole make up one queue, which one worker goes through from the beginning on. Other workers first
-compile the kernels, each engine's once, and then take module by module, the longest first.
+Tests that read the clock or start processes wait most of their time: the modules marked so as a whole make up two
+queues, each gone through by one worker. Those within a process come at once; those that start real rigs come as soon as
+other workers have compiled the kernels, each engine's once. All else is taken module by module, the longest first.
 """
 
 from __future__ import annotations
@@ -41,21 +41,26 @@ def _module(nodeid: str) -> str:
 
 
 @cache
-def _reads_the_clock(module: str) -> bool:
+def _queue(module: str) -> str | None:
+    """The queue that a module waits in, if it waits."""
     path = ROOT / module
-    return path.is_file() and _CLOCK.search(path.read_text(encoding="utf-8")) is not None
+    if not path.is_file() or _CLOCK.search(path.read_text(encoding="utf-8")) is None:
+        return None
+    return "rigs" if module.startswith("tests/system/") else "clock"
 
 
 def _place(nodeid: str) -> tuple[int, int]:
-    """Where a test stands in the order: what waits, what compiles, what takes long, all others."""
+    """Where a test stands in the order: what waits, what compiles, what starts rigs, what takes long, all others."""
     module = _module(nodeid)
-    if _reads_the_clock(module):
-        return 0, module.startswith("tests/system/")  # these start real rigs: by then their kernels are compiled
+    if _queue(module) == "clock":
+        return 0, 0
     if module == COMPILING:
         return 1, 0
+    if _queue(module) == "rigs":
+        return 2, 0
     if module in LONGEST:
-        return 2, LONGEST.index(module)
-    return 3, 0
+        return 3, LONGEST.index(module)
+    return 4, 0
 
 
 def pytest_configure() -> None:
@@ -74,6 +79,7 @@ def pytest_collection_finish() -> None:
     # A million objects that stay: a full collection took 0.3 s to walk them, again and again.
     gc.freeze()
     gc.enable()
+    gc.set_threshold(100_000, *gc.get_threshold()[1:])
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -85,7 +91,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
         def _split_scope(self, nodeid: str) -> str:
             module = _module(nodeid)
-            return "clock" if _reads_the_clock(module) else nodeid if module == COMPILING else module
+            return nodeid if module == COMPILING else _queue(module) or module
 
     config.option.loadscopereorder = False  # the order is ours
     return ByModule(config, log)
