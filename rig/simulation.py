@@ -302,14 +302,21 @@ class Simulation:
         return Snapshot(scene=self.scene, changing=copy.deepcopy({name: self.__dict__[name] for name in _CHANGING}))
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Go back, or over, to a snapshot of the same scene.
+        """Go back, or over, to a snapshot of the same scene; from its start also to one of the scene without commands.
+
+        Before the first command a run is the same without it.
 
         Raises:
-            InputError: It is of another scene.
+            InputError: It is of another scene, or behind the first command.
         """
+        changing = copy.deepcopy(snapshot.changing)
         if snapshot.scene != self.scene:
-            raise InputError("snapshot", f"one of this scene, {self.scene.name}", snapshot.scene.name)
-        self.__dict__.update(copy.deepcopy(snapshot.changing))
+            first_tick = min((tick for tick, _ in self._pending), default=changing["tick"])
+            alike = snapshot.scene == self.scene.model_copy(update={"commands": ()})
+            if self.tick > 0 or first_tick < changing["tick"] or not alike:
+                raise InputError("snapshot", f"one of this scene, {self.scene.name}", snapshot.scene.name)
+            changing["_pending"] = self._pending
+        self.__dict__.update(changing)
 
     def catalogue(self) -> dict[str, Any]:
         """Channel table with calibrations, and the columns of the truth tables, as a JSON document."""

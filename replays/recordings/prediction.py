@@ -17,9 +17,10 @@ from replays.recordings.experiment import Experiment
 from rig.channels import Channel, Group
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN
+from rig.offline import frames
 from rig.scenes import SensorChoice
 from rig.sensors.conditioning import Conditioner
-from rig.simulation import TICK_RATE_HZ, Frame
+from rig.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
 
 _FINE_BITS = 32
 """Bits of a predicted channel's converter: its steps are none of the recording's."""
@@ -32,6 +33,8 @@ _SETTLED_S = 0.02
 """Low-passes have settled after this [s] ..."""
 _DECAYS = 7.0
 """... and high-passes after so many of their time constants."""
+_LEAD_INS = 8
+"""So many are kept: those of a central difference in two values, and some more."""
 
 
 @dataclass(frozen=True)
@@ -226,6 +229,47 @@ def _channels(parts: dict[str, Measured], *, row_rate_hz: int) -> list[_Channels
     return [_Channels(alike, rate_hz=rate, row_rate_hz=row_rate_hz) for (rate, _), alike in rates.items()]
 
 
+class LeadIns:
+    """Runs up to shortly before the first samples, or the first command: experiments that differ in commands share one.
+
+    What is predicted by them is the same bit for bit.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[str, float, int], tuple[Snapshot, dict[str, list[np.ndarray]]]] = {}
+
+    def take(
+        self, experiment: Experiment, simulation: Simulation, *, chunk_s: float, until: int
+    ) -> dict[str, list[np.ndarray]]:
+        """Take a simulation at its start to a tick, or as many whole chunks before it as no command comes in.
+
+        Returns:
+            The truth up to there, by table.
+        """
+        ticks = [round(command.at_s * TICK_RATE_HZ) for command in experiment.scene.commands]
+        until = min([until, *ticks, *(command.tick for command in experiment.commands)])
+        alone = experiment.scene.model_copy(update={"commands": ()})
+        key = (alone.model_dump_json(), chunk_s, until)
+        if key not in self._kept:
+            if len(self._kept) == _LEAD_INS:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = _lead_in(Simulation(alone), chunk_s=chunk_s, until=until)
+        snapshot, truth = self._kept[key]
+        simulation.restore(snapshot)
+        return {name: list(blocks) for name, blocks in truth.items()}
+
+
+def _lead_in(simulation: Simulation, *, chunk_s: float, until: int) -> tuple[Snapshot, dict[str, list[np.ndarray]]]:
+    truth: dict[str, list[np.ndarray]] = {}
+    if until >= chunk_s * TICK_RATE_HZ:
+        for frame in frames(simulation, chunk_s=chunk_s):
+            for name, block in frame.truth.items():
+                truth.setdefault(name, []).append(block.values)
+            if simulation.tick + frame.ticks > until:
+                break
+    return simulation.snapshot(), truth
+
+
 def predict(
     experiment: Experiment,
     parts: dict[str, Measured],
@@ -233,6 +277,7 @@ def predict(
     end_s: float | None = None,
     follow: Callable[[Frame], None] | None = None,
     progress: Callable[[float], None] | None = None,
+    lead_ins: LeadIns | None = None,
 ) -> Prediction:
     """Simulate, and read off what the recorded channels would have shown without noise.
 
@@ -242,6 +287,7 @@ def predict(
         end_s: Only rows before this time [s].
         follow: Given every frame, to the end of the experiment; without it nothing behind the last row is simulated.
         progress: Called with the part done, 0 to 1.
+        lead_ins: Those of predictions before this one; without `follow` only.
     """
     if end_s is not None:
         parts = {name: part.until(end_s) for name, part in parts.items()}
@@ -255,6 +301,8 @@ def predict(
     for channels in taking:
         channels.begin(begin_tick * row_rate_hz // TICK_RATE_HZ)
     truth: dict[str, list[np.ndarray]] = {}
+    if lead_ins is not None:
+        truth = lead_ins.take(experiment, simulation, chunk_s=chunk_s, until=begin_tick)
     for frame in experiment.frames(simulation, chunk_s=chunk_s):
         if frame.tick <= last_s * TICK_RATE_HZ + _BEHIND * simulation.row_ticks:
             if frame.tick >= begin_tick:

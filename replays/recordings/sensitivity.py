@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.experiment import Experiment
-from replays.recordings.prediction import Measured, Prediction, bare, lagrange, predict
+from replays.recordings.prediction import LeadIns, Measured, Prediction, bare, lagrange, predict
 from rig.commands import check_command
 from rig.errors import InputError, SimulationError
 from rig.model import build_model
@@ -170,6 +170,7 @@ class Predictor:
         self._last_s = max(float(part.times_s[-1]) for part in self.parts.values())
         self._experiment = bare(experiment)
         self._cache: dict[tuple[float, ...], Prediction] = {}
+        self._lead_ins = LeadIns()
 
     def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
         """The channels at some values, shape (keys,).
@@ -259,10 +260,10 @@ class Predictor:
         self.runs += 1
         parts = on_the_models_clock(self.parts, values, about_s=self._about_s)
         last_s = max(float(part.times_s[-1]) for part in parts.values())
-        changed = with_values(self._experiment, values)
         # Nothing behind the window: contacts that begin there are none of it.
         end_s = math.ceil(round((last_s + _MARGIN_S) * _ROWS_HZ, 6)) / _ROWS_HZ
-        return predict(replace(changed, scene=change_scene(changed.scene, {"duration_s": end_s})), parts)
+        changed = with_values(self._experiment, {**values, "duration_s": end_s})
+        return predict(changed, parts, lead_ins=self._lead_ins)
 
 
 def on_the_models_clock(

@@ -276,12 +276,15 @@ def test_ripple_that_is_rounding_noise_is_left_out() -> None:
     assert fit_cylinder_map(geometry).error < 1e-8
 
 
-def maps() -> list[MagnetMap]:
-    made = [fit_cylinder_map(TABLE_1._replace(number=number)) for number in (3, 4, 5, 8, 12)]
-    return [linear_map(TABLE_1), fit_map(TABLE_1), *made]
+@pytest.fixture(
+    params=[(linear_map, 8), (fit_map, 8), *((fit_cylinder_map, number) for number in (3, 4, 5, 8, 12))],
+    ids=lambda made: f"{made[0].__name__}-{made[1]}",
+)
+def magnet_map(request: pytest.FixtureRequest) -> MagnetMap:
+    fit, number = request.param
+    return fit(TABLE_1._replace(number=number))
 
 
-@pytest.mark.parametrize("magnet_map", maps(), ids=lambda fitted: f"{fitted.terms}-{fitted.number}")
 def test_force_is_the_gradient_of_the_potential(magnet_map: MagnetMap) -> None:
     m = magnet_map
     terms = [1.0, m.a3, m.a5, m.a7]
@@ -300,7 +303,6 @@ def test_force_is_the_gradient_of_the_potential(magnet_map: MagnetMap) -> None:
     assert magnet_force(0.0, 0.0, m) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("magnet_map", maps(), ids=lambda fitted: f"{fitted.terms}-{fitted.number}")
 def test_force_turns_with_the_magnets(magnet_map: MagnetMap) -> None:
     x, y = disc(TABLE_1, REACH, points=40)
     plain = map_force(x, y, magnet_map) @ [1.0, 1j]

@@ -317,7 +317,7 @@ def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_ha
         setup.start()
 
         def warned() -> list[str]:
-            return [text for text in setup.service.status()["warnings"] if "dropped" in text]
+            return [text for text in setup.service.status()["warnings"] if "frames were dropped" in text]
 
         def over() -> bool:
             nonlocal now
@@ -335,7 +335,7 @@ def test_drops_are_a_warning_in_the_status_and_one_event_each_time_while_they_ha
             until(lambda: setup.gateway.outbox.waiting == 0)
             warned()
             until(over)
-            assert len([row for row in told if "dropped" in row.get("text", "")]) == round_ + 1
+            assert len([row for row in told if "frames were dropped" in row.get("text", "")]) == round_ + 1
 
 
 def test_a_run_without_the_clock_waits_for_the_bus() -> None:

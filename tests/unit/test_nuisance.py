@@ -100,7 +100,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return Recording.open(folder / "log.mcap")
 
 
-# Motion dies out in a tenth of the time: the scene needs 1 s to settle, not 5, in each of 550 predictions.
+# Motion dies out in a tenth of the time: the scene needs 1 s to settle, not 5.
 DAMPED = {"shaft.damping_ratio_x": 0.15, "shaft.damping_ratio_y": 0.15}
 
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from replays.recordings.experiment import Experiment
-from replays.recordings.prediction import Measured, sampled
+from replays.recordings.prediction import LeadIns, Measured, bare, predict, sampled
 from replays.recordings.sensitivity import Predictor, value_of, with_values
 from rig.channels import Channel, default_table
 from rig.errors import InputError
 from rig.offline import SentCommand, simulate
 from rig.scenes import load_scene
+from rig.simulation import Simulation
 
 CHANNELS = ("disk_x", "ring_y", "P_E", "inner_x", "speed", "hammer")
 
@@ -68,6 +69,32 @@ def test_a_late_start_is_the_same_as_from_the_start() -> None:
     whole, late = (shown(experiment, "ring_x", "inner_x", start_s=start, end_s=3.6)[-100:] for start in (0.0, 3.5))
     assert np.abs(whole[:, 0] - late[:, 0]).max() < 1e-8
     assert np.abs(whole[:, 1] - late[:, 1]).max() < 1e-3 * np.abs(whole[:, 1]).max()
+
+
+def test_experiments_that_differ_in_a_command_share_the_run_before_it_bit_for_bit() -> None:
+    pulse = {"at_s": 0.46, "command": "hammer", "force_n": 60.0, "duration_ms": 5.0, "direction": "x"}
+    experiment = bare(Experiment(scene=load_scene("hammer", {"duration_s": 0.5, "commands": [pulse]})))
+    parts = rows(("ring_x", "hammer"), np.arange(9000, 10_000) / 20_000)
+    lead_ins = LeadIns()
+    for values in ({}, {"hammer.1.force_n": 90.0}, {"hammer.1.at_s": 0.2}, {"shaft.unbalance_phase": 0.1}):
+        changed = with_values(experiment, values)
+        alone, shared = predict(changed, parts), predict(changed, parts, lead_ins=lead_ins)
+        assert alone.contacts == shared.contacts
+        for one, other in ((alone.values, shared.values), (alone.truth, shared.truth)):
+            assert {name: each.tobytes() for name, each in one.items()} == {
+                name: each.tobytes() for name, each in other.items()
+            }
+
+
+def test_a_snapshot_of_a_scene_without_commands_is_of_no_use_behind_the_first() -> None:
+    scene = load_scene("hammer", {"commands": []})
+    lead = Simulation(scene)
+    lead.advance(200_000)
+    pulse = {"command": "hammer", "force_n": 60.0, "duration_ms": 5.0, "direction": "x"}
+    for at_s, changes in ((0.1, {}), (0.3, {"seed": 7})):
+        other = Simulation(load_scene("hammer", {"commands": [{"at_s": at_s, **pulse}], **changes}))
+        with pytest.raises(InputError, match="snapshot must be one of this scene"):
+            other.restore(lead.snapshot())
 
 
 def test_values_between_samples_are_those_of_the_polynomial() -> None:
