@@ -112,22 +112,33 @@ class Envelope:
         self._times.append(times_s)
         self._values.append(values)
 
-    def take(self, *, until_s: float, windows: list[Span], rest: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Give the points of the buckets that end before `until_s`; with `rest`, also of the unfinished one."""
+    def take(
+        self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Give the points of the buckets that end before `until_s`.
+
+        Args:
+            until_s: Time [s].
+            windows: Where every row is given.
+            rest: Give those of the unfinished bucket, too.
+            most: So many points at most, from larger buckets; what is in a window comes on top.
+        """
         if not self._times:
             return np.empty(0), np.empty((0, 0))
         times_s, values = np.concatenate(self._times), np.concatenate(self._values)
-        whole = int(np.searchsorted(times_s, until_s)) // self._bucket
-        rows = whole * self._bucket
+        ready = int(np.searchsorted(times_s, until_s))
+        bucket = self._bucket if most is None else max(self._bucket, -(-2 * ready // most))
+        whole = ready // bucket
+        rows = whole * bucket
         points = [(times_s[:0], values[:0])]
         if whole:
-            bucket_times = times_s[:rows].reshape(whole, self._bucket)
-            bucket_values = values[:rows].reshape(whole, self._bucket, -1)
+            bucket_times = times_s[:rows].reshape(whole, bucket)
+            bucket_values = values[:rows].reshape(whole, bucket, -1)
             full = np.zeros(whole, dtype=bool)
             for start, end in windows:
                 full |= (bucket_times[:, -1] >= start) & (bucket_times[:, 0] <= end)
             for part in np.split(np.arange(whole), np.flatnonzero(np.diff(full)) + 1):
-                reduce = _flat if full[part[0]] or self._bucket <= 2 else _extremes
+                reduce = _flat if full[part[0]] or bucket <= 2 else _extremes
                 points.append(reduce(bucket_times[part], bucket_values[part]))
         if rest and rows < len(times_s):
             points.append(_extremes(times_s[None, rows:], values[None, rows:]))
@@ -174,10 +185,10 @@ class SeriesPlot:
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             envelope.add(times_s, series.select(values))
 
-    def flush(self, *, until_s: float, windows: list[Span], rest: bool = False) -> None:
-        """Draw what is complete before `until_s`."""
+    def flush(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> None:
+        """Draw what is complete before `until_s`: `most` points of each curve, and what is in the windows."""
         for series, envelope in zip(self._series, self._envelopes, strict=True):
-            times, values = envelope.take(until_s=until_s, windows=windows, rest=rest)
+            times, values = envelope.take(until_s=until_s, windows=windows, rest=rest, most=most)
             if len(times):
                 self._canvas.plot(series.path, times, rr.Scalars.columns(scalars=values))
                 self.points += values.size

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +14,7 @@ import typer
 
 from rig.cli.connection import Connection
 from rig.cli.options import Force, OptionalRecordingFiles
-from rig.cli.tables import echo
+from rig.cli.tables import echo, progress_bar
 from rig.errors import DiskError, InputError, RefusedError, check_new_file, whole_file
 
 if TYPE_CHECKING:
@@ -80,7 +82,7 @@ def _check(
 
 def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None) -> None:
     from recorder.reader import join
-    from recorder.viewer import blueprint, window
+    from recorder.viewer import blueprint
     from recorder.viewer.canvas import Canvas, new_stream
     from recorder.viewer.file import paint
     from recorder.viewer.geometry import Geometry
@@ -98,7 +100,7 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
         size = save.stat().st_size / 1e6
         echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
         return
-    with window.picture_of(screenshot) if screenshot is not None else window.Window(_kind(web=web)) as shown:
+    with _window_of_file(screenshot, web=web) as shown:
         stream.connect_grpc(shown.url, default_blueprint=plan)
         try:
             painted = paint(recording, Canvas(stream))
@@ -131,12 +133,15 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
             if view.failed:
                 raise typer.Exit(1)
             return
-        with window.Window(_kind(web=web), memory="512MiB") as shown:
+        # A browser that comes later takes in the whole history before anything new, so that it is short.
+        with window.Window(_kind(web=web), memory="512MiB", history="2MiB") as shown:
             stream.connect_grpc(shown.url, default_blueprint=plan)
             _tell(shown, f"the rig at {connection.connect}")
             try:
-                view = live.LiveView(client, Canvas(stream), described)
-                echo(view.run(stop=lambda: not shown.open))
+                view = live.LiveView(client, Canvas(stream), described, taken_s=shown.taken_s)
+                with _telling(shown) as tell:
+                    reason = view.run(stop=lambda: not shown.open, tell=tell)
+                echo(reason)
             finally:
                 _close(stream)
             if shown.open:
@@ -146,6 +151,34 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
             finally:
                 if view.failed:
                     raise typer.Exit(1)
+
+
+@contextmanager
+def _telling(shown: Window) -> Iterator[Callable[[str], None]]:
+    """Say how it goes: as the title of a browser's page, and on stderr in a live line, or a line every 5 s."""
+    printed_s = -math.inf
+    live = sys.stderr.isatty()
+    with progress_bar(auto_refresh=False, transient=True, disable=not live) as bar:
+        task = bar.add_task("", total=None)
+
+        def tell(text: str) -> None:
+            nonlocal printed_s
+            if shown.page is not None:
+                shown.page.title = f"rig: {text}"
+            bar.update(task, description=text, refresh=live)
+            if not live and time.monotonic() - printed_s >= 5.0:
+                printed_s = time.monotonic()
+                echo(text, err=True)
+
+        yield tell
+
+
+def _window_of_file(screenshot: Path | None, *, web: bool) -> Window:
+    from recorder.viewer import window
+
+    if screenshot is None:
+        return window.Window(_kind(web=web))
+    return window.picture_of(screenshot, tell=lambda text: echo(text, err=True))
 
 
 def _kind(*, web: bool) -> Kind:

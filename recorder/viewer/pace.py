@@ -1,0 +1,74 @@
+"""How often a live view draws: as often as its viewer takes in what is drawn, and never far ahead of it.
+
+A rerun viewer takes in what arrived for 10 ms of each frame that it paints, however much waits. A slow one that gets
+more than that keeps it all and falls behind without end. So the viewer is asked how far it has come; a new picture
+leaves only while those on their way are young, and pictures get rarer as soon as they take long to be taken in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+FASTEST_S = 0.04
+"""Time between two pictures for a viewer that keeps up [s]."""
+SLOWEST_S = 2.0
+"""Longest time between two pictures that is chosen [s]; waiting for a viewer may add to it, up to `DEAF_S`."""
+LATE_S, PROMPT_S = 0.8, 0.4
+"""A picture that took longer than the first to be taken in makes the next ones rarer; below the second, denser [s]."""
+DEAF_S = 10.0
+"""A picture leaves at least that often, even for a viewer that takes nothing in [s]."""
+CURVES_S = 0.16
+"""Curves are drawn at most that often [s]: a piece of a curve costs the viewer as much as a whole picture."""
+POINTS = 120
+"""Points of each curve between two pictures at most, full rate around hammer pulses apart: a slow viewer gets an
+envelope that is coarser, with the same peaks."""
+
+
+class Pace:
+    """When to draw, by what was drawn and what the viewer has taken in; every time is passed in."""
+
+    def __init__(self) -> None:
+        self.every_s = FASTEST_S
+        """Time between two pictures [s]."""
+        self._on_the_way: deque[tuple[float, float]] = deque()  # up to which simulated time, and when it was drawn
+        self._drawn_s = -math.inf
+        self._changed_s = -math.inf
+        self._delay_s: float | None = None
+
+    def due(self, now_s: float) -> bool:
+        """Whether to draw now."""
+        since_s = now_s - self._drawn_s
+        if since_s < self.every_s - 1e-6:
+            return False
+        return not self._on_the_way or now_s - self._on_the_way[0][1] < LATE_S or since_s >= DEAF_S
+
+    def drew(self, until_s: float, *, now_s: float) -> None:
+        """A picture of the rig until that simulated time [s] was drawn."""
+        self._drawn_s = now_s
+        self._on_the_way.append((until_s, now_s))
+
+    def taken_in(self, until_s: float | None, *, now_s: float) -> None:
+        """The slowest viewer has all until that simulated time [s], or nobody looks (None)."""
+        if until_s is None:
+            self._on_the_way.clear()
+            self.every_s, self._delay_s = SLOWEST_S, None
+            return
+        drawn_s = None
+        while self._on_the_way and self._on_the_way[0][0] <= until_s + 1e-6:
+            drawn_s = self._on_the_way.popleft()[1]
+        if drawn_s is None:
+            return
+        self._delay_s = now_s - drawn_s
+        if drawn_s < self._changed_s:
+            return  # drawn at the pace before
+        if self._delay_s > LATE_S:
+            self.every_s = min(SLOWEST_S, 2.0 * self.every_s)
+            self._changed_s = now_s
+        elif self._delay_s < PROMPT_S:
+            self.every_s = max(FASTEST_S, 0.7 * self.every_s)
+
+    def behind_s(self, now_s: float) -> float | None:
+        """How long ago what the viewer shows was drawn [s]; None as long as that is not known."""
+        oldest_s = now_s - self._on_the_way[0][1] if self._on_the_way else 0.0
+        return None if self._delay_s is None else max(self._delay_s, oldest_s)
