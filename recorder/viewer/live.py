@@ -116,6 +116,7 @@ class LiveView:
         self._curves_s = self._noted_s = -math.inf
         self._noted_every_s = FASTEST_S
         self._fresh = False
+        self._missing: dict[str, int] = {}
         self._inbox: deque[tuple[float, str, bytes]] = deque(maxlen=_INBOX)
         self._intake = Intake(described.catalogue)
         self._continuity = wire.Continuity()
@@ -234,13 +235,20 @@ class LiveView:
             self._painter.flush(most=None if self._pace is None else POINTS)
             self._curves_s = now_s
         self._fresh = False
+        if self._missing:
+            rows = ", ".join(f"{rows} rows of {name}" for name, rows in self._missing.items())
+            text = f"{rows} did not reach the viewer (a recording may have them)"
+            self._painter.note(self._painter.now_s, text, level="WARN")
+            self._missing = {}
         if self._pace is not None:
             self._pace.drew(self._painter.now_s, now_s=now_s)
 
     def _tell_pace(self, pace: Pace, now_s: float, tell: Callable[[str], None]) -> None:
         """Say how far the viewer is behind and what is left out; in the log of events, too, if that has changed."""
         every_s, behind_s = pace.every_s, pace.behind_s(now_s)
-        who = "no viewer looks" if behind_s is None else f"viewer {behind_s:.1f} s behind"
+        who = "viewer loading" if pace.looked_at else "no viewer looks"
+        if behind_s is not None:
+            who = f"viewer {behind_s:.1f} s behind"
         points = min(ROWS_PER_S, POINTS / max(every_s, CURVES_S))
         thinned = f"{1.0 / every_s:.1f} of {1.0 / FASTEST_S:.0f} pictures/s, {points:.0f} of {ROWS_PER_S:.0f} points/s"
         tell(f"{who}, {thinned}; {self.waits_s:.2f} s here")
@@ -293,11 +301,8 @@ class LiveView:
                 self._take_run(key, run)
                 run = []
                 if gap.size > 0 and key in self._groups:
-                    self._painter.note(
-                        float(block.times_s[0]),
-                        f"{gap.size} rows of {self._groups[key]} did not reach the viewer (a recording may have them)",
-                        level="WARN",
-                    )
+                    name = self._groups[key]
+                    self._missing[name] = self._missing.get(name, 0) + gap.size
             run.append(block)
         self._take_run(key, run)
 

@@ -14,7 +14,9 @@ FASTEST_S = 0.04
 """Time between two pictures for a viewer that keeps up [s]."""
 SLOWEST_S = 2.0
 """Longest time between two pictures that is chosen [s]; waiting for a viewer may add to it, up to `DEAF_S`."""
-LATE_S, PROMPT_S = 0.8, 0.4
+FIRST_S = 0.2
+"""Time between two pictures for a viewer of which nothing is known yet [s]."""
+LATE_S, PROMPT_S = 0.6, 0.3
 """A picture that took longer than the first to be taken in makes the next ones rarer; below the second, denser [s]."""
 DEAF_S = 10.0
 """A picture leaves at least that often, even for a viewer that takes nothing in [s]."""
@@ -29,19 +31,24 @@ class Pace:
     """When to draw, by what was drawn and what the viewer has taken in; every time is passed in."""
 
     def __init__(self) -> None:
-        self.every_s = FASTEST_S
+        self.every_s = SLOWEST_S
         """Time between two pictures [s]."""
         self._on_the_way: deque[tuple[float, float]] = deque()  # up to which simulated time, and when it was drawn
         self._drawn_s = -math.inf
         self._changed_s = -math.inf
-        self._delay_s: float | None = None
+        self._delay_s = 0.0
+        self._shown_s: float | None = None  # when the latest that the viewer has was drawn
+        self.looked_at = False
+        """Whether there is a viewer, be it one that is still loading."""
 
     def due(self, now_s: float) -> bool:
         """Whether to draw now."""
         since_s = now_s - self._drawn_s
         if since_s < self.every_s - 1e-6:
             return False
-        return not self._on_the_way or now_s - self._on_the_way[0][1] < LATE_S or since_s >= DEAF_S
+        if not self._on_the_way or since_s >= DEAF_S:
+            return True
+        return self._shown_s is not None and now_s - self._on_the_way[0][1] < LATE_S
 
     def drew(self, until_s: float, *, now_s: float) -> None:
         """A picture of the rig until that simulated time [s] was drawn."""
@@ -52,23 +59,28 @@ class Pace:
         """The slowest viewer has all until that simulated time [s], or nobody looks (None)."""
         if until_s is None:
             self._on_the_way.clear()
-            self.every_s, self._delay_s = SLOWEST_S, None
+            self.looked_at, self.every_s, self._shown_s = False, SLOWEST_S, None
             return
+        if not self.looked_at:
+            self.looked_at, self.every_s = True, FIRST_S
         drawn_s = None
         while self._on_the_way and self._on_the_way[0][0] <= until_s + 1e-6:
             drawn_s = self._on_the_way.popleft()[1]
         if drawn_s is None:
             return
-        self._delay_s = now_s - drawn_s
+        self._shown_s, self._delay_s = drawn_s, now_s - drawn_s
         if drawn_s < self._changed_s:
             return  # drawn at the pace before
-        if self._delay_s > LATE_S:
+        if self._delay_s > max(LATE_S, 1.5 * self.every_s):
             self.every_s = min(SLOWEST_S, 2.0 * self.every_s)
             self._changed_s = now_s
-        elif self._delay_s < PROMPT_S:
-            self.every_s = max(FASTEST_S, 0.7 * self.every_s)
+        elif self._delay_s < max(PROMPT_S, 0.5 * self.every_s):
+            # In large steps only as long as the viewer is idle between two pictures.
+            step = 0.7 if self._delay_s < 0.5 * self.every_s else 0.93
+            self.every_s = max(FASTEST_S, step * self.every_s)
 
     def behind_s(self, now_s: float) -> float | None:
-        """How long ago what the viewer shows was drawn [s]; None as long as that is not known."""
-        oldest_s = now_s - self._on_the_way[0][1] if self._on_the_way else 0.0
-        return None if self._delay_s is None else max(self._delay_s, oldest_s)
+        """How old what the viewer shows is [s]; None as long as it shows nothing."""
+        if self._shown_s is None:
+            return None
+        return now_s - self._shown_s if self._on_the_way else self._delay_s

@@ -16,6 +16,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 _FILE = re.compile(r"/[A-Za-z0-9_]*(\.(js|wasm|ico|png|svg))?")
 _FOREIGN = re.compile(rb"<link[^>]*https://fonts[^>]*>")
+_PAGE = re.compile(r"[a-z0-9]{1,16}")
 _MOST_BYTES = 1 << 20
 _MOST_PAGES = 32
 _FORGOTTEN_S = 10.0
@@ -37,6 +38,7 @@ async function tell() {
   } catch (error) { console.debug(error); }
   setTimeout(tell, 200);
 }
+addEventListener("pagehide", () => navigator.sendBeacon("closed?" + page));
 tell();
 </script></body>"""
 _RESTING = b"""<!doctype html><title>rig: resting</title><script>
@@ -83,7 +85,7 @@ class Page:
                 """Nothing: the terminal is ours."""
 
         self._server = ThreadingHTTPServer((host, port), Handler)
-        threading.Thread(target=self._server.serve_forever, name="page", daemon=True).start()
+        threading.Thread(target=self._server.serve_forever, args=(0.1,), name="page", daemon=True).start()
 
     def taken_s(self) -> float | None:
         """Time until which the slowest browser has taken all in [s], -inf where one has nothing; None without any."""
@@ -121,13 +123,17 @@ class Page:
     def _post(self, request: BaseHTTPRequestHandler) -> None:
         path, _, page = request.path.partition("?")
         size = request.headers.get("Content-Length", "")
-        if path != "/state" or not re.fullmatch(r"[a-z0-9]{1,16}", page) or not size.isdecimal():
+        # A browser says from which site a page speaks; programs say nothing.
+        foreign = request.headers.get("Origin", "").partition("//")[2] not in ("", request.headers.get("Host"))
+        if foreign or path not in ("/state", "/closed") or not _PAGE.fullmatch(page) or not size.isdecimal():
             return request.send_error(HTTPStatus.BAD_REQUEST)
         if int(size) > _MOST_BYTES:
             return request.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
         taken_s = end_of(self._timeline, request.rfile.read(int(size)))
         with self._lock:
-            if page in self._told or len(self._told) < _MOST_PAGES:
+            if path == "/closed":
+                self._told.pop(page, None)
+            elif page in self._told or len(self._told) < _MOST_PAGES:
                 self._told[page] = (taken_s, time.monotonic())
         return _reply(request, self.title.encode(), kind="text/plain; charset=utf-8")
 

@@ -116,9 +116,9 @@ class Waterfall:
         ticks = [[(self.x_of(hz), HEIGHT), (self.x_of(hz), HEIGHT + (5 if hz == 0 else 3))] for hz in marks]
         faint = pixels(0.6)
         self._canvas.fix(f"{WATERFALL}/ticks", rr.LineStrips2D(ticks, colors=[_MARKS_RGB], radii=faint, draw_order=2.0))
-        named = {(self.x_of(hz), HEIGHT + 10.0): f"{hz:+d} Hz" if hz else "0" for hz in marks if hz % 100 == 0}
+        named = {(self.x_of(hz), HEIGHT + 7.0): f"{hz:+d} Hz" if hz else "0" for hz in marks if hz % 100 == 0}
         self._canvas.write(f"{WATERFALL}/frequencies", named, [_MARKS_RGB])
-        senses = {(self.x_of(-150), -8.0): "BACKWARD", (self.x_of(150), -8.0): "FORWARD"}
+        senses = {(self.x_of(-150), -14.0): "BACKWARD", (self.x_of(150), -14.0): "FORWARD"}
         self._canvas.write(f"{WATERFALL}/senses", senses, [BACKWARD_RGB, FORWARD_RGB])
 
     def x_of(self, frequency_hz: float) -> float:
@@ -179,4 +179,4 @@ class Waterfall:
             self._draw_times("now", f"-{HEIGHT * self._interval_s:.0f} s")
 
     def _draw_times(self, newest: str, oldest: str) -> None:
-        self._canvas.write(f"{WATERFALL}/times", {(-9.0, 0.5): newest, (-9.0, HEIGHT - 0.5): oldest}, [_MARKS_RGB])
+        self._canvas.write(f"{WATERFALL}/times", {(-17.0, 2.0): newest, (-17.0, HEIGHT - 10.0): oldest}, [_MARKS_RGB])

@@ -112,7 +112,7 @@ class Window:
         if kind == "web":
             ports.append(own_port)
             command += ["--serve-web", "--web-viewer-port", str(own_port), "--server-memory-limit", history]
-            self.address = f"http://{_HOST}:{web_port}"
+            self.address = f"http://{_HOST}:{web_port}/"
         elif kind == "headless":
             command += ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
         else:

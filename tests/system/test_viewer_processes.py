@@ -153,11 +153,15 @@ def test_the_web_viewer_is_on_loopback_only_and_goes_with_the_command(recorded: 
 
     with started([*VIEW, str(recorded)]) as viewer:
         assert viewer.stdout is not None
-        address = re.search(r"http://127\.0\.0\.1:\d+/\S+", viewer.stdout.readline())
+        address = re.search(r"http://127\.0\.0\.1:\d+/\S*", viewer.stdout.readline())
         assert address is not None
-        assert "notebook=1" in address[0]
+        assert len(address[0]) <= 30
         with urllib.request.urlopen(address[0], timeout=10) as page:
             assert page.status == 200
+            assert "notebook=1" in page.url
+            assert b"viewer_state()" in page.read()
+        with urllib.request.urlopen(f"{address[0]}re_viewer.js", timeout=10) as code:
+            assert b"viewer_state()" in code.read()  # what the page's script asks, in the version that is installed
         children = psutil.Process(viewer.pid).children(recursive=True)
         listening = [
             connection.laddr
