@@ -92,7 +92,7 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
     name = recording.path.name + (f" and {len(files) - 1} more" if len(files) > 1 else "")
     for text in not_drawn(recording.table):
         echo(f"not shown: {text}", err=True)
-    stream = new_stream(name)
+    stream = new_stream(name, batch_s=2.0)
     plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
     if save is not None:
         with _saved(stream, save, plan):
