@@ -89,7 +89,7 @@ class LiveView:
         described: Described,
         *,
         wall: Callable[[], float] = time.time,
-        taken_s: Callable[[], float | None] | None = None,
+        taken: Callable[[], int | None] | None = None,
     ) -> None:
         """Prepare the canvas; nothing is received before `run`.
 
@@ -98,8 +98,8 @@ class LiveView:
             canvas: Where to draw.
             described: What the rig says of itself.
             wall: The wall clock [s since 1970].
-            taken_s: Simulated time until which the viewer has taken all in [s], or None if nobody looks; without it
-                nothing is thinned for a viewer.
+            taken: Number of the latest picture that the viewer has taken in, or None if nobody looks; without it
+                pictures are not counted and nothing is thinned for a viewer.
         """
         self._client = client
         self._reporter = Reporter(client, NAME)
@@ -111,8 +111,8 @@ class LiveView:
         self._beat_key = next(iter(self._groups), "")
         columns = described.contact_columns
         self._force_column = columns.index("normal_force") if "normal_force" in columns else None
-        self._taken_s = taken_s
-        self._pace = None if taken_s is None else Pace()
+        self._taken = taken
+        self._pace = None if taken is None else Pace()
         self._curves_s = self._noted_s = -math.inf
         self._noted_every_s = FASTEST_S
         self._fresh = False
@@ -171,8 +171,8 @@ class LiveView:
             now_s = time.monotonic()
             if self.take_in():
                 heard_s = now_s
-            if self._pace is not None and self._taken_s is not None:
-                self._pace.taken_in(self._taken_s(), now_s=now_s)
+            if self._pace is not None and self._taken is not None:
+                self._pace.taken_in(self._taken(), now_s=now_s)
             if self._pace is None or self._pace.due(now_s):
                 self._draw(now_s)
             if now_s - check_s >= _CHECK_S:
@@ -229,6 +229,9 @@ class LiveView:
         """Draw a picture of the latest instant, and the curves until then."""
         if self._stalled or not self._fresh:
             return
+        if self._pace is not None:
+            self._canvas.picture += 1
+            self._pace.drew(self._canvas.picture, now_s=now_s)
         for name in self._groups.values():
             self._painter.frame(name)
         if now_s - self._curves_s >= CURVES_S - 1e-6:
@@ -240,8 +243,6 @@ class LiveView:
             text = f"{rows} did not reach the viewer (a recording may have them)"
             self._painter.note(self._painter.now_s, text, level="WARN")
             self._missing = {}
-        if self._pace is not None:
-            self._pace.drew(self._painter.now_s, now_s=now_s)
 
     def _tell_pace(self, pace: Pace, now_s: float, tell: Callable[[str], None]) -> None:
         """Say how far the viewer is behind and what is left out; in the log of events, too, if that has changed."""

@@ -33,7 +33,7 @@ class Pace:
     def __init__(self) -> None:
         self.every_s = SLOWEST_S
         """Time between two pictures [s]."""
-        self._on_the_way: deque[tuple[float, float]] = deque()  # up to which simulated time, and when it was drawn
+        self._on_the_way: deque[tuple[int, float]] = deque()  # pictures' numbers, and when they were drawn
         self._drawn_s = -math.inf
         self._changed_s = -math.inf
         self._delay_s = 0.0
@@ -50,21 +50,21 @@ class Pace:
             return True
         return self._shown_s is not None and now_s - self._on_the_way[0][1] < LATE_S
 
-    def drew(self, until_s: float, *, now_s: float) -> None:
-        """A picture of the rig until that simulated time [s] was drawn."""
+    def drew(self, picture: int, *, now_s: float) -> None:
+        """The picture of that number was drawn."""
         self._drawn_s = now_s
-        self._on_the_way.append((until_s, now_s))
+        self._on_the_way.append((picture, now_s))
 
-    def taken_in(self, until_s: float | None, *, now_s: float) -> None:
-        """The slowest viewer has all until that simulated time [s], or nobody looks (None)."""
-        if until_s is None:
+    def taken_in(self, picture: int | None, *, now_s: float) -> None:
+        """The slowest viewer has all pictures up to that number, or nobody looks (None)."""
+        if picture is None:
             self._on_the_way.clear()
             self.looked_at, self.every_s, self._shown_s = False, SLOWEST_S, None
             return
         if not self.looked_at:
             self.looked_at, self.every_s = True, FIRST_S
         drawn_s = None
-        while self._on_the_way and self._on_the_way[0][0] <= until_s + 1e-6:
+        while self._on_the_way and self._on_the_way[0][0] <= picture:
             drawn_s = self._on_the_way.popleft()[1]
         if drawn_s is None:
             return

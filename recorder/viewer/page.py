@@ -6,7 +6,6 @@ comes in so is checked here: bounded in size, number and time, and read as far a
 
 from __future__ import annotations
 
-import math
 import re
 import threading
 import time
@@ -62,13 +61,13 @@ class Page:
             port: Where.
             viewer: URL of rerun's own page.
             query: What that page is asked for.
-            timeline: Whose end tells how far a browser has come; in nanoseconds.
+            timeline: Whose end tells how far a browser has come.
         """
         self.title = "rig"
         self._viewer = viewer
         self._query = query
         self._timeline = timeline
-        self._told: dict[str, tuple[float, float]] = {}
+        self._told: dict[str, tuple[int, float]] = {}
         self._lock = threading.Lock()
         page = self
 
@@ -87,12 +86,12 @@ class Page:
         self._server = ThreadingHTTPServer((host, port), Handler)
         threading.Thread(target=self._server.serve_forever, args=(0.1,), name="page", daemon=True).start()
 
-    def taken_s(self) -> float | None:
-        """Time until which the slowest browser has taken all in [s], -inf where one has nothing; None without any."""
+    def taken(self) -> int | None:
+        """Number of the latest picture that the slowest browser has, 0 where it has none; None without any browser."""
         now_s = time.monotonic()
         with self._lock:
             self._told = {page: told for page, told in self._told.items() if now_s - told[1] < _FORGOTTEN_S}
-            return min((taken_s for taken_s, _ in self._told.values()), default=None)
+            return min((number for number, _ in self._told.values()), default=None)
 
     def close(self) -> None:
         """Serve no more."""
@@ -129,12 +128,12 @@ class Page:
             return request.send_error(HTTPStatus.BAD_REQUEST)
         if int(size) > _MOST_BYTES:
             return request.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        taken_s = end_of(self._timeline, request.rfile.read(int(size)))
+        number = end_of(self._timeline, request.rfile.read(int(size)))
         with self._lock:
             if path == "/closed":
                 self._told.pop(page, None)
             elif page in self._told or len(self._told) < _MOST_PAGES:
-                self._told[page] = (taken_s, time.monotonic())
+                self._told[page] = (number, time.monotonic())
         return _reply(request, self.title.encode(), kind="text/plain; charset=utf-8")
 
 
@@ -146,14 +145,15 @@ def _reply(request: BaseHTTPRequestHandler, body: bytes, *, kind: str = "text/ht
     request.wfile.write(body)
 
 
-def end_of(timeline: str, state: bytes) -> float:
-    """The end of a timeline [s] in a viewer's state; -inf where there is no such line, or it is no such state.
+def end_of(timeline: str, state: bytes) -> int:
+    """The end of a timeline in a viewer's state; 0 where there is no such line, or it is no such state.
 
     Args:
         timeline: Its name.
         state: A `GetStateResponse` of rerun's viewer control. In it a timeline's name is followed by its type (field 2)
-            and its range (field 3): a start, which may be missing, and an end, both in nanoseconds.
+            and its range (field 3): a start, which may be missing, and an end.
     """
-    ends = re.findall(timeline.encode() + rb"\x10.\x1a.(?:\x08[\x80-\xff]*.)?\x10([\x80-\xff]{0,8}.)", state, re.DOTALL)
+    number = rb"[\x80-\xff]{0,9}[\x00-\x7f]"
+    ends = re.findall(timeline.encode() + rb"\x10.\x1a.(?:\x08%b)?\x10(%b)" % (number, number), state, re.DOTALL)
     # A protobuf number has seven bits in each byte, the lowest first.
-    return max((1e-9 * sum((byte & 0x7F) << 7 * at for at, byte in enumerate(end)) for end in ends), default=-math.inf)
+    return max((sum((byte & 0x7F) << 7 * at for at, byte in enumerate(end)) for end in ends), default=0)

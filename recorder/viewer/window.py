@@ -7,7 +7,6 @@ process group that ends with us: ending the starting script alone would leave th
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import signal
 import socket
@@ -22,7 +21,7 @@ from typing import Literal, Self, TypeVar
 
 from rerun.experimental import ViewerClient, ViewerState
 
-from recorder.viewer.canvas import SIMULATED
+from recorder.viewer.canvas import PICTURE, SIMULATED
 from recorder.viewer.page import Page
 from rig.errors import InputError
 
@@ -102,7 +101,7 @@ class Window:
             WindowError: It ended at once, or does not listen in time.
         """
         self._tell = tell
-        self._taken_s: float | None = None
+        self._taken: int | None = None
         self.page: Page | None = None
         port, web_port, own_port = free_port(_PORT), free_port(_WEB_PORT), free_port(0)
         ports = [port]
@@ -138,7 +137,7 @@ class Window:
             else:
                 asked = f"url=rerun%2Bhttp%3A%2F%2F{_HOST}%3A{port}%2Fproxy&{_PAGE}"
                 viewer = f"http://{_HOST}:{own_port}"
-                self.page = Page(_HOST, web_port, viewer=viewer, query=asked, timeline=SIMULATED)
+                self.page = Page(_HOST, web_port, viewer=viewer, query=asked, timeline=PICTURE)
         except BaseException:
             self.close()
             raise
@@ -164,16 +163,16 @@ class Window:
             self._process.wait(timeout_s)
         return not self.open
 
-    def taken_s(self) -> float | None:
-        """Simulated time until which the viewer, or the slowest browser, has taken all in [s]; None if nobody looks."""
-        return self._taken_s if self.page is None else self.page.taken_s()
+    def taken(self) -> int | None:
+        """Number of the latest picture that the viewer, or the slowest browser, has taken in; None if nobody looks."""
+        return self._taken if self.page is None else self.page.taken()
 
     def _watch(self) -> None:
         """Ask a viewer on the screen again and again how far it is: it answers with its next frame."""
         viewer = ViewerClient.connect(self.url)
         while self.open:
             with contextlib.suppress(*_NO_ANSWER):
-                self._taken_s = _end_of(viewer.get_state())
+                self._taken = _end_of(PICTURE, viewer.get_state())
             time.sleep(_ASKED_S)
 
     def picture(self, path: Path, *, at_s: float, end_s: float) -> None:
@@ -187,7 +186,7 @@ class Window:
         Raises:
             WindowError: It does not show the recording in time.
         """
-        self._ask(lambda viewer: _end_of(viewer.get_state()) >= end_s - 1e-6)
+        self._ask(lambda viewer: _end_of(SIMULATED, viewer.get_state()) >= round(end_s * 1e9) - 1000)
         self._ask(lambda viewer: viewer.set_time(SIMULATED, duration=at_s, play_state="paused") or True)
         # Nothing tells that the last of it is on the screen: it is when two pictures are equal.
         picture = b""
@@ -255,10 +254,10 @@ class Window:
             time.sleep(pause_s)
 
 
-def _end_of(state: ViewerState) -> float:
-    """End of the simulated time line in a viewer [s]; -inf where nothing is there yet."""
-    lines = (line for recording in state.recordings for line in recording.timelines if line.name == SIMULATED)
-    return max((line.end * 1e-9 for line in lines if line.end is not None), default=-math.inf)
+def _end_of(timeline: str, state: ViewerState) -> int:
+    """The end of a time line in a viewer; 0 where nothing is there yet."""
+    lines = (line for recording in state.recordings for line in recording.timelines if line.name == timeline)
+    return max((line.end or 0 for line in lines), default=0)
 
 
 def picture_of(path: Path, *, tell: Callable[[str], None]) -> Window:

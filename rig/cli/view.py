@@ -138,7 +138,7 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
             stream.connect_grpc(shown.url, default_blueprint=plan)
             _tell(shown, f"the rig at {connection.connect}")
             try:
-                view = live.LiveView(client, Canvas(stream), described, taken_s=shown.taken_s)
+                view = live.LiveView(client, Canvas(stream), described, taken=shown.taken)
                 with _telling(shown) as tell:
                     reason = view.run(stop=lambda: not shown.open, tell=tell)
                 echo(reason)

@@ -18,9 +18,9 @@ class Viewer:
     def __init__(self, cost_s: float) -> None:
         self.cost_s = cost_s
         self.pace = Pace()
-        self.waiting: deque[float] = deque()
+        self.waiting: deque[tuple[int, float]] = deque()
         self.busy_until_s = 0.0
-        self.taken_s = -math.inf
+        self.taken = 0
         self.drawn: list[float] = []
         self.behind_s: list[float] = []
         self.now_s = 0.0
@@ -30,15 +30,16 @@ class Viewer:
         while self.now_s < end_s:
             self.now_s += TICK_S
             while self.waiting:
-                done_s = max(self.busy_until_s, self.waiting[0]) + self.cost_s
+                done_s = max(self.busy_until_s, self.waiting[0][1]) + self.cost_s
                 if done_s > self.now_s:
                     break
-                self.busy_until_s, self.taken_s = done_s, self.waiting.popleft()
-            self.pace.taken_in(self.taken_s, now_s=self.now_s)
+                self.busy_until_s = done_s
+                self.taken, _ = self.waiting.popleft()
+            self.pace.taken_in(self.taken, now_s=self.now_s)
             if self.pace.due(self.now_s):
-                self.pace.drew(self.now_s, now_s=self.now_s)
                 self.drawn.append(self.now_s)
-                self.waiting.append(self.now_s)
+                self.pace.drew(len(self.drawn), now_s=self.now_s)
+                self.waiting.append((len(self.drawn), self.now_s))
             if (behind_s := self.pace.behind_s(self.now_s)) is not None:
                 self.behind_s.append(behind_s)
 
@@ -81,7 +82,7 @@ def test_nobody_looks() -> None:
         now_s = tick * TICK_S
         pace.taken_in(None, now_s=now_s)
         if pace.due(now_s):
-            pace.drew(now_s, now_s=now_s)
             drawn += 1
+            pace.drew(drawn, now_s=now_s)
     assert drawn == pytest.approx(1000 * TICK_S / SLOWEST_S, abs=1)
     assert not pace.looked_at
