@@ -113,7 +113,7 @@ class LiveView:
         self._force_column = columns.index("normal_force") if "normal_force" in columns else None
         self._taken = taken
         self._pace = None if taken is None else Pace()
-        self._curves_s = self._noted_s = -math.inf
+        self._curves_s = self._folded_s = self._noted_s = -math.inf
         self._noted_every_s = FASTEST_S
         self._fresh = False
         self._missing: dict[str, int] = {}
@@ -175,6 +175,9 @@ class LiveView:
                 self._pace.taken_in(self._taken(), now_s=now_s)
             if self._pace is None or self._pace.due(now_s):
                 self._draw(now_s)
+            elif now_s - self._folded_s >= CURVES_S:
+                self._painter.fold(most=POINTS)
+                self._folded_s = now_s
             if now_s - check_s >= _CHECK_S:
                 self._check_canvas()
                 if self._pace is not None:

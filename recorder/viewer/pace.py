@@ -72,7 +72,7 @@ class Pace:
         if drawn_s < self._changed_s:
             return  # drawn at the pace before
         if self._delay_s > max(LATE_S, 1.5 * self.every_s):
-            self.every_s = min(SLOWEST_S, 2.0 * self.every_s)
+            self.every_s = min(SLOWEST_S, max(2.0 * self.every_s, 0.5 * self._delay_s))
             self._changed_s = now_s
         elif self._delay_s < max(PROMPT_S, 0.5 * self.every_s):
             # In large steps only as long as the viewer is idle between two pictures.

@@ -18,8 +18,8 @@ _FOREIGN = re.compile(rb"<link[^>]*https://fonts[^>]*>")
 _PAGE = re.compile(r"[a-z0-9]{1,16}")
 _MOST_BYTES = 1 << 20
 _MOST_PAGES = 32
-_FORGOTTEN_S = 10.0
-"""A page that tells nothing for so long is closed; one that is loading or painting may take a few seconds [s]."""
+_FORGOTTEN_S = 30.0
+"""A page that tells nothing for so long is lost, not only busy loading or painting [s]."""
 _REST_S = 15.0
 """A page that nobody sees paints nothing and takes nothing in: after so long it leaves, to come back when seen [s]."""
 _SCRIPT = """<script>

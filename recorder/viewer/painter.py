@@ -202,6 +202,12 @@ class Painter:
             oldest = min(self._last_s.values()) - self._held_s - 1.0
             self._windows = [window for window in self._windows if window[1] > oldest]
 
+    def fold(self, *, most: int) -> None:
+        """Thin what waits for `flush` to `most` points of each curve outside of hammer pulses."""
+        for name, curves in self._curves.items():
+            if name in self._last_s:
+                curves.fold(until_s=self._last_s[name] - self._held_s, windows=self._windows, most=most)
+
     def close(self) -> None:
         """Draw what is still held."""
         for name, curves in self._curves.items():
