@@ -249,7 +249,7 @@ class LiveView:
 
     def _tell_pace(self, pace: Pace, now_s: float, tell: Callable[[str], None]) -> None:
         """Say how far the viewer is behind and what is left out; in the log of events, too, if that has changed."""
-        every_s, behind_s = pace.every_s, pace.behind_s(now_s)
+        every_s, behind_s = max(pace.every_s, pace.interval_s), pace.behind_s(now_s)
         who = "viewer loading" if pace.looked_at else "no viewer looks"
         if behind_s is not None:
             who = f"viewer {behind_s:.1f} s behind"

@@ -32,7 +32,9 @@ class Pace:
 
     def __init__(self) -> None:
         self.every_s = SLOWEST_S
-        """Time between two pictures [s]."""
+        """Time between two pictures that is aimed at [s]."""
+        self.interval_s = SLOWEST_S
+        """Time between the last two [s], with all waiting for the viewer."""
         self._on_the_way: deque[tuple[int, float]] = deque()  # pictures' numbers, and when they were drawn
         self._drawn_s = -math.inf
         self._changed_s = -math.inf
@@ -52,7 +54,7 @@ class Pace:
 
     def drew(self, picture: int, *, now_s: float) -> None:
         """The picture of that number was drawn."""
-        self._drawn_s = now_s
+        self.interval_s, self._drawn_s = min(now_s - self._drawn_s, DEAF_S), now_s
         self._on_the_way.append((picture, now_s))
 
     def taken_in(self, picture: int | None, *, now_s: float) -> None:
