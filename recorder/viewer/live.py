@@ -28,7 +28,8 @@ ROWS_PER_S = 500.0
 _TICK_S = FASTEST_S
 _HEARTBEAT_S = 0.5
 _INBOX = 4000
-"""Payloads held at most, about 4 s of all streams; then the oldest go."""
+_OLDEST_S = 1.5
+"""How many payloads wait at most, and for how long [s]; then the oldest go."""
 _QUIET_S = 0.3
 _GONE_S = 3.0
 """How long a rig that is gone may take to be there again [s]: a viewer that was stopped is linked again in a second."""
@@ -268,8 +269,9 @@ class LiveView:
         now_s = time.monotonic()
         while self._inbox:
             came_s, key, payload = self._inbox.popleft()
-            self._oldest_s = max(self._oldest_s, now_s - came_s)
-            arrived.append((key, payload))
+            if key == wire.EVENTS or now_s - came_s < _OLDEST_S:
+                self._oldest_s = max(self._oldest_s, now_s - came_s)
+                arrived.append((key, payload))
         # Stable: each key stays in order, and its blocks come together. Events first: they announce hammer pulses.
         arrived.sort(key=lambda item: (item[0] != wire.EVENTS, item[0]))
         for key, items in groupby(arrived, key=lambda item: item[0]):

@@ -19,7 +19,7 @@ FIRST_S = 0.2
 LATE_S, PROMPT_S = 0.6, 0.3
 """A picture that took longer than the first to be taken in makes the next ones rarer; below the second, denser [s]."""
 DEAF_S = 10.0
-"""A picture leaves at least that often, even for a viewer that takes nothing in [s]."""
+"""A picture leaves at least that often, even if nobody looks or takes it in [s]: a viewer that comes takes all in."""
 CURVES_S = 0.16
 """Curves are drawn at most that often [s]: a piece of a curve costs the viewer as much as a whole picture."""
 POINTS = 120
@@ -31,9 +31,9 @@ class Pace:
     """When to draw, by what was drawn and what the viewer has taken in; every time is passed in."""
 
     def __init__(self) -> None:
-        self.every_s = SLOWEST_S
+        self.every_s = DEAF_S
         """Time between two pictures that is aimed at [s]."""
-        self.interval_s = SLOWEST_S
+        self.interval_s = DEAF_S
         """Time between the last two [s], with all waiting for the viewer."""
         self._on_the_way: deque[tuple[int, float]] = deque()  # pictures' numbers, and when they were drawn
         self._drawn_s = -math.inf
@@ -61,7 +61,7 @@ class Pace:
         """The slowest viewer has all pictures up to that number, or nobody looks (None)."""
         if picture is None:
             self._on_the_way.clear()
-            self.looked_at, self.every_s, self._shown_s = False, SLOWEST_S, None
+            self.looked_at, self.every_s, self._shown_s = False, DEAF_S, None
             return
         if not self.looked_at:
             self.looked_at, self.every_s = True, FIRST_S

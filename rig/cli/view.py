@@ -134,7 +134,7 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
                 raise typer.Exit(1)
             return
         # A browser that comes later takes in the whole history before anything new, so that it is short.
-        with window.Window(_kind(web=web), memory="512MiB", history="2MiB") as shown:
+        with window.Window(_kind(web=web), memory="512MiB", history="1MiB") as shown:
             stream.connect_grpc(shown.url, default_blueprint=plan)
             _tell(shown, f"the rig at {connection.connect}")
             try:
