@@ -27,7 +27,7 @@ const page = Math.random().toString(36).slice(2);
 let hidden = 0;
 async function tell() {
   hidden = document.hidden ? hidden + 1 : 0;
-  if (hidden > %d) return location.replace("resting");
+  if (hidden > %s) return location.replace("resting");
   try {
     if (!document.hidden) {
       const state = window._handle ? window._handle.viewer_state() : "";
@@ -53,7 +53,7 @@ class Page:
         title: What the browsers show as the page's title.
     """
 
-    def __init__(self, host: str, port: int, *, viewer: str, query: str, timeline: str) -> None:
+    def __init__(self, host: str, port: int, *, viewer: str, query: str, timeline: str, rests: bool = False) -> None:
         """Listen.
 
         Args:
@@ -62,11 +62,13 @@ class Page:
             viewer: URL of rerun's own page.
             query: What that page is asked for.
             timeline: Whose end tells how far a browser has come.
+            rests: A page that is not seen leaves and begins anew when it is, instead of falling behind.
         """
         self.title = "rig"
         self._viewer = viewer
         self._query = query
         self._timeline = timeline
+        self._script = _SCRIPT % (round(_REST_S / 0.2) if rests else "Infinity")
         self._told: dict[str, tuple[int, float]] = {}
         self._lock = threading.Lock()
         page = self
@@ -115,8 +117,7 @@ class Page:
         except OSError:
             return request.send_error(HTTPStatus.NOT_FOUND)
         if path == "/":
-            script = (_SCRIPT % round(_REST_S / 0.2)).encode()
-            body = _FOREIGN.sub(b"", body).replace(b"</body>", script)
+            body = _FOREIGN.sub(b"", body).replace(b"</body>", self._script.encode())
         return _reply(request, body, kind=kind)
 
     def _post(self, request: BaseHTTPRequestHandler) -> None:

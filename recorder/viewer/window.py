@@ -84,8 +84,7 @@ class Window:
         kind: Kind,
         *,
         size: tuple[int, int] = (1920, 1080),
-        memory: str = "2GiB",
-        history: str = "2GiB",
+        live: bool = False,
         tell: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Start it and wait until it listens.
@@ -93,13 +92,15 @@ class Window:
         Args:
             kind: What it is.
             size: Of the picture [pixels].
-            memory: What the viewer may keep.
-            history: What its server keeps for a browser that comes later, which has to take all of it in first.
+            live: For a stream without end: little is kept.
             tell: Is told in words if something takes long.
 
         Raises:
             WindowError: It ended at once, or does not listen in time.
         """
+        memory = "512MiB" if live else "2GiB"
+        # A browser that comes later takes in all that the server kept before anything new.
+        history = "1MiB" if live else memory
         self._tell = tell
         self._taken: int | None = None
         self.page: Page | None = None
@@ -137,7 +138,7 @@ class Window:
             else:
                 asked = f"url=rerun%2Bhttp%3A%2F%2F{_HOST}%3A{port}%2Fproxy&{_PAGE}"
                 viewer = f"http://{_HOST}:{own_port}"
-                self.page = Page(_HOST, web_port, viewer=viewer, query=asked, timeline=PICTURE)
+                self.page = Page(_HOST, web_port, viewer=viewer, query=asked, timeline=PICTURE, rests=live)
         except BaseException:
             self.close()
             raise

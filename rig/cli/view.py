@@ -133,8 +133,7 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
             if view.failed:
                 raise typer.Exit(1)
             return
-        # A browser that comes later takes in the whole history before anything new, so that it is short.
-        with window.Window(_kind(web=web), memory="512MiB", history="1MiB") as shown:
+        with window.Window(_kind(web=web), live=True) as shown:
             stream.connect_grpc(shown.url, default_blueprint=plan)
             _tell(shown, f"the rig at {connection.connect}")
             try:
@@ -189,6 +188,8 @@ def _kind(*, web: bool) -> Kind:
 
 def _tell(shown: Window, what: str) -> None:
     echo(f"viewing {what} at {shown.address}" if shown.address else f"viewing {what}")
+    if shown.page is not None:
+        shown.page.title = f"rig: {what}"
     echo("Ctrl-C ends the viewer")
     sys.stdout.flush()  # the address is wanted now, also in a pipe
 
