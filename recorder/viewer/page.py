@@ -24,12 +24,13 @@ _REST_S = 15.0
 """A page that nobody sees paints nothing and takes nothing in: after so long it leaves, to come back when seen [s]."""
 _SCRIPT = """<script>
 const page = Math.random().toString(36).slice(2);
-let hidden = 0;
+let seen = Date.now();
 async function tell() {
-  hidden = document.hidden ? hidden + 1 : 0;
-  if (hidden > %s) return location.replace("resting");
+  if (!document.hidden) seen = Date.now();
+  if (Date.now() - seen > %s) return location.replace("resting");
   try {
-    if (!document.hidden) {
+    if (document.hidden) navigator.sendBeacon("closed?" + page);
+    else {
       const state = window._handle ? window._handle.viewer_state() : "";
       const reply = await fetch("state?" + page, {method: "POST", body: state});
       document.title = await reply.text();
@@ -68,7 +69,7 @@ class Page:
         self._viewer = viewer
         self._query = query
         self._timeline = timeline
-        self._script = _SCRIPT % (round(_REST_S / 0.2) if rests else "Infinity")
+        self._script = _SCRIPT % (round(1000.0 * _REST_S) if rests else "Infinity")
         self._told: dict[str, tuple[int, float]] = {}
         self._lock = threading.Lock()
         page = self
