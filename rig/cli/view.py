@@ -187,7 +187,8 @@ def _kind(*, web: bool) -> Kind:
 
 
 def _tell(shown: Window, what: str) -> None:
-    echo(f"viewing {what} at {shown.address}" if shown.address else f"viewing {what}")
+    # The address comes first, so that no terminal breaks it.
+    echo(f"{shown.address} shows {what}" if shown.address else f"viewing {what}")
     if shown.page is not None:
         shown.page.title = f"rig: {what}"
     echo("Ctrl-C ends the viewer")
