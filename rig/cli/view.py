@@ -101,7 +101,7 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
         echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
         return
     with _window_of_file(screenshot, web=web) as shown:
-        stream.connect_grpc(shown.url, default_blueprint=plan)
+        _connect(stream, shown, plan)
         try:
             painted = paint(recording, Canvas(stream))
         finally:
@@ -134,7 +134,7 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
                 raise typer.Exit(1)
             return
         with window.Window(_kind(web=web), live=True) as shown:
-            stream.connect_grpc(shown.url, default_blueprint=plan)
+            _connect(stream, shown, plan)
             _tell(shown, f"the rig at {connection.connect}")
             try:
                 view = live.LiveView(client, Canvas(stream), described, taken=shown.taken)
@@ -209,6 +209,12 @@ def _hush() -> None:
     import os
 
     os.environ.setdefault("RUST_LOG", "off")
+
+
+def _connect(stream: rr.RecordingStream, shown: Window, plan: rrb.Blueprint) -> None:
+    """Draw to a viewer, in our layout: as a default only, it would give way to the one that was shown last."""
+    stream.connect_grpc(shown.url)
+    stream.send_blueprint(plan)
 
 
 def _close(stream: rr.RecordingStream, *, timeout_s: float = 5.0) -> None:
