@@ -28,12 +28,12 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Bluepr
     frequency: list[tuple[rrb.View | rrb.Container, float]] = []
     if planes:
         motion.append((rrb.Horizontal(*(_orbit_view(plane, geometry) for plane in planes)), 5.2))
-        frequency += [(_spectrum_view(), 3.6), (_waterfall_view(), 5.0), (_contact_view(live=live), 2.0)]
+        frequency += [(_spectrum_view(), 3.6), (_waterfall_view(), 5.0), (_contact_view(live=live), 2.6)]
     if planes or "speed" in table.channels:
         motion.append((_scene_view(), 5.0))
     if small:
         motion.append((rrb.Horizontal(*small), 2.6))
-    frequency.append((_events_view(), 3.0))
+    frequency.append((_events_view(), 2.6))
     columns = [(motion, 5.2), ([(view, 1.0) for view in curves.values()], 5.0), (frequency, 4.6)]
     columns = [(views, share) for views, share in columns if views]
     return rrb.Blueprint(
@@ -60,7 +60,7 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Bluepr
 def _spectrum_view() -> rrb.BarChartView:
     return rrb.BarChartView(
         origin=f"{spectrum.ROOT}/now",
-        name="Full spectrum of x + jy at the ring [mm] over [Hz]: backward < 0 < forward",
+        name="Full spectrum at the ring [mm] over [Hz]: backward < 0",
         plot_legend=rrb.PlotLegend(visible=False),
     )
 
@@ -69,7 +69,7 @@ def _waterfall_view() -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
         origin=spectrum.WATERFALL,
         name="Waterfall of the full spectrum [dB re 1 um]",
-        visual_bounds=rrb.VisualBounds2D(x_range=[-26, 220], y_range=[-16, spectrum.HEIGHT + 20]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[-34, 216], y_range=[-18, spectrum.HEIGHT + 26]),
         background=_BACKGROUND,
     )
 
@@ -99,47 +99,48 @@ def _scene_view() -> rrb.Spatial3DView:
         background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
-            kind="Orbital", position=(-0.32, 0.13, 0.43), look_target=(0.0, -0.004, 0.205), eye_up=(0.0, 1.0, 0.0)
+            kind="Orbital", position=(-0.26, 0.11, 0.38), look_target=(0.0, -0.004, 0.205), eye_up=(0.0, 1.0, 0.0)
         ),
     )
 
 
 def _curve_views(table: ChannelTable, geometry: Geometry, *, live: bool) -> dict[str, rrb.TimeSeriesView]:
     """One plot a quantity by its title, those that the table has."""
+    # Titles name the colours: a legend would hide the first impacts.
     plots = {
-        "Displacement at the ring [mm]": [f"{series.ROOT}/probes/ring"],
-        "Displacement at the disk [mm]": [f"{series.ROOT}/probes/disk"],
-        "Reaction of each direction [N]": [series.REACTION],
-        "Force transducers [N]": [f"{series.ROOT}/forces/P"],
-        "Accelerations of the houses [m/s^2]": [
+        "Ring [mm]: x blue, y amber": [f"{series.ROOT}/probes/ring"],
+        "Disk [mm]: x blue, y amber": [f"{series.ROOT}/probes/disk"],
+        "Reaction [N]: x = E - W blue, y = N - S amber": [series.REACTION],
+        "Forces [N]: N blue, S dark blue, E amber, W brown": [f"{series.ROOT}/forces/P"],
+        "Accelerations [m/s²]: x blue, y amber, outer house darker": [
             f"{series.ROOT}/accelerations/inner",
             f"{series.ROOT}/accelerations/outer",
         ],
         "Spin speed [Hz]": [f"{series.ROOT}/drive/speed"],
         "Hammer [N]": [f"{series.ROOT}/hammer/hammer"],
     }
-    ranges = {
-        "Displacement at the ring [mm]": 1.15 * geometry.clearance_mm("ring"),
-        "Displacement at the disk [mm]": 1.15 * geometry.clearance_mm("disk"),
-    }
+    reaches = {f"{series.ROOT}/probes/{plane}": 1.15 * geometry.clearance_mm(plane) for plane in orbit.PLANES}
     there = series.paths_of(table)
     planned = {path for paths in plots.values() for path in paths}
-    for path in there:
-        if path not in planned:
-            plots[path.removeprefix(f"{series.ROOT}/")] = [path]
-    return {
-        title: _curve_view(title, [path for path in paths if path in there], reach=ranges.get(title), live=live)
+    views = {
+        title: _curve_view(title, [path for path in paths if path in there], reach=reaches.get(paths[0]), live=live)
         for title, paths in plots.items()
         if set(paths) & set(there)
     }
+    others = {path.removeprefix(f"{series.ROOT}/"): path for path in there if path not in planned}
+    return views | {
+        title: _curve_view(title, [path], reach=None, live=live, legend=True) for title, path in others.items()
+    }
 
 
-def _curve_view(title: str, paths: Sequence[str], *, reach: float | None, live: bool) -> rrb.TimeSeriesView:
+def _curve_view(
+    title: str, paths: Sequence[str], *, reach: float | None, live: bool, legend: bool = False
+) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"+ {path}" for path in paths],
         name=title,
-        plot_legend=rrb.PlotLegend(corner="LeftTop"),
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
         axis_x=_time_axis(live=live),
         axis_y=None if reach is None else rrb.ScalarAxis(range=(-reach, reach)),
     )
@@ -149,7 +150,7 @@ def _contact_view(*, live: bool) -> rrb.StateTimelineView:
     return rrb.StateTimelineView(
         origin="/contact",
         contents=[f"+ {contact.SENSED}", f"+ {contact.TRUTH}"],
-        name="Contact at the ring: sensed by the probes, and the model's truth where it is given",
+        name="Contact at the ring: by the probes, and by the model if it tells",
         time_view=_time_axis(live=live),
     )
 

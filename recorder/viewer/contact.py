@@ -50,6 +50,8 @@ class ContactPlot:
         self._canvas = canvas
         self._path = path
         self._touch = touch
+        self._times: list[float] = []
+        self._words: list[str] = []
         self.last_contact_s: float | None = None
         canvas.fix(
             path,
@@ -64,15 +66,20 @@ class ContactPlot:
         return bool(self._touch.state)
 
     def add(self, times_s: np.ndarray, quantity: np.ndarray) -> None:
-        """Take the rows of the deciding quantity, shape (n,), and draw the changes."""
+        """Take the rows of the deciding quantity, shape (n,)."""
         times, states = self._touch.changes(times_s, quantity)
         if len(times_s) and self.touching:
             self.last_contact_s = float(times_s[-1])
         elif states[:-1].any():
             self.last_contact_s = float(times[-1])
-        if len(times):
-            words = [TOUCH if state else FREE for state in states]
-            self._canvas.plot(self._path, times, rr.StateChange.columns(state=words))
+        self._times += times.tolist()
+        self._words += [TOUCH if state else FREE for state in states]
+
+    def flush(self) -> None:
+        """Draw the changes."""
+        if self._times:
+            self._canvas.plot(self._path, np.array(self._times), rr.StateChange.columns(state=self._words))
+            self._times, self._words = [], []
 
     def interrupt(self) -> None:
         """Rows are missing: the state is not known."""

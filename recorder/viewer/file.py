@@ -81,7 +81,15 @@ def paint(recording: Recording, canvas: Canvas) -> Painted:
 
 def _new_painter(recording: Recording, canvas: Canvas, duration_s: float) -> Painter:
     geometry = Geometry.from_parameters(recording.parameters)
-    painter = Painter(canvas, recording.table, geometry, rows_per_s=rows_per_s(duration_s), whole=True, held_s=0.0)
+    painter = Painter(
+        canvas,
+        recording.table,
+        geometry,
+        rows_per_s=rows_per_s(duration_s),
+        whole=True,
+        held_s=0.0,
+        frame_s=frame_s(duration_s),
+    )
     for event in recording.events:
         painter.add_event(event)
     return painter

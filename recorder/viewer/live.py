@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import numpy as np
 
 from recorder.viewer.canvas import Canvas
 from recorder.viewer.geometry import Geometry
+from recorder.viewer.pace import CURVES_S, FASTEST_S, POINTS, Pace
 from recorder.viewer.painter import Painter
 from rig import wire
 from rig.channels import ChannelTable
@@ -23,16 +25,17 @@ from rig.transport.clients import Reporter
 NAME = "viewer"
 ROWS_PER_S = 500.0
 """Points of each curve per simulated second [Hz]; full rate around hammer pulses."""
-_TICK_S = 0.04
-_FLUSH_EVERY = 4
+_TICK_S = FASTEST_S
 _HEARTBEAT_S = 0.5
 _INBOX = 4000
-"""Payloads held at most, about 4 s of all streams; then the oldest go."""
+_OLDEST_S = 1.5
+"""How many payloads wait at most, and for how long [s]; then the oldest go."""
 _QUIET_S = 0.3
 _GONE_S = 3.0
 """How long a rig that is gone may take to be there again [s]: a viewer that was stopped is linked again in a second."""
 _CHECK_S = 1.0
 _PATIENCE_S = 0.3
+_NOTED_S = 10.0
 _CONTACT = wire.truth_key("contact")
 
 
@@ -81,7 +84,13 @@ class LiveView:
     """Draws a rig's streams from now on until they end."""
 
     def __init__(
-        self, client: Client, canvas: Canvas, described: Described, *, wall: Callable[[], float] = time.time
+        self,
+        client: Client,
+        canvas: Canvas,
+        described: Described,
+        *,
+        wall: Callable[[], float] = time.time,
+        taken: Callable[[], int | None] | None = None,
     ) -> None:
         """Prepare the canvas; nothing is received before `run`.
 
@@ -90,6 +99,8 @@ class LiveView:
             canvas: Where to draw.
             described: What the rig says of itself.
             wall: The wall clock [s since 1970].
+            taken: Number of the latest picture that the viewer has taken in, or None if nobody looks; without it
+                pictures are not counted and nothing is thinned for a viewer.
         """
         self._client = client
         self._reporter = Reporter(client, NAME)
@@ -101,7 +112,13 @@ class LiveView:
         self._beat_key = next(iter(self._groups), "")
         columns = described.contact_columns
         self._force_column = columns.index("normal_force") if "normal_force" in columns else None
-        self._inbox: deque[tuple[str, bytes]] = deque(maxlen=_INBOX)
+        self._taken = taken
+        self._pace = None if taken is None else Pace()
+        self._curves_s = self._folded_s = self._noted_s = -math.inf
+        self._noted_every_s = FASTEST_S
+        self._fresh = False
+        self._missing: dict[str, int] = {}
+        self._inbox: deque[tuple[float, str, bytes]] = deque(maxlen=_INBOX)
         self._intake = Intake(described.catalogue)
         self._continuity = wire.Continuity()
         self._received_index = 0
@@ -115,6 +132,9 @@ class LiveView:
         self._malformed = 0
         self.skipped = 0
         """Sensor rows that arrived and were not drawn, because the viewer's window did not take them."""
+        self._oldest_s = 0.0
+        self.waits_s = 0.0
+        """How long what came waits on our side [s]: for us to take it, and for the viewer's server to have it."""
 
     @property
     def malformed(self) -> int:
@@ -131,8 +151,12 @@ class LiveView:
         """Sensor rows that did not arrive: the viewer takes what it gets."""
         return sum(rows for key, rows in self._continuity.lost.items() if key in self._groups)
 
-    def run(self, *, stop: Callable[[], bool] = lambda: False) -> str:
+    def run(self, *, stop: Callable[[], bool] = lambda: False, tell: Callable[[str], None] = lambda text: None) -> str:
         """Draw until the rig ends, is gone, or `stop` says so.
+
+        Args:
+            stop: Asked again and again.
+            tell: Is told every second how it goes.
 
         Returns:
             Why it ended, in one line.
@@ -143,16 +167,22 @@ class LiveView:
         # Events are few: those from before we came are fetched.
         self._client.subscribe(wire.EVENTS, self.take, history=True)
         self._client.watch(wire.ALIVE, self._watch)
-        count, heard_s, beat_s, check_s = 0, time.monotonic(), 0.0, 0.0
+        heard_s, beat_s, check_s = time.monotonic(), 0.0, 0.0
         while True:
             now_s = time.monotonic()
-            if self.draw():
+            if self.take_in():
                 heard_s = now_s
-            count += 1
-            if count % _FLUSH_EVERY == 0:
-                self._painter.flush()
+            if self._pace is not None and self._taken is not None:
+                self._pace.taken_in(self._taken(), now_s=now_s)
+            if self._pace is None or self._pace.due(now_s):
+                self._draw(now_s)
+            elif now_s - self._folded_s >= CURVES_S:
+                self._painter.fold(most=POINTS)
+                self._folded_s = now_s
             if now_s - check_s >= _CHECK_S:
                 self._check_canvas()
+                if self._pace is not None:
+                    self._tell_pace(self._pace, now_s, tell)
                 check_s = now_s
             if now_s - beat_s >= _HEARTBEAT_S:
                 self._report()
@@ -180,7 +210,7 @@ class LiveView:
 
     def take(self, key: str, payload: bytes) -> None:
         """Take a payload, from any thread."""
-        self._inbox.append((key, payload))
+        self._inbox.append((time.monotonic(), key, payload))
 
     def _watch(self, there: bool) -> None:
         self._gone_at_s = time.monotonic()
@@ -191,28 +221,68 @@ class LiveView:
 
     def _check_canvas(self) -> None:
         """Stop drawing for a viewer that takes nothing, or memory would fill with what it still has to get."""
+        begin_s = time.monotonic()
         stalled = not self._canvas.keeps_up(timeout_s=_PATIENCE_S)
+        self.waits_s, self._oldest_s = self._oldest_s + time.monotonic() - begin_s, 0.0
         if self._stalled and not stalled:
             text = f"the viewer took nothing for a while: {self.skipped} rows in all were not drawn"
             self._painter.note(self._painter.now_s, text, level="WARN")
         self._stalled = stalled
 
-    def draw(self) -> bool:
-        """Draw all that has arrived; whether anything had."""
-        arrived = []
+    def _draw(self, now_s: float) -> None:
+        """Draw a picture of the latest instant, and the curves until then."""
+        if self._stalled or not self._fresh:
+            return
+        if self._pace is not None:
+            self._canvas.picture += 1
+            self._pace.drew(self._canvas.picture, now_s=now_s)
+        for name in self._groups.values():
+            self._painter.frame(name)
+        if now_s - self._curves_s >= CURVES_S - 1e-6:
+            self._painter.flush(most=None if self._pace is None else POINTS)
+            self._curves_s = now_s
+        self._fresh = False
+        if self._missing:
+            rows = ", ".join(f"{rows} rows of {name}" for name, rows in self._missing.items())
+            text = f"{rows} did not reach the viewer (a recording may have them)"
+            self._painter.note(self._painter.now_s, text, level="WARN")
+            self._missing = {}
+
+    def _tell_pace(self, pace: Pace, now_s: float, tell: Callable[[str], None]) -> None:
+        """Say how far the viewer is behind and what is left out; in the log of events, too, if that has changed."""
+        every_s, behind_s = max(pace.every_s, pace.interval_s), pace.behind_s(now_s)
+        who = "viewer loading" if pace.looked_at else "no viewer looks"
+        if behind_s is not None:
+            who = f"viewer {behind_s:.1f} s behind"
+        points = min(ROWS_PER_S, POINTS / max(every_s, CURVES_S))
+        thinned = f"{1.0 / every_s:.1f} of {1.0 / FASTEST_S:.0f} pictures/s, {points:.0f} of {ROWS_PER_S:.0f} points/s"
+        tell(f"{who}, {thinned}; {self.waits_s:.2f} s here")
+        changed = not 0.4 < every_s / self._noted_every_s < 2.5
+        if changed and behind_s is not None and now_s - self._noted_s >= _NOTED_S:
+            self._noted_s, self._noted_every_s = now_s, every_s
+            level = "INFO" if points == ROWS_PER_S else "WARN"
+            self._painter.note(self._painter.now_s, f"{who}, so it gets {thinned} a curve; peaks stay", level=level)
+
+    def take_in(self) -> bool:
+        """Take all that has arrived; whether anything had."""
+        arrived: list[tuple[str, bytes]] = []
+        now_s = time.monotonic()
         while self._inbox:
-            arrived.append(self._inbox.popleft())
+            came_s, key, payload = self._inbox.popleft()
+            if key == wire.EVENTS or now_s - came_s < _OLDEST_S:
+                self._oldest_s = max(self._oldest_s, now_s - came_s)
+                arrived.append((key, payload))
         # Stable: each key stays in order, and its blocks come together. Events first: they announce hammer pulses.
         arrived.sort(key=lambda item: (item[0] != wire.EVENTS, item[0]))
         for key, items in groupby(arrived, key=lambda item: item[0]):
             payloads = [payload for _, payload in items]
             if key == wire.EVENTS:
-                self._draw_events(payloads)
+                self._take_events(payloads)
             elif key in self._groups or key == _CONTACT:
-                self._draw_blocks(key, payloads)
+                self._take_blocks(key, payloads)
         return bool(arrived)
 
-    def _draw_events(self, payloads: list[bytes]) -> None:
+    def _take_events(self, payloads: list[bytes]) -> None:
         for payload in payloads:
             try:
                 event = event_in(payload)
@@ -223,7 +293,7 @@ class LiveView:
             if event["event"] == "end":
                 self.ended = printable(event.get("reason") or "no reason given", 500)
 
-    def _draw_blocks(self, key: str, payloads: list[bytes]) -> None:
+    def _take_blocks(self, key: str, payloads: list[bytes]) -> None:
         taken = []
         for payload in payloads:
             try:
@@ -234,21 +304,16 @@ class LiveView:
         for _, block, *_ in taken:
             gap = self._continuity.follow(key, block.index, len(block.values))
             if gap is not None:
-                self._draw_run(key, run)
+                self._take_run(key, run)
                 run = []
                 if gap.size > 0 and key in self._groups:
-                    self._painter.note(
-                        float(block.times_s[0]),
-                        f"{gap.size} rows of {self._groups[key]} did not reach the viewer (a recording may have them)",
-                        level="WARN",
-                    )
+                    name = self._groups[key]
+                    self._missing[name] = self._missing.get(name, 0) + gap.size
             run.append(block)
-        self._draw_run(key, run)
-        if key in self._groups and not self._stalled:
-            self._painter.frame(self._groups[key])
+        self._take_run(key, run)
 
-    def _draw_run(self, key: str, run: list[wire.Block]) -> None:
-        """Draw consecutive blocks."""
+    def _take_run(self, key: str, run: list[wire.Block]) -> None:
+        """Take consecutive blocks."""
         if not run:
             return
         if key == self._beat_key:
@@ -256,6 +321,7 @@ class LiveView:
         if self._stalled:
             self.skipped += sum(len(block.values) for block in run) if key in self._groups else 0
             return
+        self._fresh = True
         values = np.concatenate([block.values for block in run])
         ticks_a_row = run[0].tick_rate_hz / run[0].rate_hz
         times_s = (run[0].tick + ticks_a_row * np.arange(len(values))) / run[0].tick_rate_hz

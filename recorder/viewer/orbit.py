@@ -74,9 +74,9 @@ class OrbitPlot:
         )
         at_ring = " (ring at rest)" if plane == "disk" else ""
         words = {
-            1.30 * radius: "EAST +x",
-            1.22j * radius: "UP +y",
-            1.58j * radius: f"clearance {radius:.3f} mm{at_ring}",
+            1.48 * radius: "EAST +x",
+            1.42j * radius: "UP +y",
+            1.80j * radius: f"clearance {radius:.3f} mm{at_ring}",
         }
         self._canvas.write(f"{self._path}/words", _placed(words), [_WORDS_RGB, _WORDS_RGB, _CLEARANCE_RGB])
 
@@ -110,8 +110,8 @@ class OrbitPlot:
         )
         self._draw_turn(time_s, complex(points[-1] - z.mean()), whirl)
         first, second = reading_of(whirl)
-        at = -1.32j * self._clearance_mm
-        words = _placed({at: first, 1.27 * at: second})
+        at = -1.16j * self._clearance_mm
+        words = _placed({at: first, 1.31 * at: second})
         self._canvas.write(f"{self._path}/reading", words, [whirl.color], time_s=time_s)
 
     def _draw_turn(self, time_s: float, position: complex, whirl: Whirl) -> None:

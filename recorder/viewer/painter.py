@@ -24,7 +24,7 @@ EVENTS = "/events"
 FRAME_S = 0.04
 """Orbits and the 3-D rig are drawn at 25 Hz."""
 SPECTRUM_EVERY = 5
-"""Frames per spectrum: 5 Hz."""
+"""Least number of frames for a spectrum: 5 Hz."""
 AROUND_HAMMER_S = 0.05
 HELD_S = AROUND_HAMMER_S + 0.02
 """Live curves lag by this much, so that a hammer pulse still finds the rows before it at full rate."""
@@ -95,6 +95,7 @@ class Painter:
         rows_per_s: float,
         whole: bool,
         held_s: float = HELD_S,
+        frame_s: float = FRAME_S,
     ) -> None:
         """Prepare the canvas.
 
@@ -105,6 +106,7 @@ class Painter:
             rows_per_s: Points of each curve per simulated second [Hz]; full rate around hammer pulses.
             whole: A file, drawn from its start to its end, in contrast to a stream.
             held_s: How long curves wait for a hammer pulse that is not known yet [s].
+            frame_s: Least time between two frames [s].
         """
         self._canvas = canvas
         self._held_s = held_s
@@ -119,7 +121,8 @@ class Painter:
         }
         self._scene = Scene3D(canvas, geometry)
         self._parts = {
-            name: _parts_of(group, canvas, self._scene, geometry, whole=whole) for name, group in table.groups.items()
+            name: _parts_of(group, canvas, self._scene, geometry, whole=whole, frame_s=frame_s)
+            for name, group in table.groups.items()
         }
         self._groups = table.groups
         self._truth = ContactPlot(canvas, path=contact.TRUTH, touch=Touch(enter=1e-9, leave=1e-9))
@@ -189,14 +192,21 @@ class Painter:
             for part in self._parts[name]:
                 part.draw(self._last_s[name])
 
-    def flush(self) -> None:
-        """Draw all curves as far as they are settled."""
+    def flush(self, *, most: int | None = None) -> None:
+        """Draw all curves as far as they are settled, with `most` points each outside of hammer pulses."""
         for name, curves in self._curves.items():
             if name in self._last_s:
-                curves.flush(until_s=self._last_s[name] - self._held_s, windows=self._windows)
+                curves.flush(until_s=self._last_s[name] - self._held_s, windows=self._windows, most=most)
+        self._flush_contact()
         if self._last_s and not self._whole:
             oldest = min(self._last_s.values()) - self._held_s - 1.0
             self._windows = [window for window in self._windows if window[1] > oldest]
+
+    def fold(self, *, most: int) -> None:
+        """Thin what waits for `flush` to `most` points of each curve outside of hammer pulses."""
+        for name, curves in self._curves.items():
+            if name in self._last_s:
+                curves.fold(until_s=self._last_s[name] - self._held_s, windows=self._windows, most=most)
 
     def close(self) -> None:
         """Draw what is still held."""
@@ -204,6 +214,13 @@ class Painter:
             curves.flush(until_s=np.inf, windows=self._windows, rest=True)
             for part in self._parts[name]:
                 part.close()
+        self._flush_contact()
+
+    def _flush_contact(self) -> None:
+        self._truth.flush()
+        for parts in self._parts.values():
+            for part in parts:
+                part.flush()
 
     def _watch_hammer(self, group: Group, times_s: np.ndarray, values: np.ndarray) -> None:
         channel = group.channels[0]
@@ -229,6 +246,9 @@ class _Part:
     def draw(self, time_s: float) -> None:
         """Draw the latest instant."""
 
+    def flush(self) -> None:
+        """Draw what was collected."""
+
     def interrupt(self) -> None:
         """Rows are missing before the next ones."""
 
@@ -240,7 +260,15 @@ class _Probes(_Part):
     """Orbits, spectrum, contact and the rotor's tilt."""
 
     def __init__(
-        self, canvas: Canvas, scene: Scene3D, group: Group, planes: list[_Plane], geometry: Geometry, *, whole: bool
+        self,
+        canvas: Canvas,
+        scene: Scene3D,
+        group: Group,
+        planes: list[_Plane],
+        geometry: Geometry,
+        *,
+        whole: bool,
+        frame_s: float,
     ) -> None:
         self._scene = scene
         self._planes = {plane.name: plane for plane in planes}
@@ -252,8 +280,7 @@ class _Probes(_Part):
         }
         # The ring's plane shows most; a rig with probes at the disk only shows the same whirl there.
         self._main = planes[0]
-        self._spectrum = SpectrumPlot(canvas, rate_hz=group.rate_hz, interval_s=FRAME_S * SPECTRUM_EVERY, whole=whole)
-        self._frames = 0
+        self._spectrum = SpectrumPlot(canvas, rate_hz=group.rate_hz, interval_s=frame_s * SPECTRUM_EVERY, whole=whole)
         self._contact = None
         if "ring" in self._planes:
             clearance = geometry.clearance_mm("ring")
@@ -282,9 +309,11 @@ class _Probes(_Part):
         self._scene.draw_tilt(time_s, 1e-3 * self._z[plane] * self._geometry.disk_arm_m / arms[plane])
         if self._contact is not None:
             self._scene.draw_contact(time_s, 1e-3 * self._z["ring"], touching=self._contact.touching)
-        if self._frames % SPECTRUM_EVERY == 0:
-            self._spectrum.draw(time_s)
-        self._frames += 1
+        self._spectrum.draw(time_s)
+
+    def flush(self) -> None:
+        if self._contact is not None:
+            self._contact.flush()
 
     def interrupt(self) -> None:
         for plot in self._orbits.values():
@@ -329,10 +358,12 @@ class _Spin(_Part):
         self._scene.draw_spin(time_s, self._turned_rad)
 
 
-def _parts_of(group: Group, canvas: Canvas, scene: Scene3D, geometry: Geometry, *, whole: bool) -> list[_Part]:
+def _parts_of(
+    group: Group, canvas: Canvas, scene: Scene3D, geometry: Geometry, *, whole: bool, frame_s: float
+) -> list[_Part]:
     parts: list[_Part] = []
     if planes := planes_of(group):
-        parts.append(_Probes(canvas, scene, group, planes, geometry, whole=whole))
+        parts.append(_Probes(canvas, scene, group, planes, geometry, whole=whole, frame_s=frame_s))
     if set(group.names) >= REACTIONS:
         parts.append(_Reaction(scene, reaction_of(group)))
     if "speed" in group.names:

@@ -77,11 +77,10 @@ class Scene3D:
             ),
         )  # fmt: skip
         places = {
-            "pivot": (0.0, -0.045, 0.0),
-            "ring in its houses": (0.0, -outer - 0.02, g.ring_arm_m),
-            "disk": (0.0, _DISK_RADIUS_M + 0.045, g.disk_arm_m),
-            "magnets": (0.0, -0.075, g.magnet_arm_m),
-            f"displacement x {EXAGGERATION:g}": (0.0, outer + 0.05, 0.06),
+            "pivot": (0.0, 0.06, 0.0),
+            "ring in its houses": (0.0, -outer - 0.035, g.ring_arm_m),
+            "disk": (0.0, _DISK_RADIUS_M + 0.03, g.disk_arm_m),
+            "magnets": (0.0, -0.085, g.magnet_arm_m),
         }
         self._canvas.fix(
             f"{ROOT}/stator/names",
@@ -89,7 +88,7 @@ class Scene3D:
                 list(places.values()), radii=[0.0], colors=[(190, 195, 205)], labels=list(places), show_labels=True,
             ),
         )  # fmt: skip
-        origin, length = np.array([-0.03, -0.15, 0.0]), 0.05
+        origin, length = np.array([0.0, -0.13, -0.05]), 0.05
         vectors = np.array([[length, 0.0, 0.0], [0.0, length, 0.0]])
         colors = [(86, 180, 233), (240, 190, 70)]
         self._canvas.fix(
@@ -99,7 +98,7 @@ class Scene3D:
         self._canvas.fix(
             f"{ROOT}/stator/direction_names",
             rr.Points3D(
-                origin + 1.25 * vectors, radii=[0.0], colors=colors, labels=["EAST +x", "UP +y"], show_labels=True
+                origin + 1.5 * vectors, radii=[0.0], colors=colors, labels=["EAST +x", "UP +y"], show_labels=True
             ),
         )
 

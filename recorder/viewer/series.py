@@ -31,6 +31,8 @@ _SHADES = {"outer": 0.6}
 """Curves of the outer house stand in the plot of the inner one."""
 
 Span = tuple[float, float]
+Points = tuple[np.ndarray, np.ndarray]
+"""Times [s] and values, shapes (n,) and (n, curves)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,43 +106,77 @@ class Envelope:
 
     def __init__(self, *, bucket: int) -> None:
         self._bucket = max(1, bucket)
+        self._coarse = 1
         self._times: list[np.ndarray] = []
         self._values: list[np.ndarray] = []
+        self._points: list[Points] = []
 
     def add(self, times_s: np.ndarray, values: np.ndarray) -> None:
         """Take rows, shapes (n,) and (n, curves)."""
         self._times.append(times_s)
         self._values.append(values)
 
-    def take(self, *, until_s: float, windows: list[Span], rest: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Give the points of the buckets that end before `until_s`; with `rest`, also of the unfinished one."""
-        if not self._times:
-            return np.empty(0), np.empty((0, 0))
-        times_s, values = np.concatenate(self._times), np.concatenate(self._values)
-        whole = int(np.searchsorted(times_s, until_s)) // self._bucket
-        rows = whole * self._bucket
-        points = [(times_s[:0], values[:0])]
-        if whole:
-            bucket_times = times_s[:rows].reshape(whole, self._bucket)
-            bucket_values = values[:rows].reshape(whole, self._bucket, -1)
-            full = np.zeros(whole, dtype=bool)
-            for start, end in windows:
-                full |= (bucket_times[:, -1] >= start) & (bucket_times[:, 0] <= end)
-            for part in np.split(np.arange(whole), np.flatnonzero(np.diff(full)) + 1):
-                reduce = _flat if full[part[0]] or self._bucket <= 2 else _extremes
-                points.append(reduce(bucket_times[part], bucket_values[part]))
-        if rest and rows < len(times_s):
-            points.append(_extremes(times_s[None, rows:], values[None, rows:]))
-            rows = len(times_s)
-        self._times, self._values = [times_s[rows:]], [values[rows:]]
-        return np.concatenate([at for at, _ in points]), np.concatenate([value for _, value in points])
+    def fold(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> None:
+        """Turn rows into points, so that what waits to be given is bounded.
+
+        Args:
+            until_s: Of the buckets that end before this time [s].
+            windows: Where every row is kept.
+            rest: Those of the unfinished bucket, too.
+            most: So many points wait outside of the windows; where they would be more, the buckets become larger.
+        """
+        if self._times:
+            times_s, values = np.concatenate(self._times), np.concatenate(self._values)
+            bucket = self._bucket * self._coarse
+            rows = int(np.searchsorted(times_s, until_s)) // bucket * bucket
+            self._points.append(_reduced(times_s[:rows], values[:rows], bucket, windows))
+            if rest and rows < len(times_s):
+                self._points.append(_extremes(times_s[None, rows:], values[None, rows:]))
+                rows = len(times_s)
+            self._times, self._values = [times_s[rows:]], [values[rows:]]
+        while most is not None and sum(_outside(at, windows) for at, _ in self._points) > most:
+            self._points = [_reduced(*_joined(self._points), 4, windows)]
+            self._coarse *= 2
+
+    def take(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> Points:
+        """Give the points of the buckets that end before `until_s`; as `fold`, whose points are given first."""
+        self.fold(until_s=until_s, windows=windows, rest=rest, most=most)
+        points, self._points, self._coarse = self._points, [], 1
+        return _joined(points) if points else (np.empty(0), np.empty((0, 0)))
 
 
-def _flat(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _joined(points: list[Points]) -> Points:
+    return np.concatenate([at for at, _ in points]), np.concatenate([values for _, values in points])
+
+
+def _outside(times_s: np.ndarray, windows: list[Span]) -> int:
+    """How many of the times are in no window."""
+    return len(times_s) - int(np.any([(times_s >= start) & (times_s <= end) for start, end in windows], axis=0).sum())
+
+
+def _reduced(times_s: np.ndarray, values: np.ndarray, bucket: int, windows: list[Span]) -> Points:
+    """The extremes of each bucket, every row of the buckets that touch a window, and what is left of the last one."""
+    whole = len(times_s) // bucket
+    rows = whole * bucket
+    points = [(times_s[rows:], values[rows:])]
+    if whole:
+        bucket_times = times_s[:rows].reshape(whole, bucket)
+        bucket_values = values[:rows].reshape(whole, bucket, -1)
+        full = np.zeros(whole, dtype=bool)
+        for start, end in windows:
+            full |= (bucket_times[:, -1] >= start) & (bucket_times[:, 0] <= end)
+        parts = np.split(np.arange(whole), np.flatnonzero(np.diff(full)) + 1)
+        reduces = [_flat if full[part[0]] or bucket <= 2 else _extremes for part in parts]
+        points = [reduce(bucket_times[part], bucket_values[part]) for part, reduce in zip(parts, reduces, strict=True)]
+        points.append((times_s[rows:], values[rows:]))
+    return _joined(points)
+
+
+def _flat(times: np.ndarray, values: np.ndarray) -> Points:
     return times.reshape(-1), values.reshape(times.size, -1)
 
 
-def _extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _extremes(times: np.ndarray, values: np.ndarray) -> Points:
     low, high = values.min(axis=1), values.max(axis=1)
     low_first = values.argmin(axis=1) <= values.argmax(axis=1)
     first, second = np.where(low_first, low, high), np.where(low_first, high, low)
@@ -174,13 +210,18 @@ class SeriesPlot:
         for series, envelope in zip(self._series, self._envelopes, strict=True):
             envelope.add(times_s, series.select(values))
 
-    def flush(self, *, until_s: float, windows: list[Span], rest: bool = False) -> None:
-        """Draw what is complete before `until_s`."""
+    def flush(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> None:
+        """Draw what is complete before `until_s`: `most` points of each curve, and what is in the windows."""
         for series, envelope in zip(self._series, self._envelopes, strict=True):
-            times, values = envelope.take(until_s=until_s, windows=windows, rest=rest)
+            times, values = envelope.take(until_s=until_s, windows=windows, rest=rest, most=most)
             if len(times):
                 self._canvas.plot(series.path, times, rr.Scalars.columns(scalars=values))
                 self.points += values.size
+
+    def fold(self, *, until_s: float, windows: list[Span], most: int) -> None:
+        """Thin what is complete before `until_s` and waits to be drawn."""
+        for envelope in self._envelopes:
+            envelope.fold(until_s=until_s, windows=windows, most=most)
 
     def lift(self, *, at_s: float, windows: list[Span]) -> None:
         """Draw what is held, then interrupt the curves at `at_s`: rows are missing from here on."""

@@ -52,6 +52,8 @@ class SpectrumPlot:
     def __init__(self, canvas: Canvas, *, rate_hz: int, interval_s: float, whole: bool) -> None:
         self._canvas = canvas
         self._rate_hz = rate_hz
+        self._interval_s = interval_s
+        self._drawn_s = -math.inf
         self._history = History(capacity=math.ceil(WINDOW_S * rate_hz), dtype=complex)
         self._waterfall = Waterfall(canvas, whole=whole, interval_s=interval_s)
         for path, start, color in ((BACKWARD, -LIMIT_HZ, BACKWARD_RGB), (FORWARD, 1, FORWARD_RGB)):
@@ -72,12 +74,17 @@ class SpectrumPlot:
     def interrupt(self) -> None:
         """Rows are missing: a spectrum across the gap would show what never was."""
         self._history.clear()
+        self._drawn_s = -math.inf
 
     def draw(self, time_s: float) -> None:
-        """Draw the spectrum of the half second that ends at `time_s`; nothing before there is that much."""
+        """Draw the spectrum of the half second that ends at `time_s`.
+
+        Nothing before there is that much, nor as long as the last one is younger than the interval.
+        """
         z = self._history.last(math.ceil(WINDOW_S * self._rate_hz))
-        if len(z) < math.ceil(WINDOW_S * self._rate_hz):
+        if len(z) < math.ceil(WINDOW_S * self._rate_hz) or time_s - self._drawn_s < 0.9 * self._interval_s:
             return
+        self._drawn_s = time_s
         _, amplitude = shown_spectrum(z, self._rate_hz)
         bars = amplitude.astype(np.float32)
         self._canvas.draw(BACKWARD, time_s, rr.BarChart(bars[:LIMIT_HZ]))
@@ -109,9 +116,9 @@ class Waterfall:
         ticks = [[(self.x_of(hz), HEIGHT), (self.x_of(hz), HEIGHT + (5 if hz == 0 else 3))] for hz in marks]
         faint = pixels(0.6)
         self._canvas.fix(f"{WATERFALL}/ticks", rr.LineStrips2D(ticks, colors=[_MARKS_RGB], radii=faint, draw_order=2.0))
-        named = {(self.x_of(hz), HEIGHT + 10.0): f"{hz:+d} Hz" if hz else "0" for hz in marks if hz % 100 == 0}
+        named = {(self.x_of(hz), HEIGHT + 7.0): f"{hz:+d} Hz" if hz else "0" for hz in marks if hz % 100 == 0}
         self._canvas.write(f"{WATERFALL}/frequencies", named, [_MARKS_RGB])
-        senses = {(self.x_of(-150), -8.0): "BACKWARD", (self.x_of(150), -8.0): "FORWARD"}
+        senses = {(self.x_of(-150), -14.0): "BACKWARD", (self.x_of(150), -14.0): "FORWARD"}
         self._canvas.write(f"{WATERFALL}/senses", senses, [BACKWARD_RGB, FORWARD_RGB])
 
     def x_of(self, frequency_hz: float) -> float:
@@ -123,8 +130,11 @@ class Waterfall:
         around = np.pad(amplitude_mm, 1)
         widest = np.maximum(np.maximum(around[:-2], around[2:]), amplitude_mm)[::COLUMN_HZ]
         decibel = 20.0 * np.log10(np.maximum(widest * 1e3, 1e-6))
-        self._rows.append(np.clip(decibel, FLOOR_DB, CEILING_DB).round().astype(np.uint8))
-        self._times.append(time_s)
+        # Live, spectra that were left out are filled with the next one, so that the image keeps its scale of time.
+        passed = (time_s - self._times[-1]) / self._interval_s if self._times and not self._whole else 1.0
+        rows = min(max(1, round(passed)), HEIGHT)
+        self._rows.extend([np.clip(decibel, FLOOR_DB, CEILING_DB).round().astype(np.uint8)] * rows)
+        self._times.extend([time_s] * rows)
         if self._whole:
             return
         self._draw_image(time_s, self.image())
@@ -169,4 +179,4 @@ class Waterfall:
             self._draw_times("now", f"-{HEIGHT * self._interval_s:.0f} s")
 
     def _draw_times(self, newest: str, oldest: str) -> None:
-        self._canvas.write(f"{WATERFALL}/times", {(-9.0, 0.5): newest, (-9.0, HEIGHT - 0.5): oldest}, [_MARKS_RGB])
+        self._canvas.write(f"{WATERFALL}/times", {(-17.0, 2.0): newest, (-17.0, HEIGHT - 10.0): oldest}, [_MARKS_RGB])

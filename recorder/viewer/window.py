@@ -13,25 +13,34 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Self, TypeVar
 
 from rerun.experimental import ViewerClient, ViewerState
 
-from recorder.viewer.canvas import SIMULATED
+from recorder.viewer.canvas import PICTURE, SIMULATED
+from recorder.viewer.page import Page
 from rig.errors import InputError
 
 Kind = Literal["native", "web", "headless"]
+_Answer = TypeVar("_Answer")
+_NO_ANSWER = (ConnectionError, TimeoutError, RuntimeError)
+"""What rerun raises of a viewer that is not there, is not there yet, or has too much to do."""
 
 _HOST = "127.0.0.1"
 _PORT, _WEB_PORT = 9876, 9090
-_PAGE = "&notebook=1&theme=dark"
+_PAGE = "notebook=1&theme=dark"
 """As in a notebook: the page then sends no usage reports and looks for no updates, which no environment can tell it."""
-_READY_S = 30.0
-_LOADED_S = 60.0
-_SETTLED_S = 1.5
+_ASKED_S = 0.2
+_READY_S = 60.0
+_LOADED_S = 240.0
+"""On a busy machine without a graphics card one answer may take the 15 s that rerun itself waits for a picture."""
+_TOLD_S = 15.0
+_SETTLED_S = 0.5
+_PICTURES = 8
 _ENDED_S = 5.0
 
 
@@ -67,24 +76,43 @@ class Window:
     Attributes:
         url: Where a recording stream connects to.
         address: What to open in a browser; empty if it is not that kind.
+        page: What browsers are served; None if it is not that kind.
     """
 
-    def __init__(self, kind: Kind, *, size: tuple[int, int] = (1920, 1080), memory: str = "2GiB") -> None:
+    def __init__(
+        self,
+        kind: Kind,
+        *,
+        size: tuple[int, int] = (1920, 1080),
+        live: bool = False,
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> None:
         """Start it and wait until it listens.
+
+        Args:
+            kind: What it is.
+            size: Of the picture [pixels].
+            live: For a stream without end: little is kept.
+            tell: Is told in words if something takes long.
 
         Raises:
             WindowError: It ended at once, or does not listen in time.
         """
-        port = free_port(_PORT)
+        memory = "512MiB" if live else "2GiB"
+        # A browser that comes later takes in all that the server kept before anything new.
+        history = "1MiB" if live else memory
+        self._tell = tell
+        self._taken: int | None = None
+        self.page: Page | None = None
+        port, web_port, own_port = free_port(_PORT), free_port(_WEB_PORT), free_port(0)
         ports = [port]
         command = [sys.executable, "-m", "rerun_cli", "--bind", _HOST, "--port", str(port), "--memory-limit", memory]
         self.url = f"rerun+http://{_HOST}:{port}/proxy"
         self.address = ""
         if kind == "web":
-            web_port = free_port(_WEB_PORT)
-            ports.append(web_port)
-            command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", memory]
-            self.address = f"http://{_HOST}:{web_port}/?url=rerun%2Bhttp%3A%2F%2F{_HOST}%3A{port}%2Fproxy{_PAGE}"
+            ports.append(own_port)
+            command += ["--serve-web", "--web-viewer-port", str(own_port), "--server-memory-limit", history]
+            self.address = f"http://{_HOST}:{web_port}/"
         elif kind == "headless":
             command += ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
         else:
@@ -103,9 +131,14 @@ class Window:
                 self._wait_for(each)
             # A viewer listens before it looks for a screen, and without one for a graphics driver at its first picture.
             if kind == "native":
-                self._ask(lambda viewer: bool(viewer.get_state().viewer_version))
+                self._ask(lambda viewer: viewer.get_state().viewer_version)
+                threading.Thread(target=self._watch, name="viewer watch", daemon=True).start()
             elif kind == "headless":
-                self._ask(lambda viewer: bool(viewer.take_screenshot(max_size=64)))
+                self._ask(lambda viewer: viewer.take_screenshot(max_size=64))
+            else:
+                asked = f"url=rerun%2Bhttp%3A%2F%2F{_HOST}%3A{port}%2Fproxy&{_PAGE}"
+                viewer = f"http://{_HOST}:{own_port}"
+                self.page = Page(_HOST, web_port, viewer=viewer, query=asked, timeline=PICTURE, rests=live)
         except BaseException:
             self.close()
             raise
@@ -131,6 +164,18 @@ class Window:
             self._process.wait(timeout_s)
         return not self.open
 
+    def taken(self) -> int | None:
+        """Number of the latest picture that the viewer, or the slowest browser, has taken in; None if nobody looks."""
+        return self._taken if self.page is None else self.page.taken()
+
+    def _watch(self) -> None:
+        """Ask a viewer on the screen again and again how far it is: it answers with its next frame."""
+        viewer = ViewerClient.connect(self.url)
+        while self.open:
+            with contextlib.suppress(*_NO_ANSWER):
+                self._taken = _end_of(PICTURE, viewer.get_state())
+            time.sleep(_ASKED_S)
+
     def picture(self, path: Path, *, at_s: float, end_s: float) -> None:
         """Save what it shows at an instant.
 
@@ -142,20 +187,28 @@ class Window:
         Raises:
             WindowError: It does not show the recording in time.
         """
-        viewer = self._ask(lambda viewer: _reaches(viewer.get_state(), end_s))
-        viewer.set_time(SIMULATED, duration=at_s, play_state="paused")
-        # Nothing tells that the last of it is on the screen; a software renderer takes about a quarter of a second.
-        time.sleep(_SETTLED_S)
-        viewer.save_screenshot(str(path.resolve()))
+        self._ask(lambda viewer: _end_of(SIMULATED, viewer.get_state()) >= round(end_s * 1e9) - 1000)
+        self._ask(lambda viewer: viewer.set_time(SIMULATED, duration=at_s, play_state="paused") or True)
+        # Nothing tells that the last of it is on the screen: it is when two pictures are equal.
+        picture = b""
+        for _ in range(_PICTURES):
+            time.sleep(_SETTLED_S)
+            before, picture = picture, self._ask(lambda viewer: viewer.take_screenshot())
+            if picture == before:
+                break
+        path.write_bytes(picture)
 
-    def _ask(self, satisfied: Callable[[ViewerClient], bool]) -> ViewerClient:
-        """Wait until the viewer answers as wanted."""
+    def _ask(self, asked: Callable[[ViewerClient], _Answer]) -> _Answer:
+        """Ask the viewer until it gives an answer that is one."""
         for _ in self._while_it_runs(_LOADED_S, 0.1):
-            with contextlib.suppress(ConnectionError, RuntimeError):
-                viewer = ViewerClient.connect(self.url)
-                if satisfied(viewer):
-                    return viewer
-        raise WindowError(f"the viewer does not answer, or did not load the recording: {self.last_words()}")
+            with contextlib.suppress(*_NO_ANSWER):
+                answer = asked(ViewerClient.connect(self.url))
+                if answer:
+                    return answer
+        raise WindowError(
+            f"the viewer did not load the recording and answer within {_LOADED_S:g} s (a busy machine?): "
+            f"{self.last_words()}"
+        )
 
     def last_words(self) -> str:
         """The end of what it printed."""
@@ -167,6 +220,8 @@ class Window:
 
     def close(self) -> None:
         """End it and all that it started."""
+        if self.page is not None:
+            self.page.close()
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGTERM)
         self.wait(_ENDED_S)
@@ -189,31 +244,31 @@ class Window:
 
     def _while_it_runs(self, timeout_s: float, pause_s: float) -> Iterator[None]:
         """Again and again for a time, with a pause after each turn."""
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
+        begin_s = told_s = time.monotonic()
+        while (now_s := time.monotonic()) - begin_s < timeout_s:
             if not self.open:
                 raise WindowError(f"the viewer could not start: {self.last_words()}")
+            if now_s - told_s > _TOLD_S:
+                told_s = now_s
+                self._tell(f"waiting for the viewer since {now_s - begin_s:.0f} s, at most {timeout_s:.0f} s")
             yield
             time.sleep(pause_s)
 
 
-def _reaches(state: ViewerState, end_s: float) -> bool:
-    """Whether a viewer has a recording up to an instant on its simulated time line."""
-    for recording in state.recordings:
-        for timeline in recording.timelines:
-            if timeline.name == SIMULATED and timeline.end is not None and timeline.end >= round(end_s * 1e9) - 1000:
-                return True
-    return False
+def _end_of(timeline: str, state: ViewerState) -> int:
+    """The end of a time line in a viewer; 0 where nothing is there yet."""
+    lines = (line for recording in state.recordings for line in recording.timelines if line.name == timeline)
+    return max((line.end or 0 for line in lines), default=0)
 
 
-def picture_of(path: Path) -> Window:
-    """A viewer for a picture.
+def picture_of(path: Path, *, tell: Callable[[str], None]) -> Window:
+    """A viewer for a picture; `tell` is told in words if something takes long.
 
     Raises:
         InputError: This machine cannot draw.
     """
     try:
-        return Window("headless")
+        return Window("headless", tell=tell)
     except WindowError as error:
         must = "used where a Vulkan driver is installed (Debian: libvulkan1 mesa-vulkan-drivers)"
         raise InputError("--screenshot", must, f"{path}; {error}") from None

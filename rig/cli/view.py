@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +14,7 @@ import typer
 
 from rig.cli.connection import Connection
 from rig.cli.options import Force, OptionalRecordingFiles
-from rig.cli.tables import echo
+from rig.cli.tables import echo, progress_bar
 from rig.errors import DiskError, InputError, RefusedError, check_new_file, whole_file
 
 if TYPE_CHECKING:
@@ -80,7 +82,7 @@ def _check(
 
 def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: Path | None, at_s: float | None) -> None:
     from recorder.reader import join
-    from recorder.viewer import blueprint, window
+    from recorder.viewer import blueprint
     from recorder.viewer.canvas import Canvas, new_stream
     from recorder.viewer.file import paint
     from recorder.viewer.geometry import Geometry
@@ -90,7 +92,7 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
     name = recording.path.name + (f" and {len(files) - 1} more" if len(files) > 1 else "")
     for text in not_drawn(recording.table):
         echo(f"not shown: {text}", err=True)
-    stream = new_stream(name)
+    stream = new_stream(name, batch_s=2.0)
     plan = blueprint.layout(recording.table, Geometry.from_parameters(recording.parameters), live=False)
     if save is not None:
         with _saved(stream, save, plan):
@@ -98,8 +100,8 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
         size = save.stat().st_size / 1e6
         echo(f"{save}: {size:.1f} MB, {painted.points} points of curves, {painted.end_s:.3f} s")
         return
-    with window.picture_of(screenshot) if screenshot is not None else window.Window(_kind(web=web)) as shown:
-        stream.connect_grpc(shown.url, default_blueprint=plan)
+    with _window_of_file(screenshot, web=web) as shown:
+        _connect(stream, shown, plan)
         try:
             painted = paint(recording, Canvas(stream))
         finally:
@@ -131,12 +133,14 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
             if view.failed:
                 raise typer.Exit(1)
             return
-        with window.Window(_kind(web=web), memory="512MiB") as shown:
-            stream.connect_grpc(shown.url, default_blueprint=plan)
+        with window.Window(_kind(web=web), live=True) as shown:
+            _connect(stream, shown, plan)
             _tell(shown, f"the rig at {connection.connect}")
             try:
-                view = live.LiveView(client, Canvas(stream), described)
-                echo(view.run(stop=lambda: not shown.open))
+                view = live.LiveView(client, Canvas(stream), described, taken=shown.taken)
+                with _telling(shown) as tell:
+                    reason = view.run(stop=lambda: not shown.open, tell=tell)
+                echo(reason)
             finally:
                 _close(stream)
             if shown.open:
@@ -148,6 +152,34 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
                     raise typer.Exit(1)
 
 
+@contextmanager
+def _telling(shown: Window) -> Iterator[Callable[[str], None]]:
+    """Say how it goes: as the title of a browser's page, and on stderr in a live line, or a line every 5 s."""
+    printed_s = -math.inf
+    live = sys.stderr.isatty()
+    with progress_bar(auto_refresh=False, transient=True, disable=not live) as bar:
+        task = bar.add_task("", total=None)
+
+        def tell(text: str) -> None:
+            nonlocal printed_s
+            if shown.page is not None:
+                shown.page.title = f"rig: {text}"
+            bar.update(task, description=text, refresh=live)
+            if not live and time.monotonic() - printed_s >= 5.0:
+                printed_s = time.monotonic()
+                echo(text, err=True)
+
+        yield tell
+
+
+def _window_of_file(screenshot: Path | None, *, web: bool) -> Window:
+    from recorder.viewer import window
+
+    if screenshot is None:
+        return window.Window(_kind(web=web))
+    return window.picture_of(screenshot, tell=lambda text: echo(text, err=True))
+
+
 def _kind(*, web: bool) -> Kind:
     from recorder.viewer.window import screen_is_there
 
@@ -155,7 +187,10 @@ def _kind(*, web: bool) -> Kind:
 
 
 def _tell(shown: Window, what: str) -> None:
-    echo(f"viewing {what} at {shown.address}" if shown.address else f"viewing {what}")
+    # The address comes first, so that no terminal breaks it.
+    echo(f"{shown.address} shows {what}" if shown.address else f"viewing {what}")
+    if shown.page is not None:
+        shown.page.title = f"rig: {what}"
     echo("Ctrl-C ends the viewer")
     sys.stdout.flush()  # the address is wanted now, also in a pipe
 
@@ -174,6 +209,12 @@ def _hush() -> None:
     import os
 
     os.environ.setdefault("RUST_LOG", "off")
+
+
+def _connect(stream: rr.RecordingStream, shown: Window, plan: rrb.Blueprint) -> None:
+    """Draw to a viewer, in our layout: as a default only, it would give way to the one that was shown last."""
+    stream.connect_grpc(shown.url)
+    stream.send_blueprint(plan)
 
 
 def _close(stream: rr.RecordingStream, *, timeout_s: float = 5.0) -> None:

@@ -13,9 +13,11 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from recorder.viewer import window
 from recorder.viewer.window import Window, WindowError, environment, free_port
 from tests.processes import ROOT, free_endpoint, python
 from tests.unit.viewer_recording import Saved, Synthetic, documents_of, stream_of
@@ -153,11 +155,15 @@ def test_the_web_viewer_is_on_loopback_only_and_goes_with_the_command(recorded: 
 
     with started([*VIEW, str(recorded)]) as viewer:
         assert viewer.stdout is not None
-        address = re.search(r"http://127\.0\.0\.1:\d+/\S+", viewer.stdout.readline())
+        address = re.search(r"http://127\.0\.0\.1:\d+/\S*", viewer.stdout.readline())
         assert address is not None
-        assert "notebook=1" in address[0]
+        assert len(address[0]) <= 30
         with urllib.request.urlopen(address[0], timeout=10) as page:
             assert page.status == 200
+            assert "notebook=1" in page.url
+            assert b"viewer_state()" in page.read()
+        with urllib.request.urlopen(f"{address[0]}re_viewer.js", timeout=10) as code:
+            assert b"viewer_state()" in code.read()  # what the page's script asks, in the version that is installed
         children = psutil.Process(viewer.pid).children(recursive=True)
         listening = [
             connection.laddr
@@ -197,6 +203,48 @@ def test_a_viewer_that_cannot_start_says_why(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(WindowError, match="could not start"):
         Window("native")
+
+
+class BusyViewer:
+    """Answers every second question; the others are not answered in rerun's own time."""
+
+    asked = 0
+    picture = b"a picture"
+
+    @classmethod
+    def connect(cls, url: str) -> BusyViewer:
+        return cls()
+
+    def _answer(self) -> None:
+        BusyViewer.asked += 1
+        if BusyViewer.asked % 2:
+            raise TimeoutError("Deadline expired before operation could complete")
+
+    def get_state(self) -> SimpleNamespace:
+        self._answer()
+        line = SimpleNamespace(name="simulated_time", end=2_000_000_000)
+        return SimpleNamespace(recordings=[SimpleNamespace(timelines=[line])])
+
+    def set_time(self, *_: object, **__: object) -> None:
+        self._answer()
+
+    def take_screenshot(self) -> bytes:
+        self._answer()
+        return self.picture
+
+
+def test_a_busy_viewer_is_asked_again_and_given_up_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(window, "ViewerClient", BusyViewer)
+    said: list[str] = []
+    monkeypatch.setattr(window, "_TOLD_S", 0.0)
+    with Window("web", tell=said.append) as shown:
+        shown.picture(tmp_path / "busy.png", at_s=1.0, end_s=2.0)
+        assert (tmp_path / "busy.png").read_bytes() == BusyViewer.picture
+        assert said[-1].startswith("waiting for the viewer since ")
+        monkeypatch.setattr(window, "_LOADED_S", 0.3)
+        with pytest.raises(WindowError, match="did not load the recording and answer within"):
+            shown.picture(tmp_path / "never.png", at_s=1.0, end_s=3.0)
+    assert not (tmp_path / "never.png").exists()
 
 
 def test_a_taken_port_is_avoided() -> None:

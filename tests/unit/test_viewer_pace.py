@@ -1,0 +1,88 @@
+"""How often a live view draws, against viewers that are a few lines and a clock that is a number."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import pytest
+
+from recorder.viewer.pace import DEAF_S, FASTEST_S, Pace
+
+TICK_S = 0.04
+
+
+class Viewer:
+    """Takes in one picture after the other, each for so long; draws and takes simulated time for wall time."""
+
+    def __init__(self, cost_s: float) -> None:
+        self.cost_s = cost_s
+        self.pace = Pace()
+        self.waiting: deque[tuple[int, float]] = deque()
+        self.busy_until_s = 0.0
+        self.taken = 0
+        self.drawn: list[float] = []
+        self.behind_s: list[float] = []
+        self.now_s = 0.0
+
+    def run(self, seconds: float) -> None:
+        end_s = self.now_s + seconds
+        while self.now_s < end_s:
+            self.now_s += TICK_S
+            while self.waiting:
+                done_s = max(self.busy_until_s, self.waiting[0][1]) + self.cost_s
+                if done_s > self.now_s:
+                    break
+                self.busy_until_s = done_s
+                self.taken, _ = self.waiting.popleft()
+            self.pace.taken_in(self.taken, now_s=self.now_s)
+            if self.pace.due(self.now_s):
+                self.drawn.append(self.now_s)
+                self.pace.drew(len(self.drawn), now_s=self.now_s)
+                self.waiting.append((len(self.drawn), self.now_s))
+            if (behind_s := self.pace.behind_s(self.now_s)) is not None:
+                self.behind_s.append(behind_s)
+
+
+@pytest.mark.parametrize("cost_s", [0.01, 0.1, 0.5, 1.5, 4.0])
+def test_a_viewer_of_any_speed_is_held(cost_s: float) -> None:
+    viewer = Viewer(cost_s)
+    viewer.run(300.0)
+    assert max(viewer.behind_s) < 2.0 + 2.5 * cost_s
+    # And it is not left idle: it gets a good part of what it could take.
+    could = min(1.0 / FASTEST_S, 1.0 / cost_s)
+    assert 0.6 * could < len(viewer.drawn) / 300.0 < 1.1 * could
+
+
+def test_a_viewer_that_becomes_slow_and_fast_again() -> None:
+    viewer = Viewer(0.01)
+    viewer.run(20.0)
+    assert viewer.pace.every_s == pytest.approx(FASTEST_S)
+    viewer.cost_s = 1.0
+    viewer.run(60.0)
+    assert len(viewer.waiting) <= 2
+    viewer.cost_s = 0.01
+    viewer.run(30.0)
+    assert viewer.pace.every_s == pytest.approx(FASTEST_S)
+    assert viewer.behind_s[-1] < 0.2
+
+
+def test_a_viewer_that_takes_nothing_gets_a_picture_now_and_then() -> None:
+    viewer = Viewer(math.inf)
+    viewer.run(100.0)
+    late = [time for time in viewer.drawn if time > 2.0]
+    assert len(late) == pytest.approx(100.0 / DEAF_S, abs=1)
+    assert viewer.pace.behind_s(viewer.now_s) is None
+
+
+def test_nobody_looks() -> None:
+    pace = Pace()
+    drawn = 0
+    for tick in range(1000):
+        now_s = tick * TICK_S
+        pace.taken_in(None, now_s=now_s)
+        if pace.due(now_s):
+            drawn += 1
+            pace.drew(drawn, now_s=now_s)
+    assert drawn == pytest.approx(1000 * TICK_S / DEAF_S, abs=1)
+    assert not pace.looked_at

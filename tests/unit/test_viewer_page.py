@@ -1,0 +1,125 @@
+"""The page of the web viewer: what it adds to rerun's own, and what it makes of what browsers say."""
+
+from __future__ import annotations
+
+import http.client
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
+
+import pytest
+
+from recorder.viewer import page
+from recorder.viewer.canvas import SIMULATED
+from recorder.viewer.window import free_port
+
+pytestmark = pytest.mark.wallclock
+
+# What a browser with rerun 0.41 said, as it came, its views cut off.
+STATE = (
+    b"\nHabout:recording?app_id=rig&recording_id=25718b766d4b4e7f9b698300588bf302\x12.Recording:rig:"
+    b"25718b766d4b4e7f9b698300588bf302\x1a\xe7\x01\n.Recording:rig:25718b766d4b4e7f9b698300588bf302"
+    b'\x12$\n\x10\n\x0esimulated_time\x10\x02\x1a\x06\x10\xb0\xab\xf9\x9d\x15"\x06\x08\xb0\xab\xf9\x9d\x15'
+    b"\x12%\n\x0b\n\twall_time\x10\x03\x1a\x14\x08\x80\xfc\xd9\x95\xfe\xcb\x9c\xf5\x18\x10\x80\x84\xa0\xb4\x93\xcc\x9c\xf5\x18"
+    b"\x1a\x1c\n\x10\n\x0esimulated_time\x10\x02\x1a\x06\x08\xb0\xab\xf9\x9d\x15"
+)
+
+
+class Rerun(BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        body = b'<html><link href="https://fonts.googleapis.com/x"><body>viewer</body></html>'
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[page.Page, str]]:
+    with HTTPServer(("127.0.0.1", 0), Rerun) as rerun:
+        Thread(target=rerun.serve_forever, args=(0.02,), daemon=True).start()
+        port = free_port(0)
+        viewer = f"http://127.0.0.1:{rerun.server_address[1]}"
+        shown = page.Page("127.0.0.1", port, viewer=viewer, query="url=x", timeline=SIMULATED)
+        yield shown, f"http://127.0.0.1:{port}"
+        shown.close()
+        rerun.shutdown()
+
+
+def post(address: str, body: bytes) -> str:
+    with urllib.request.urlopen(address, data=body, timeout=10) as reply:
+        return reply.read().decode()
+
+
+def test_the_page_is_the_viewers_own_with_a_script_and_asks_no_other_site(served: tuple[page.Page, str]) -> None:
+    with urllib.request.urlopen(served[1], timeout=10) as reply:
+        body = reply.read()
+        assert reply.url.endswith("/?url=x")
+    assert b"viewer_state()" in body
+    assert b"viewer" in body
+    assert b"googleapis" not in body
+
+
+def test_the_slowest_browser_counts(served: tuple[page.Page, str]) -> None:
+    shown, address = served
+    assert shown.taken() is None
+    shown.title = "rig: 0.1 s behind"
+    assert post(f"{address}/state?a", STATE) == "rig: 0.1 s behind"
+    assert shown.taken() == 5_699_950_000
+    post(f"{address}/state?b", b"")  # one that is still loading
+    assert shown.taken() == 0
+    post(f"{address}/closed?b", b"")
+    assert shown.taken() == 5_699_950_000
+
+
+def test_pages_of_other_sites_are_not_heard(served: tuple[page.Page, str]) -> None:
+    request = urllib.request.Request(f"{served[1]}/state?a", data=STATE, headers={"Origin": "http://example.com"})
+    with pytest.raises(urllib.error.HTTPError, match="400"):
+        urllib.request.urlopen(request, timeout=10)
+    assert served[0].taken() is None
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "size", "status"),
+    [
+        ("POST", "/state?A", "0", 400),
+        ("POST", "/state?" + "a" * 17, "0", 400),
+        ("POST", "/other?a", "0", 400),
+        ("POST", "/state?a", "many", 400),
+        ("POST", "/state?a", str((1 << 20) + 1), 413),
+        ("GET", "/../secret", "0", 404),
+        ("GET", "/%2e%2e/x", "0", 404),
+        ("PUT", "/state?a", "0", 501),
+    ],
+)
+def test_what_is_no_word_of_the_page_is_refused(
+    served: tuple[page.Page, str], method: str, path: str, size: str, status: int
+) -> None:
+    connection = http.client.HTTPConnection(served[1].removeprefix("http://"), timeout=10)
+    connection.request(method, path, headers={"Content-Length": size})
+    assert connection.getresponse().status == status
+    connection.close()
+    assert served[0].taken() is None
+
+
+def test_pages_are_not_without_number(served: tuple[page.Page, str]) -> None:
+    shown, address = served
+    for number in range(32):
+        post(f"{address}/state?{number}", STATE)
+    post(f"{address}/state?more", b"")
+    assert shown.taken() == 5_699_950_000
+
+
+@pytest.mark.parametrize("cut", range(0, len(STATE), 7))
+def test_a_state_that_breaks_off_is_none_or_the_same(cut: int) -> None:
+    assert page.end_of(SIMULATED, STATE[:cut]) in (0, 5_699_950_000)
+
+
+def test_a_line_with_a_start() -> None:
+    assert page.end_of("wall_time", STATE) > 1_700_000_000_000_000_000
+    assert page.end_of("other", STATE) == 0
