@@ -22,7 +22,7 @@ import numpy as np
 from drivers.link import LinkTimeoutError
 from drivers.samples import Pile, Samples, StreamEndedError, follow
 from drivers.sources import Source, open_source
-from rig.errors import InputError, UnknownNameError
+from rig.errors import InputError, UnknownNameError, Words
 from rig.wire import Continuity, Gap
 
 _GAPS = 1000
@@ -277,7 +277,7 @@ class Daq:
     def call(self, function: Callable[[Samples], object], *, rows: int | None = None) -> None:
         """Call a function with each block, on a thread of its own; one that is slow loses rows, which are counted."""
         if self._thread is not None:
-            raise InputError("call", "made once", "a second function")
+            raise InputError("call", "made once", Words("a second function"))
 
         def loop() -> None:
             while True:
@@ -303,7 +303,7 @@ class Daq:
             BaseException: What the function raised, which ended the calls.
         """
         if self._thread is None:
-            raise InputError("wait", "called after call", "no function")
+            raise InputError("wait", "called after call", Words("no function"))
         self._thread.join(timeout_s)
         if self._error is not None:
             raise self._error

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from rig.errors import PART_SUFFIX, InputError, check_new_file
+from rig.errors import PART_SUFFIX, InputError, Words, check_new_file
 
 
 def part_of(path: Path) -> Path:
@@ -32,7 +32,7 @@ def check_destination(path: Path, *, force: bool = False) -> None:
     """
     check_new_file(path, field="output", suffixes=(".mcap",), force=force)
     if (part := part_of(path)).exists() and not force:
-        raise InputError("output", "a new file (--force replaces one)", f"{part}, which exists")
+        raise InputError("output", "a new file (--force replaces one)", Words(f"{part}, which exists"))
 
 
 def files_like(path: Path, what: str) -> list[Path]:
@@ -60,7 +60,7 @@ def remove(files: Iterable[Path]) -> None:
         try:
             file.unlink(missing_ok=True)
         except OSError as error:
-            raise InputError("output", "files that can be replaced", f"{file} ({error.strerror})") from None
+            raise InputError("output", "files that can be replaced", Words(f"{file} ({error.strerror})")) from None
 
 
 class Draft:
@@ -94,7 +94,7 @@ class Draft:
             self.file = self.part.open("x+b")  # readable, to save it if somebody removes it
             fcntl.flock(self.file, fcntl.LOCK_EX)
         except OSError as error:
-            raise InputError("output", "a file that can be written", f"{self.part} ({error.strerror})") from None
+            raise InputError("output", "a file that can be written", Words(f"{self.part} ({error.strerror})")) from None
 
     def sync(self) -> int:
         """Bring what was written to the disk; gives the file's size [bytes].

@@ -13,7 +13,7 @@ from recorder.counts import NS
 from recorder.records import COPY
 from recorder.views import View
 from rig.channels import ChannelTable, Group
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.wire import EDGES, SENSORS, TRUTH, sensor_key, truth_key
 
 _MOST_COMMANDS = 10_000
@@ -82,7 +82,7 @@ class Head:
             if self.tick_rate_hz < 1:
                 raise ValueError(f"tick rate {self.tick_rate_hz}")
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError("catalogue", "a document with a channel table and a tick rate", str(error)) from None
+            raise InputError("catalogue", "a document with a channel table and a tick rate", Words(error)) from None
         self._truth: dict[str, Any] = catalogue.get("truth", {})
         self.streams = [*map(sensor_key, self.table.groups), *map(truth_key, self._truth)]
 

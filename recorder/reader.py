@@ -16,7 +16,7 @@ from recorder.recording_file import Message, RecordingFile
 from recorder.records import Chunk
 from recorder.samples import row_times_s, samples_of
 from recorder.survey import OnBlock, Stream, Survey
-from rig.errors import InputError, UnknownNameError
+from rig.errors import InputError, UnknownNameError, Words
 from rig.samples import Samples, joined
 from rig.wire import EDGES, EVENTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
 
@@ -310,7 +310,7 @@ def join(paths: list[Path]) -> Recording:
     surveys = sorted(map(Survey, parts), key=lambda survey: _extent_s(survey)[0])
     for earlier, later in pairwise(surveys):
         if _extent_s(later)[0] < _extent_s(earlier)[1]:
-            found = f"{earlier.file.path} and {later.file.path}, which overlap"
+            found = Words(f"{earlier.file.path} and {later.file.path}, which overlap")
             raise InputError("files", "recordings behind each other", found)
     return Recording(tuple(survey.file for survey in surveys), tuple(surveys))
 
@@ -318,7 +318,7 @@ def join(paths: list[Path]) -> Recording:
 def _check_one_run(parts: list[RecordingFile]) -> None:
     for part in parts[1:]:
         if _run_of(part) != _run_of(parts[0]):
-            raise InputError("files", "recordings of one run", f"{parts[0].path} and {part.path}")
+            raise InputError("files", "recordings of one run", Words(f"{parts[0].path} and {part.path}"))
 
 
 def _run_of(part: RecordingFile) -> tuple[Any, ...]:

@@ -15,7 +15,7 @@ from recorder import documents, schemas
 from recorder.payload import block_in
 from recorder.records import COPY, MAGIC, Chunk, DamagedError, messages, read_contents, unpack
 from rig import intake
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.outside import open_file, read_json
 from rig.wire import Block
 
@@ -57,7 +57,7 @@ class RecordingFile:
         self.path = path
         with self._open() as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise InputError("file", _OURS, f"{path}, which is no MCAP file")
+                raise InputError("file", _OURS, Words(f"{path}, which is no MCAP file"))
             found = read_contents(file, path.stat().st_size, salvage=salvage)
             self._take_metadata(found.metadata, found.attachments.get(COPY), salvage=salvage)
         self.complete, self.unchecked = found.complete, found.unchecked
@@ -102,7 +102,7 @@ class RecordingFile:
         )
         if self.damaged and not salvage:
             must = "an intact recording (`rig recover` passes over what is damaged)"
-            raise InputError("file", must, f"{self.path}, with {self.damaged} damaged records")
+            raise InputError("file", must, Words(f"{self.path}, with {self.damaged} damaged records"))
         self._catalogue = intake.Catalogue.read(self.catalogue)
         self.table = self._catalogue.table
 
@@ -173,9 +173,9 @@ class RecordingFile:
         except InputError:
             raise
         except OSError as error:
-            raise InputError("file", "a file that can be read", f"{self.path} ({error.strerror})") from None
+            raise InputError("file", "a file that can be read", Words(f"{self.path} ({error.strerror})")) from None
         except DamagedError as error:
             must = "an intact recording (`rig recover` passes over what is damaged)"
-            raise InputError("file", must, f"{self.path} ({error})") from None
+            raise InputError("file", must, Words(f"{self.path} ({error})")) from None
         except (McapError, struct.error, ValueError, MemoryError, OverflowError) as error:
-            raise InputError("file", "an intact recording", f"{self.path} ({error})") from None
+            raise InputError("file", "an intact recording", Words(f"{self.path} ({error})")) from None

@@ -25,7 +25,7 @@ from recorder.payload import Payload, tick_in
 from recorder.reader import Recording
 from recorder.records import COPY
 from recorder.writer import RecordingWriter
-from rig.errors import PART_SUFFIX, InputError, check_not_among
+from rig.errors import PART_SUFFIX, InputError, Words, check_not_among
 from rig.outside import open_file
 from rig.wire import EDGES, SENSORS, TRUTH, Block, encode_block, schema_of
 
@@ -156,7 +156,7 @@ def cut(
         RecordingError: The disk refused.
     """
     if math.isnan(from_s) or math.isnan(to_s) or not from_s < to_s:
-        raise InputError("from and to", "times, one before the other", f"{from_s:g} and {to_s:g}")
+        raise InputError("from and to", "times, one before the other", Words(f"{from_s:g} and {to_s:g}"))
     if only not in (None, "sensors", "truth"):
         raise InputError("only", "sensors or truth", only)
     check_not_among([part.path for part in recording.parts], output)
@@ -192,7 +192,7 @@ def cut(
     }
     streams = [stream for key, stream in recording.streams.items() if key in columns and stream.rows]
     if not any(stream.first_time_s < to_s and stream.last_time_s >= from_s for stream in streams):
-        raise InputError("from and to", "times that the recording holds", f"{from_s:g} to {to_s:g} s")
+        raise InputError("from and to", "times that the recording holds", Words(f"{from_s:g} to {to_s:g} s"))
     counts = _write(
         recording,
         output,
@@ -287,7 +287,7 @@ def _unlocked(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.filename != str(path):
             raise
-        raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
+        raise InputError("file", "a file that can be read", Words(f"{path} ({error.strerror})")) from None
 
 
 def _narrowed(

@@ -11,7 +11,7 @@ from typing import Literal
 
 from recorder.draft import check_destination, files_like
 from recorder.writer import RecordingWriter
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 MB = 1_000_000
 _PENDING_BYTES = 2 * MB
@@ -79,7 +79,7 @@ def check_files(path: Path, first: Iterable[Path], others: str, limits: Limits, 
     for name in first:
         check_destination(name, force=force)
     if others and not force and (taken := files_like(path, others)):
-        raise InputError("output", "new files (--force replaces them)", f"{taken[0]}, which exists")
+        raise InputError("output", "new files (--force replaces them)", Words(f"{taken[0]}, which exists"))
     if why := _lack_of_room(path.parent, limits.keep_free_mb):
         raise InputError("output", f"on a disk with room: {why} (--keep-free-mb)", str(path))
 

@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
 
-from rig.errors import InputError, UnknownNameError
+from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import check, input_error, parse_toml
 
 TABLE = Path(__file__).with_name("channels.toml")
@@ -178,7 +178,7 @@ def parse_table(text: str) -> ChannelTable:
     except (TypeError, AttributeError):
         raise InputError("channel table", "[groups.NAME] with title, rate_hz, kind and channels", text[:80]) from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError("channel table", "a TOML file", str(error)) from None
+        raise InputError("channel table", "a TOML file", Words(error)) from None
 
 
 def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:

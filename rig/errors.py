@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from rig.text import Words as Words
 from rig.text import nearest, printable, shown
 
 PART_SUFFIX = ".part"
@@ -19,7 +20,8 @@ class InputError(ValueError):
     """A field has a value it must not have.
 
     The message always reads `FIELD must be MUST; instead received RECEIVED`, so that every command, service reply and
-    notebook shows the same three facts. The command line turns it into one line and exit status 2.
+    notebook shows the same three facts. The command line turns it into one line and exit status 2. What was received is
+    a value, which is quoted, or `Words` about it.
 
     Example:
         >>> import rig
@@ -91,7 +93,7 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
     try:
         path.with_name(path.name + PART_SUFFIX).exists()
     except OSError as error:  # a name that is too long
-        raise InputError(field, "a file name that the system accepts", f"{path} ({error.strerror})") from None
+        raise InputError(field, "a file name that the system accepts", Words(f"{path} ({error.strerror})")) from None
     if path.suffix not in suffixes:
         *others, last = suffixes
         endings = f"{', '.join(others)} or {last}" if others else last
@@ -101,12 +103,12 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
     if path.is_dir():
         raise InputError(field, "a file, not a folder", str(path))
     if path.exists() and not force:
-        raise InputError(field, "a new file (--force replaces one)", f"{path}, which exists")
+        raise InputError(field, "a new file (--force replaces one)", Words(f"{path}, which exists"))
     try:
         # Asked of the system by trying: permissions alone do not tell.
         tempfile.TemporaryFile(dir=path.parent).close()
     except OSError as error:
-        raise InputError(field, "in a folder that can be written", f"{path} ({error.strerror})") from None
+        raise InputError(field, "in a folder that can be written", Words(f"{path} ({error.strerror})")) from None
 
 
 def check_not_among(sources: list[Path], output: Path, *, field: str = "output") -> None:

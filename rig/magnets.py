@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.kernels.constants import Magnet
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED, magnet_force
 
@@ -217,7 +217,9 @@ def cylinder_force(x: np.ndarray, y: np.ndarray, geometry: MagnetGeometry) -> np
     """
     farthest = float(np.max(np.hypot(x, y), initial=0.0))
     if farthest > geometry.reach * (1.0 + 1e-9):
-        raise InputError("displacement", f"within the reach of {geometry.reach * 1e3:.4g} mm", f"{farthest * 1e3:.4g}")
+        raise InputError(
+            "displacement", f"within the reach of {geometry.reach * 1e3:.4g} mm", Words(f"{farthest * 1e3:.4g}")
+        )
     series, _ = _pair_series(geometry)
     away = np.stack([x, y], axis=-1)[:, None, :] - _centres(geometry)
     distance = np.linalg.norm(away, axis=-1)

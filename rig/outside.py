@@ -19,7 +19,7 @@ from typing import Annotated, Any, BinaryIO, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.text import printable
 
 DOCUMENT_BYTES = 16 << 20
@@ -102,11 +102,11 @@ def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUM
             # An escaped half of a surrogate pair is a string that cannot be written anywhere.
             json.dumps(document, ensure_ascii=False).encode("utf-8")
     except RecursionError:
-        raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper") from None
+        raise InputError(field, f"nested at most {DEPTH} deep", Words("a document nested deeper")) from None
     except InputError as error:
         raise InputError(field, error.must, error.received) from None
     except ValueError as error:
-        raise InputError(field, "a JSON object in UTF-8", printable(str(error), 200)) from None
+        raise InputError(field, "a JSON object in UTF-8", Words(printable(str(error), 200))) from None
     if not isinstance(document, dict):
         raise InputError(field, "a JSON object", document)
     if text.count("[") + text.count("{") > DEPTH:
@@ -142,9 +142,9 @@ def read_toml(path: Path) -> dict[str, Any]:
             data = file.read(TOML_BYTES + 1)
         return parse_toml(data.decode("utf-8-sig"), field=str(path))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(str(path), "a TOML file", printable(str(error), 200)) from None
+        raise InputError(str(path), "a TOML file", Words(printable(str(error), 200))) from None
     except OSError as error:
-        raise InputError(str(path), "a readable file", error.strerror) from None
+        raise InputError(str(path), "a readable file", Words(error.strerror)) from None
 
 
 def parse_toml(text: str, *, field: str) -> dict[str, Any]:
@@ -159,21 +159,21 @@ def parse_toml(text: str, *, field: str) -> dict[str, Any]:
         InputError: It is too large, nested too deep, or has a whole number that 64 bits do not hold.
     """
     if len(text) > TOML_BYTES:
-        raise InputError(field, f"at most {TOML_BYTES} bytes", "a longer text")
+        raise InputError(field, f"at most {TOML_BYTES} bytes", Words("a longer text"))
     # The parser takes the square of the parts of a dotted key.
     if max(map(len, map(_DOTTED.findall, re.split(r"[,=\n]", text)))) > DEPTH:
-        raise InputError(field, f"keys of at most {DEPTH} parts", "a longer one")
+        raise InputError(field, f"keys of at most {DEPTH} parts", Words("a longer one"))
     try:
         document = tomllib.loads(text)
     except RecursionError:
-        raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper") from None
+        raise InputError(field, f"nested at most {DEPTH} deep", Words("a document nested deeper")) from None
     except tomllib.TOMLDecodeError:
         raise
     except ValueError as error:  # digits beyond Python's own limit
         number = _LONG_NUMBER.search(text)
         if number is not None and "\n" in text:
             field += f", line {text.count(chr(10), 0, number.start()) + 1}"
-        received = printable(str(error), 100) if number is None else "one of thousands of digits"
+        received = Words(printable(str(error), 100) if number is None else "one of thousands of digits")
         raise InputError(field, f"without whole numbers beyond +-{LARGEST}", received) from None
     check_depth(document, field=field)
     return document
@@ -198,7 +198,7 @@ def check_depth(document: Any, *, field: str) -> None:
         ]
         if not level:
             return
-    raise InputError(field, f"nested at most {DEPTH} deep", "a document nested deeper")
+    raise InputError(field, f"nested at most {DEPTH} deep", Words("a document nested deeper"))
 
 
 def table_in(data: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -289,7 +289,7 @@ def input_error(error: ValidationError, where: str) -> InputError:
     if isinstance(cause, InputError):  # a rule over several fields names its own
         return cause
     field = ".".join(part for part in (where, *_place(first["loc"], first["type"])) if part)
-    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ").partition(", unable")[0]
     message = re.sub(r"^\w+ should have ", "a value of ", message).replace("a valid tuple", "a list")
     if first["type"] == "union_tag_invalid":
         context = first.get("ctx", {})

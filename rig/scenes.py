@@ -14,7 +14,7 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 from rig.channels import ChannelTable, check_signals, default_table
 from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand
 from rig.engines import ENGINES
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.kernels.signals import COLUMN
 from rig.levels import ModelLevels
 from rig.outside import Written, check, parse_toml, read_toml, table_in
@@ -218,11 +218,15 @@ class Scene(Written):
             command = timed.request
             if isinstance(command, ReleaseCommand):
                 if not held:
-                    raise InputError("release", "given once, while the magnets hold", f"another at {timed.at_s:g} s")
+                    raise InputError(
+                        "release", "given once, while the magnets hold", Words(f"another at {timed.at_s:g} s")
+                    )
                 held = False
             elif isinstance(command, HammerCommand):
                 if timed.at_s < free_s:
-                    raise InputError("hammer", f"idle (in a pulse until {free_s:g} s)", f"a pulse at {timed.at_s:g} s")
+                    raise InputError(
+                        "hammer", f"idle (in a pulse until {free_s:g} s)", Words(f"a pulse at {timed.at_s:g} s")
+                    )
                 free_s = timed.at_s + command.duration_ms * 1e-3
         return self
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from rig import wire
 from rig.bounded_queue import BoundedQueue
 from rig.desk import Note, Pending, Step, finite
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.pacing import Clock, Lockstep, RealTime
 from rig.served_run import ServedRun
 from rig.transport import Server
@@ -261,7 +261,9 @@ class Service(ServedRun):
     def _check_step(self, asked: Step) -> int:
         """Grant a step; returns the tick at which it is done."""
         if not isinstance(self._clock, Lockstep):
-            raise InputError("step", "sent to a rig that runs with --pace lockstep", f"--pace {self._clock.pace}")
+            raise InputError(
+                "step", "sent to a rig that runs with --pace lockstep", Words(f"--pace {self._clock.pace}")
+            )
         ticks, unit = asked.ticks, self._simulation.block_ticks
         most = _STEP_S * self._rate
         if asked.blocks is not None:

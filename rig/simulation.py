@@ -21,7 +21,7 @@ from rig.channels import ChannelTable
 from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.engines import ENGINES, load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, STEPS
-from rig.errors import InputError, SimulationError
+from rig.errors import InputError, SimulationError, Words
 from rig.kernels import signals as S
 from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
@@ -237,13 +237,13 @@ class Simulation:
             busy_until = self._pulse[2] if self._pulse is not None else 0
             if self.tick < busy_until or any(isinstance(other, HammerCommand) for other in waiting):
                 until = f"until {busy_until / TICK_RATE_HZ:.6f} s" if self.tick < busy_until else "from now on"
-                raise InputError("hammer", f"idle (it is in a pulse {until})", "another pulse")
+                raise InputError("hammer", f"idle (it is in a pulse {until})", Words("another pulse"))
         elif isinstance(command, SpeedCommand):
             top = self.model.parameters.entries["drive.top_speed"].value
             if not isinstance(top, str) and command.speed_hz > top:
                 raise InputError("speed.speed_hz", f"at most drive.top_speed = {top:g} Hz", command.speed_hz)
         elif not self._engaged or any(isinstance(other, ReleaseCommand) for other in waiting):
-            raise InputError("release", "given once (the magnets have let go already)", "another release")
+            raise InputError("release", "given once (the magnets have let go already)", Words("another release"))
         insort(self._pending, (self.tick, command), key=lambda entry: entry[0])
         return self.tick
 

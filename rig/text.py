@@ -10,6 +10,10 @@ _MOST = 500
 _LONG_INT_BITS = 256
 
 
+class Words(str):
+    """Words of ours about what was received, which are shown as they stand; any other text is a value and quoted."""
+
+
 def printable(text: str, most: int | None = None) -> str:
     """The same text without anything that a terminal would act on.
 
@@ -65,4 +69,6 @@ class _Shown(reprlib.Repr):
 
 def shown(value: object) -> str:
     """A value as an error shows it: its bounded repr, and `nothing` for None, as for a field that is missing."""
+    if isinstance(value, Words):
+        return printable(value, 2 * _MOST)
     return "nothing" if value is None else printable(_Shown().repr(value), 2 * _MOST)

@@ -42,7 +42,7 @@ def python(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
 
 def rig(*arguments: str, **settings: Any) -> Any:
     """A command of `rig` as a process."""
-    return python("-m", "rig.cli.main", *arguments, **settings)
+    return python("-m", "rig", *arguments, **settings)
 
 
 def line_of(child: subprocess.Popen[str], words: str) -> str:

@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.can.bus import frame as frames
 from drivers.can.bus.timing import Speed, speed
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 if TYPE_CHECKING:
     import can
@@ -142,7 +142,7 @@ def check_load(
     """
     share = load(messages, rate)
     if share > limit:
-        raise InputError("load of the bus", f"at most {limit:.0%} at {speed(rate)}", f"{share:.1%}")
+        raise InputError("load of the bus", f"at most {limit:.0%} at {speed(rate)}", Words(f"{share:.1%}"))
     return share
 
 

@@ -8,7 +8,7 @@ from drivers.can import analysis
 from drivers.can.bus.timing import Speed
 from drivers.can.message import Message, MessageTable
 from drivers.can.signals import CLASSIC_HZ, CLASSIC_SHARE, FD_HZ, default_messages
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 SLOT_S = 1e-3
 """The gateway hands over frames once in this time: that much later than due they may be queued [s]."""
@@ -59,7 +59,7 @@ class Schedule:
         share = self.load(speed)
         if share > 1.0:
             must = "a schedule of at most 100 % of the bus in the worst case (or add --can-overload)"
-            raise InputError("CAN load", must, f"{100 * share:.1f} % of {speed}")
+            raise InputError("CAN load", must, Words(f"{100 * share:.1f} % of {speed}"))
         return share
 
     def warnings(self, speed: Speed) -> list[str]:
@@ -68,7 +68,7 @@ class Schedule:
         if self.classic_hz is None or self.fd_hz is not None or share <= CLASSIC_SHARE:
             return []
         must = f"at most {100 * CLASSIC_SHARE:g} % of {speed} with classic frames, so that others find room beside them"
-        received = f"{100 * share:.1f} % with {len(default_messages().classic)} frames an instant"
+        received = Words(f"{100 * share:.1f} % with {len(default_messages().classic)} frames an instant")
         return [f"{InputError('CAN load', must, received)} (a lower --can-rate or --can-fd helps)"]
 
     def _check_fd(self, speed: Speed) -> None:

@@ -1,9 +1,9 @@
 """Read the force and the DAQ client at the same time with asyncio."""
 
 import asyncio
-import sys
 
 from drivers.daq import Daq
+from drivers.examples import run
 from drivers.force.driver import AsyncForce
 
 
@@ -21,4 +21,4 @@ async def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.
 
 
 if __name__ == "__main__":
-    asyncio.run(main(*sys.argv[1:]))
+    run(main, 2)

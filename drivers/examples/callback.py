@@ -1,9 +1,9 @@
 """Have a function called with each block while the program does something else."""
 
-import sys
 import time
 
 from drivers.daq import Daq
+from drivers.examples import run
 
 
 def main(url: str = "zenoh:127.0.0.1:7460", seconds: float = 1.0) -> int:
@@ -17,4 +17,4 @@ def main(url: str = "zenoh:127.0.0.1:7460", seconds: float = 1.0) -> int:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1]) if sys.argv[1:] else main()
+    run(main)

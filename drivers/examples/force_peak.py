@@ -1,7 +1,6 @@
 """Calibrated peak of each force transducer in a second, with what the amplifier says about its calibration."""
 
-import sys
-
+from drivers.examples import run
 from drivers.force.driver import Force
 
 
@@ -19,4 +18,4 @@ def main(url: str = "zenoh:127.0.0.1:7462", seconds: float = 1.0) -> dict[str, t
 
 
 if __name__ == "__main__":
-    main(sys.argv[1]) if sys.argv[1:] else main()
+    run(main)

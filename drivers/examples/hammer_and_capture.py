@@ -1,10 +1,9 @@
 """Hit the shaft and capture from 50 ms before to 200 ms after the impact."""
 
-import sys
-
 import numpy as np
 
 from drivers.daq import Daq
+from drivers.examples import run
 from drivers.hammer.driver import Hammer
 from drivers.samples import Samples
 
@@ -22,4 +21,4 @@ def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.0.0.1:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(main, 2)

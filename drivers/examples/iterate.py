@@ -1,8 +1,7 @@
 """Print the shaft's largest excursion in each tenth of a second, block after block."""
 
-import sys
-
 from drivers.daq import Daq
+from drivers.examples import run
 
 
 def main(url: str = "zenoh:127.0.0.1:7460", blocks: int = 10) -> None:
@@ -14,4 +13,4 @@ def main(url: str = "zenoh:127.0.0.1:7460", blocks: int = 10) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1]) if sys.argv[1:] else main()
+    run(main)

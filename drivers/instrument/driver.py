@@ -20,7 +20,7 @@ from drivers.instrument.protocol import Codec, Message, ProtocolError
 from drivers.link import ROOM, Link, LinkError, LinkTimeoutError, open_link
 from drivers.samples import Pile, Samples, StreamEndedError, follow
 from rig.channels import Group
-from rig.errors import InputError, RefusedError
+from rig.errors import InputError, RefusedError, Words
 from rig.wire import Continuity
 
 M = TypeVar("M", bound=Message)
@@ -248,7 +248,7 @@ class Sampler(Instrument):
         if rows is not None and rows < 1:
             raise InputError("rows", "at least 1", rows)
         if self._stream is None:
-            raise InputError("read", "called after start", "no stream")
+            raise InputError("read", "called after start", Words("no stream"))
         deadline = time.monotonic() + timeout_s
         while (ready := self._pile.take(rows, ended=self._ended is not None)) is None:
             if self._ended is not None:

@@ -21,7 +21,7 @@ from drivers.stream import RigStream, thin, whole_step
 from rig import wire
 from rig.channels import Group
 from rig.desk import one_line
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.transport import NoReplyError
 
 MANUFACTURER = "Virtual rotor-stator rig"
@@ -140,7 +140,7 @@ class Twin:
     def _measured(self) -> Group:
         """The channels as the rig runs them now."""
         if self.GROUP is None:
-            raise InputError("request", f"one that a {self.CODEC.address.name} has", "one for measurements")
+            raise InputError("request", f"one that a {self.CODEC.address.name} has", Words("one for measurements"))
         return self._stream.group(self.GROUP)
 
     def _configure(self, request: protocol.Configure) -> protocol.Configured:

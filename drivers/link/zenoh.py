@@ -59,7 +59,7 @@ class ZenohLink:
                 raise
         except NoReplyError:
             raise LinkClosedError(
-                f"no instruments answer at {endpoint}; start them with: rig twins --zenoh (see rig twins --help)"
+                f"no instruments answer at {endpoint}; start them with: rig twins (see rig twins --help)"
             ) from None
 
     @property

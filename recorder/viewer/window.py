@@ -23,7 +23,7 @@ from rerun.experimental import ViewerClient, ViewerState
 
 from recorder.viewer.canvas import PICTURE, SIMULATED
 from recorder.viewer.page import Page
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 Kind = Literal["native", "web", "headless"]
 _Answer = TypeVar("_Answer")
@@ -271,4 +271,4 @@ def picture_of(path: Path, *, tell: Callable[[str], None]) -> Window:
         return Window("headless", tell=tell)
     except WindowError as error:
         must = "used where a Vulkan driver is installed (Debian: libvulkan1 mesa-vulkan-drivers)"
-        raise InputError("--screenshot", must, f"{path}; {error}") from None
+        raise InputError("--screenshot", must, Words(f"{path}; {error}")) from None

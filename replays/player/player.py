@@ -22,7 +22,7 @@ from replays.player.timeline import Batch, By, Timeline
 from replays.player.track import Track
 from rig import wire
 from rig.desk import Pending, Rate, Seek, Step, finite
-from rig.errors import InputError, RefusedError
+from rig.errors import InputError, RefusedError, Words
 from rig.pacing import FreeRun, RealTime
 from rig.served_run import ServedRun
 from rig.service import COMMANDS, REPLAY_COMMANDS
@@ -355,7 +355,7 @@ class Player(ServedRun):
             self._seek(asked.time_s)
         elif isinstance(asked, Rate):
             if self._burst:
-                raise InputError("rate", "sent to a replay with a rate of its own", "one that runs with --burst")
+                raise InputError("rate", "sent to a replay with a rate of its own", Words("one that runs with --burst"))
             self._playhead.set_rate(asked.rate, self._now_ns())
         elif pending.command == "pause":
             self._cancel_step("a pause")
@@ -380,7 +380,7 @@ class Player(ServedRun):
 
     def _begin_step(self, pending: Pending, asked: Step) -> None:
         if not self._paused or self._step is not None:
-            raise InputError("step", "sent to a replay that is paused", "one that plays")
+            raise InputError("step", "sent to a replay that is paused", Words("one that plays"))
         most = _STEP_S * self._rate
         for name, value in asked:
             if value is not None and value > most:

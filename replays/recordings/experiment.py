@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from recorder.reader import Recording
 from rig.commands import COMMANDS
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.offline import Run, SentCommand, frames, simulate
 from rig.parameters import DEFAULT_SET, load_parameters, set_names
 from rig.scenes import Scene, change_scene, parse_scene
@@ -46,7 +46,7 @@ class Experiment:
         streams = [stream for stream in recording.streams.values() if stream.rows]
         if "import" in recording.scene and not isinstance(document, dict):
             must = "a recording with the scene it ran: add [experiment] to the mapping, and import it again"
-            raise InputError("file", must, f"{recording.path}, imported without one")
+            raise InputError("file", must, Words(f"{recording.path}, imported without one"))
         if not isinstance(document, dict) or not streams:
             raise InputError("file", "a recording of this rig, with the scene it ran and samples", str(recording.path))
         duration_s = max(_end_s(recording), 1.0 / TICK_RATE_HZ)
@@ -97,7 +97,9 @@ def _end_s(recording: Recording) -> float:
             steps = stream.rows + stream.lost - 1
             period_s = (stream.last_time_s - stream.first_time_s) / steps
             if key in rates and not 0.5 < period_s * rates[key] < 2.0:
-                raise InputError("file", "a recording whose times fit its row numbers", f"{recording.path}, {key}")
+                raise InputError(
+                    "file", "a recording whose times fit its row numbers", Words(f"{recording.path}, {key}")
+                )
             ends.append(stream.last_time_s + period_s)
     return math.floor(max(ends) * TICK_RATE_HZ + 0.5) / TICK_RATE_HZ
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from recorder.samples import Samples
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.orbit import whirl_frequency
 
 
@@ -53,7 +53,9 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
     edges = edges[(edges >= from_s) & (edges < to_s)]
     if kept.sum() < 1000 or len(edges) < 3:
         raise InputError(
-            "recording", "long enough to judge a whirl (three turns of the shaft)", f"{from_s:.2f} to {to_s:.2f} s"
+            "recording",
+            "long enough to judge a whirl (three turns of the shaft)",
+            Words(f"{from_s:.2f} to {to_s:.2f} s"),
         )
     times = probes.times_s[kept]
     ring_x, ring_y = (probes.column(name)[kept] * 1e-3 for name in ("ring_x", "ring_y"))

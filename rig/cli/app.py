@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import errno
 import sys
-from importlib import import_module
-from keyword import iskeyword
+from functools import partial
 from typing import Annotated, Any, NoReturn
 
 import typer
 
-from rig.cli import can, can_messages, keys, origin
-from rig.cli.groups import grouped
+from rig.cli import origin
+from rig.cli.command import Group, load_command, make_group, usage_error
 from rig.errors import DiskError, InputError, SimulationError
 from rig.text import printable
 
@@ -21,27 +20,87 @@ _UsageError: Any = typer.BadParameter.__base__
 _INTERRUPTED = 130
 """What typer makes of Ctrl-C, and shells expect."""
 
-app = typer.Typer(
-    name="rig",
-    help="A virtual rotor-stator test rig: simulate, serve, hit, record, view and judge it.",
-    invoke_without_command=True,
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-
-_PANELS = {
-    "Start here": ("demo", "scenes", "params", "laws", "magnets"),
-    "The rig as a service": ("run", "hammer", "speed", "release", "step", "note", "status", "stop", "twins"),
-    "A recording as the rig": ("replay", "pause", "resume", "seek", "rate"),
-    "Recordings": ("record", "view", "info", "cut", "recover", "import", "export"),
-    "Recordings against the model": ("validate", "identify", "sessions"),
-    "Without a clock": ("simulate", "bench", "ladder", "chart", "stability", "paper"),
+COMMANDS = {
+    "Start here": {
+        "demo": "Start the service, record, hit, let it whirl, stop",
+        "scenes": "List the scenes that come with the rig, or show one",
+        "params": "Show a parameter set: value, unit, source and kind of each",
+        "laws": "Compare all normal contact laws",
+        "magnets": "Compare the magnet models",
+        "keys": "Show every key, message and unit of the rig's streams",
+        "completion": "Complete commands, options and names in a shell",
+    },
+    "The rig as a service": {
+        "run": "Run a scene in real time and publish its sensors",
+        "hammer": "Hit the shaft of a running rig at the disk",
+        "speed": "Set the spin speed of a running rig",
+        "release": "Make the magnets of a running rig let go of the shaft",
+        "step": "Let a rig that runs with --pace lockstep simulate TICKS more",
+        "note": "Put a note into every recording that is being made of a rig",
+        "status": "Show how a running rig is doing: time, pace, lateness, losses",
+        "stop": "End the run of a rig; recordings of it close",
+        "twins": "Serve the six instruments of a running rig to their drivers",
+        "can": "Run virtual CAN buses, and show what the rig sends on one",
+    },
+    "A recording as the rig": {
+        "replay": "Play a recording to whoever listens, as if it were the rig",
+        "pause": "Hold the replay of a recording",
+        "resume": "Let the replay of a recording go on",
+        "seek": "Let the replay of a recording go on from another position",
+        "rate": "Set how fast the replay of a recording goes",
+    },
+    "Recordings": {
+        "record": "Record all streams of a running rig to FILE.mcap, losslessly",
+        "view": "View a recording, or the running rig, in rerun",
+        "info": "Show what a recording holds: calibration, gaps, health, events",
+        "cut": "Cut a recording, or join several files of one run",
+        "recover": "Make finished recordings of files that were cut off or damaged",
+        "import": "Turn logs of a real rig into a recording",
+        "export": "Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV",
+    },
+    "Recordings against the model": {
+        "validate": "Do a recording again and hold it against the model",
+        "identify": "Fit numbers of the rig to a recording",
+        "sessions": "Make the reference sessions anew",
+    },
+    "Without a clock": {
+        "simulate": "Simulate a scene as fast as it goes and write it to a file",
+        "bench": "Measure simulated over processor time with the error beside it",
+        "ladder": "Find the cheapest model, engine and step that are good enough",
+        "chart": "Chart speed against error",
+        "stability": "Test where integration methods fail",
+        "paper": "Make the paper's figures, tables and claims again",
+    },
 }
-"""Each command is the function of its name in the module of its name, behind which an underscore stands if need be."""
+"""What the help says of each command, which is what its own text begins with; the command itself is the function of its
+name in the module of its name, and is imported when it is called."""
+
+GROUPS = {
+    "can": {
+        "hub": "Run virtual CAN buses of their own, without a rig, until Ctrl-C",
+        "dbc": "Show the DBC of the rig's messages, made from the channel table",
+        "load": "Show every message of the rig with its period, share of the bus",
+    },
+    "keys": {"init": "Make the certificates of a rig that is exposed"},
+}
+"""The commands of those that are groups, whose own function is what they do without one."""
 
 
-@app.callback()
+def rig() -> Group:
+    """The command line."""
+    about = "A virtual rotor-stator test rig: simulate, serve, hit, record, view and judge it."
+    return make_group("rig", COMMANDS, _load, _rig, about)
+
+
+def _load(name: str) -> Any:
+    if name not in GROUPS:
+        return load_command(name, name)
+    from importlib import import_module
+
+    function = getattr(import_module(f"rig.cli.{name}"), name)
+    return make_group(name, {"Commands": GROUPS[name]}, partial(load_command, name), function)
+
+
 def _rig(
     context: typer.Context,
     *,
@@ -55,34 +114,22 @@ def _rig(
         typer.echo(context.get_help())
 
 
-for _panel, _names in _PANELS.items():
-    for _name in _names:
-        _module = _name + "_" * iskeyword(_name)
-        _function = grouped(getattr(import_module(f"rig.cli.{_module}"), _module))
-        # A negative value such as `rig speed -1` is a value, not an option: the rig explains what is wrong with it.
-        _settings = {"ignore_unknown_options": True} if _name in ("speed", "rate", "seek", "step") else {}
-        app.command(_name, rich_help_panel=_panel, context_settings=_settings)(_function)
-
-app.add_typer(keys.app, name="keys", rich_help_panel="Start here")
-can.app.command()(can_messages.dbc)
-can.app.command()(grouped(can_messages.load))
-app.add_typer(can.app, name="can", rich_help_panel="The rig as a service")
-
-
 def start(arguments: list[str] | None = None) -> None:
     """Run the command and end the process with its exit status."""
+    if arguments is None and sys.argv[1:2] == ["__complete"] and len(sys.argv) == 4:
+        from rig.cli.completion import complete
+
+        sys.stdout.write("".join(f"{line}\n" for line in complete(rig(), *sys.argv[2:])))
+        return
     origin.given[:] = sys.argv[1:] if arguments is None else arguments
     try:
-        code = app(args=arguments, standalone_mode=False)
+        code = rig().main(arguments, prog_name="rig", standalone_mode=False)
     except InputError as error:
         _fail(str(error))
     except (SimulationError, DiskError) as error:
         _fail(str(error), status=1)
-    except typer.BadParameter as error:
-        _fail(error.format_message() if error.param is None else _wrong_value(error))
     except _UsageError as error:
-        command = error.ctx.command_path if error.ctx is not None else "rig"
-        _fail(f"{error.format_message()} (see `{command} --help`)")
+        _fail(usage_error(error))
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", status=_INTERRUPTED)
     except BrokenPipeError:
@@ -97,19 +144,6 @@ def start(arguments: list[str] | None = None) -> None:
     if code == _INTERRUPTED:
         print("rig: interrupted", file=sys.stderr)
     sys.exit(code if isinstance(code, int) else 0)
-
-
-def _wrong_value(error: Any) -> str:
-    """A value of another type, in the form of every other wrong value."""
-    from pydantic import ValidationError
-
-    options = [name for name in error.param.opts if name.startswith("-")]
-    field = max(options, key=len) if options else error.param.metavar or error.param.name
-    if not isinstance(error.__cause__, ValidationError):
-        return f"{error.format_message()} (see `{error.ctx.command_path if error.ctx else 'rig'} --help`)"
-    first = error.__cause__.errors()[0]
-    must = first["msg"].removeprefix("Input should be ").partition(", unable")[0]
-    return str(InputError(field, must, first["input"]))
 
 
 def _fail(message: str, *, status: int = 2) -> NoReturn:

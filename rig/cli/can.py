@@ -9,23 +9,23 @@ from typing import Annotated, Any
 
 import typer
 
+from rig.cli.can_messages import dbc, load
 from rig.cli.progress import reporting
 from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
 
-app = typer.Typer(help="The virtual CAN bus.", no_args_is_help=True)
+__all__ = ["can", "dbc", "hub", "load"]
 
 LISTEN = "127.0.0.1:7461"
 _SPEED = "1M/8M"
 
 
-@app.callback()
-def _can() -> None:
-    # With this, one subcommand is still named.
-    pass
+def can(context: typer.Context) -> None:
+    """Run virtual CAN buses, and show what the rig sends on one."""
+    if context.invoked_subcommand is None:
+        echo(context.get_help())
 
 
-@app.command()
 def hub(
     channels: Annotated[list[str], typer.Argument(metavar="CHANNEL...", help="Names of the buses, such as can0.")],
     *,
@@ -61,7 +61,7 @@ def hub(
     from rig.transport.endpoint import parse_loopback
     from rig.transport.zenoh import ZenohServer
 
-    parse_loopback(listen, field="listen")
+    parse_loopback(listen, field="--listen")
     if len(set(channels)) < len(channels):
         raise InputError("CHANNEL", "named once each", " ".join(channels))
     rates = parse_speed(speed)

@@ -10,7 +10,7 @@ import typer
 
 from rig.cli.can_output import CanMessages
 from rig.cli.tables import Form, echo, echo_document, echo_json, new_table
-from rig.errors import whole_file
+from rig.errors import check_new_file, whole_file
 
 if TYPE_CHECKING:
     from drivers.can.bus.timing import Speed
@@ -19,20 +19,24 @@ if TYPE_CHECKING:
 
 def dbc(
     *,
-    out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write it to this file.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.dbc", help="Write it to this file.")
+    ] = None,
 ) -> None:
     """Show the DBC of the rig's messages, made from the channel table, or write it to a file."""
     from drivers.can.dbc import text
     from rig.scenes import rig_table
 
+    if output is not None:
+        check_new_file(output, field="--output", suffixes=(".dbc",), force=True)
     rig_table()
     _warn(*CanMessages(can_classic=True).plan())
-    if out is None:
+    if output is None:
         echo_document(text())
         return
-    with whole_file(out) as draft:
+    with whole_file(output) as draft:
         draft.write_text(text(), encoding="utf-8")
-    echo(f"{out} written")
+    echo(f"{output} written")
 
 
 def load(*, messages: CanMessages, form: Form) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rig.cli.groups import panel
 from rig.cli.progress import reporting
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 if TYPE_CHECKING:
     import can
@@ -229,7 +229,9 @@ class CanOutput:
         try:
             bus = self._open_more()
         except (can.CanError, OSError, ValueError, TypeError) as error:
-            raise InputError("--can", "a bus that can be opened", f"{self.interface}:{self.channel}: {error}") from None
+            raise InputError(
+                "--can", "a bus that can be opened", Words(f"{self.interface}:{self.channel}: {error}")
+            ) from None
         with bus:
             yield bus
 

@@ -31,10 +31,10 @@ def chart(
 ) -> None:
     """Chart speed against error: our engines against other solvers, by phase of the motion and by contact law."""
     from replays.studies.chart.session import Progress, draw_again, make_chart
-    from rig.errors import InputError
+    from rig.errors import InputError, Words
 
     if quick and full:
-        raise InputError("--quick, --full", "one of the two", "both")
+        raise InputError("--quick, --full", "one of the two", Words("both"))
     if draw:
         for path in draw_again(output, only=only, panels=panel).files:
             echo(str(path))

@@ -15,7 +15,7 @@ from rig.cli.display import end_with, showing
 from rig.cli.groups import panel
 from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
-from rig.errors import InputError, RefusedError
+from rig.errors import InputError, RefusedError, Words
 from rig.transport import DEFAULT_ENDPOINT, EXPOSED_PORT, NoReplyError
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class Serving:
         if (self.tls is not None) == self.plaintext:
             made = f"rig keys init DIR --host {self.expose.partition(':')[0]}"
             must = f"given with --tls DIR (made by: {made}), or --plaintext"
-            raise InputError("--expose", must, "both" if self.plaintext else "neither")
+            raise InputError("--expose", must, Words("both" if self.plaintext else "neither"))
         from rig.transport.certificates import holder_in
         from rig.transport.zenoh import Exposure
 

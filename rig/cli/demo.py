@@ -37,7 +37,7 @@ def demo(
     import time
     from datetime import datetime
 
-    from rig.errors import InputError
+    from rig.errors import InputError, Words
 
     folder = output or Path(f"rig-demo-{datetime.now().astimezone():%Y%m%d-%H%M%S}")
     try:
@@ -45,7 +45,7 @@ def demo(
     except FileExistsError:
         raise InputError("--output", "a new folder", str(folder)) from None
     except OSError as error:
-        raise InputError("--output", "a folder that can be made", f"{folder} ({error.strerror})") from None
+        raise InputError("--output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
     begin = time.perf_counter()
 
     def say(text: str) -> None:
@@ -125,7 +125,7 @@ def _processes(log: Path) -> Iterator[Callable[..., Process]]:
 
     def start(*arguments: str) -> Process:
         # -P: a file of the user's own in the present folder must not be taken for a package of ours.
-        command = [sys.executable, "-P", "-m", "rig.cli.main", *arguments]
+        command = [sys.executable, "-P", "-m", "rig", *arguments]
         started.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=file, stderr=file))
         return started[-1]
 

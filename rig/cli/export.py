@@ -30,7 +30,7 @@ def export(
     method: Annotated[str, typer.Option(help="How: polyphase (band-limited) or linear.")] = "polyphase",
     force: Force = False,
 ) -> None:
-    """Write a recording, or its parts as one, as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, with units and calibration.
+    """Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, or its parts as one, with units and calibration.
 
     Impacts, commands, notes, parameters and scene go with it: in MDF4 as events and attachments, in FILE.json beside
     CSV and WAV; UFF58 leaves them out. CSV, Parquet and WAV hold one rate: channels of several make as many files, or

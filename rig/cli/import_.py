@@ -9,7 +9,7 @@ import typer
 
 from rig.cli.options import Force
 from rig.cli.tables import Form, echo, echo_json, new_table
-from rig.errors import InputError, check_not_among, whole_file
+from rig.errors import InputError, Words, check_not_among, whole_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -44,7 +44,7 @@ def import_(
     in the recording.
     """
     if (template is None) == (mapping is None):
-        raise InputError("import", "given either --mapping or --template", "both" if mapping else "neither")
+        raise InputError("import", "given either --mapping or --template", Words("both" if mapping else "neither"))
     from rig.scenes import rig_table
 
     rig_table()
@@ -54,9 +54,9 @@ def import_(
         _write_template(files or [], template, force=force)
         return
     if not files:
-        raise InputError("FILE", "given: the logs to import", "none")
+        raise InputError("FILE", "given: the logs to import", None)
     if output is None or mapping is None:
-        raise InputError("--output", "given: a recording to write, such as -o log.mcap", "none")
+        raise InputError("--output", "given: a recording to write, such as -o log.mcap", None)
     from recorder.draft import check_destination
     from replays.recordings.formats.conversion import convert, write_recording
     from replays.recordings.formats.mapping import Mapping, load_mapping

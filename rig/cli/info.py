@@ -28,7 +28,7 @@ def info(
     quick: Annotated[bool, typer.Option("--quick", help="Without reading the samples.")] = False,
     form: Form,
 ) -> None:
-    """Show contents, calibration, gaps, health, events, notes and end of a recording; of several files as of one."""
+    """Show what a recording holds: calibration, gaps, health, events, notes and end; several files count as one."""
     from recorder.reader import join
 
     with reporting() as reporter:

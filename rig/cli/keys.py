@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
     from rich.text import Text
 
-app = typer.Typer()
 
-
-@app.callback(invoke_without_command=True)
 def keys(
     context: typer.Context,
     *,
@@ -61,7 +58,6 @@ def _parts(page: str) -> Iterator[Table | Text | str]:
             yield from lines
 
 
-@app.command()
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder.")],
     *,

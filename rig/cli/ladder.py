@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig.cli.folder import check_folder
 from rig.cli.options import Changes, SceneChanges, SceneName
 from rig.cli.progress import reporting
 from rig.cli.tables import Form, Table, echo, echo_json, new_table
@@ -20,7 +21,7 @@ def ladder(
     scene: SceneName,
     *,
     quantity: Annotated[
-        list[str], typer.Option("--quantity", "-q", metavar="NAME", help="What counts; may be repeated.")
+        list[str], typer.Option("--quantity", "-q", metavar="QUANTITY", help="What counts; may be repeated.")
     ],
     tolerance: Annotated[
         list[float],
@@ -40,7 +41,7 @@ def ladder(
     budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
     form: Form,
 ) -> None:
-    """Go down the ladder of models: what does each level cost, what does it err by, what is good enough here?"""
+    """Find the cheapest model, engine and step that are good enough: what does each cost, and what does it err by?"""
     import json
 
     from replays.studies.ladder.chart import draw
@@ -51,6 +52,8 @@ def ladder(
     from rig.scenes import load_scene
 
     tolerances = parse_quantities(quantity, tolerance)
+    if output is not None:
+        check_folder(output, field="--output")
     # A pick is made anew from what the scene is without one.
     loaded = load_scene(scene, {**SceneChanges(changes=changes).overrides(), "fidelity": "given"})
     if write is not None:

@@ -26,7 +26,3 @@ def entry() -> None:
     finally:
         signals.ignore()
         gc.freeze()  # looking for garbage in a process that ends took a quarter of a short run's processor time
-
-
-if __name__ == "__main__":
-    entry()

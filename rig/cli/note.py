@@ -15,6 +15,6 @@ def note(
     tag: Annotated[list[str] | None, typer.Option(help="A word to find it by; may be repeated.")] = None,
     connection: Connection,
 ) -> None:
-    """Put a note with the present simulated and wall time into every recording that is being made of a rig."""
+    """Put a note into every recording that is being made of a rig, with the present simulated and wall time."""
     with connection.console("note") as rig:
         show(rig.note(text, tags=tag or []), "note")

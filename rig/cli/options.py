@@ -20,7 +20,7 @@ Changes = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change one value; may be repeated.")
 ]
 Parameters = Annotated[str | None, typer.Option(metavar="SET", help="Parameter set, by name or path.")]
-Engine = Annotated[str | None, typer.Option(help="Integration method.")]
+Engine = Annotated[str | None, typer.Option(metavar="ENGINE", help="Integration method.")]
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="FILE", help="Draw them as well, to a .png or .svg file.")]
 Json = Annotated[bool, typer.Option("--json", help="As a JSON document.")]
 Wide = Annotated[bool, typer.Option("--wide", help="Every column, and a row on one line, as into a pipe.")]

@@ -10,7 +10,7 @@ import typer
 from rig.cli.options import Force
 from rig.cli.progress import reporting
 from rig.cli.tables import echo
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 
 def recover(
@@ -30,7 +30,7 @@ def recover(
     from recorder.rewrite import recovered_path
 
     if output is not None and len(files) > 1:
-        raise InputError("--output", "used with one FILE", f"{len(files)} files")
+        raise InputError("--output", "used with one FILE", Words(f"{len(files)} files"))
     for file in files:
         if not file.is_file():
             raise InputError("file", "a file that can be read", str(file))

@@ -54,9 +54,9 @@ def run(
         from rig.simulation import Simulation
         from rig.transport.endpoint import check_free, parse_endpoint, parse_loopback
 
-        check_free(parse_loopback(serving.listen, field="listen"), field="listen")
+        check_free(parse_loopback(serving.listen, field="--listen"), field="--listen")
         if exposed is not None:
-            check_free(parse_endpoint(exposed.endpoint, field="expose"), field="expose")
+            check_free(parse_endpoint(exposed.endpoint, field="--expose"), field="--expose")
         loaded = load_scene(scene, overrides)
         bus = can.output()
         simulation = Simulation(loaded)

@@ -15,7 +15,7 @@ from rig.errors import InputError
 
 
 def sessions(
-    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Only these.")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[SESSION]...", help="Only these.")] = None,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to; made if missing.")],
     force: Force = False,

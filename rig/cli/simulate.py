@@ -20,7 +20,7 @@ def simulate(
     check: Annotated[bool, typer.Option("--check", help="Run it again by finer steps and tell the error.")] = False,
     force: Force = False,
 ) -> None:
-    """Simulate a scene as fast as it goes and write every state, force and sensor to a file, named and with units."""
+    """Simulate a scene as fast as it goes and write it to a file: every state, force and sensor, with units."""
     import time
 
     from rig.pacing import rare_collections

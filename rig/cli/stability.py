@@ -24,9 +24,7 @@ def stability(
         str | None,
         typer.Option("--only", metavar="T3,T7", help="Only these trials; pictures stay whole."),
     ] = None,
-    engines: Annotated[
-        str | None, typer.Option("--engines", metavar="NAMES", help="Only these engines, joined by commas.")
-    ] = None,
+    engines: Annotated[str | None, typer.Option("--engines", metavar="ENGINE,...", help="Only these engines.")] = None,
     full: Annotated[
         bool, typer.Option("--full/--quick", help="Long ladders and fine maps (some minutes), or the short ones.")
     ] = False,

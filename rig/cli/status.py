@@ -21,7 +21,7 @@ def status(
     form: Form,
     connection: Connection,
 ) -> None:
-    """Show time, pace, lateness, losses, clients and doubts of a running rig."""
+    """Show how a running rig is doing: time, pace, lateness, losses, clients and doubts."""
     with connection.console("status") as rig:
         if watch:
             try:

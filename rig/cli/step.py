@@ -8,7 +8,7 @@ import typer
 
 from rig.cli.connection import Connection
 from rig.cli.tables import echo
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 
 def step(
@@ -22,7 +22,7 @@ def step(
 ) -> None:
     """Let a rig that runs with --pace lockstep simulate TICKS more, or a paused replay play them; returns when done."""
     if (ticks is None) == (blocks is None):
-        raise InputError("step", "given TICKS or --blocks", "neither" if ticks is None else "both")
+        raise InputError("step", "given TICKS or --blocks", Words("neither" if ticks is None else "both"))
     with connection.console("step") as rig:
         done = rig.step(ticks) if ticks is not None else rig.step_blocks(blocks or 0)
         echo(f"stepped to {done.time_s:.6f} s (tick {done.tick})")

@@ -10,12 +10,11 @@ from drivers.link import DEFAULT_ENDPOINT as INSTRUMENTS
 from rig.cli.connection import Connection
 from rig.cli.signals import stopping_on_signals
 from rig.cli.tables import echo
-from rig.errors import InputError
 
 
 def twins(
     *,
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="Serve them over zenoh, at --listen.")] = False,
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Serve them over zenoh, at --listen; so by default.")] = False,
     pty: Annotated[bool, typer.Option("--pty", help="Serve each at a pseudo-terminal of its own.")] = False,
     can: Annotated[
         str | None, typer.Option(metavar="SPEC", help="Serve them on a CAN bus, INTERFACE:CHANNEL, such as zenoh:can0.")
@@ -28,11 +27,9 @@ def twins(
 
     from drivers.twins import Twins
 
-    if not (zenoh or pty or can):
-        raise InputError("rig twins", "given --zenoh, --pty or --can SPEC, or several of them", "none")
     done = threading.Event()
     with connection.client() as client, Twins(client) as serving:
-        if zenoh:
+        if zenoh or not (pty or can):
             serving.serve_zenoh(listen)
         if pty:
             serving.serve_pty()

@@ -15,7 +15,7 @@ import typer
 from rig.cli.connection import Connection
 from rig.cli.options import Force, OptionalRecordingFiles
 from rig.cli.tables import echo, progress_bar
-from rig.errors import DiskError, InputError, RefusedError, check_new_file, whole_file
+from rig.errors import DiskError, InputError, RefusedError, Words, check_new_file, whole_file
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -68,9 +68,9 @@ def _check(
 ) -> None:
     """Refuse what does not go together before anything starts."""
     if bool(files) == live:
-        raise InputError("view", "given either a FILE or --live", "both" if live else "neither")
+        raise InputError("view", "given either a FILE or --live", Words("both" if live else "neither"))
     if sum((web, save is not None, screenshot is not None)) > 1:
-        raise InputError("view", "given at most one of --web, --save and --screenshot", "several")
+        raise InputError("view", "given at most one of --web, --save and --screenshot", Words("several"))
     if live and screenshot is not None:
         raise InputError("--screenshot", "used with a FILE", "--live")
     if at_s is not None and screenshot is None:

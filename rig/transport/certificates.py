@@ -18,7 +18,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.transport.access import ROLES, WITH_TRUTH
 
 if TYPE_CHECKING:
@@ -110,11 +110,13 @@ def holder_in(folder: Path | str, *, server: bool) -> Holder:
     key = where / _KEY
     if os.name == "posix" and key.stat().st_mode & 0o077:
         raise InputError(
-            "--tls", f"a folder whose key is its owner's alone (chmod 600 {key})", "one that others may read"
+            "--tls", f"a folder whose key is its owner's alone (chmod 600 {key})", Words("one that others may read")
         )
     expires = certificate.not_valid_after_utc
     if expires <= datetime.now(UTC):
-        raise InputError("--tls", "a certificate that is valid (rig keys init makes new ones)", f"{where}, expired")
+        raise InputError(
+            "--tls", "a certificate that is valid (rig keys init makes new ones)", Words(f"{where}, expired")
+        )
     return Holder(where, name, expires)
 
 
@@ -153,11 +155,11 @@ def make(
         found = {path.relative_to(folder) for path in folder.rglob("*")} if folder.is_dir() else {None}
         if found and not (force and found <= _LAYOUT):
             must = "a new folder (--force replaces one that holds nothing but keys of a rig)"
-            raise InputError("DIR", must, f"{folder}, which exists")
+            raise InputError("DIR", must, Words(f"{folder}, which exists"))
     try:
         part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.absolute().parent))
     except OSError as error:
-        raise InputError("DIR", "in a folder that can be written", f"{folder} ({error.strerror})") from None
+        raise InputError("DIR", "in a folder that can be written", Words(f"{folder} ({error.strerror})")) from None
     try:
         signing = ec.generate_private_key(ec.SECP256R1())
         issue = Issue(signing, timedelta(days=days))

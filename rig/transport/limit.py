@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 _MOST = 64
 """Senders that are told apart. A sender is the name that it gives itself: who makes up names meets the common bound."""
@@ -69,4 +69,4 @@ class CommandLimit:
                 return
             self.refused += 1
         must = f"at most {self._rate_hz:g} a second from one sender, {_TOGETHER * self._rate_hz:g} from all"
-        raise InputError("commands", must, f"one too many from {sender}")
+        raise InputError("commands", must, Words(f"one too many from {sender}"))

@@ -32,7 +32,7 @@ def hub_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
     """`rig can hub` in a process of its own, and where it listens."""
     endpoint = free_endpoint()
     arguments = ("can", "hub", "can0", "can1", "--speed", "1M/8M", "--listen", endpoint)
-    with process("-m", "rig.cli.main", *arguments) as child:
+    with process("-m", "rig", *arguments) as child:
         assert child.stdout is not None
         # The first start after a change compiles.
         assert "Ctrl-C ends it" in child.stdout.readline()

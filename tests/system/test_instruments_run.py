@@ -119,9 +119,9 @@ def test_drivers_and_daq_show_the_same_rig() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "rig: rig twins must be given --zenoh, --pty or --can SPEC, or several of them"),
+        (("--connect", "127.0.0.1:1"), "rig: no rig answers at 127.0.0.1:1"),
         (("--pty", "--connect", "127.0.0.1:1"), "rig: no rig answers at 127.0.0.1:1"),
-        (("--zenoh", "--connect", "nowhere"), "rig: connect must be HOST:PORT"),
+        (("--zenoh", "--connect", "nowhere"), "rig: --connect must be HOST:PORT"),
     ],
 )
 def test_what_is_wrong_is_one_line(arguments: tuple[str, ...], message: str) -> None:

@@ -193,9 +193,9 @@ def test_clients_that_do_not_come_end_the_command(path: Path, capsys: pytest.Cap
     ("arguments", "message"),
     [
         (("nothing.mcap",), "file must be a file that can be read"),
-        (("FILE", "--rate", "0"), "rate must be a number of 0.01 to 1000"),
-        (("FILE", "--rate", "2", "--burst"), "rate must be left out with --burst"),
-        (("FILE", "--from", "9"), "from must be within the recording, 0 to 0.6 s"),
+        (("FILE", "--rate", "0"), "--rate must be a number of 0.01 to 1000"),
+        (("FILE", "--rate", "2", "--burst"), "--rate must be left out with --burst"),
+        (("FILE", "--from", "9"), "--from must be within the recording, 0 to 0.6 s"),
         (("FILE", "--remap", "a"), "--remap must be KEY=KEY"),
         (("FILE", "--wait-for", "2", "--pause"), "--wait-for must be left out with --pause"),
         (("FILE", "--can-rate", "1000"), "--can must be given with the other --can options"),

@@ -74,9 +74,9 @@ def test_ctrl_c_ends_the_run_in_good_order(number: signal.Signals) -> None:
     [
         (
             ("hammer", "--listen", "0.0.0.0:7999"),
-            "listen must be on 127.0.0.1, since",
+            "--listen must be on 127.0.0.1, since",
         ),
-        (("hammer", "--listen", "7999"), "listen must be HOST:PORT"),
+        (("hammer", "--listen", "7999"), "--listen must be HOST:PORT"),
         (("hammer", "--block-ms", "0.3"), "--block-ms must be a positive whole multiple of"),
         (("hammer", "--block-ms", "nan"), "--block-ms must be a positive whole multiple of"),
         (("hammer", "--block-ms", "-10"), "--block-ms must be a positive whole multiple of"),

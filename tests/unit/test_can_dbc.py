@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from drivers.can import dbc, schedule
 from drivers.can.bus.timing import speed
@@ -24,9 +23,9 @@ from drivers.can.signals import (
     parse_command,
 )
 from rig.channels import default_table
-from rig.cli.app import app
 from rig.cli.can_output import CanMessages, CanOptions, CanOutput
 from rig.errors import InputError
+from tests.commands import said, shown
 
 TABLE = default_messages()
 DATABASE = dbc.database()
@@ -37,23 +36,23 @@ def test_the_committed_copy_is_up_to_date() -> None:
     assert dbc.COPY.read_text(encoding="utf-8") == dbc.text(), "run `rig can dbc -o drivers/can/rig.dbc`"
 
 
-def test_the_command_shows_and_writes_it(tmp_path: Path) -> None:
-    shown = CliRunner().invoke(app, ["can", "dbc"], catch_exceptions=False)
-    assert shown.output == dbc.text()
-    CliRunner().invoke(app, ["can", "dbc", "-o", str(tmp_path / "rig.dbc")], catch_exceptions=False)
+def test_the_command_shows_and_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert shown(capsys, "can", "dbc") == dbc.text()
+    shown(capsys, "can", "dbc", "-o", tmp_path / "rig.dbc")
     assert (tmp_path / "rig.dbc").read_text(encoding="utf-8") == dbc.text()
 
 
-def test_the_load_command_shows_every_message() -> None:
-    result = CliRunner().invoke(app, ["can", "load"], catch_exceptions=False)
+def test_the_load_command_shows_every_message(capsys: pytest.CaptureFixture[str]) -> None:
+    output = shown(capsys, "can", "load")
     for name in (row.name for row in (*TABLE.others, *TABLE.classic)):
-        assert name in result.output
-    assert "load: at most 69.0 % of the bus" in result.output
-    result = CliRunner().invoke(app, ["can", "load", "--can-fd", "--can-bitrate", "1M/5M"], catch_exceptions=False)
-    assert "load: at most 125.9 % of the bus" in result.output
+        assert name in output
+    assert "load: at most 69.0 % of the bus" in output
+    assert "load: at most 125.9 % of the bus" in shown(capsys, "can", "load", "--can-fd", "--can-bitrate", "1M/5M")
 
 
-def test_a_bus_that_gets_too_full_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_that_gets_too_full_is_told_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     groups = default_table().groups
     forces = groups["forces"]
     more = [row.model_copy(update={"name": f"{row.name}_{side}"}) for row in forces.channels[:1] for side in "ab"]
@@ -62,10 +61,10 @@ def test_a_bus_that_gets_too_full_is_told_in_one_line(monkeypatch: pytest.Monkey
     monkeypatch.setattr(schedule, "default_messages", lambda: table)
     warning = (
         "rig: warning: CAN load must be at most 70 % of 1M with classic frames, so that others find room beside them; "
-        "instead received '80.5 % with 6 frames an instant' (a lower --can-rate or --can-fd helps)\n"
+        "instead received 80.5 % with 6 frames an instant (a lower --can-rate or --can-fd helps)\n"
     )
     for command in (["can", "load"], ["can", "dbc"]):
-        assert CliRunner().invoke(app, command, catch_exceptions=False).stderr == warning
+        assert said(capsys, *command)[2] == warning
     assert warning in f"{CanOutput('virtual:full')}\n"
     # What is still carried is only told; what is not is refused.
     assert (
@@ -75,9 +74,9 @@ def test_a_bus_that_gets_too_full_is_told_in_one_line(monkeypatch: pytest.Monkey
         CanOutput("virtual:full", CanOptions(messages=CanMessages(can_bitrate="500k")))
 
 
-def test_the_usual_bus_is_not_too_full() -> None:
+def test_the_usual_bus_is_not_too_full(capsys: pytest.CaptureFixture[str]) -> None:
     for command in (["can", "load"], ["can", "dbc"], ["can", "load", "--can-fd"]):
-        assert CliRunner().invoke(app, command, catch_exceptions=False).stderr == ""
+        assert said(capsys, *command)[2] == ""
 
 
 def test_cantools_sees_the_messages_of_the_table() -> None:

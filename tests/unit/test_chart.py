@@ -281,7 +281,7 @@ def test_without_peers_there_is_still_a_reference() -> None:
         (["--panel", "pretty"], "panel must be one of exact"),
         (["--panel", "memory", "--only", "drop"], "panel must be one that has the phase drop"),
         (["--quick", "--full"], "must be one of the two"),
-        (["--peers"], "No such option"),
+        (["--peers"], "option must be one of `rig chart -h`, such as --no-peers"),
         (["--draw"], "output must be a folder with chart.csv of an earlier chart"),
     ],
 )

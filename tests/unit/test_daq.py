@@ -35,7 +35,7 @@ from rig.errors import InputError
 from rig.transport.memory import MemoryClient, MemoryServer
 from rig.transport.zenoh import ZenohClient, ZenohServer
 from rig.wire import Continuity
-from tests.processes import free_endpoint
+from tests.processes import free_endpoint, python
 from tests.unit.instruments_fake import BLOCK, FakeRig, counts_of, values_of
 
 pytestmark = pytest.mark.wallclock
@@ -480,6 +480,16 @@ def test_the_examples_are_short_and_all_run_here() -> None:
         main = importlib.import_module(f"drivers.examples.{name}").main
         lines = inspect.getsource(main).splitlines()[2:]
         assert len(lines) <= 12, name
+
+
+@pytest.mark.wallclock
+def test_an_example_without_a_rig_says_so_in_one_line() -> None:
+    file = Path(drivers.examples.__file__).with_name("callback.py")
+    with python(str(file), f"zenoh:{free_endpoint()}") as child:
+        output, complaints = child.communicate(timeout=60.0)
+    assert (child.returncode, output, complaints.count("\n")) == (2, "", 1)
+    assert complaints.startswith("no rig answers at 127.0.0.1:")
+    assert "start one with: rig run" in complaints
 
 
 def test_example_iterate(live: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,6 +25,7 @@ from rig.errors import InputError
 from rig.scenes import load_scene
 from rig.simulation import Simulation
 from rig.wire import EVENTS, Block, encode_block, encode_document, sensor_key
+from tests.commands import said
 
 DURATION_S = 0.12
 
@@ -397,8 +398,8 @@ def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["-o", "x.xls"], "output must be a file name that ends in .mf4, .tdms, .uff"),
-        (["-o", "no/x.csv"], "output must be in a folder that exists"),
+        (["-o", "x.xls"], "--output must be a file name that ends in .mf4, .tdms, .uff"),
+        (["-o", "no/x.csv"], "--output must be in a folder that exists"),
         (["-o", "x.csv", "--channels", "disk_z"], "channel must be one of the recording's, such as disk_y"),
         (["-o", "x.csv", "--channels", "foo"], "channel must be a channel of the recording, one of its groups (probes"),
         (["-o", "x.csv", "--channels", "truth.nothing"], "channel must be one of truth.state, truth."),
@@ -407,8 +408,8 @@ def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp
         (["-o", "x.csv", "--method", "magic"], "--method must be polyphase or linear"),
         (["-o", "x.csv", "--from", "5"], "range must be in the recording, 0 to 0.11995 s; instead received 'from 5 s'"),
         (["-o", "x.csv", "--from", "0.1", "--to", "0.05"], "--to must be after --from 0.1"),
-        (["-o", "x.csv", "--rate-hz", "0"], "rate_hz must be between 1 and 1e6"),
-        (["-o", "x.tdms", "--rate-hz", "1000", "--unit", "counts"], "unit must be engineering or volts"),
+        (["-o", "x.csv", "--rate-hz", "0"], "--rate-hz must be between 1 and 1e6"),
+        (["-o", "x.tdms", "--rate-hz", "1000", "--unit", "counts"], "--unit must be engineering or volts"),
     ],
 )
 def test_wrong_exports_are_one_line(
@@ -430,6 +431,31 @@ def test_wrong_exports_are_one_line(
     assert len(printed.err) < 600
     assert printed.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "says"),
+    [
+        ("raise ModuleNotFoundError(name='pyuff')", "not installed: pip install 'rotor-stator-rig[formats]'\n"),
+        (
+            "raise OSError('no libuff')",
+            "installed and broken (OSError: no libuff): pip install --force-reinstall pyuff\n",
+        ),
+        ("import no_such_module", "installed and broken (ModuleNotFoundError: No module named 'no_such_module'): pip"),
+    ],
+)
+def test_a_package_that_a_format_needs_is_named(
+    module: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, "pyuff", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    Path("pyuff.py").write_text(module)
+    Path("run.uff").write_text("    -1\n")
+    status, output, complaints = said(capsys, "import", "run.uff", "--template", "mapping.toml")
+    assert (status, output, complaints.count("\n")) == (2, "", 1)
+    assert complaints.startswith(f"rig: UFF files need the package pyuff, which is {says}")
+    assert not Path("mapping.toml").exists()
 
 
 @pytest.mark.parametrize(("rate_hz", "target_hz"), [(51_200.0, 20_000.0), (10_000.0, 20_000.0), (19_998.7, 20_000.0)])

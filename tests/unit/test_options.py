@@ -1,25 +1,45 @@
-"""Options that several commands share are the same everywhere, and their texts are read the same way."""
+"""The command line: its help, its options, what it completes, and what it says of a line that is wrong."""
 
 from __future__ import annotations
 
+import inspect
+import io
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
-from rig.cli.app import app
+from rig.cli.app import COMMANDS, GROUPS, rig
+from rig.cli.command import Group
+from rig.cli.completion import SCENE_KEYS, complete
 from rig.cli.options import names_of, pairs
 from rig.errors import InputError
+from rig.scenes import Scene
+from tests.commands import said, shown
 
+ROOT = Path(__file__).parents[2]
 SHARED = ("--from", "--to", "--force", "--report", "--connect")
+
+
+def commands() -> dict[str, Any]:
+    """Every command and subcommand, by its name behind `rig`."""
+    root = rig()
+    found = {name: root.get_command(None, name) for name in root.list_commands(None)}
+    return found | {f"{name} {part}": found[name].get_command(None, part) for name in GROUPS for part in GROUPS[name]}
+
+
+COMMAND = commands()
 
 
 def options() -> list[tuple[str, str, Any]]:
     """Command, flag and parameter of every option there is."""
-    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     return [
         (name, flag, parameter)
-        for name, command in commands.items()
+        for name, command in COMMAND.items()
         for parameter in command.params
         for flag in parameter.opts
         if flag.startswith("--")
@@ -48,3 +68,110 @@ def test_names_and_pairs() -> None:
             pairs("--set", [wrong], "KEY=VALUE")
     with pytest.raises(InputError, match="--set must be given once for a"):
         pairs("--set", ["a=1", "a=2"], "KEY=VALUE")
+
+
+def test_the_help_says_what_each_command_says_of_itself() -> None:
+    listed = {name: line for lines in COMMANDS.values() for name, line in lines.items()}
+    listed |= {f"{name} {part}": line for name, lines in GROUPS.items() for part, line in lines.items()}
+    assert listed.keys() == COMMAND.keys()
+    for name, line in listed.items():
+        assert inspect.cleandoc(COMMAND[name].help).startswith(line), name
+
+
+def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    alone = shown(capsys)
+    assert alone == shown(capsys, "-h") == shown(capsys, "--help")
+    assert alone.count("Usage:") == 1
+    assert {line.split()[0] for line in alone.splitlines() if line.startswith("  ")} > set(rig().list_commands(None))
+    for name, command in COMMAND.items():
+        page = shown(capsys, *name.split(), "-h")
+        assert f"Usage: rig {name} " in page
+        assert max(map(len, page.splitlines())) < 80, name
+        assert isinstance(command, Group) or page.count("-h, --help") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("rnu", "command must be one of `rig -h`, such as run; instead received 'rnu'"),
+        ("can lod", "command must be one of `rig can -h`, such as load; instead received 'lod'"),
+        ("run x --sed 1", "option must be one of `rig run -h`, such as --seed or --set; instead received '--sed'"),
+        ("run", "SCENE must be given: name of a scene, or the path of a scene file; instead received nothing"),
+        ("stop now", "argument must be one that `rig stop` takes (see -h); instead received 'now'"),
+        ("run x --set", "--set must be followed by a value; instead received nothing"),
+        ("view --live=3", "--live must be given without a value; instead received one"),
+        ("bench --runs 0", "--runs must be greater than or equal to 1; instead received 0"),
+        ("bench --runs x", "--runs must be a valid integer; instead received 'x'"),
+        ("run x --pace y", "--pace must be one of real-time, lockstep, free; instead received 'y'"),
+        ("view --live --wait-s nan", "--wait-s must be a number; instead received nan"),
+        ("speed nan", "HZ must be a number; instead received nan"),
+        ("record -o x.txt", "--output must be a file name that ends in .mcap; instead received 'x.txt'"),
+        ("run hammer --seed -1", "--seed must be greater than or equal to 0; instead received -1"),
+        ("view", "view must be given either a FILE or --live; instead received neither"),
+        ("chart --quick --full", "--quick, --full must be one of the two; instead received both"),
+    ],
+)
+def test_a_wrong_line_is_told_in_one(capsys: pytest.CaptureFixture[str], line: str, says: str) -> None:
+    assert said(capsys, *line.split()) == (2, "", f"rig: {says}\n")
+
+
+def completed(line: str, shell: str = "zsh") -> list[str]:
+    return [each.partition("\t")[0] for each in complete(rig(), shell, line)]
+
+
+def test_what_may_follow_on_a_line() -> None:
+    assert set(completed("rig ")) == set(COMMAND) - {name for name in COMMAND if " " in name}
+    assert completed("rig can ") == list(GROUPS["can"])
+    assert completed("rig run ham") == ["hammer"]
+    assert completed("rig run hammer ") == completed("rig nothing ") == []
+    assert completed("rig run hammer --see") == ["--seed"]
+    assert completed("rig run --set contact.fric") == ["contact.friction="]
+    assert completed("rig run --set=drive.sp") == ["--set=drive.speed_hz="]
+    assert completed("rig run --set=drive.sp", "bash") == ["drive.speed_hz="]
+    assert completed("rig run --set engine.name=rk") == ["engine.name=rk8", "engine.name=rk4"]
+    assert completed("rig validate --engine ros") == ["rosenbrock"]
+    assert completed("rig run x --pace lo") == ["lockstep"]
+    assert completed("rig params dtu") == ["dtu-2019"]
+    assert completed("rig export a.mcap --channels disk_x,disk") == ["disk_x,disk_y"]
+    assert complete(rig(), "fish", "rig info a.mcap 'b") == ["\t.mcap"]
+    assert complete(rig(), "fish", "rig run own") == ["\t.toml"]
+    assert complete(rig(), "fish", "rig run x --tls ") == ["\t/"]
+
+
+def test_keys_of_a_scene_that_are_completed_are_those_that_it_has() -> None:
+    inner = {name: getattr(field.annotation, "model_fields", None) for name, field in Scene.model_fields.items()}
+    keys = {f"{name}.{part}" for name, parts in inner.items() for part in parts or ()} | set(inner)
+    others = {*("name", "title", "set", "commands", "pick"), *(name for name, parts in inner.items() if parts)}
+    assert set(SCENE_KEYS) == {key for key in keys - others if not key.startswith("pick.")}
+
+
+@pytest.mark.wallclock
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_new_shell_completes_once_that_is_installed(shell: str, tmp_path: Path) -> None:
+    if shutil.which(shell) is None:
+        pytest.skip(f"there is no {shell} on this machine")
+    program = tmp_path / "rig"
+    program.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} -m rig "$@"\n')
+    program.chmod(0o755)
+    home = {"HOME": str(tmp_path), "PATH": f"{tmp_path}:{os.environ['PATH']}", "SHELL": shell, "TERM": "dumb"}
+    settings: Any = {"env": home, "cwd": tmp_path}
+    for _ in range(2):  # which changes nothing more
+        subprocess.run([program, "completion", "--install"], check=True, **settings)
+    for path in (path for path in tmp_path.iterdir() if path.name.endswith("shrc")):
+        assert path.read_text().count("completion --install") == 1
+    if shell == "fish":
+        asked = [shell, "-c", "complete -C 'rig run ham'"]
+        assert subprocess.check_output(asked, **settings).startswith(b"hammer\tHammer during a stable run")
+        return
+    terminal = [sys.executable, "-c", f"import pty; pty.spawn(['{shell}', '-i'])"]
+    with subprocess.Popen(terminal, stdin=subprocess.PIPE, stdout=subprocess.PIPE, **settings) as child:
+        assert isinstance(child.stdout, io.BufferedReader)
+        assert child.stdin is not None
+        output = child.stdout.read1()  # its prompt
+        child.stdin.write(b"rig run ham\t")
+        child.stdin.flush()
+        while b"rig run hammer" not in output:
+            more = child.stdout.read1()
+            assert more, output
+            output += more
+        child.kill()

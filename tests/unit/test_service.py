@@ -215,7 +215,7 @@ def test_the_console_raises_the_rigs_own_line() -> None:
 def test_step_is_refused_where_nothing_waits_for_it() -> None:
     with (
         Running(FakeSimulation(duration_s=None), RealTime()) as rig,
-        pytest.raises(RefusedError, match="--pace lockstep; instead received '--pace real-time'"),
+        pytest.raises(RefusedError, match="--pace lockstep; instead received --pace real-time"),
     ):
         rig.console.step(BLOCK)
 

@@ -73,7 +73,7 @@ def test_a_real_terminal_shows_whole_values() -> None:
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
     environment |= {"TERM": "xterm", "NO_COLOR": "1"}
-    command = [sys.executable, "-m", "rig.cli.main", "scenes"]
+    command = [sys.executable, "-m", "rig", "scenes"]
     subprocess.run(command, stdout=theirs, stderr=theirs, stdin=theirs, env=environment, check=True, timeout=120)
     os.close(theirs)
     text = b""

@@ -19,7 +19,7 @@ from drivers.can.bus import codec
 from drivers.can.bus.frame import resized, sendable
 from drivers.can.bus.model import BusModel
 from drivers.can.bus.results import STATES
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 WINDOW = 512
 """Frames that one endpoint may have waiting; what it offers beyond is dropped and counted."""
@@ -173,7 +173,9 @@ class Endpoints:
         if len(others) < MAX_ENDPOINTS and (token or len(tokenless) < MAX_TOKENLESS):
             return
         if not tokenless:
-            raise InputError("endpoint", f"one of at most {MAX_ENDPOINTS}", f"{len(others)} that are there already")
+            raise InputError(
+                "endpoint", f"one of at most {MAX_ENDPOINTS}", Words(f"{len(others)} that are there already")
+            )
         self._counts["evicted"] += 1
         self._remove(tokenless[0])
 

@@ -23,7 +23,7 @@ from drivers.can.bus import frame as frames
 from drivers.can.bus import kernels
 from drivers.can.bus.results import OUTCOMES, RESULT, STATES, BusState, Delivery, Latency, NodeState
 from drivers.can.bus.timing import Speed, speed
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 if TYPE_CHECKING:
     import can
@@ -191,7 +191,7 @@ class BusModel:
             one_shot: Give it up when it loses an arbitration or meets an error.
         """
         if self._row(node)[kernels.LISTENING]:
-            raise InputError("node", "one that may send", f"{self._names[node]} (listen only)")
+            raise InputError("node", "one that may send", Words(f"{self._names[node]} (listen only)"))
         if frame.fd and not self.speed.fd:
             raise InputError("frame", f"classic on a bus of {self.speed}", frame)
         time_ns = self.now_ns if at_ns is None else max(at_ns, self._start_ns)
@@ -208,7 +208,7 @@ class BusModel:
                 when.
         """
         if not self.speed.fd and (offers["flags"] & frames.FD).any():
-            raise InputError("frame", f"classic on a bus of {self.speed}", "a CAN FD frame")
+            raise InputError("frame", f"classic on a bus of {self.speed}", Words("a CAN FD frame"))
         offers = frames.check_records(offers)
         nodes = offers["node"]
         highest = int(nodes.max()) if len(nodes) else -1

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 EVEN = 0.05
 """Part of a sample within which time stamps must lie on their straight line to be even."""
@@ -85,12 +85,14 @@ def axis_of_stamps(times_s: np.ndarray, *, line: bool, what: str) -> Axis:
     """
     n = len(times_s)
     if n < 2 or not np.isfinite(times_s).all():
-        raise InputError("time stamps", "two or more finite numbers", f"{what} with {n}")
+        raise InputError("time stamps", "two or more finite numbers", Words(f"{what} with {n}"))
     steps = np.diff(times_s)
     if not np.all(steps > 0.0) and not line:
         at = int(np.argmax(steps <= 0.0)) + 1
         must = 'ascending (or time.stamps = "line", or time.rate_hz given)'
-        raise InputError("time stamps", must, f"{what}, {times_s[at]:g} s after {times_s[at - 1]:g} s (row {at + 1})")
+        raise InputError(
+            "time stamps", must, Words(f"{what}, {times_s[at]:g} s after {times_s[at - 1]:g} s (row {at + 1})")
+        )
     first_s, step, jitter = _line(times_s, np.arange(n))
     even = line or jitter[1] < EVEN * step
     if not even:
@@ -225,7 +227,7 @@ def shift_by_edges(
     found = [crossings(*signal, threshold=threshold, hysteresis=None)[0] for signal in (reference, moved)]
     if not len(found[0]) or not len(found[1]):
         must = "an edge through the threshold in both signals"
-        raise InputError("align", must, f"{len(found[0])} in the reference, {len(found[1])} in what is moved")
+        raise InputError("align", must, Words(f"{len(found[0])} in the reference, {len(found[1])} in what is moved"))
     a, b = found
     if len(a) == len(b) > 1:
         middle = b.mean()
@@ -238,7 +240,7 @@ def shift_by_edges(
         how = f"first edges ({len(a)} and {len(b)} in all)"
     moves = max(abs(offset + (stretch - 1.0) * t) for t in (b[0], b[-1]))
     if moves > within_s:
-        raise InputError("align", f"within {within_s:g} s (align.within_s)", f"{moves:g} s")
+        raise InputError("align", f"within {within_s:g} s (align.within_s)", Words(f"{moves:g} s"))
     return Shift(offset, float(stretch), f"by {how}")
 
 
@@ -269,7 +271,7 @@ def shift_by_correlation(
     lags = correlation_lags(len(x), len(y)) / rate + x_start - y_start
     near = np.abs(lags) <= within_s
     if norm == 0.0 or not near.any():
-        raise InputError("align", "two signals that vary, and overlap within align.within_s", f"{within_s:g} s")
+        raise InputError("align", "two signals that vary, and overlap within align.within_s", Words(f"{within_s:g} s"))
     best = int(np.flatnonzero(near)[np.argmax(alike[near])])
     peak = float(alike[best])
     if peak < 0.3:

@@ -14,7 +14,7 @@ from replays.recordings.background import Background
 from replays.recordings.formats import columnar
 from replays.recordings.formats.dialect import MISSING, Layout, find_layout, instant, time_column
 from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.text import printable
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
         times_s = columns[stamps] * options.time_scale(layout.units[stamps])
         if np.isnan(times_s).any():
             line = layout.first + int(np.argmax(np.isnan(times_s))) + 1
-            raise InputError("file.time_column", "a column without holes", f"{path}, line {line}")
+            raise InputError("file.time_column", "a column without holes", Words(f"{path}, line {line}"))
     rate = layout.rate_hz if times_s is None else even_rate_hz(times_s)
     entries = tuple(
         Entry(name, "", layout.units[c], len(columns[c]), rate, c) for c, name in enumerate(names) if c != stamps
@@ -111,7 +111,7 @@ def _parse(path: Path, layout: Layout, options: FileOptions, stamps: int | None)
         line = f"line {row.number + layout.first - skipped}: " if row.number else ""
         raise InputError(
             "file", f"a text file of {layout.width} columns throughout",
-            f"{path}, where {len(bad)} lines are not so ({line}{row.actual_columns} columns, {row.text[:40]!r})",
+            Words(f"{path}, where {len(bad)} lines are not so ({line}{row.actual_columns} columns, {row.text[:40]!r})"),
         )  # fmt: skip
     if not table.num_rows:
         raise InputError("file", "a text file with lines of numbers", str(path))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rig import units
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.outside import open_file
 
 if TYPE_CHECKING:
@@ -185,14 +185,14 @@ def _head(path: Path, encoding: str | None) -> tuple[str, str, tuple[str, ...]]:
     if encoding is None and raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         encoding = "utf-16"
     if b"\0" in raw and encoding is None:
-        raise InputError("file", "a text file", f"{path}, which is binary")
+        raise InputError("file", "a text file", Words(f"{path}, which is binary"))
     try:
         return raw.decode(encoding or "utf-8-sig"), encoding or "utf-8-sig", ()
     except LookupError:
         raise InputError("file.encoding", "a text encoding such as utf-8, latin-1, cp1252", encoding) from None
     except UnicodeDecodeError as error:
         if encoding is not None:
-            raise InputError("file.encoding", "that of the file", f"{encoding} ({error.reason})") from None
+            raise InputError("file.encoding", "that of the file", Words(f"{encoding} ({error.reason})")) from None
         return raw.decode("latin-1"), "latin-1", ("read as latin-1, as it is no UTF-8",)
 
 
@@ -296,7 +296,7 @@ def _lvm_layout(path: Path, lines: list[str], encoding: str) -> Layout:
     decimal = (head.get("Decimal_Separator") or ["."])[0] or "."
     mode = (head.get("X_Columns") or ["No"])[0].lower()
     if mode not in ("no", "one"):
-        raise InputError("file", "a .lvm file with no or one column of times", f"{path} (X_Columns {mode})")
+        raise InputError("file", "a .lvm file with no or one column of times", Words(f"{path} (X_Columns {mode})"))
 
     def number(key: str) -> float | None:
         try:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rig.channels import ChannelTable, default_table
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 if TYPE_CHECKING:
     from replays.recordings.formats.clock import Axis
@@ -130,7 +130,7 @@ def build_experiment(
         speed = speed_hz if wanted.speed_hz == "measured" else wanted.speed_hz
         if speed is None:
             raise InputError(
-                "experiment.speed_hz", "a number, or measured by a channel `speed` or a keyphasor", "measured"
+                "experiment.speed_hz", "a number, or measured by a channel `speed` or a keyphasor", Words("measured")
             )
         data["drive"] = {**data["drive"], "speed_hz": max(0.0, speed), "profile": ()}
     if wanted.commands == "detected":

@@ -14,7 +14,7 @@ import numpy as np
 
 from replays.recordings.formats import clock
 from replays.recordings.formats.selection import ROWS, ExportChunk, ExportTable, Selection
-from rig.errors import InputError, check_new_file, check_not_among, whole_file
+from rig.errors import InputError, Words, check_new_file, check_not_among, whole_file
 
 _WRITERS = {
     ".mf4": ("mdf", "MdfWriter"), ".tdms": ("tdms", "TdmsWriter"), ".uff": ("uff", "UffWriter"),
@@ -139,7 +139,7 @@ def export(
                 raise InputError("channel", "given once", names)
             if not kind.sparse and (missing := part.missing[table.name]) > table.rows // 2 + _MOST_MISSING:
                 must = f"one of which a {path.suffix} file can hold the gaps (--from and --to choose)"
-                raise InputError("range", must, f"{missing} rows missing in {table.name}")
+                raise InputError("range", must, Words(f"{missing} rows missing in {table.name}"))
     done = 0
     written = []
     with ExitStack() as stack:
@@ -208,13 +208,13 @@ def resampled(selection: Selection, rate_hz: float, method: Method) -> Selection
     last_s = min(table.first_s + (table.rows - 1) / table.rate_hz for table in selection.tables)
     rows = int((last_s - first_s) * rate_hz + 1e-6) + 1
     if rows < 2:
-        raise InputError("range", "one that all channels share", f"{first_s:g} to {last_s:g} s")
+        raise InputError("range", "one that all channels share", Words(f"{first_s:g} to {last_s:g} s"))
     wanted = first_s + np.arange(rows) / rate_hz
     columns, parts = [], []
     for table in selection.tables:
         if not selection.whole(table):
             raise InputError("range", "free of missing rows where samples are resampled (from_s and to_s choose)",
-                             f"{selection.missing[table.name]} missing in {table.name}")  # fmt: skip
+                             Words(f"{selection.missing[table.name]} missing in {table.name}"))  # fmt: skip
         values = np.concatenate([chunk.values for chunk in selection.chunks(table)])
         axis = clock.Axis(table.first_s, table.rate_hz, table.rows)
         for c, column in enumerate(table.columns):

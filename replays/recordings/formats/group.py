@@ -15,7 +15,7 @@ from replays.recordings.formats.mapping import Mapping
 from replays.recordings.formats.selection import NO_VOLTS
 from rig import units
 from rig.channels import Channel, ChannelTable, Group, default_table
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.outside import check
 
 _MOST_TIMES, _MOST_ROWS = 1000, 1_000_000
@@ -68,7 +68,7 @@ def place(
         if not last[name] - first[name] >= 1.0 / rates[name]:
             spans = ", ".join(f"{e.name} {e.axis.first_s:g} to {e.axis.last_s:g} s" for e in members[name])
             raise InputError("range", f"one in which all channels of {name} have samples ({spans})",
-                             f"{first[name]:g} to {last[name]:g} s")  # fmt: skip
+                             Words(f"{first[name]:g} to {last[name]:g} s"))  # fmt: skip
     # Time zero is an instant of the source wherever its samples stay as they are.
     lead = min(order, key=lambda name: first[name])
     zero_s = _next_sample(members[lead][0].axis, first[lead]) if _untouched(members[lead], rates[lead]) else first[lead]
@@ -83,7 +83,7 @@ def place(
         held = max(entry.axis.rows for entry in entries)
         if rows > _MOST_TIMES * held + _MOST_ROWS:
             must = f"such that {held} values in {name} become at most {_MOST_TIMES * held + _MOST_ROWS} rows"
-            raise InputError("resample.rate_hz", must, f"{rate} Hz, {rows} rows")
+            raise InputError("resample.rate_hz", must, Words(f"{rate} Hz, {rows} rows"))
         placed[name] = PlacedGroup(rate, start, rows, {entry.name: entry for entry in entries})
         for entry in entries:
             _put(placed[name], entry, mapping)
@@ -170,7 +170,7 @@ def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str])
         a, b = entry.channels
         group = next((group.channels for group in groups.values() if {a, b} <= set(group.channels)), None)
         if group is None or group[a].target.unit != group[b].target.unit or a == b:
-            raise InputError(f"rotate.{number}.channels", "two channels of one group and unit", f"{a}, {b}")
+            raise InputError(f"rotate.{number}.channels", "two channels of one group and unit", Words(f"{a}, {b}"))
         angles = np.radians(entry.angles_deg)
         seen = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         if abs(np.linalg.det(seen)) < 0.1:

@@ -15,7 +15,7 @@ from replays.recordings.formats.mapping import ChannelMapping, Mapping, SignalNa
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
 from rig import units
 from rig.channels import Channel, default_table
-from rig.errors import InputError, UnknownNameError
+from rig.errors import InputError, UnknownNameError, Words
 from rig.text import nearest
 
 BITS = 32
@@ -94,7 +94,7 @@ class Log:
             return found[0]
         if found:
             places = ", ".join(f"{source.path.name} {entry.group}".strip() for source, entry in found)
-            raise InputError(f"{where}.group", f"given, as {wanted.source} stands in {places}", wanted.group or "none")
+            raise InputError(f"{where}.group", f"given, as {wanted.source} stands in {places}", wanted.group or None)
         if not inside:
             groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
             raise InputError(f"{where}.group", f"one of {', '.join(groups)}", wanted.group)
@@ -109,7 +109,7 @@ class Log:
         """
         signal = source.read(entry)
         if not len(signal.values):
-            raise InputError(where, "a signal with values", f"{entry.name}, which is empty")
+            raise InputError(where, "a signal with values", Words(f"{entry.name}, which is empty"))
         axis = self._axis(signal, f"{entry.name} in {source.path.name}")
         if axis.numbers is not None:
             signal = replace(signal, values=axis.placed(signal.values.astype(float)))
@@ -129,7 +129,7 @@ class Log:
             return clock.axis_of_stamps(signal.times_s, line=time.stamps == "line", what=what)
         if signal.rate_hz is not None:
             return clock.Axis(signal.first_s, signal.rate_hz, rows, note="rate from the file")
-        raise InputError("time.rate_hz", f"given, as the file tells no rate of {what}", "none")
+        raise InputError("time.rate_hz", f"given, as the file tells no rate of {what}", None)
 
     def take(self, name: str, wanted: ChannelMapping) -> MappedSignal:
         """Find and read the signal of a channel.
@@ -158,11 +158,11 @@ class Log:
         if wanted.sensitivity is not None:
             per_unit_v = units.sensitivity_v(wanted.sensitivity, target.unit, field=f"{where}.sensitivity")
             if volts is None:
-                raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit or "none")
+                raise InputError(f"{where}.unit", "V or mV with a sensitivity", unit or None)
             gain = volts / per_unit_v
         else:
             if wanted.unit is None and not entry.unit and target.unit != "1":
-                raise InputError(f"{where}.unit", f"given, as {source.path.name} tells none", "none")
+                raise InputError(f"{where}.unit", f"given, as {source.path.name} tells none", None)
             # A pulse may stay in volts: only when it passes its level matters.
             pulse = volts is not None and target.unit == "1"
             gain = volts if pulse and volts is not None else units.factor(unit, target.unit, field=f"{where}.unit")
@@ -276,7 +276,7 @@ def engineering(entry: MappedSignal, mapping: Mapping) -> None:
         if wanted.missing == "refuse":
             time_s = float(entry.axis.instants()[at])
             raise InputError(where, 'free of missing values (missing = "gap" or "hold")',
-                             f"{entry.missing} of them, the first in row {at + 1} at {time_s:g} s")  # fmt: skip
+                             Words(f"{entry.missing} of them, the first in row {at + 1} at {time_s:g} s"))  # fmt: skip
         if wanted.missing == "hold":
             last = np.maximum.accumulate(np.where(bad, -1, np.arange(len(bad))))
             last[last < 0] = int(np.argmax(~bad))

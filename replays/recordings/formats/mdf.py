@@ -64,7 +64,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
 
 def _open(path: Path) -> Any:
-    asammdf = library("asammdf")
+    asammdf = library("MDF", "asammdf")
     try:
         with _quiet():
             return asammdf.MDF(path)
@@ -163,7 +163,7 @@ class MdfWriter(export.FormatWriter):
     sparse = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
-        asammdf = library("asammdf")
+        asammdf = library("MDF", "asammdf")
         self._path = path
         self._selection = selection
         self._signal = asammdf.Signal

@@ -16,7 +16,7 @@ from recorder.reader import Recording
 from recorder.survey import Stream
 from replays.recordings.formats.history import ExportEvent, happenings
 from rig.channels import Channel
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.text import nearest, printable
 from rig.wire import Block, sensor_key, truth_key
 
@@ -359,7 +359,7 @@ def select(
         held = [s for s in streams.values() if s.rows]
         low, high = min((s.first_time_s for s in held), default=0.0), max((s.last_time_s for s in held), default=0.0)
         ends = [f"{word} {end:g} s" for word, end in (("from", from_s), ("to", to_s)) if end is not None]
-        raise InputError("range", f"in the recording, {low:g} to {high:g} s", " ".join(ends) or "all of it")
+        raise InputError("range", f"in the recording, {low:g} to {high:g} s", " ".join(ends) or Words("all of it"))
     return Selection(
         recording=recording, tables=tuple(_merge(alike) for alike in tables.values()), unit=unit,
         from_s=-math.inf if from_s is None else from_s, to_s=math.inf if to_s is None else to_s,

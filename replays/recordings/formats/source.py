@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rig.errors import InputError
+from rig.errors import InputError, RefusedError, Words
 from rig.outside import open_file
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
         with open_file(path) as file:
             empty = not file.read(1)
     except OSError as error:
-        raise InputError("file", "a file that can be read", f"{path} ({error.strerror})") from None
+        raise InputError("file", "a file that can be read", Words(f"{path} ({error.strerror})")) from None
     if empty:
         raise InputError("file", "a file with something in it", str(path))
     if name != "delimited":
@@ -203,26 +203,33 @@ def _distinct(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
     return tuple(found)
 
 
-def library(name: str, module: str | None = None) -> Any:
+def library(what: str, name: str, module: str | None = None) -> Any:
     """An optional library.
 
+    Args:
+        what: The format that it is for.
+        name: What pip knows it by.
+        module: What Python knows it by, if that is another name.
+
     Raises:
-        InputError: It is not installed.
+        RefusedError: It is not installed, or fails when it is imported.
     """
     try:
         return importlib.import_module(module or name)
-    except ImportError:
-        raise InputError(
-            "this format",
-            f"asked for with the library {name} installed (pip install 'rotor-stator-rig[formats]')",
-            name,
-        ) from None
+    except Exception as error:  # whatever a broken installation raises
+        need = f"{what} files need the package {name}, which is"
+        if isinstance(error, ModuleNotFoundError) and error.name == (module or name):
+            line = f"{need} not installed: pip install 'rotor-stator-rig[formats]'"
+        else:
+            broken = f"{need} installed and broken ({type(error).__name__}: {error})"
+            line = f"{broken}: pip install --force-reinstall {name}"
+        raise RefusedError(line) from None
 
 
 def damaged(path: Path, what: str, error: Exception | str) -> InputError:
     """The one line for whatever a library raises on a file that it cannot read."""
     text = error if isinstance(error, str) else f"{type(error).__name__}: {error}"
-    return InputError("file", f"an intact {what} file", f"{path} ({text})"[:300])
+    return InputError("file", f"an intact {what} file", Words(f"{path} ({text})"[:300]))
 
 
 def even_rate_hz(times_s: np.ndarray) -> float | None:

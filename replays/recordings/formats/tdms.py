@@ -43,7 +43,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     Raises:
         InputError: It is none, it is cut off, or npTDMS is missing.
     """
-    nptdms = library("npTDMS", "nptdms")
+    nptdms = library("TDMS", "npTDMS", "nptdms")
     with _quiet():
         file = nptdms.TdmsFile.read_metadata(path)
     groups = [(group.name, group.channels()) for group in file.groups()]
@@ -120,7 +120,7 @@ class TdmsWriter(export.FormatWriter):
     """
 
     def __init__(self, path: Path, selection: Selection) -> None:
-        nptdms = library("npTDMS", "nptdms")
+        nptdms = library("TDMS", "npTDMS", "nptdms")
         self._api = nptdms
         self._selection = selection
         self._file = nptdms.TdmsWriter(path)

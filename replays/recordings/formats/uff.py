@@ -58,7 +58,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     Raises:
         InputError: It is none, is cut off, has no time history, or pyuff is missing.
     """
-    pyuff = library("pyuff")
+    pyuff = library("UFF", "pyuff")
     if not _ends(path):
         raise damaged(path, "universal (UFF)", "it is cut off")
     file = pyuff.UFF(str(path))

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field, FiniteFloat
 
 from replays.recordings.formats import export
 from replays.recordings.formats.source import Entry, FileSignal, Source, library
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.outside import DOCUMENT_BYTES, check
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     Raises:
         InputError: It is none, or soundfile is missing.
     """
-    soundfile = library("soundfile")
+    soundfile = library("WAV", "soundfile")
     with soundfile.SoundFile(path) as file:
         rate, channels, rows, subtype = file.samplerate, file.channels, file.frames, file.subtype
         comment = file.copy_metadata().get("comment", "")
@@ -108,14 +108,16 @@ class WavWriter(export.FormatWriter):
     sidecar = True
 
     def __init__(self, path: Path, selection: Selection) -> None:
-        soundfile = library("soundfile")
+        soundfile = library("WAV", "soundfile")
         table = selection.tables[0]
         if not float(table.rate_hz).is_integer():
             raise InputError("rate_hz", "a whole number for a WAV file", table.rate_hz)
         if len(table.columns) > 1024:
             raise InputError("channels", "at most 1024 in a WAV file", len(table.columns))
         if not selection.whole(table):
-            raise InputError("range", "free of missing rows for a WAV file (from_s and to_s choose)", "one with gaps")
+            raise InputError(
+                "range", "free of missing rows for a WAV file (from_s and to_s choose)", Words("one with gaps")
+            )
         truth = any(column.source is None for column in table.columns)
         bits = max((column.source.adc_bits for column in table.columns if column.source is not None), default=64)
         self._integers = selection.unit == "counts" and not truth

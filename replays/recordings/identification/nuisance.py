@@ -18,7 +18,7 @@ from replays.recordings.identification.question import first_command_s, observe
 from replays.recordings.least_squares import Fit, fit
 from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.sensitivity import ANGLE, Predictor, on_the_models_clock, value_of, with_values
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 NUISANCES = (
     "clock.offset_s",
@@ -195,7 +195,7 @@ def check_begin(experiment: Experiment, to_s: float | None) -> None:
     if experiment.first_s > 0.0 and hammer_s > 0.0 and (to_s is None or to_s > hammer_s):
         must = "a log that begins with the run, at rest (lead_s = 0 in its mapping), to be fitted through impacts; of "
         must += f"one from the middle of a run, only what is before the hammer pulse: --to {hammer_s - _MARGIN_S:.3f}"
-        raise InputError("file", must, f"{experiment.first_s:g} s of the run are before its first sample")
+        raise InputError("file", must, Words(f"{experiment.first_s:g} s of the run are before its first sample"))
 
 
 def shortly_before(experiment: Experiment) -> float | None:

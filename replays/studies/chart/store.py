@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from replays.studies import provenance
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 KEY = ("mode", "panel", "phase", "case", "method", "rung")
 """Columns that tell one point from another."""
@@ -44,11 +44,11 @@ class Store:
             InputError: It cannot be written, or is a file.
         """
         if folder.exists() and not folder.is_dir():
-            raise InputError("output", "a folder", f"{folder}, which is a file")
+            raise InputError("output", "a folder", Words(f"{folder}, which is a file"))
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError("output", "a folder that can be made", f"{folder} ({error.strerror})") from None
+            raise InputError("output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
         if not os.access(folder, os.W_OK):
             raise InputError("output", "a folder that can be written", str(folder))
         self.folder, self.stem = folder, stem

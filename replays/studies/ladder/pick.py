@@ -6,7 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.pick import Pick
 from rig.scenes import Scene, load_scene, pick_digests, scene_path
 
@@ -91,7 +91,7 @@ def with_pick(text: str, pick: Pick) -> str:
     except tomllib.TOMLDecodeError:
         new_data = {}
     if new_data.pop("pick", None) is None or old_data != new_data:
-        raise InputError("--write", "a file whose [pick] stands in a table of its own", "text that hides it")
+        raise InputError("--write", "a file whose [pick] stands in a table of its own", Words("text that hides it"))
     return new
 
 

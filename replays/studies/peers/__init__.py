@@ -16,7 +16,7 @@ import numpy as np
 
 from replays.studies.peers.problem import ERROR_COLUMNS, ERROR_SCALE, Problem, scaled_error
 from replays.studies.peers.solution import Journal, Manner, Setting, Solution
-from rig.errors import InputError
+from rig.errors import InputError, Words
 
 __all__ = [
     "ERROR_COLUMNS", "ERROR_SCALE", "PEERS", "Peer", "Problem", "Setting", "Solution", "scaled_error",
@@ -75,7 +75,9 @@ class Peer:
         """
         if not self.installed:
             raise InputError(
-                "peer", f"installed ({self.name} needs {self.module}: pip install 'rotor-stator-rig[peers]')", "missing"
+                "peer",
+                f"installed ({self.name} needs {self.module}: pip install 'rotor-stator-rig[peers]')",
+                Words("missing"),
             )
 
     def solve(self, problem: Problem, setting: Setting | None = None, *, budget_s: float = 60.0) -> Solution:

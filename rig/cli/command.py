@@ -1,0 +1,189 @@
+"""What every command of `rig` has in common: its page of help, and that it is loaded only when it is called.
+
+The page is plain text that fits 80 columns. To draw it as typer does would take longer than all else that a page needs,
+and boxes do not go well through a pipe.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from keyword import iskeyword
+from typing import Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from rig.cli.groups import grouped
+from rig.errors import InputError, RefusedError, Words
+from rig.text import nearest
+
+_PLAIN: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None}
+_SETTINGS = {"help_option_names": ["-h", "--help"]}
+_NEGATIVE = re.compile(r"-\.?(\d|inf$|nan$)", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?[\d.]+|nan|inf")
+
+
+class _Page:
+    """Options in sections under their panels' titles, arguments by their own names."""
+
+    params: list[Any]
+    get_params: Callable[[Any], list[Any]]
+
+    def get_help_option(self, ctx: Any) -> Any:
+        option = super().get_help_option(ctx)  # type: ignore[misc]
+        option.default = False  # of None, typer would have pydantic make a truth value: a tenth of a second
+        return option
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        tail = ["COMMAND ..."] if isinstance(self, TyperGroup) else []
+        return [
+            "[OPTIONS]",
+            *(shown_name(param) for param in self.params if param.param_type_name == "argument"),
+            *tail,
+        ]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in sorted(self.get_params(ctx), key=lambda param: param.param_type_name != "argument"):
+            if (record := param.get_help_record(ctx)) is not None:
+                title = getattr(param, "rich_help_panel", None) or f"{param.param_type_name.capitalize()}s"
+                name = shown_name(param) if param.param_type_name == "argument" else record[0]
+                sections.setdefault(title, []).append((name, record[1]))
+        _write(sections, formatter)
+
+
+def shown_name(param: Any) -> str:
+    """What a person knows a parameter by."""
+    options = [name for name in param.opts if name.startswith("-")]
+    return max(options, key=len) if options else param.metavar or param.name.upper()
+
+
+def _write(sections: Mapping[str, list[tuple[str, str]]], formatter: Any) -> None:
+    for title, rows in sections.items():
+        with formatter.section(title):
+            formatter.write_dl(rows)
+
+
+class _Command(_Page, TyperCommand):
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        # A negative number is a value, not an option: whoever gets it explains what is wrong with it.
+        ctx.ignore_unknown_options = any(map(_NEGATIVE.match, args))
+        ctx.allow_extra_args = True
+        if rest := super().parse_args(ctx, args):
+            raise InputError("argument", f"one that `{ctx.command_path}` takes (see -h)", rest[0])
+        for param in self.params:
+            value = ctx.params[param.name]
+            # No comparison refuses it: it would be waited for, or counted to, without end.
+            if any(isinstance(each, float) and each != each for each in (value if param.multiple else [value])):
+                raise InputError(shown_name(param), "a number", Words("nan"))
+        return rest
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except RefusedError:
+            raise
+        except InputError as error:
+            # What is a field to whoever refused it is an option to whoever gave it.
+            option = f"--{error.field.replace('_', '-')}"
+            given = (param for param in self.params if option in param.opts and ctx.params[param.name] != param.default)
+            if next(given, None) is None:
+                raise
+            raise InputError(option, error.must, error.received) from None
+
+
+class Group(_Page, TyperGroup):
+    """Commands by the titles that they stand under, each with its line of help; none is imported before it is called.
+
+    Attributes:
+        sections: Names and lines by title.
+        load: Gives the command of a name.
+    """
+
+    sections: Mapping[str, Mapping[str, str]]
+    load: Callable[[str], Any]
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names of all commands, in the order of the help."""
+        return [name for commands in self.sections.values() for name in commands]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command of a name.
+
+        Raises:
+            InputError: There is none.
+        """
+        names = self.list_commands(ctx)
+        if cmd_name in names:
+            return self.load(cmd_name)
+        near = nearest(cmd_name, names) or names
+        raise InputError("command", f"one of `{ctx.command_path} -h`, such as {' or '.join(near[:2])}", cmd_name)
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """The options, then the commands."""
+        super().format_options(ctx, formatter)
+        width = max(map(len, self.list_commands(ctx)))
+        for title, commands in self.sections.items():
+            _write({title: [(f"{name:{width}}", line) for name, line in commands.items()]}, formatter)
+
+
+def load_command(module: str, name: str) -> Any:
+    """The command that is the function of its name in a module, behind which an underscore stands if need be."""
+    name, shown = name + "_" * iskeyword(name), name
+    function = grouped(getattr(import_module(f"rig.cli.{module}{'_' * iskeyword(module)}"), name))
+    app = typer.Typer(**_PLAIN)
+    app.command(shown, cls=_Command, context_settings=_SETTINGS)(function)
+    return typer.main.get_command(app)
+
+
+def make_group(
+    name: str,
+    sections: Mapping[str, Mapping[str, str]],
+    load: Callable[[str], Any],
+    callback: Callable[..., None],
+    help: str | None = None,
+) -> Group:
+    """A group of commands.
+
+    Args:
+        name: Its name.
+        sections: As for `Group`.
+        load: As for `Group`.
+        callback: What is done before a command, and without one.
+        help: Its text; without it, that of the callback.
+    """
+    app = typer.Typer(name=name, **_PLAIN)
+    app.callback(cls=Group, help=help or callback.__doc__, invoke_without_command=True, context_settings=_SETTINGS)(
+        callback
+    )
+    group = typer.main.get_command(app)
+    assert isinstance(group, Group)
+    group.sections, group.load = sections, load
+    return group
+
+
+def usage_error(error: Any) -> str:
+    """What was wrong with the options, in the form of every other wrong value where it has one."""
+    page, kind = f"`{error.ctx.command_path if error.ctx is not None else 'rig'} -h`", type(error).__name__
+    wrong = error.__cause__.errors()[0] if hasattr(error.__cause__, "errors") else None
+    if kind == "NoSuchOption":
+        near = " or ".join([name for name in error.possibilities or () if name.startswith("--")][:2])
+        found = InputError("option", f"one of {page}" + f", such as {near}" * bool(near), error.option_name)
+    elif kind == "MissingParameter":
+        says = (error.param.help or page).rstrip(".")
+        found = InputError(shown_name(error.param), f"given: {says[0].lower()}{says[1:]}", None)
+    elif kind == "BadOptionUsage":
+        with_value = "requires" in error.message
+        must = "followed by a value" if with_value else "given without a value"
+        found = InputError(error.option_name, must, None if with_value else Words("one"))
+    elif wrong is not None:
+        received = Words(wrong["input"]) if _NUMBER.fullmatch(str(wrong["input"])) else wrong["input"]
+        must = wrong["msg"].removeprefix("Input should be ").partition(", unable")[0]
+        if "is not one of" in must:
+            must = "one of " + must.partition(" is not one of ")[2].rstrip(".").replace("'", "")
+        found = InputError(shown_name(error.param), must, received)
+    else:
+        return f"{error.format_message()} (see {page})"
+    return str(found)
