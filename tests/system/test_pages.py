@@ -141,7 +141,8 @@ class Reader:
         running = self.terminals[terminal] = Running(command, process, log, status)
         deadline = time.monotonic() + COMPILE_S
         while _READY[command.split()[1]] not in running.said():
-            assert process.poll() is None and time.monotonic() < deadline, f"{command}\n{running.said()}"
+            assert process.poll() is None, f"{command}\n{running.said()}"
+            assert time.monotonic() < deadline, f"{command}\n{running.said()}"
             time.sleep(0.05)
 
     def leave(self) -> None:
@@ -189,7 +190,9 @@ def test_a_page_says_what_works(page: Path, reader: Reader) -> None:
 
 
 def test_the_two_commands_of_the_readme_differ_in_what_they_install_alone() -> None:
-    commands = {directive: text for directive, _, text in blocks_of(ROOT / "README.md") if directive.endswith(" command")}
+    commands = {
+        directive: text for directive, _, text in blocks_of(ROOT / "README.md") if directive.endswith(" command")
+    }
     assert set(commands) == {"demo command", "test command"}
     for text in commands.values():
         assert re.fullmatch(r"python3 -m venv \.venv && \.venv/bin/pip install -q (-e )?'\.\[\w+\]' && .*\n", text)
