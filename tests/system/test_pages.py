@@ -22,9 +22,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-import click
 import pytest
-import typer.main
+import typer
 
 from tests.processes import COMPILE_S, ROOT
 
@@ -56,6 +55,11 @@ class Running:
     log: IO[bytes]
     status: int
 
+    @property
+    def ends_with_the_rig(self) -> bool:
+        """It serves a rig, or records one."""
+        return self.line.split()[1] in ("run", "replay", "record")
+
     def said(self) -> str:
         """What it has printed so far."""
         return Path(self.log.name).read_text(encoding="utf-8", errors="replace")
@@ -77,7 +81,6 @@ class Reader:
     terminals: dict[str, Running] = field(default_factory=dict)
     settings: list[str] = field(default_factory=list)
     """Variables of the shell that the page has set so far."""
-    stopped: bool = False
 
     def do(self, directive: str, language: str, text: str) -> None:
         """Do what one block says."""
@@ -107,7 +110,9 @@ class Reader:
             self._start(terminal[1], command, status)
         else:
             self._run(command, status)
-            self.stopped = self.stopped or command.startswith("rig stop")
+            if command.startswith("rig stop"):  # its recorder ends with it
+                for name in [name for name, each in self.terminals.items() if each.ends_with_the_rig]:
+                    self.terminals.pop(name).end(by_itself=True)
 
     def _script(self, command: str) -> list[str]:
         return ["bash", "-c", "\n".join([*self.settings, command])]
@@ -146,9 +151,9 @@ class Reader:
             time.sleep(0.05)
 
     def leave(self) -> None:
-        """End what the page left running: first those that began last. A rig that is stopped ends its recorder too."""
+        """End what the page left running: first those that began last."""
         for running in reversed(self.terminals.values()):
-            running.end(by_itself=self.stopped and running.line.split()[1] in ("run", "record", "replay"))
+            running.end(by_itself=False)
 
     def kill(self) -> None:
         """Leave nothing behind, whatever happened."""
@@ -206,18 +211,17 @@ def spans_of(text: str) -> Iterator[list[str]]:
 
 @pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.stem)
 def test_every_command_that_is_named_is_there_with_its_options(page: Path) -> None:
-    from rig.cli.app import app
+    from rig.cli.app import rig
+    from rig.cli.command import Group
 
     found = 0
     for words in spans_of(page.read_text(encoding="utf-8")):
-        command: Any = typer.main.get_command(app)
+        command: Any = rig()
         rest = list(words)
-        while isinstance(command, click.Group) and rest and not rest[0].startswith("-"):
-            name = rest.pop(0)
-            command = command.get_command(click.Context(command), name)
-            assert command is not None, f"no command {name!r} in: rig {' '.join(words)}"
+        while isinstance(command, Group) and rest and not rest[0].startswith("-"):
+            command = command.get_command(typer.Context(command), rest.pop(0))
         options = {name for parameter in command.params for name in [*parameter.opts, *parameter.secondary_opts]}
-        options |= {"--help", "-h", "--install-completion", "--show-completion"}
+        options |= {"--help", "-h"}
         for word in rest:
             if word.startswith("-") and not re.match(r"-\d", word):
                 assert word.rstrip(",.;)").partition("=")[0] in options, f"{word} in: rig {' '.join(words)}"
