@@ -51,12 +51,21 @@ if not TYPE_CHECKING:  # a type checker knows all names by the imports above
 
     def __getattr__(name: str) -> Any:
         # Loaded on first use: `rig --help` must not wait for compiled code.
-        from importlib import import_module
+        from importlib import import_module, metadata
 
+        if name == "__version__":
+            return metadata.version("rotor-stator-rig")
         home = next((home for home, names in _HOMES.items() if name in names), None)
         if home is None:
             raise AttributeError(f"module 'rig' has no attribute {name!r}")
-        return getattr(import_module(f"rig.{home}"), name)
+        try:
+            return getattr(import_module(f"rig.{home}"), name)
+        except ModuleNotFoundError as error:
+            from rig.errors import FULL_INSTALL, belongs_to_full
+
+            if belongs_to_full(error):
+                error.add_note(f"rig.{name} needs {error.name}, {FULL_INSTALL}")
+            raise
 
 
 def __dir__() -> list[str]:

@@ -12,6 +12,9 @@ from rig.text import nearest, printable, shown
 
 PART_SUFFIX = ".part"
 """What a file's name ends in while it is being written."""
+FULL = frozenset({"scipy", "numba", "rerun", "matplotlib", "pyarrow", "jinja2", "fpdf"})
+"""What the extra `full` brings, by the names that are imported: what talks to a rig does without."""
+FULL_INSTALL = "which comes with the whole rig: pip install 'rotor-stator-rig[full]'"
 _LONGEST_LINE = 5000
 _MOST_NAMES = 12
 
@@ -76,6 +79,11 @@ class SimulationError(RuntimeError):
 
 class DiskError(RuntimeError):
     """The disk refused in the middle of writing; the message says what is kept of it."""
+
+
+def belongs_to_full(error: ModuleNotFoundError) -> bool:
+    """Whether what is not there is a part of the whole rig, and so was left out on purpose."""
+    return (error.name or "").partition(".")[0] in FULL
 
 
 def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: bool) -> None:

@@ -11,7 +11,7 @@ import typer
 
 from rig.cli import origin
 from rig.cli.command import Group, load_command, make_group, usage_error
-from rig.errors import DiskError, InputError, SimulationError
+from rig.errors import FULL_INSTALL, DiskError, InputError, SimulationError, belongs_to_full
 from rig.text import printable
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
@@ -132,6 +132,10 @@ def start(arguments: list[str] | None = None) -> None:
         _fail(usage_error(error))
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", status=_INTERRUPTED)
+    except ModuleNotFoundError as error:
+        if not belongs_to_full(error):
+            raise
+        _fail(f"this needs {error.name}, {FULL_INSTALL}")
     except BrokenPipeError:
         # The reader of our output has gone (`rig params | head`): nothing is wrong.
         sys.stderr.close()

@@ -226,11 +226,15 @@ def run_session(session: RecordingSession) -> Summary:
 
     before = {number: signal.signal(number, stop) for number in ends}
     console = table_console(stderr=True)
-    told, name = 0, f"recording {printable(session.path.name, 30)}"
+    told, begun, name = 0, False, f"recording {printable(session.path.name, 30)}"
     try:
         with console.status(plain(f"{name}: waiting for the rig")) as status:
 
             def show(progress: Progress) -> None:
+                nonlocal begun
+                if progress.rows and not begun and not console.is_terminal:
+                    echo(f"rig: recording {session.path}; Ctrl-C ends it well", err=True)  # scripts wait for this line
+                begun = begun or progress.rows > 0
                 remark(progress.remarks)
                 lost = f"{progress.lost} lost"
                 parts = [

@@ -10,6 +10,7 @@ import itertools
 import tomllib
 from dataclasses import dataclass, field
 from html import escape
+from math import fsum
 from pathlib import Path
 from typing import Any
 
@@ -59,18 +60,18 @@ class Box:
         """Work out width and height, inside first."""
         for box in itertools.chain(*self.rows):
             box.measure()
-        inner = [sum(box.width for box in row) + GAP * (len(row) - 1) for row in self.rows]
+        inner = [fsum(box.width for box in row) + GAP * (len(row) - 1) for row in self.rows]
         self.width = max(least, len(self.label) * CHARACTER + 2 * PAD, max(inner, default=0.0) + 2 * PAD)
         self.height = float(LINE)
         if self.rows:
-            self.height += sum(max(box.height for box in row) + GAP for row in self.rows) + PAD - GAP / 2
+            self.height += fsum(max(box.height for box in row) + GAP for row in self.rows) + PAD - GAP / 2
 
     def place(self, left: float, top: float) -> None:
         """Set where it is, and what is in it, each row in the middle."""
         self.left, self.top = left, top
         at = top + LINE
         for row in self.rows:
-            across = left + (self.width - sum(box.width for box in row) - GAP * (len(row) - 1)) / 2
+            across = left + (self.width - fsum(box.width for box in row) - GAP * (len(row) - 1)) / 2
             for box in row:
                 if box.rows:
                     box.height = max(beside.height for beside in row)
