@@ -233,7 +233,8 @@ def run_session(session: RecordingSession) -> Summary:
             def show(progress: Progress) -> None:
                 nonlocal begun
                 if progress.rows and not begun and not console.is_terminal:
-                    echo(f"rig: recording {session.path}; Ctrl-C ends it well", err=True)  # scripts wait for this line
+                    begin = f"rig: recording {printable(str(session.path))}; Ctrl-C ends it well"
+                    echo(begin, err=True)  # scripts wait for this line
                 begun = begun or progress.rows > 0
                 remark(progress.remarks)
                 lost = f"{progress.lost} lost"

@@ -292,11 +292,12 @@ def uses() -> dict[str, Use]:
     from replays.recordings.formats.export import export, merged
     from replays.recordings.formats.selection import select
     from rig.cli import info
+    from rig.cli.tables import Form
 
     def told(path: Path, _: Path) -> object:
         recording = join([path])
         with unheard():
-            info.info([path])
+            info.info([path], form=Form())
             return json.dumps(info.describe(recording, quick=True))
 
     def exported(suffix: str) -> Use:

@@ -320,8 +320,8 @@ def test_the_live_view_draws_the_true_rows(monkeypatch: pytest.MonkeyPatch) -> N
         if is_true and key.startswith(wire.SENSORS):
             rows += len(wire.decode_block(payload, wire.SAMPLE_SCHEMA).values)
         if number % 500 == 0:
-            view.draw()
-    view.draw()
+            view.take_in()
+    view.take_in()
     assert (view.received, view.lost, still.rows) == (rows, 0, rows)
     assert view.ended == "completed"
     assert view.malformed > inputs(3000) / 3
