@@ -11,8 +11,8 @@ import typer
 
 from rig.cli import origin
 from rig.cli.command import Group, load_command, make_group, usage_error
+from rig.cli.tables import echo
 from rig.errors import FULL_INSTALL, DiskError, InputError, SimulationError, belongs_to_full
-from rig.text import printable
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
@@ -151,5 +151,5 @@ def start(arguments: list[str] | None = None) -> None:
 
 
 def _fail(message: str, *, status: int = 2) -> NoReturn:
-    print("rig: " + printable(" ".join(message.split())), file=sys.stderr)
+    echo("rig: " + " ".join(message.split()), err=True)
     sys.exit(status)

@@ -54,13 +54,14 @@ def run(
         from rig.simulation import Simulation
         from rig.transport.endpoint import check_free, parse_endpoint, parse_loopback
 
-        check_free(parse_loopback(serving.listen, field="--listen"), field="--listen")
-        if exposed is not None:
-            check_free(parse_endpoint(exposed.endpoint, field="--expose"), field="--expose")
         loaded = load_scene(scene, overrides)
         bus = can.output()
         simulation = Simulation(loaded)
         block_ticks = _block_ticks(block_ms, simulation)
+        # Last: a wrong line is told as such also where another rig runs.
+        check_free(parse_loopback(serving.listen, field="--listen"), field="--listen")
+        if exposed is not None:
+            check_free(parse_endpoint(exposed.endpoint, field="--expose"), field="--expose")
         echo(f"rig: scene {scene}, {pace}; preparing", err=True)
         # Before anybody can connect: whoever does is answered at once.
         with reporting(compiles=True):
