@@ -25,6 +25,7 @@ from functools import cache
 from drivers.can.bus.frame import FD_LENGTHS
 from drivers.can.message import ABSENT, Message, MessageTable, Samples, Signal
 from rig.channels import Channel, ChannelTable, default_table
+from rig.errors import InputError
 
 CLASSIC_HZ = 1_000
 FD_HZ = 10_000
@@ -358,25 +359,39 @@ def command_frame(
     kind: Kind,
     counter: int,
     *,
-    force_n: float = 0.0,
-    duration_ms: float = 0.0,
-    direction: float = 0.0,
-    speed_hz: float = 0.0,
+    force_n: float | None = None,
+    duration_ms: float | None = None,
+    direction: float | None = None,
+    speed_hz: float | None = None,
 ) -> tuple[int, bytes]:
-    """Identifier and data of a command, as a controller sends it.
+    """Identifier and data of a command, as a controller sends it. Whether the rig takes its values, the rig says.
 
     Args:
         kind: What to do.
         counter: One more than that of the last one (see Heartbeat), modulo 256; the first has 1.
         force_n: Peak force [N], to 0.1.
         duration_ms: Length of the half sine [ms], to 0.25.
-        direction: From x toward y [degrees], to 1.5.
+        direction: From x toward y [degrees], to 1.5; 0 unless given.
         speed_hz: Speed that the drive holds [Hz], to 0.001.
+
+    Raises:
+        InputError: A value is missing, is one of another kind, or finds no room in the frame.
     """
     message = default_messages().by_name["Stop" if kind is Kind.STOP else "Command"]
     values = {"force_n": force_n, "duration_ms": duration_ms, "direction": direction, "speed_hz": speed_hz}
-    scales = {signal.name: signal.scale for signal in message.signals}
-    raw = {key: round(values[name] / scales[key]) for key, name in _REQUEST_FIELDS[kind].items()}
+    if kind is Kind.HAMMER:
+        values["direction"] = (direction or 0.0) % 360.0
+    signals = {signal.name: signal for signal in message.signals}
+    raw = {}
+    for key, name in _REQUEST_FIELDS[kind].items():
+        signal, value = signals[key], values.pop(name)
+        most = signal.raw_range[1] * signal.scale
+        if value is None or not 0.0 <= value <= most:
+            raise InputError(name, f"given for {kind.name}, from 0 to {most:g} {signal.unit}", value)
+        raw[key] = round(value / signal.scale)
+    for name, value in values.items():
+        if value is not None:
+            raise InputError(name, f"left out: {kind.name} has no such value", value)
     if "direction" in raw:
         raw["direction"] %= _DIRECTIONS
     data = message.encode(kind=int(kind), counter=counter & 0xFF, key=KEY, **raw)

@@ -167,6 +167,12 @@ class LiveView:
         # Events are few: those from before we came are fetched.
         self._client.subscribe(wire.EVENTS, self.take, history=True)
         self._client.watch(wire.ALIVE, self._watch)
+        try:
+            return self._draw_on(stop, tell)
+        finally:
+            self._report(done=True)
+
+    def _draw_on(self, stop: Callable[[], bool], tell: Callable[[str], None]) -> str:
         heard_s, beat_s, check_s = time.monotonic(), 0.0, 0.0
         while True:
             now_s = time.monotonic()
@@ -192,7 +198,6 @@ class LiveView:
                 if self.ended is None:
                     self._painter.note(self._painter.now_s, reason, level="WARN")
                 self._painter.close()
-                self._report(done=True)
                 return reason
             # An absolute grid is not needed here: a late picture is only late.
             time.sleep(max(0.0, _TICK_S - (time.monotonic() - now_s)))

@@ -160,7 +160,8 @@ def complete(root: Group, shell: str, line: str) -> list[str]:
     # Of a word with = or : in it, bash replaces only what is behind the last one.
     cut = max(start.rfind("="), start.rfind(":")) + 1 if shell == "bash" else 0
     head = "" if shell == "bash" else head
-    fit = [each for each in found if not each[0] or (each[0].startswith(start) and each[0] != start)]
+    fit = [each for each in found if not each[0] or each[0].startswith(start)]
+    fit = [] if [word for word, _ in fit] == [start] != [""] else fit  # it is complete
     return [f"{word and head + word[cut:]}\t{printable(says)}" for word, says in fit]
 
 

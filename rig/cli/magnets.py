@@ -51,7 +51,7 @@ def _show(document: dict[str, Any], console: Console) -> None:
 
 def _force_table(document: dict[str, Any], column: str, title: str) -> Table:
     places = (f">{place:.3g} mm [N]" for place in document["displacement_mm"])
-    table = new_table(title, "model", "runs as", ">K [kN/m]", *places, spare=["runs as"])
+    table = new_table(title, "model", "runs as", ">K [kN/m]", *places, keys=2)
     scaled = column == "force_at_stiffness_used_n"
     for model in document["models"]:
         stiffness = document["stiffness_used_n_m"] if scaled else model["stiffness_n_m"]

@@ -331,7 +331,7 @@ class ZenohClient:
         return NoReplyError(f"{self.endpoint} listens, but does not let us in {why}")
 
     def _no_reply(self) -> NoReplyError:
-        return NoReplyError(f"no rig answers at {self.endpoint}; start one with: rig run hammer (see rig run --help)")
+        return NoReplyError(f"no rig answers at {self.endpoint}; start one with: rig run stable-run")
 
     @property
     def connection(self) -> str | None:

@@ -115,10 +115,9 @@ def a_frame(random: np.random.Generator, last: int) -> can.Message:
     """A frame that is a command, nearly one, or anything else."""
     kind = tuple(Kind)[random.integers(len(Kind))]
     counter = (last + int(random.integers(-3, AHEAD + 4))) % 256
-    identifier, data = command_frame(
-        kind, counter, force_n=float(random.uniform(0, 6500)), duration_ms=float(random.uniform(0, 63)),
-        direction=float(random.uniform(0, 360)), speed_hz=float(random.uniform(0, 16_000)),
-    )  # fmt: skip
+    most = {Kind.HAMMER: {"force_n": 6500, "duration_ms": 63, "direction": 360}, Kind.SPEED: {"speed_hz": 16_000}}
+    values = {name: float(random.uniform(0, end)) for name, end in most.get(kind, {}).items()}
+    identifier, data = command_frame(kind, counter, **values)
     flags: dict[str, Any] = {"is_extended_id": False}
     choice = random.integers(10)
     if choice < 4:

@@ -133,8 +133,9 @@ def test_a_command_made_by_cantools_alone_is_taken() -> None:
 
 
 def test_cantools_decodes_every_command() -> None:
+    values = {Kind.HAMMER: {"force_n": 100.0, "duration_ms": 5.0}, Kind.SPEED: {"speed_hz": 6.2}}
     for kind in Kind:
-        decoded = DATABASE.decode_message(*command_frame(kind, 9, force_n=100.0, duration_ms=5.0, speed_hz=6.2))
+        decoded = DATABASE.decode_message(*command_frame(kind, 9, **values.get(kind, {})))
         assert str(decoded["kind"]) == kind.name.lower()
         assert decoded["counter"] == 9
 
@@ -145,7 +146,7 @@ def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeyp
     data = probes.samples.pack(np.array([10]), np.full((5, 4), 0x1000, np.int32), 64).tobytes()
     lines = [
         f"(1700000000.000000) can0 {probes.identifier:03X}##1{data.hex().upper()}",
-        f"(1700000000.000100) can0 {0x020:03X}#{command_frame(Kind.HAMMER, 1, force_n=50.0)[1].hex().upper()}",
+        f"(1700000000.000100) can0 {0x020:03X}#{command_frame(Kind.HAMMER, 1, force_n=50.0, duration_ms=5.0)[1].hex().upper()}",
     ]
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines) + "\n"))
     monkeypatch.setattr(sys, "argv", ["cantools", "decode", str(dbc.COPY)])

@@ -385,7 +385,10 @@ def test_refusals_name_their_reason_and_are_counted() -> None:
         reply = setup.tap.ask(*command_frame(Kind.HAMMER, 2, force_n=5000.0, duration_ms=5.0))
         assert (reply["result"], reply["field"], reply["limit"]) == (Result.OUT_OF_RANGE, 1, 10_000)
         # Used up by the refusal.
-        assert setup.tap.ask(*command_frame(Kind.HAMMER, 2, force_n=50.0))["result"] == Result.STALE_COUNTER
+        assert (
+            setup.tap.ask(*command_frame(Kind.HAMMER, 2, force_n=50.0, duration_ms=5.0))["result"]
+            == Result.STALE_COUNTER
+        )
         assert dict(setup.gateway.commands.refused) == {
             "bad_checksum": 1, "bad_length": 1, "stale_counter": 2, "out_of_range": 1,
         }  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from drivers.can.signals import (
     parse_command,
 )
 from rig.channels import ChannelTable, default_table
+from rig.errors import InputError
 from rig.errors import InputError
 
 TABLE = default_messages()
@@ -213,6 +215,20 @@ def test_each_way_of_being_wrong_has_its_result() -> None:
         assert parse_command(*_signed(place, plain[:3] + b"\x01" + plain[4:]), 7) is Result.RESERVED_BITS
     place, plain = command_frame(Kind.SPEED, 8, speed_hz=5.0)
     assert parse_command(*_signed(place, plain[:5] + b"\x01" + plain[6:]), 7) is Result.RESERVED_BITS
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "line"),
+    [
+        (Kind.SPEED, {}, "speed_hz must be given for SPEED, from 0 to 65.535 Hz; instead received nothing"),
+        (Kind.SPEED, {"speed_hz": 5.0, "force_n": 10.0}, "force_n must be left out: SPEED has no such value; instead"),
+        (Kind.HAMMER, {"force_n": 1e6, "duration_ms": 5.0}, "force_n must be given for HAMMER, from 0 to 6553.5 N; "),
+        (Kind.HAMMER, {"force_n": 1.0, "duration_ms": 5.0, "direction": np.nan}, "direction must be given for HAMMER"),
+    ],
+)
+def test_a_frame_has_the_values_of_its_kind(kind: Kind, values: dict[str, float], line: str) -> None:
+    with pytest.raises(InputError, match=re.escape(line)):
+        command_frame(kind, 1, **values)
 
 
 def test_only_a_counter_that_goes_on_is_taken() -> None:
