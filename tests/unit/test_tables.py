@@ -50,6 +50,13 @@ def test_command_prints_tables_that_are_legible(arguments: list[Any], capsys: py
         json.loads(shown(capsys, *arguments, "--json"))
 
 
+def test_an_encoding_that_lacks_a_character_shows_it_escaped() -> None:
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    found = subprocess.run([sys.executable, "-m", "rig", "laws"], env=environment, capture_output=True, timeout=120)
+    assert found.returncode == 0, found.stderr.decode()
+    assert b"\\xb5" in found.stdout
+
+
 def test_json_has_null_for_what_is_no_number(capsys: pytest.CaptureFixture[str]) -> None:
     echo_json({"a": math.nan, "b": [math.inf, 1.0], "c": ({"d": -math.inf},)})
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0], "c": [{"d": None}]}
