@@ -199,7 +199,7 @@ class Selection:
         """What is known of the whole."""
         about = self.recording.metadata["rig"]
         return {
-            "recording": self.recording.path.name, "scene": about["scene"], "seed": about["seed"],
+            "recording": printable(self.recording.path.name), "scene": about["scene"], "seed": about["seed"],
             "parameter_set": about["parameter_set"], "start": self.start.isoformat(), "values": self.unit, **self.notes,
         }  # fmt: skip
 
