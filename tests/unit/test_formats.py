@@ -175,8 +175,10 @@ def counts_of(recording: Recording, group: str) -> np.ndarray:
 def test_a_recording_whose_name_is_no_text_is_exported(suffix: str, recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"a\xff\x01.mcap")
     path.write_bytes(recording.path.read_bytes())
-    chosen = select(Recording.open(path), channels=["disk_x"])
-    assert chosen.metadata["recording"] == "a\\udcff\\x01.mcap"
+    opened = Recording.open(path)
+    opened.metadata["rig"]["scene"] = "\x01"
+    chosen = select(opened, channels=["disk_x"])
+    assert (chosen.metadata["recording"], chosen.metadata["scene"]) == ("a\\udcff\\x01.mcap", "\\x01")
     export(chosen, tmp_path / f"out{suffix}")
 
 
