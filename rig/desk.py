@@ -6,7 +6,6 @@ commands wait for the thread that runs, which takes them between two blocks.
 
 from __future__ import annotations
 
-import math
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -261,14 +260,3 @@ def refusal(error: Exception) -> dict[str, Any]:
 def one_line(error: BaseException) -> str:
     """What an error says, without line breaks."""
     return " ".join(printable(str(error), 2000).split()) or type(error).__name__
-
-
-def finite(value: Any) -> Any:
-    """The same document with None for numbers that JSON cannot carry: a diverged run must still be able to say so."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {name: finite(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    return value

@@ -73,6 +73,9 @@ class Run:
         """
         return self.signals[:, place(name, NAMES, must=_MUST)]
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(NAMES)
+
     def unit(self, name: str) -> str:
         """SI unit of one signal of the model, `run[name]`."""
         return ROW[place(name, NAMES, must=_MUST)].unit

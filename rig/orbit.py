@@ -125,8 +125,8 @@ def waterfall(
         >>> [f"{at:.2f} s: {frequency[row.argmax()]:.0f} Hz" for at, row in zip(at_s, amplitude)][::7]
         ['0.25 s: 4 Hz', '0.95 s: 18 Hz', '1.65 s: 32 Hz']
     """
-    size, hop = round(window_s * rate_hz), round(hop_s * rate_hz)
-    starts = range(0, max(1, len(x) - size), hop)
+    size, hop = (max(1, round(each * rate_hz)) for each in (window_s, hop_s))
+    starts = range(0, max(1, len(x) - size + 1), hop)
     spectra = [full_spectrum(x[s : s + size], y[s : s + size], rate_hz) for s in starts]
     frequency = spectra[0][0]
     near = np.abs(frequency) <= SPECTRUM_HZ

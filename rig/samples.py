@@ -60,8 +60,6 @@ class Columns:
         """
         return self.values[:, place(name, self.names)]
 
-    column = __getitem__
-
     def unit(self, name: str) -> str:
         """Unit of one column.
 
@@ -137,7 +135,8 @@ def joined(parts: Sequence[Samples]) -> Samples:
     index = reduce(np.intersect1d, [part.index for part in parts]) if parts else np.empty(0)
     rows = [np.intersect1d(part.index, index, return_indices=True)[1] for part in parts]
     times = [part.times_s[chosen] for part, chosen in zip(parts, rows, strict=True)]
-    if not parts or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_S for each in times):
+    alike = len({part.rate_hz for part in parts}) == 1  # else a stretch may have no number in common, and all be well
+    if not alike or any(np.abs(each - times[0]).max(initial=0.0) > _SAME_S for each in times):
         rates = ", ".join(f"{part.name} at {part.rate_hz:g} Hz" for part in parts)
         raise InputError("groups", "sampled at the same instants", rates or None)
     return Samples(

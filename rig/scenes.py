@@ -319,7 +319,7 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
     """
     path = scene_path(name_or_path)
     data = {"name": path.stem, **read_toml(path)}
-    for key, value in (overrides or {}).items():
+    for key, value in _keyed(overrides or {}):
         _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
     scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
     if data.get("fidelity") == "auto":
@@ -343,11 +343,19 @@ def change_scene(scene: Scene, changes: dict[str, Any]) -> Scene:
         InputError: The one thing that is wrong, with its field.
     """
     data = scene.model_dump()
+    named = _keyed(changes)
     if "engine.name" in changes:
         data["engine"] = {}
-    for key, value in changes.items():
+    for key, value in named:
         _override(data, key, value)
     return parse_scene(data)
+
+
+def _keyed(changes: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Keys and values of changes, which come from a notebook as anything."""
+    if not isinstance(changes, dict) or not all(isinstance(key, str) for key in changes):
+        raise InputError("changes", "a dictionary of values by dotted key", changes)
+    return list(changes.items())
 
 
 def _with_pick(scene: Scene, data: dict[str, Any], overrides: list[str]) -> Scene:

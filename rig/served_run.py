@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from rig import wire
-from rig.desk import Desk, Pending, finite, one_line
+from rig.desk import Desk, Pending, one_line
 from rig.errors import InputError
 from rig.pacing import Clock, StepTimeoutError, short_collections
+from rig.text import finite
 from rig.transport import Server
 
 _SUMMED_UP = (

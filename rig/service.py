@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 from rig import wire
 from rig.bounded_queue import BoundedQueue
-from rig.desk import Note, Pending, Step, finite
+from rig.desk import Note, Pending, Step
 from rig.errors import InputError, Words
 from rig.pacing import Clock, Lockstep, RealTime
 from rig.served_run import ServedRun
+from rig.text import finite
 from rig.transport import Server
 from rig.transport.limit import CommandLimit
 

@@ -142,7 +142,7 @@ class Simulation:
         )
         self.row_ticks = self._stride * self._step_ticks
         self.block_ticks = math.lcm(*periods)
-        self.end_tick = math.ceil(round(scene.duration_s * TICK_RATE_HZ) / self.block_ticks) * self.block_ticks
+        self.end_tick = math.ceil(max(1, round(scene.duration_s * TICK_RATE_HZ)) / self.block_ticks) * self.block_ticks
         self.table: ChannelTable = rig_table().only(sensors.groups, sensors.rate_hz)
         self._conditioner = Conditioner(
             tuple(self.table.groups.values()),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import reprlib
 from collections.abc import Iterable
+from typing import Any
 
 _MOST = 500
 """Longest value that is shown whole [characters]."""
@@ -48,6 +50,17 @@ def nearest(name: object, known: Iterable[str], *, most: int = 3) -> list[str]:
 
     folded = {each.casefold(): each for each in known}
     return [folded[each] for each in difflib.get_close_matches(str(name)[:100].casefold(), folded, most, 0.5)]
+
+
+def finite(value: Any) -> Any:
+    """The same document with None for numbers that JSON cannot carry: a diverged run must still be able to say so."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {name: finite(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return value
 
 
 class _Shown(reprlib.Repr):

@@ -7,15 +7,20 @@ comes in so is checked here: bounded in size, number and time, and read as far a
 from __future__ import annotations
 
 import re
+import sys
 import threading
 import time
 import urllib.request
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
 _FILE = re.compile(r"/[A-Za-z0-9_]*(\.(js|wasm|ico|png|svg))?")
 _FOREIGN = re.compile(rb"<link[^>]*https://fonts[^>]*>")
 _PAGE = re.compile(r"[a-z0-9]{1,16}")
+_SIZE = re.compile(r"[0-9]{1,9}")
+_HERE = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]+)?")
+"""What a page of ours is asked for by; another site may give a name of its own our address."""
 _MOST_BYTES = 1 << 20
 _MOST_PAGES = 32
 _FORGOTTEN_S = 30.0
@@ -45,6 +50,13 @@ _RESTING = b"""<!doctype html><title>rig: resting</title><script>
 document.addEventListener("visibilitychange", () => document.hidden || location.replace("/"));
 document.hidden || location.replace("/");
 </script>"""
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Nothing for a browser that goes in the middle of a file or a word: the terminal is ours."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
 
 
 class Page:
@@ -86,7 +98,7 @@ class Page:
             def log_message(self, format: str, *args: object) -> None:
                 """Nothing: the terminal is ours."""
 
-        self._server = ThreadingHTTPServer((host, port), Handler)
+        self._server = _Server((host, port), Handler)
         threading.Thread(target=self._server.serve_forever, args=(0.1,), name="page", daemon=True).start()
 
     def taken(self) -> int | None:
@@ -103,6 +115,8 @@ class Page:
 
     def _get(self, request: BaseHTTPRequestHandler) -> None:
         path, _, query = request.path.partition("?")
+        if not _HERE.fullmatch(request.headers.get("Host", "")):
+            return request.send_error(HTTPStatus.BAD_REQUEST)
         if path == "/resting":
             return _reply(request, _RESTING)
         if path == "/" and query != self._query:
@@ -124,9 +138,10 @@ class Page:
     def _post(self, request: BaseHTTPRequestHandler) -> None:
         path, _, page = request.path.partition("?")
         size = request.headers.get("Content-Length", "")
-        # A browser says from which site a page speaks; programs say nothing.
-        foreign = request.headers.get("Origin", "").partition("//")[2] not in ("", request.headers.get("Host"))
-        if foreign or path not in ("/state", "/closed") or not _PAGE.fullmatch(page) or not size.isdecimal():
+        # A browser says from which site a page speaks, or null where it hides that; programs say nothing.
+        host = request.headers.get("Host", "")
+        ours = _HERE.fullmatch(host) and request.headers.get("Origin") in (None, f"http://{host}")
+        if not ours or path not in ("/state", "/closed") or not _PAGE.fullmatch(page) or not _SIZE.fullmatch(size):
             return request.send_error(HTTPStatus.BAD_REQUEST)
         if int(size) > _MOST_BYTES:
             return request.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)

@@ -131,11 +131,15 @@ class Envelope:
             rows = int(np.searchsorted(times_s, until_s)) // bucket * bucket
             self._points.append(_reduced(times_s[:rows], values[:rows], bucket, windows))
             if rest and rows < len(times_s):
-                self._points.append(_extremes(times_s[None, rows:], values[None, rows:]))
+                self._points.append(_reduced(times_s[rows:], values[rows:], len(times_s) - rows, windows))
                 rows = len(times_s)
             self._times, self._values = [times_s[rows:]], [values[rows:]]
-        while most is not None and sum(_outside(at, windows) for at, _ in self._points) > most:
+        outside = sum(_outside(at, windows) for at, _ in self._points)
+        while most is not None and outside > most:
             self._points = [_reduced(*_joined(self._points), 4, windows)]
+            before, outside = outside, _outside(self._points[0][0], windows)
+            if outside > 0.75 * before:  # between windows that are close together little is left to be thinned
+                break
             self._coarse *= 2
 
     def take(self, *, until_s: float, windows: list[Span], rest: bool = False, most: int | None = None) -> Points:

@@ -39,7 +39,7 @@ def draw(recording: Recording, path: Path) -> None:
     axes = figure.subplots(3, 3)
     impacts, whole = (hammer_s - 0.01, hammer_s + 0.12), (float(probes.times_s[0]), end_s)
     _draw_orbit(axes[0, 0], recording, hammer_s, end_s)
-    disk = (probes.column("disk_x"), probes.column("disk_y"))
+    disk = (probes["disk_x"], probes["disk_y"])
     for ax, window, title in (
         (axes[0, 1], whole, "Displacement"),
         (axes[0, 2], impacts, "Displacement, first impacts"),
@@ -49,7 +49,7 @@ def draw(recording: Recording, path: Path) -> None:
 
     ax = axes[1, 0]
     kept = (drive.times_s >= hammer_s - 0.5) & (drive.times_s < hammer_s + 2.5)
-    draw_signals(ax, drive.times_s[kept], (drive.column("speed")[kept], BLACK, ""))
+    draw_signals(ax, drive.times_s[kept], (drive["speed"][kept], BLACK, ""))
     ax.axvline(hammer_s, color="0.5", lw=0.9, ls=":", label="hammer")
     ax.set(title="Spin, around the hammer", xlabel="time [s]", ylabel="spin speed [Hz]")
     ax.legend(loc="lower right")
@@ -103,7 +103,7 @@ def _draw_orbit(ax: Any, recording: Recording, hammer_s: float, end_s: float) ->
         ("whirl", _WHIRL, end_s - 0.2, end_s),
     ):
         kept = (probes.times_s >= low) & (probes.times_s < high)
-        ax.plot(probes.column("disk_x")[kept], probes.column("disk_y")[kept], color=color, lw=1.0, label=label)
+        ax.plot(probes["disk_x"][kept], probes["disk_y"][kept], color=color, lw=1.0, label=label)
     ax.set(title="Orbit at the disk", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
     # Above the orbit, where nothing is.
     ax.set_ylim(top=1.75 * ax.get_ylim()[1])

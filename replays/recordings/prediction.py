@@ -305,9 +305,11 @@ def predict(
         truth = lead_ins.take(experiment, simulation, chunk_s=chunk_s, until=begin_tick)
     for frame in experiment.frames(simulation, chunk_s=chunk_s):
         if frame.tick <= last_s * TICK_RATE_HZ + _BEHIND * simulation.row_ticks:
-            if frame.tick >= begin_tick:
+            # A command that was sent ends a frame, and those behind it begin on no grid.
+            before = max(0, begin_tick - frame.tick) // simulation.row_ticks
+            if before < len(frame.rows):
                 for channels in taking:
-                    channels.take(frame.rows)
+                    channels.take(frame.rows[before:])
             for name, block in frame.truth.items():
                 truth.setdefault(name, []).append(block.values)
         if follow is not None:

@@ -68,7 +68,7 @@ def judge(recording: Recording) -> Verdict:
     end_s = float(recording.samples("probes").times_s[-1])
     figures = whirl_figures(recording, max(hammer_s + 0.5, end_s - 2.0), end_s)
     drive = recording.samples("drive")
-    spin = drive.column("speed")
+    spin = drive["speed"]
     before, after = spin[drive.times_s < hammer_s], spin[drive.times_s >= hammer_s]
     before_hz = float(np.mean(before)) if len(before) else float("nan")
     rows = [

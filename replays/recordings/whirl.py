@@ -58,7 +58,7 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
             Words(f"{from_s:.2f} to {to_s:.2f} s"),
         )
     times = probes.times_s[kept]
-    ring_x, ring_y = (probes.column(name)[kept] * 1e-3 for name in ("ring_x", "ring_y"))
+    ring_x, ring_y = (probes[name][kept] * 1e-3 for name in ("ring_x", "ring_y"))
     frequency = whirl_frequency(times, ring_x, ring_y)
     spin = (len(edges) - 1) / (edges[-1] - edges[0])
     radius = float(np.hypot(ring_x, ring_y).mean())
@@ -69,7 +69,7 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
         from_s=from_s,
         to_s=to_s,
         frequency_hz=frequency,
-        disk_frequency_hz=whirl_frequency(times, probes.column("disk_x")[kept], probes.column("disk_y")[kept]),
+        disk_frequency_hz=whirl_frequency(times, probes["disk_x"][kept], probes["disk_y"][kept]),
         spin_hz=float(spin),
         radius_m=radius,
         law_hz=float(law),
@@ -81,7 +81,7 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
 
 def reactions(forces: Samples) -> tuple[np.ndarray, np.ndarray]:
     """What opposed transducers differ by: P_E - P_W and P_N - P_S [N], each shape (n,)."""
-    return forces.column("P_E") - forces.column("P_W"), forces.column("P_N") - forces.column("P_S")
+    return forces["P_E"] - forces["P_W"], forces["P_N"] - forces["P_S"]
 
 
 def parameter_si(recording: Recording, key: str) -> float:

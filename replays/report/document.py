@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from replays.report.canvas import DPI, png
 from rig.errors import InputError, check_new_file, whole_file
+from rig.text import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,7 +89,7 @@ ReportPart = Heading | Paragraph | Table | Picture
 
 
 class Report:
-    """A report that grows part by part and is written once.
+    """A report that grows part by part and is written once; texts of others, such as a file's name, come out printable.
 
     Attributes:
         title: Its title.
@@ -101,19 +102,19 @@ class Report:
     def __init__(
         self, title: str, lead: str = "", *, origin: Mapping[str, str] | None = None, mark: Mark = "plain"
     ) -> None:
-        self.title = title
-        self.lead = lead
-        self.origin = dict(origin or {})
+        self.title = printable(title)
+        self.lead = printable(lead)
+        self.origin = {name: printable(value) for name, value in (origin or {}).items()}
         self.mark: Mark = mark
         self.parts: list[ReportPart] = []
 
     def heading(self, text: str, *, level: int = 1) -> None:
         """Add a heading; level 1 or 2."""
-        self.parts.append(Heading(text, level))
+        self.parts.append(Heading(printable(text), level))
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
-        self.parts.append(Paragraph(text))
+        self.parts.append(Paragraph(printable(text)))
 
     def table(self, headings: Sequence[str], rows: Iterable[Row | Sequence[str]], *, caption: str = "") -> None:
         """Add a table.
@@ -126,15 +127,16 @@ class Report:
         Raises:
             ValueError: A row of another length.
         """
-        whole = tuple(row if isinstance(row, Row) else Row(tuple(row)) for row in rows)
+        given = (row if isinstance(row, Row) else Row(tuple(row)) for row in rows)
+        whole = tuple(Row(tuple(map(printable, row.cells)), row.mark) for row in given)
         for row in whole:
             if len(row.cells) != len(headings):
                 raise ValueError(f"row must have {len(headings)} cells; instead received {row.cells}")
-        self.parts.append(Table(tuple(headings), whole, caption))
+        self.parts.append(Table(tuple(map(printable, headings)), whole, printable(caption)))
 
     def picture(self, figure: Figure, caption: str, *, dpi: int = DPI) -> None:
         """Add a figure of matplotlib as a picture."""
-        self.parts.append(Picture(png(figure, dpi=dpi), caption))
+        self.parts.append(Picture(png(figure, dpi=dpi), printable(caption)))
 
     def write(self, path: Path) -> None:
         """Write the report to a file that is whole or not there; the same report gives the same bytes.

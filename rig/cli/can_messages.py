@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -56,7 +55,7 @@ def load(*, messages: CanMessages, form: Form) -> None:
             "period_s": row.message.period_s,
             "transmission_s": row.transmission_s,
             "load": row.transmission_s / row.message.period_s,
-            "worst_response_s": row.worst_s if math.isfinite(row.worst_s) else None,
+            "worst_response_s": row.worst_s,
             "in_time": row.schedulable,
         }
         for message, row in schedule.response_times(speed)

@@ -12,6 +12,7 @@ import typer
 from rig.cli.options import RecordingFiles
 from rig.cli.progress import reporting
 from rig.cli.tables import Form, Table, echo_json, facts, new_table, shown
+from rig.text import finite
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -78,7 +79,7 @@ def describe(
         health = asdict(examine(recording, progress))  # the one pass in which the streams are counted, too
         document["streams"] = {key: asdict(stream) for key, stream in recording.streams.items()}
         document["health"] = health
-    return _without_nan(document)
+    return finite(document)
 
 
 def _print(recording: Recording, document: dict[str, Any], console: Console) -> None:
@@ -255,14 +256,3 @@ def events_table(events: list[dict[str, Any]]) -> Table:
         stamp = f"{time_s:.4f}" if isinstance(time_s, float | int) else ""
         table.add_row(stamp, event_text(event)[1], style="bold" if event.get("event") == "note" else "")
     return table
-
-
-def _without_nan(value: Any) -> Any:
-    """The same document with None for what was not measured: JSON has no nan."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {name: _without_nan(item) for name, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return value

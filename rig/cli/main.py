@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import sys
 
 from rig.cli import signals
@@ -21,6 +22,9 @@ def main(arguments: list[str] | None = None) -> None:
 def entry() -> None:
     """Run the command as a process of its own."""
     signals.listen()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # what a terminal's encoding lacks is no reason to fail
     try:
         main()
     finally:

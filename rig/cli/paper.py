@@ -67,14 +67,12 @@ def paper(
 
 
 def summary(findings: Findings) -> dict[str, object]:
-    """The summary as a JSON document; null where a number does not exist."""
-    import math
-
+    """The summary as a JSON document; nan where a number does not exist."""
     return {
         "statements": [
             {
                 **line.statement.model_dump(exclude={"low", "high"}),
-                "values": {name: value if math.isfinite(value) else None for name, value in line.values.items()},
+                "values": line.values,
                 "verdicts": line.verdicts,
             }
             for line in [*findings.lines, *findings.claims]

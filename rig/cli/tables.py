@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from rig.cli.options import Json, Wide
-from rig.text import printable
+from rig.text import finite, printable
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions
@@ -80,10 +80,10 @@ def echo_document(text: str) -> None:
 
 
 def echo_json(document: Any, *, indent: int | None = 2) -> None:
-    """Print a document as JSON."""
+    """Print a document as JSON, with null for a number that is not finite."""
     import json
 
-    echo_document(json.dumps(document, indent=indent, allow_nan=False) + "\n")
+    echo_document(json.dumps(finite(document), indent=indent, allow_nan=False) + "\n")
 
 
 def shown(document: Any) -> Any:

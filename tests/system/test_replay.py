@@ -99,7 +99,7 @@ def test_a_daq_gets_every_row_of_a_burst(path: Path) -> None:
         assert (got[0].index, sum(map(len, got))) == (0, 200 * BLOCKS)
         assert (daq.dropped, daq.unmatched, sum(daq.lost.values())) == (0, 0, 0)
         force = np.concatenate([samples["P_N"] for samples in got])
-    assert np.allclose(force, Recording.open(path).samples("forces").column("P_N"), rtol=1e-12)
+    assert np.allclose(force, Recording.open(path).samples("forces")["P_N"], rtol=1e-12)
 
 
 def test_passes_without_end_have_consecutive_rows_for_a_daq(path: Path) -> None:

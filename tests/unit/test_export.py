@@ -82,7 +82,7 @@ def test_mcap_is_the_run(folder: Path, run: Run) -> None:
         assert samples.units == tuple(channel.unit for channel in group.channels)
         np.testing.assert_allclose(samples.times_s, run.samples.times_s, rtol=0, atol=1e-12)
         for name in group.names:
-            np.testing.assert_array_equal(samples.column(name), run.samples[name])
+            np.testing.assert_array_equal(samples[name], run.samples[name])
     for name, columns in TRUTH.items():
         truth = recording.truth(name)
         assert truth.names == columns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import subprocess
 import sys
 import wave
@@ -169,6 +170,18 @@ def counts_of(recording: Recording, group: str) -> np.ndarray:
     return np.concatenate([block.values for block in recording.blocks(sensor_key(group))])
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="file names are text")
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_recording_whose_name_is_no_text_is_exported(suffix: str, recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / os.fsdecode(b"a\xff\x01.mcap")
+    path.write_bytes(recording.path.read_bytes())
+    opened = Recording.open(path)
+    opened.metadata["rig"]["scene"] = "\x01"
+    chosen = select(opened, channels=["disk_x"])
+    assert (chosen.metadata["recording"], chosen.metadata["scene"]) == ("a\\udcff\\x01.mcap", "\\x01")
+    export(chosen, tmp_path / f"out{suffix}")
+
+
 def test_mdf_by_asammdf(recording: Recording, tmp_path: Path) -> None:
     from asammdf import MDF
 
@@ -191,7 +204,7 @@ def test_mdf_by_asammdf(recording: Recording, tmp_path: Path) -> None:
                 np.testing.assert_allclose(found.samples, samples.values[:, c], rtol=1e-15, atol=0)
                 np.testing.assert_allclose(found.timestamps, samples.times_s, rtol=0, atol=1e-12)
         force = mdf.get("truth.contact.normal_force")
-        np.testing.assert_array_equal(force.samples, recording.truth("contact").column("normal_force"))
+        np.testing.assert_array_equal(force.samples, recording.truth("contact")["normal_force"])
         assert (force.unit, len(force.timestamps)) == ("N", round(DURATION_S * 2000))
 
 
@@ -237,7 +250,7 @@ def test_uff_by_the_columns_of_its_specification(recording: Recording, tmp_path:
         assert head[10][47:67].strip() == recording.table.channels[name].unit
         assert size == 8 * rows
         values = np.frombuffer(rest[:size], "<f8")
-        np.testing.assert_array_equal(values, recording.samples(group).column(name))
+        np.testing.assert_array_equal(values, recording.samples(group)[name])
         assert rest[size : size + 8] == b"\n    -1\n"
         data = rest[size + 8 :]
     assert data == b""
@@ -279,7 +292,7 @@ def test_uff_by_pyuff(recording: Recording, tmp_path: Path) -> None:
         assert (found["rsp_ent_name"], found["rsp_node"], found["rsp_dir"]) == (channel.name, *FREEDOMS[channel.name])
         assert found["id5"].startswith(f"node {found['rsp_node']}: ")
         assert (found["ref_node"], found["ref_dir"]) == (0, 0)
-        np.testing.assert_array_equal(found["data"], recording.samples(channel.group).column(channel.name))
+        np.testing.assert_array_equal(found["data"], recording.samples(channel.group)[channel.name])
 
 
 def test_csv_by_the_csv_module(recording: Recording, tmp_path: Path) -> None:
@@ -322,7 +335,7 @@ def test_wav_by_scipy_and_the_wave_module(recording: Recording, tmp_path: Path) 
     for c, column in enumerate(beside):
         channel = recording.table.channels[column["name"]]
         values = samples[:, c].astype(float) * column["full_scale"] + column["offset_exported"]
-        expected = recording.samples("probes").column(column["name"])
+        expected = recording.samples("probes")[column["name"]]
         np.testing.assert_allclose(values, expected, rtol=0, atol=1e-12)
         assert column["full_scale"] == pytest.approx(channel.adc_v / channel.sensitivity_v)
 
@@ -338,7 +351,7 @@ def test_volts_are_what_the_converter_saw(recording: Recording, tmp_path: Path) 
     table = selection.tables[0]
     volts = np.concatenate([table.exported(0, chunk) for chunk in selection.chunks(table)])
     channel = recording.table.channels["disk_x"]
-    mm = recording.samples("probes").column("disk_x")
+    mm = recording.samples("probes")["disk_x"]
     np.testing.assert_allclose(volts, channel.bias_v + channel.sensitivity_v * mm, rtol=0, atol=1e-12)
 
 
@@ -372,7 +385,7 @@ def test_rows_that_are_missing_are_left_out_or_nan_never_made_up(gappy: Recordin
     written(gappy, tmp_path / "x.tdms", "disk_x")
     found = TdmsFile.read(tmp_path / "x.tdms")["probes"]["disk_x"][:]
     assert np.flatnonzero(np.isnan(found)).tolist() == list(range(600, 800))
-    np.testing.assert_array_equal(found[~np.isnan(found)], samples.column("disk_x")[order])
+    np.testing.assert_array_equal(found[~np.isnan(found)], samples["disk_x"][order])
     with pytest.raises(InputError, match=r"^range must be free of missing rows for a WAV file"):
         written(gappy, tmp_path / "x.wav", "disk_x")
     _, made = written(gappy, tmp_path / "x.mf4")

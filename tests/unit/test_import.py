@@ -96,7 +96,7 @@ def test_text_with_semicolons_and_decimal_commas(daq_text: tuple[Path, np.ndarra
         assert samples.rate_hz == RATE_HZ
         np.testing.assert_allclose(samples.times_s, columns[:, 0], rtol=0, atol=1e-9)
         half = 0.5 * abs(recording.table.channels[name].scale)
-        assert np.abs(samples.column(name) - values).max() <= half * (1 + 1e-6)
+        assert np.abs(samples[name] - values).max() <= half * (1 + 1e-6)
         reach = np.abs(values - recording.table.channels[name].offset).max()
         assert half < 2.0**-29 * reach, "nothing that a 24-bit converter could have told is lost"
     assert recording.table.channels["ring_x"].sensitivity_v == pytest.approx(-7.874, abs=1e-3)
@@ -209,8 +209,8 @@ def test_labview_measurement_file(tmp_path: Path) -> None:
     mapping = '[channels.hammer]\nsource = "Force"\n[channels.inner_x]\nsource = "Acc"\n'
     conversion, recording = imported(tmp_path, [path], mapping)
     assert recording.samples("hammer").rate_hz == 25_600
-    np.testing.assert_allclose(recording.samples("hammer").column("hammer"), [0.5, 0.25, -1.0])
-    np.testing.assert_allclose(recording.samples("accelerations").column("inner_x"), 9.80665 * np.array([1.5, -2.5, 0]))
+    np.testing.assert_allclose(recording.samples("hammer")["hammer"], [0.5, 0.25, -1.0])
+    np.testing.assert_allclose(recording.samples("accelerations")["inner_x"], 9.80665 * np.array([1.5, -2.5, 0]))
     assert conversion.start.isoformat().startswith("2026-11-21T09:51:39.25")
 
 
@@ -263,13 +263,11 @@ def test_mdf_of_another_system_keeps_its_integers(daq_mdf: Path, tmp_path: Path)
     codes[100:103] = 32_767
     blocks = list(recording.blocks("rig/sensors/hammer"))
     np.testing.assert_array_equal(np.concatenate([block.values[:, 0] for block in blocks]), codes)
-    np.testing.assert_allclose(
-        recording.samples("hammer").column("hammer"), codes * (10 / 32_768) / 2.25e-3, rtol=1e-12
-    )
+    np.testing.assert_allclose(recording.samples("hammer")["hammer"], codes * (10 / 32_768) / 2.25e-3, rtol=1e-12)
     # At 51.2 kHz a sample is no whole number of microseconds: the times are exact all the same.
     np.testing.assert_allclose(recording.samples("hammer").times_s, np.arange(8192) / 51_200.0, rtol=0, atol=1e-12)
     assert recording.samples("drive").rate_hz == 2500
-    np.testing.assert_allclose(recording.samples("drive").column("speed"), np.linspace(370, 380, 400) / 60, rtol=1e-6)
+    np.testing.assert_allclose(recording.samples("drive")["speed"], np.linspace(370, 380, 400) / 60, rtol=1e-6)
     assert any("without numbers" in remark for remark in conversion.remarks)
     # The pulse rises where 40 t + 0.3 is whole, within a sample; half way up between two samples.
     edges = recording.edges()
@@ -306,7 +304,7 @@ def test_a_mean_is_taken_off_within_the_range(tmp_path: Path) -> None:
     _, recording = imported(tmp_path, [path], mapping)
     samples = recording.samples("probes")
     assert samples.times_s[0] == 0.0
-    np.testing.assert_allclose(samples.column("disk_x"), 0.01 * np.sign(samples.times_s - 0.2495), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(samples["disk_x"], 0.01 * np.sign(samples.times_s - 0.2495), rtol=0, atol=1e-9)
 
 
 def test_the_noise_of_a_channel_is_told(tmp_path: Path) -> None:
@@ -334,7 +332,7 @@ def test_wav_of_another_writer_shows_its_rails(tmp_path: Path) -> None:
         file.writeframes(codes.tobytes())
     mapping = '[channels.outer_x]\nsource = "channel 1"\nunit = "m/s^2"\nfactor = 50.0\n'
     conversion, recording = imported(tmp_path, [path], mapping)
-    np.testing.assert_allclose(recording.samples("accelerations").column("outer_x"), codes / 32_768 * 50, rtol=1e-12)
+    np.testing.assert_allclose(recording.samples("accelerations")["outer_x"], codes / 32_768 * 50, rtol=1e-12)
     assert conversion.channels[0].overrange == 2
 
 
@@ -359,7 +357,7 @@ def test_tdms_groups_start_when_they_say(tmp_path: Path) -> None:
         tmp_path, [path], '[channels.P_N]\nsource = "North"\n[channels.inner_x]\nsource = "X"\ngroup = "Acc"\n'
     )
     np.testing.assert_array_equal(_counts(recording, "forces")[:, 0], np.arange(-500, 500))
-    np.testing.assert_allclose(recording.samples("forces").column("P_N"), 100 + 0.5 * np.arange(-500, 500))
+    np.testing.assert_allclose(recording.samples("forces")["P_N"], 100 + 0.5 * np.arange(-500, 500))
     acceleration = recording.samples("accelerations")
     np.testing.assert_allclose(acceleration.times_s, 0.25 + np.arange(1000) / 2000, rtol=0, atol=1e-9)
     np.testing.assert_allclose(acceleration.values[:, 0], 9.80665 * np.linspace(-1, 1, 1000), atol=1e-8)
@@ -389,7 +387,7 @@ def test_uff_of_pyuff(binary: int, tmp_path: Path) -> None:
     _, recording = imported(tmp_path, [path], '[channels.P_W]\nsource = "P 1"\n')
     samples = recording.samples("forces")
     assert samples.rate_hz == 4000
-    np.testing.assert_allclose(samples.column("P_W"), 1e3 * values, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(samples["P_W"], 1e3 * values, rtol=0, atol=1e-5)
 
 
 def test_parquet_with_instants_and_integers(tmp_path: Path) -> None:
@@ -440,8 +438,8 @@ def test_probes_at_any_angles_become_x_and_y(angles: tuple[float, float], tmp_pa
         '[channels.ring_x]\nsource = "A"\n[channels.ring_y]\nsource = "B"\n',
     )  # fmt: skip
     samples = recording.samples("probes")
-    np.testing.assert_allclose(samples.column("ring_x"), x, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(samples.column("ring_y"), y, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(samples["ring_x"], x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(samples["ring_y"], y, rtol=0, atol=1e-9)
 
 
 def trigger(t: np.ndarray, at: tuple[float, ...]) -> np.ndarray:
@@ -488,8 +486,8 @@ def test_two_clocks_are_aligned(method: str, ppm: float, within: float, tmp_path
     force, way = recording.samples("hammer"), recording.samples("probes")
     true = np.sin(40 * way.times_s)
     inner = slice(200, -400)
-    np.testing.assert_allclose(way.column("disk_x")[inner] * 10, true[inner], rtol=0, atol=within)
-    np.testing.assert_allclose(force.column("hammer") / 100, np.sin(40 * force.times_s), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(way["disk_x"][inner] * 10, true[inner], rtol=0, atol=within)
+    np.testing.assert_allclose(force["hammer"] / 100, np.sin(40 * force.times_s), rtol=0, atol=1e-6)
     remark = next(remark for remark in conversion.remarks if "moved by" in remark)
     assert remark.startswith("b.csv: moved by +123.4")
     if ppm:
@@ -505,8 +503,8 @@ def test_files_lie_as_their_times_of_day_say(tmp_path: Path) -> None:
     mapping = "".join(f'[channels.{c}]\nsource = "F"\nfile = "{f}"\n' for c, f in (("P_N", "a.csv"), ("P_S", "b.csv")))
     _, recording = imported(tmp_path, [tmp_path / "a.csv", tmp_path / "b.csv"], mapping)
     samples = recording.samples("forces")
-    np.testing.assert_allclose(samples.column("P_N"), 250.0 + np.arange(650), atol=1e-6)
-    np.testing.assert_allclose(samples.column("P_S"), samples.column("P_N"), atol=1e-6)
+    np.testing.assert_allclose(samples["P_N"], 250.0 + np.arange(650), atol=1e-6)
+    np.testing.assert_allclose(samples["P_S"], samples["P_N"], atol=1e-6)
 
 
 def test_one_group_of_a_file_is_aligned_and_the_others_stay(tmp_path: Path) -> None:
@@ -538,8 +536,8 @@ source = "south"
     conversion, recording = imported(tmp_path, [path], mapping)
     samples = recording.samples("forces")
     # Edges are found to a sample: 0.0123 s is 12.3 of them, and both triggers rise half way between two.
-    np.testing.assert_allclose(samples.column("P_N"), np.sin(20 * (samples.times_s + 0.012)), rtol=0, atol=1e-6)
-    np.testing.assert_allclose(samples.column("P_S"), samples.column("P_N"), rtol=0, atol=20 * 1.01e-3)
+    np.testing.assert_allclose(samples["P_N"], np.sin(20 * (samples.times_s + 0.012)), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(samples["P_S"], samples["P_N"], rtol=0, atol=20 * 1.01e-3)
     assert "x.tdms, group B: moved by +12.0000 ms" in " ".join(conversion.remarks)
     with pytest.raises(InputError, match='scope "group"'):
         imported(tmp_path, [path], mapping.replace('scope = "group"\n', ""), name="file")
@@ -555,7 +553,7 @@ def test_a_clock_that_is_some_ppm_off_is_put_right(tmp_path: Path) -> None:
     samples = recording.samples("forces")
     inside = slice(60, -60)  # where the filter has samples on both sides
     expected = np.sin(300 * samples.times_s)
-    np.testing.assert_allclose(samples.column("P_N")[inside], expected[inside], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(samples["P_N"][inside], expected[inside], rtol=0, atol=1e-5)
     assert "999.988 Hz to 1000 Hz" in conversion.channels[0].time
 
 
@@ -588,16 +586,16 @@ def test_the_example_has_every_option_and_imports(tmp_path: Path) -> None:
     at = np.rint((probes.times_s + zero_s) * rate).astype(int)
     inside = slice(100, -100)
     for name, motion in (("ring_x", x), ("ring_y", y)):
-        found, expected = probes.column(name), motion[at]
+        found, expected = probes[name], motion[at]
         # The mean of what was imported is taken for zero.
         assert np.ptp((found - expected)[inside]) < 1e-6
     house = recording.samples("accelerations")
     # Samples that nobody had to move stay as they are, at times in whole microseconds.
     acceleration = 30.0 * np.sin(400 * (house.times_s + zero_s))  # m/s^2
-    np.testing.assert_allclose(house.column("inner_x"), acceleration, rtol=0, atol=30 * 400 * 0.6e-6)
+    np.testing.assert_allclose(house["inner_x"], acceleration, rtol=0, atol=30 * 400 * 0.6e-6)
     force = recording.samples("forces")
     np.testing.assert_allclose(
-        force.column("P_E")[inside], 50.0 * np.sin(100 * (force.times_s + zero_s))[inside], rtol=0, atol=1e-4
+        force["P_E"][inside], 50.0 * np.sin(100 * (force.times_s + zero_s))[inside], rtol=0, atol=1e-4
     )
     (timed,) = Experiment.of(recording).scene.commands
     assert timed.at_s == pytest.approx(4.0 + 0.2, abs=1e-4)
@@ -713,7 +711,7 @@ def test_a_delay_moves_a_channel_back(tmp_path: Path) -> None:
         imported(tmp_path, [path], mapping)
     _, recording = imported(tmp_path, [path], f'[resample]\nmethod = "polyphase"\n{mapping}')
     samples = recording.samples("forces")
-    np.testing.assert_allclose(samples.column("P_S")[100:-100], samples.column("P_N")[100:-100], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(samples["P_S"][100:-100], samples["P_N"][100:-100], rtol=0, atol=2e-5)
 
 
 @pytest.mark.parametrize("suffix", [".mf4", ".tdms", ".uff", ".csv", ".parquet", ".wav"])

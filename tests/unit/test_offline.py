@@ -138,6 +138,12 @@ def test_what_is_shown_of_each_object_is_a_line(run: Run) -> None:
     assert "\n" not in repr(run.samples)
 
 
+def test_a_run_is_gone_through_by_its_signals(run: Run) -> None:
+    assert tuple(run) == run.names
+    assert "disk_x" in run
+    assert "disk_z" not in run
+
+
 def test_samples_are_columns_like_those_of_a_table(run: Run) -> None:
     assert len(run.samples) == len(run.times_s)
     assert list(run.samples) == list(run.samples.keys()) == list(run.samples.names)
@@ -206,6 +212,17 @@ def test_another_duration_and_its_progress() -> None:
 def test_a_duration_that_cannot_be_is_the_users_error() -> None:
     with pytest.raises(InputError, match=r"^duration_s must be"):
         simulate(load_scene("drop"), duration_s=-1.0)
+
+
+@pytest.mark.parametrize("changes", [5.2, ["drive.speed_hz"], {1: 2}])
+def test_changes_that_are_no_values_by_key_are_the_users_error(changes: Any) -> None:
+    for scene in ("hammer", load_scene("hammer")):
+        with pytest.raises(InputError, match="changes must be a dictionary of values by dotted key"):
+            simulate(scene, changes)
+
+
+def test_the_shortest_run_is_a_block() -> None:
+    assert len(simulate("hammer", duration_s=1e-9).times_s) == 10
 
 
 def test_duration_is_rounded_up_to_a_whole_block() -> None:

@@ -93,6 +93,12 @@ def test_phase_and_frequency_about_a_given_centre_tell_a_small_orbit_beside_it_f
     assert whirl_frequency(times, x, y) == pytest.approx(10.0, abs=0.02)
 
 
+def test_the_last_window_of_a_waterfall_ends_with_the_samples() -> None:
+    times, x, y = orbit(-80.0, n=4_000)
+    assert waterfall(times, x, y, 4_000.0, window_s=0.5, hop_s=0.5)[0] == pytest.approx([0.25, 0.75])
+    assert len(waterfall(times, x, y, 4_000.0, window_s=0.5, hop_s=0.0)[0]) == 2001
+
+
 def test_waterfall_shows_when_the_whirl_turns_over() -> None:
     times, x, y = orbit(-80.0, n=8_000)
     y = np.where(times < 1.0, y, -y)

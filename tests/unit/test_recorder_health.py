@@ -85,7 +85,7 @@ def test_a_sound_recording_raises_no_doubt_and_its_noise_is_that_which_was_put_i
 
 def test_figures_are_those_of_the_samples(tmp_path):
     health = record(tmp_path / "a.mcap")
-    samples = Recording.open(tmp_path / "a.mcap").samples("probes").column("ring_y")
+    samples = Recording.open(tmp_path / "a.mcap").samples("probes")["ring_y"]
     ring = channel(health, "ring_y")
     assert (ring.mean, ring.low, ring.high) == pytest.approx((samples.mean(), samples.min(), samples.max()))
 

@@ -60,7 +60,7 @@ def test_samples_are_the_published_counts_in_engineering_units(recording, group)
     assert samples.units == tuple(channel.unit for channel in table.channels)
     assert (samples.name, samples.rate_hz) == (group, 20_000.0)
     for column, name in enumerate(samples.names):
-        np.testing.assert_array_equal(samples.column(name), samples.values[:, column])
+        np.testing.assert_array_equal(samples[name], samples.values[:, column])
 
 
 @pytest.mark.parametrize("table", list(TRUTH_COLUMNS))
@@ -104,7 +104,7 @@ def test_streams_tell_their_extent(recording):
             "truth must be one of the recording's tables, such as state, contact",
         ),
         (
-            lambda recording: recording.samples("probes").column("disk"),
+            lambda recording: recording.samples("probes")["disk"],
             "name must be one of those .* such as disk_y",
         ),
         (lambda recording: list(recording.blocks(STATUS)), "key must be a key of blocks"),
@@ -135,7 +135,9 @@ def test_groups_are_joined_where_all_have_a_row(recording):
     shorter = replace(probes, index=probes.index[7:], times_s=probes.times_s[7:], values=probes.values[7:])
     np.testing.assert_array_equal(joined([opened.samples("forces"), shorter]).index, shorter.index)
     late = replace(probes, times_s=probes.times_s + 20e-6)
-    for parts in ([], [opened.samples("forces"), late]):
+    # A stretch of two rates, from far behind the start, has no row number in common.
+    slow = replace(probes, rate_hz=probes.rate_hz / 4, index=probes.index + 10**9)
+    for parts in ([], [opened.samples("forces"), late], [probes, slow]):
         with pytest.raises(InputError, match=r"^groups must be sampled at the same instants"):
             joined(parts)
 

@@ -301,7 +301,7 @@ def test_channels_and_kinds_are_left_out_with_their_calibration(path, tmp_path):
     assert recording.table.groups["forces"].names == ("P_W",)
     assert recording.catalogue["truth"] == {}
     for group, name in (("forces", "P_W"), ("probes", "disk_y")):
-        np.testing.assert_array_equal(recording.samples(group).column(name), whole.samples(group).column(name))
+        np.testing.assert_array_equal(recording.samples(group)[name], whole.samples(group)[name])
     truth = Recording.open(cut(whole, tmp_path / "b.mcap", only="truth").path)
     assert not truth.table.groups
     np.testing.assert_array_equal(truth.truth("state").values, whole.truth("state").values)

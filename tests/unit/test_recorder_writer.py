@@ -133,7 +133,7 @@ def test_plots_are_labelled_and_show_the_samples(path):
             channel = table.channels[label.split(" [")[0]]
             assert label == f"{channel.name} [{channel.unit}]"
             slot = {"mm": "position", "N": "effort"}.get(channel.unit, "velocity")
-            expected = recording.samples(channel.group).column(channel.name)[::40]
+            expected = recording.samples(channel.group)[channel.name][::40]
             np.testing.assert_array_equal(arrays[slot][:, column], expected)
             for other in arrays:
                 if other != slot and arrays[other].size:

@@ -101,6 +101,18 @@ def test_pdf_is_one(tmp_path: Path) -> None:
     assert b"/Subtype /Image" in data
 
 
+@pytest.mark.parametrize("suffix", [".html", ".pdf"])
+def test_a_name_that_is_no_text_is_shown_escaped(suffix: str, tmp_path: Path) -> None:
+    name = "a\udcff\x01\u202e.mcap"  # as the system gives a file's name that is not UTF-8
+    report = Report(name, name, origin={"file": name})
+    report.heading(name)
+    report.text(name)
+    report.table([name], [[name]], caption=name)
+    report.write(tmp_path / f"report{suffix}")
+    if suffix == ".html":
+        assert (tmp_path / "report.html").read_text("utf-8").count("a\\udcff\\x01\\u202e.mcap") == 9
+
+
 def test_a_row_of_another_length_is_refused() -> None:
     with pytest.raises(ValueError, match="row must have 2 cells"):
         Report("x").table(("a", "b"), [("1", "2", "3")])

@@ -63,9 +63,10 @@ def test_a_recordings_own_calibration_counts_and_not_the_rigs(experiment: Experi
     assert delay_s == pytest.approx(2.6131 / (2.0 * np.pi * 200.0), rel=0.03)
 
 
-def test_a_late_start_is_the_same_as_from_the_start() -> None:
+@pytest.mark.parametrize("sent", [(), (SentCommand(30_500, "speed", {"speed_hz": 5.0}),)])
+def test_a_late_start_is_the_same_as_from_the_start(sent: tuple[SentCommand, ...]) -> None:
     """Far behind the start the channels are worked out from shortly before the rows wanted on."""
-    experiment = Experiment(scene=load_scene("hammer", {"duration_s": 4.0}))
+    experiment = Experiment(scene=load_scene("hammer", {"duration_s": 4.0}), commands=sent)
     whole, late = (shown(experiment, "ring_x", "inner_x", start_s=start, end_s=3.6)[-100:] for start in (0.0, 3.5))
     assert np.abs(whole[:, 0] - late[:, 0]).max() < 1e-8
     assert np.abs(whole[:, 1] - late[:, 1]).max() < 1e-3 * np.abs(whole[:, 1]).max()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import math
 import os
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from rig.cli.bench import cases_table
 from rig.cli.display import fitted
 from rig.cli.info import describe, events_table
 from rig.cli.stability import peers_table, trials_table
-from rig.cli.tables import facts, new_table
+from rig.cli.tables import echo_json, facts, new_table
 from rig.engines import ENGINES
 from tests.commands import check_legible, lines_of, said, shown
 
@@ -47,6 +48,18 @@ def test_command_prints_tables_that_are_legible(arguments: list[Any], capsys: py
     assert not any(mark in printed for mark in "…│┃─━\x1b")
     if arguments != ["keys"]:
         json.loads(shown(capsys, *arguments, "--json"))
+
+
+def test_an_encoding_that_lacks_a_character_shows_it_escaped() -> None:
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    found = subprocess.run([sys.executable, "-m", "rig", "laws"], env=environment, capture_output=True, timeout=120)
+    assert found.returncode == 0, found.stderr.decode()
+    assert b"\\xb5" in found.stdout
+
+
+def test_json_has_null_for_what_is_no_number(capsys: pytest.CaptureFixture[str]) -> None:
+    echo_json({"a": math.nan, "b": [math.inf, 1.0], "c": ({"d": -math.inf},)})
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1.0], "c": [{"d": None}]}
 
 
 def test_width_of_the_terminal_is_nothing_to_a_pipe(

@@ -99,15 +99,15 @@ def test_figures_are_those_of_the_model(good: Recording) -> None:
     figures = whirl_figures(good, 0.6, 2.0)
     truth, contact = good.truth("state"), good.truth("contact")
     settled = truth.times_s >= 0.6
-    spin_hz = truth.column("theta_rate")[settled].mean() / (2 * math.pi)
+    spin_hz = truth["theta_rate"][settled].mean() / (2 * math.pi)
     assert figures.spin_hz == pytest.approx(spin_hz, rel=2e-3)
-    radius = parameter_si(good, "ring.clearance") + contact.column("penetration")[settled].mean()
+    radius = parameter_si(good, "ring.clearance") + contact["penetration"][settled].mean()
     assert figures.radius_m == pytest.approx(radius, rel=2e-3)
     assert figures.frequency_hz == pytest.approx(
         -figures.spin_hz * parameter_si(good, "shaft.radius") / radius, rel=5e-3
     )
     forces = good.truth("forces")
-    pair = forces.column("P_E")[settled] - forces.column("P_W")[settled]
+    pair = forces["P_E"][settled] - forces["P_W"][settled]
     assert figures.reaction_x_n == pytest.approx(np.ptp(pair) / 2, rel=0.1)
 
 

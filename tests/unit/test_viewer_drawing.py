@@ -113,6 +113,19 @@ def test_envelope_keeps_every_row_in_a_window() -> None:
     np.testing.assert_array_equal(kept[np.isin(at, times[inside]), 0], values[inside, 0])
 
 
+def test_envelope_between_windows_that_are_close_together_is_thinned_as_far_as_it_goes() -> None:
+    times, values = np.arange(20_000) / 2000.0, np.arange(20_000.0)[:, None]
+    windows = [(0.21 * number - 0.05, 0.21 * number + 0.05) for number in range(48)]
+    envelope = Envelope(bucket=8)
+    for start in range(0, 20_000, 300):
+        envelope.add(times[start : start + 300], values[start : start + 300])
+        envelope.fold(until_s=math.inf, windows=windows, most=60)
+    at, _ = envelope.take(until_s=math.inf, windows=windows, rest=True)
+    inside = np.any([(times >= start) & (times <= end) for start, end in windows], axis=0)
+    assert set(times[inside]) <= set(at)
+    assert len(at) - inside.sum() < 20 * len(windows)
+
+
 @pytest.mark.parametrize("chunk", [1, 7, 50, 999])
 def test_envelope_does_not_depend_on_how_the_rows_come(chunk: int) -> None:
     times, values = np.arange(1000) / 1000.0, np.sin(np.arange(1000.0))[:, None]

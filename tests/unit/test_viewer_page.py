@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import http.client
+import socket
+import struct
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -77,11 +79,34 @@ def test_the_slowest_browser_counts(served: tuple[page.Page, str]) -> None:
     assert shown.taken() == 5_699_950_000
 
 
-def test_pages_of_other_sites_are_not_heard(served: tuple[page.Page, str]) -> None:
-    request = urllib.request.Request(f"{served[1]}/state?a", data=STATE, headers={"Origin": "http://example.com"})
-    with pytest.raises(urllib.error.HTTPError, match="400"):
-        urllib.request.urlopen(request, timeout=10)
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Origin": "http://example.com"},
+        {"Origin": "null"},  # a frame of another site that hides whose it is
+        {"Origin": "http://example.com", "Host": "example.com"},  # a site that gives its own name our address
+        {"Host": "example.com"},
+    ],
+)
+def test_pages_of_other_sites_are_not_heard(served: tuple[page.Page, str], headers: dict[str, str]) -> None:
+    for data in (STATE, None) if "Host" in headers else (STATE,):
+        request = urllib.request.Request(f"{served[1]}/state?a", data=data, headers=headers)
+        with pytest.raises(urllib.error.HTTPError, match="400"):
+            urllib.request.urlopen(request, timeout=10)
     assert served[0].taken() is None
+
+
+@pytest.mark.parametrize("begun", [b"GET /?url=x", b"POST /state?a"])
+def test_a_browser_that_goes_in_the_middle_prints_nothing(
+    served: tuple[page.Page, str], begun: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    host = served[1].removeprefix("http://")
+    with socket.create_connection(("127.0.0.1", int(host.partition(":")[2])), timeout=10) as browser:
+        browser.sendall(begun + b" HTTP/1.1\r\nHost: " + host.encode() + b"\r\nContent-Length: 9\r\n\r\na")
+        browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it resets the connection
+    assert post(f"{served[1]}/state?b", b"")
+    served[0].close()
+    assert not capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -92,6 +117,7 @@ def test_pages_of_other_sites_are_not_heard(served: tuple[page.Page, str]) -> No
         ("POST", "/other?a", "0", 400),
         ("POST", "/state?a", "many", 400),
         ("POST", "/state?a", str((1 << 20) + 1), 413),
+        ("POST", "/state?a", "9" * 5000, 400),
         ("GET", "/../secret", "0", 404),
         ("GET", "/%2e%2e/x", "0", 404),
         ("PUT", "/state?a", "0", 501),

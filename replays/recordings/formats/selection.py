@@ -197,11 +197,13 @@ class Selection:
     @cached_property
     def metadata(self) -> dict[str, str]:
         """What is known of the whole."""
-        about = self.recording.metadata["rig"]
-        return {
-            "recording": self.recording.path.name, "scene": about["scene"], "seed": about["seed"],
-            "parameter_set": about["parameter_set"], "start": self.start.isoformat(), "values": self.unit, **self.notes,
-        }  # fmt: skip
+        told = self.recording.metadata["rig"]
+        about = {
+            "recording": self.recording.path.name,
+            **{name: told[name] for name in ("scene", "seed", "parameter_set")},
+        }
+        shown = {name: printable(str(text)) for name, text in about.items()}
+        return {**shown, "start": self.start.isoformat(), "values": self.unit, **self.notes}
 
     def summary(self) -> str:
         """The same for a person, line by line."""
