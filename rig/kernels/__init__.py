@@ -21,9 +21,6 @@ _KERNELS = Path(__file__).parent
 _SOURCES = (_KERNELS, _KERNELS.parent / "engines", _KERNELS.parent / "sensors")
 
 
-COMPILE_NOTICE = "compiling the kernels, once on this machine (about 20 s)"
-
-
 def source_digest() -> str:
     """Digest of all files that hold compiled code, and of their place: numba's cache serves no other."""
     digest = hashlib.sha256(str(Path(__file__).parent).encode())

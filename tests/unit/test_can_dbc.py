@@ -144,9 +144,10 @@ def test_cantools_decode_reads_a_log(capsys: pytest.CaptureFixture[str], monkeyp
     probes = TABLE.by_name["Probes"]
     assert probes.samples is not None
     data = probes.samples.pack(np.array([10]), np.full((5, 4), 0x1000, np.int32), 64).tobytes()
+    hammer = command_frame(Kind.HAMMER, 1, force_n=50.0, duration_ms=5.0)[1]
     lines = [
         f"(1700000000.000000) can0 {probes.identifier:03X}##1{data.hex().upper()}",
-        f"(1700000000.000100) can0 {0x020:03X}#{command_frame(Kind.HAMMER, 1, force_n=50.0, duration_ms=5.0)[1].hex().upper()}",
+        f"(1700000000.000100) can0 {0x020:03X}#{hammer.hex().upper()}",
     ]
     monkeypatch.setattr(sys, "stdin", io.StringIO("\n".join(lines) + "\n"))
     monkeypatch.setattr(sys, "argv", ["cantools", "decode", str(dbc.COPY)])

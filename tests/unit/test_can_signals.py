@@ -30,7 +30,6 @@ from drivers.can.signals import (
 )
 from rig.channels import ChannelTable, default_table
 from rig.errors import InputError
-from rig.errors import InputError
 
 TABLE = default_messages()
 SAMPLED = (*TABLE.classic, *TABLE.fd)
@@ -220,7 +219,7 @@ def test_each_way_of_being_wrong_has_its_result() -> None:
 @pytest.mark.parametrize(
     ("kind", "values", "line"),
     [
-        (Kind.SPEED, {}, "speed_hz must be given for SPEED, from 0 to 65.535 Hz; instead received nothing"),
+        (Kind.SPEED, {}, "speed_hz must be given for SPEED, from 0 to 16777.2 Hz; instead received nothing"),
         (Kind.SPEED, {"speed_hz": 5.0, "force_n": 10.0}, "force_n must be left out: SPEED has no such value; instead"),
         (Kind.HAMMER, {"force_n": 1e6, "duration_ms": 5.0}, "force_n must be given for HAMMER, from 0 to 6553.5 N; "),
         (Kind.HAMMER, {"force_n": 1.0, "duration_ms": 5.0, "direction": np.nan}, "direction must be given for HAMMER"),
