@@ -192,7 +192,10 @@ def cut(
     }
     streams = [stream for key, stream in recording.streams.items() if key in columns and stream.rows]
     if not any(stream.first_time_s < to_s and stream.last_time_s >= from_s for stream in streams):
-        raise InputError("from and to", "times that the recording holds", Words(f"{from_s:g} to {to_s:g} s"))
+        first_s = min((stream.first_time_s for stream in streams), default=0.0)
+        last_s = max((stream.last_time_s for stream in streams), default=0.0)
+        must = f"times that the recording holds, {first_s:g} to {last_s:g} s"
+        raise InputError("from and to", must, Words(f"{from_s:g} to {to_s:g} s"))
     counts = _write(
         recording,
         output,

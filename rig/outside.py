@@ -106,7 +106,7 @@ def read_json(payload: bytes, *, field: str = "payload", most_bytes: int = DOCUM
     except InputError as error:
         raise InputError(field, error.must, error.received) from None
     except ValueError as error:
-        raise InputError(field, "a JSON object in UTF-8", Words(printable(str(error), 200))) from None
+        raise InputError(field, f"a JSON object in UTF-8 ({printable(str(error), 200)})", payload[:60]) from None
     if not isinstance(document, dict):
         raise InputError(field, "a JSON object", document)
     if text.count("[") + text.count("{") > DEPTH:

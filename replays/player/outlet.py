@@ -7,7 +7,7 @@ from typing import Any
 from replays.player.edit import Edit, Stamp
 from replays.player.timeline import Item
 from rig import wire
-from rig.desk import finite
+from rig.text import finite
 from rig.transport import Server
 
 

@@ -21,11 +21,12 @@ from replays.player.readahead import ReadAhead
 from replays.player.timeline import Batch, By, Timeline
 from replays.player.track import Track
 from rig import wire
-from rig.desk import Pending, Rate, Seek, Step, finite
+from rig.desk import Pending, Rate, Seek, Step
 from rig.errors import InputError, RefusedError, Words
 from rig.pacing import FreeRun, RealTime
 from rig.served_run import ServedRun
 from rig.service import COMMANDS, REPLAY_COMMANDS
+from rig.text import finite
 from rig.transport import Server
 
 _OWN = (*REPLAY_COMMANDS, "step", "stop")

@@ -22,7 +22,8 @@ def parse_endpoint(text: str, *, field: str = "endpoint") -> tuple[str, int]:
         InputError: It is not of that form.
     """
     host, colon, port = text.rpartition(":")
-    if not colon or not host or "/" in host or not port.isdecimal() or not 1 <= int(port) <= 65535:
+    plain = "/" not in host and (":" not in host or host.startswith("["))
+    if not colon or not host or not plain or not port.isdecimal() or not 1 <= int(port) <= 65535:
         raise InputError(field, f"HOST:PORT with a port of 1 to 65535, such as {DEFAULT_ENDPOINT}", text)
     return host, int(port)
 

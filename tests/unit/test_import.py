@@ -811,7 +811,7 @@ X = '[channels.disk_x]\nsource = "x"\n'
             X + "sensitivity = '2 bananas'\n",
             "m.toml: channels.disk_x.sensitivity must be volts per unit, such as",
         ),
-        (X + "group = 'fast'\n", "m.toml: channels.disk_x.group must be one of"),
+        (X + "group = 'fast'\n", "m.toml: channels.disk_x.group must be left out: there are no groups"),
         (X + "sensitivity = '7 V/mm'\n", "m.toml: channels.disk_x.unit must be V or mV with a sensitivity"),
         (X + "factor = 0.0\n", "m.toml: channels.disk_x.factor must be another number than 0"),
         (X + "file = 'q.csv'\n", "m.toml: channels.disk_x.file must be one of x.csv"),

@@ -97,7 +97,8 @@ class Log:
             raise InputError(f"{where}.group", f"given, as {wanted.source} stands in {places}", wanted.group or None)
         if not inside:
             groups = dict.fromkeys(e.group for s in sources if wanted.file in (None, s.path.name) for e in s.entries)
-            raise InputError(f"{where}.group", f"one of {', '.join(groups)}", wanted.group)
+            must = f"one of {', '.join(groups)}" if any(groups) else "left out: there are no groups"
+            raise InputError(f"{where}.group", must, wanted.group)
         names = [entry.name for _, entry in inside]
         raise UnknownNameError(f"{where}.source", "a signal of the file", wanted.source, names)
 
