@@ -255,6 +255,8 @@ def _write(
             changed = change(Payload.read(key, data, wall_ns))
             if changed is not None:
                 writer.take(changed)
+        if reason == "cut" and not any(writer.counts().rows.values()):
+            raise InputError("from and to", "times between which there are rows", Words("some between two rows"))
         writer.finish(reason)
     return writer.counts()
 

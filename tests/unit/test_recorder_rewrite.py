@@ -274,7 +274,7 @@ def rows(recording: Recording, key: str) -> tuple[np.ndarray, np.ndarray, np.nda
         unique=True,
     )
 )
-@example([5.1e-05, 5.2e-05])  # nothing but a keyphasor edge between them
+@example([5.1e-05, 5.2e-05])  # no row between them
 def test_pieces_of_any_cuts_hold_each_row_once_and_join_to_the_whole(short, tmp_path_factory, times_s):
     folder = tmp_path_factory.mktemp("cuts")
     edges_s = [-np.inf, *sorted(times_s), np.inf]
