@@ -328,8 +328,8 @@ def _run_of(part: RecordingFile) -> tuple[Any, ...]:
 
 def _extent_s(survey: Survey) -> tuple[float, float]:
     """Simulated times of the first and the last row of a file [s]."""
-    edges = [stream for key, stream in survey.streams.items() if stream.rows and key == EDGES]
-    streams = [stream for key, stream in survey.streams.items() if stream.rows and key != EDGES] or edges
+    filled = {key: stream for key, stream in survey.streams.items() if stream.rows}
+    streams = [stream for key, stream in filled.items() if key != EDGES] or list(filled.values())
     return (
         min((stream.first_time_s for stream in streams), default=0.0),
         max((stream.last_time_s for stream in streams), default=0.0),

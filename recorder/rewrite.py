@@ -191,11 +191,9 @@ def cut(
         "channels": json.dumps(channels),
     }
     streams = [stream for key, stream in recording.streams.items() if key in columns and stream.rows]
-    if not any(stream.first_time_s < to_s and stream.last_time_s >= from_s for stream in streams):
-        first_s = min((stream.first_time_s for stream in streams), default=0.0)
-        last_s = max((stream.last_time_s for stream in streams), default=0.0)
-        must = f"times that the recording holds, {first_s:g} to {last_s:g} s"
-        raise InputError("from and to", must, Words(f"{from_s:g} to {to_s:g} s"))
+    first_s = min((stream.first_time_s for stream in streams), default=0.0)
+    last_s = max((stream.last_time_s for stream in streams), default=0.0)
+    must = f"times that the recording holds rows of, {first_s:g} to {last_s:g} s"
     counts = _write(
         recording,
         output,
@@ -205,6 +203,7 @@ def cut(
         reason="cut",
         force=force,
         change=change,
+        empty=InputError("from and to", must, Words(f"{from_s:g} to {to_s:g} s")),
         on_progress=on_progress,
     )
     return Rewritten(output, counts, recording.damaged, short=recording.short)
@@ -220,9 +219,10 @@ def _write(
     scene: dict[str, Any] | None = None,
     catalogue: dict[str, Any] | None = None,
     change: Callable[[Payload], Payload | None] = lambda payload: payload,
+    empty: InputError | None = None,
     on_progress: Callable[[float], None] | None,
 ) -> Counts:
-    """Copy what was recorded, changed or left out (None), and derive the rest anew."""
+    """Copy what was recorded, changed or left out (None), and derive the rest anew; without a row, raise `empty`."""
     check_destination(output, force=force)
     about = recording.metadata["rig"]
     left_out = {"rig", "end"} if "recovered" in metadata else {"rig", "end", "series"}  # a cut is no part of a series
@@ -255,8 +255,8 @@ def _write(
             changed = change(Payload.read(key, data, wall_ns))
             if changed is not None:
                 writer.take(changed)
-        if reason == "cut" and not any(writer.counts().rows.values()):
-            raise InputError("from and to", "times between which there are rows", Words("some between two rows"))
+        if empty is not None and not any(writer.counts().rows.values()):
+            raise empty
         writer.finish(reason)
     return writer.counts()
 

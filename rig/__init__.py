@@ -61,10 +61,10 @@ if not TYPE_CHECKING:  # a type checker knows all names by the imports above
         try:
             return getattr(import_module(f"rig.{home}"), name)
         except ModuleNotFoundError as error:
-            from rig.errors import FULL_INSTALL, belongs_to_full
+            from rig.errors import need_of_full
 
-            if belongs_to_full(error):
-                error.add_note(f"rig.{name} needs {error.name}, {FULL_INSTALL}")
+            if need := need_of_full(error):
+                error.add_note(f"rig.{name} {need}")
             raise
 
 

@@ -14,7 +14,6 @@ PART_SUFFIX = ".part"
 """What a file's name ends in while it is being written."""
 FULL = frozenset({"scipy", "numba", "rerun", "matplotlib", "pyarrow", "jinja2", "fpdf"})
 """What the extra `full` brings, by the names that are imported: what talks to a rig does without."""
-FULL_INSTALL = "which comes with the whole rig: pip install 'rotor-stator-rig[full]'"
 _LONGEST_LINE = 5000
 _MOST_NAMES = 12
 
@@ -81,9 +80,11 @@ class DiskError(RuntimeError):
     """The disk refused in the middle of writing; the message says what is kept of it."""
 
 
-def belongs_to_full(error: ModuleNotFoundError) -> bool:
-    """Whether what is not there is a part of the whole rig, and so was left out on purpose."""
-    return (error.name or "").partition(".")[0] in FULL
+def need_of_full(error: ModuleNotFoundError) -> str | None:
+    """What to say where a part of the whole rig was left out on purpose; None where something else is not there."""
+    if (error.name or "").partition(".")[0] not in FULL:
+        return None
+    return f"needs {error.name}, which comes with the whole rig: pip install 'rotor-stator-rig[full]'"
 
 
 def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: bool) -> None:

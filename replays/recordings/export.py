@@ -85,7 +85,7 @@ def write_run(
     with writer_for(path, simulation, force=force) as writer:
         for frame in frames(simulation):
             writer.write(frame)
-            progress(simulation.tick / (simulation.end_tick or simulation.tick))
+            progress(simulation.tick / simulation.end_tick)
 
 
 def table_columns(simulation: Simulation) -> list[str]:

@@ -12,7 +12,7 @@ import typer
 from rig.cli import origin
 from rig.cli.command import Group, load_command, make_group, usage_error
 from rig.cli.tables import echo
-from rig.errors import FULL_INSTALL, DiskError, InputError, SimulationError, belongs_to_full
+from rig.errors import DiskError, InputError, SimulationError, need_of_full
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
@@ -133,9 +133,9 @@ def start(arguments: list[str] | None = None) -> None:
     except (typer.Abort, KeyboardInterrupt):
         _fail("interrupted", status=_INTERRUPTED)
     except ModuleNotFoundError as error:
-        if not belongs_to_full(error):
+        if not (need := need_of_full(error)):
             raise
-        _fail(f"this needs {error.name}, {FULL_INSTALL}")
+        _fail(f"this {need}")
     except BrokenPipeError:
         # The reader of our output has gone (`rig params | head`): nothing is wrong.
         sys.stderr.close()

@@ -66,7 +66,6 @@ def load(*, messages: CanMessages, form: Form) -> None:
         numbers = (">bytes", ">every [ms]", ">frame [us]", ">load [%]", ">worst response [ms]", ">in time")
         table = new_table(f"CAN at {speed}, every frame at its longest", ">id", "message", "from", *numbers)
         for row in messages_found:
-            worst_s = row["worst_response_s"]
             table.add_row(
                 f"{row['id']:#05x}",
                 row["message"],
@@ -75,7 +74,7 @@ def load(*, messages: CanMessages, form: Form) -> None:
                 f"{'' if row['periodic'] else '>= '}{1e3 * row['period_s']:g}",
                 f"{1e6 * row['transmission_s']:.1f}",
                 f"{100 * row['load']:.2f}",
-                "inf" if worst_s is None else f"{1e3 * worst_s:.3f}",
+                f"{1e3 * row['worst_response_s']:.3f}",
                 "yes" if row["in_time"] else "no",
             )
         console = form.console()
