@@ -59,12 +59,12 @@ from rig.engines.taylor.place import (
 from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
 from rig.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT, ROLLING, held_speed
+from rig.kernels.contact import FLIGHT, ROLLING, held_speed, normal_force
 from rig.kernels.forces import drive_speed
 
 _SAFETY = 0.9
-_LONGEST_S, _SHORTEST_S = 2e-2, 1e-9
-"""Longest and shortest step [s]; the latter not next to an event."""
+_LONGEST_S, _SHORTEST_S = 2e-2, 1e-12
+"""Longest step, and the shortest that is no sign of trouble [s], in the variable of the series."""
 _ROUNDING = 1e-16
 """Tolerance that no step can vouch for."""
 _SCALE_T, _SCALE_ROOT = 1e-4, 3e-3
@@ -125,8 +125,16 @@ def _length(memory, Y, slowed):
 
 
 @njit(cache=True, error_model="numpy")
-def _note_peak(memory, Y):
-    """The largest normal force within a series."""
+def _force_at(constants, inputs, memory, Y, s, x):
+    """Normal force by the law, at s of a series [N]. Its own column says less: no length of step vouches for it."""
+    series_at(Y, s, x)
+    ring, _ = ring_at(constants, inputs, x)
+    return normal_force(ring.delta, ring.rate, memory[ONSET], constants.contact)[0]
+
+
+@njit(cache=True, error_model="numpy")
+def _note_peak(constants, inputs, memory, Y, x):
+    """The largest normal force within a series; x is room for a state."""
     h = memory[LENGTH]
     most, power = Y[0, FORCE], 1.0
     for k in range(1, ORDER):
@@ -139,17 +147,19 @@ def _note_peak(memory, Y):
     for i in range(1, 9):
         s = 0.125 * i * h
         value, slope = column_at(Y, FORCE, 0, s)
-        peak = max(peak, value)
+        if value > peak:
+            peak = max(peak, _force_at(constants, inputs, memory, Y, s, x))
         if slope_before > 0.0 and slope < 0.0:
             low, high = before, s
             for _ in range(30):
                 middle = 0.5 * (low + high)
                 value, slope_middle = column_at(Y, FORCE, 0, middle)
-                peak = max(peak, value)
                 if slope_middle > 0.0:
                     low = middle
                 else:
                     high = middle
+            if value > peak:
+                peak = max(peak, _force_at(constants, inputs, memory, Y, middle, x))
         before, slope_before = s, slope
     memory[PEAK_FORCE] = peak
 
@@ -163,7 +173,7 @@ def _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
     """
     if memory[SPAN] >= 0.0:
         if memory[PHASE] != FLIGHT:
-            _note_peak(memory, Y)
+            _note_peak(constants, inputs, memory, Y, x)
         series_at(Y, memory[LENGTH], x)
         memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
     change_phase(constants, inputs, memory, x, y, dy, out)
@@ -178,9 +188,8 @@ def _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
     h = _length(memory, Y, slowed)
     if not math.isfinite(h):
         return False
-    least = _SHORTEST_S / max(Y[0, ROOT], 1e-4) if slowed else _SHORTEST_S
-    if h < least:
-        h = least
+    # Never further than it holds: what a series says beyond its radius is no number to go on with.
+    if h < _SHORTEST_S:
         memory[CEILING] += 1.0
     # No further than a corner of the hammer's pulse.
     now = memory[TICK]
@@ -302,9 +311,9 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     out = np.empty(S.N_OBSERVED)
     if not _same_inputs(inputs, memory) or memory[SPAN] < 0.0:
         # A new beginning, from what is here now.
-        x[: S.N_VECTOR] = y
         if memory[SPAN] >= 0.0 and memory[PHASE] != FLIGHT:
-            _note_peak(memory, Y)
+            _note_peak(constants, inputs, memory, Y, x)
+        x[: S.N_VECTOR] = y
         memory[SPAN] = -1.0
         memory[EVENT] = NOTHING
         memory[TICK], memory[FRACTION] = float(tick), 0.0
