@@ -35,9 +35,9 @@ _BY_STATE = ("none", "smoothed", "switch")
 
 ENGINES = {
     "split": Method(
-        "exact linear flow and one contact kick a step, order 2",
+        "Taylor series through impacts, exact linear flow and kicks elsewhere",
         25,
-        0.0,
+        1e-4,
         ("none", "exact"),
         ("impact", "compliant"),
         100,

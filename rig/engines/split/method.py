@@ -37,17 +37,8 @@ import math
 import numpy as np
 from numba import njit
 
-from rig.engines.memory import EVALUATIONS, ONSET, PHASE, STEPS
-from rig.engines.split.flow import (
-    GRID,
-    HOUSE_FLOW,
-    LEVELS,
-    flow,
-    house_flows,
-    magnet_springs,
-    shaft_flows,
-)
-from rig.engines.split.impulse import Impulse
+from rig.engines.memory import EVALUATIONS, ONSET, PHASE, STEPS, TOLERANCE
+from rig.engines.split.flow import GRID, HOUSE_FLOW, LEVELS, flow, house_flows, magnet_springs, shaft_flows
 from rig.engines.split.inner_motion import (
     FAST,
     Axis,
@@ -62,120 +53,172 @@ from rig.engines.split.inner_motion import (
     plant_of,
 )
 from rig.engines.split.kick import Kick, along, continued, hammer_mean, processed, smooth_forces, turned, turning
-from rig.engines.split.levels import STRUCK, flight_level, span_of
+from rig.engines.split.levels import ANY, NONE, flight_level, longest_flight, span_of
 from rig.engines.split.place import (
-    AGO,
+    AGAIN,
     ANGLE,
+    BOUNCE,
     CONJUGATE,
     COS,
-    DEPTH,
-    ENGAGED,
     FLOWS,
     FLOWS_END,
     KICK,
     KICKED,
+    LAST_STEP,
+    LIMIT,
+    MODE,
     PX,
     PY,
     RATE,
     REST,
+    ROLLS,
     SIN,
     SLID,
     SPIN,
     SPRING_X,
     SPRING_Y,
-    THETA,
+    TURNED,
     UX,
     UY,
     WANTED,
     X0,
     Y0,
 )
+from rig.engines.split.rigid import LASTS, bounce, hold
 from rig.engines.split.state import Call, Coordinates, Direction, Smooth, Step, Touch, Work
-from rig.engines.split.touch import begin_contact, end_contact, house_kick, kick_contact
+from rig.engines.split.touch import house_kick, kick_contact, no_impulse
+from rig.engines.taylor import march as series
+from rig.engines.taylor.events import FIRST, NOTHING
+from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, SLACK, SPAN, STALLED
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT, damping_per_speed, held_speed
-from rig.kernels.dynamics import evaluate
+from rig.kernels.contact import FLIGHT, ROLLING, damping_per_speed
 from rig.kernels.forces import drive_speed
 
 ORDER = 2
 
+_SERIES, _KICKS = 0.0, 1.0
+"""Modes: series, which take everything; flow and kicks, where they may."""
+_SHARE = 1e-3
+"""Part of the tolerance that one step of the series may err by: impacts make small errors a thousand times larger."""
+_SETTLED_S = 1e-3
+"""A contact is one for kicks after this time without an event [s]; and if they had to leave it, after this time."""
+
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def start(constants, inputs, y, memory, step_ticks, tolerance):
-    """Prepare the memory for a state: the inner state, and the flows for this step."""
-    memory[:] = 0.0
-    memory[ONSET] = held_speed(0.0, constants.contact)
-    axis, w, theta, houses = from_coordinates(constants, y)
-    keep(memory, axis, w, theta, houses)
-    memory[ANGLE] = theta
-    memory[COS] = math.cos(theta + constants.shaft.unbalance_phase)
-    memory[SIN] = math.sin(theta + constants.shaft.unbalance_phase)
-    memory[SLID] = np.nan
-    memory[WANTED] = GRID
-    memory[KICKED] = -1.0
-    memory[ENGAGED] = 1.0 if inputs.magnet_engaged else 0.0
+    """Prepare the memory for a state: the series, and the flows for this step."""
+    series.start(constants, inputs, y, memory, step_ticks, _SHARE * tolerance if tolerance > 0.0 else 1e-9)
+    memory[LIMIT] = tolerance
     # The shaft's flow is linear about its rest on the magnets.
     memory[REST], memory[SPRING_X], memory[SPRING_Y] = magnet_springs(constants)
     house_flows(constants, step_ticks * inputs.tick_s, memory[FLOWS:FLOWS_END].reshape(LEVELS, HOUSE_FLOW))
 
 
 @inlined
-def keep(memory, axis, w, theta, houses):
-    """Put the motion into the memory."""
-    memory[UX], memory[UY], memory[PX], memory[PY] = axis
-    memory[SPIN], memory[THETA] = w, theta
-    memory[X0], memory[X0 + 1], memory[X0 + 2], memory[X0 + 3] = houses.x0, houses.x1, houses.x2, houses.x3
-    memory[Y0], memory[Y0 + 1], memory[Y0 + 2], memory[Y0 + 3] = houses.y0, houses.y1, houses.y2, houses.y3
-
-
-@inlined
-def kept(memory):
+def _kept(memory):
     """Axis, spin, spin angle and houses from the memory."""
     x, y = memory[X0 : X0 + 4], memory[Y0 : Y0 + 4]
     axis = Axis(memory[UX], memory[UY], memory[PX], memory[PY])
-    return axis, memory[SPIN], memory[THETA], Houses(x[0], x[1], x[2], x[3], y[0], y[1], y[2], y[3])
+    return axis, memory[SPIN], memory[ANGLE], Houses(x[0], x[1], x[2], x[3], y[0], y[1], y[2], y[3])
+
+
+@inlined
+def _keep(memory, axis, w, theta, houses):
+    """Put the motion into the memory."""
+    memory[UX], memory[UY], memory[PX], memory[PY] = axis
+    memory[SPIN], memory[ANGLE] = w, theta
+    memory[X0], memory[X0 + 1], memory[X0 + 2], memory[X0 + 3] = houses.x0, houses.x1, houses.x2, houses.x3
+    memory[Y0], memory[Y0 + 1], memory[Y0 + 2], memory[Y0 + 3] = houses.y0, houses.y1, houses.y2, houses.y3
 
 
 @inlined
 def _kept_state(constants, memory):
     """Contact, coordinates and the unbalance's direction from the memory."""
     k = memory[KICK : KICK + 8]
-    touch = Touch(
-        int(memory[PHASE]),
-        memory[SLID],
-        memory[DEPTH],
-        memory[RATE],
-        memory[AGO],
-        int(memory[WANTED]),
-        damping_per_speed(memory[ONSET], constants.contact),
-    )
+    factor = damping_per_speed(memory[ONSET], constants.contact)
+    touch = Touch(int(memory[PHASE]), memory[SLID], memory[RATE], int(memory[WANTED]), factor)
     kick = Kick(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7])
     return (
         touch,
         Coordinates(int(memory[KICKED]), memory[CONJUGATE], kick),
-        Direction(memory[COS], memory[SIN], memory[ANGLE]),
+        Direction(memory[COS], memory[SIN], memory[TURNED]),
     )
 
 
 @inlined
 def _keep_state(memory, touch, coordinates, direction):
     """Put them into the memory."""
-    memory[PHASE], memory[SLID], memory[WANTED] = float(touch.phase), touch.slid, float(touch.wanted)
-    memory[DEPTH], memory[RATE], memory[AGO] = touch.depth, touch.rate, touch.ago
+    memory[PHASE], memory[SLID], memory[RATE] = float(touch.phase), touch.slid, touch.rate
+    memory[WANTED] = float(touch.wanted)
     memory[KICKED], memory[CONJUGATE] = float(coordinates.kicked), coordinates.conjugate
     k = memory[KICK : KICK + 8]
     k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7] = coordinates.kick
-    memory[COS], memory[SIN], memory[ANGLE] = direction.cosine, direction.sine, direction.angle
+    memory[COS], memory[SIN], memory[TURNED] = direction.cosine, direction.sine, direction.angle
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _enter_kicks(constants, memory, y, phase, wanted):
+    """From the series over to kicks, at the state y."""
+    axis, w, theta, houses = from_coordinates(constants, y)
+    _keep(memory, axis, w, theta, houses)
+    angle = theta + constants.shaft.unbalance_phase
+    none = Kick(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    direction = Direction(math.cos(angle), math.sin(angle), theta)
+    ex, ey = eccentricity(constants, axis, houses)
+    rate = motion_of(constants, axis.px, axis.py, houses, ex, ey).rate
+    _keep_state(memory, Touch(phase, np.nan, rate, wanted, 0.0), Coordinates(-1, 0.0, none), direction)
+    memory[BOUNCE], memory[LAST_STEP] = rate, 0.0
+    memory[MODE] = _KICKS
 
 
 @inlined
-def _touch_with(touch, ago, wanted):
-    """The contact with another time since the last kick [s] and another level asked for."""
-    return Touch(touch.phase, touch.slid, touch.depth, touch.rate, ago, wanted, touch.factor)
+def _struck(inputs, begin, end):
+    """Whether the hammer strikes between two ticks."""
+    return inputs.hammer_start < end and inputs.hammer_end > begin
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _try_kicks(constants, inputs, call, memory, y, now, end):
+    """Go over to kicks where the next steps, up to the tick `end`, are likely to be theirs."""
+    phase = int(memory[PHASE])
+    if memory[SPAN] < 0.0 or now < memory[AGAIN] or _struck(inputs, now, end):
+        return
+    if phase == FLIGHT:
+        axis, w, _, houses = from_coordinates(constants, y)
+        longest_s = longest_flight(call, memory[LIMIT], w)
+        level = flight_level(constants, call, axis, w, houses, 0.0, longest_s)
+        if level >= GRID + 1 or (level == GRID and memory[LIMIT] == 0.0):
+            _enter_kicks(constants, memory, y, phase, GRID)
+        return
+    lasts = (now - memory[ROLLS]) * inputs.tick_s > _SETTLED_S and memory[SLACK] == 0.0
+    if lasts and constants.levels.compliant and constants.contact.gap_counts_outer == 0.0:
+        _enter_kicks(constants, memory, y, phase, ANY)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _series_to(constants, inputs, plant, memory, room, y, tick):
+    """The series up to a tick, and the state there into y.
+
+    Returns:
+        Whether a rigid contact has begun to last on the way, at the end of the series at hand; then y is the state there.
+    """
+    rigid = not constants.levels.compliant
+    while not series.holds(memory, tick, 0.0):
+        if memory[EVENT] != NOTHING:
+            memory[ROLLS] = memory[END_TICK]
+        if rigid and memory[EVENT] == FIRST:
+            series.read_off(memory, room, y, memory[END_TICK], memory[END_FRACTION])
+            if bounce(constants, inputs, plant, memory, y) == LASTS:
+                return True
+            series.begin_series(constants, inputs, memory, room, y, memory[END_TICK], memory[END_FRACTION])
+        elif not series.continue_series(constants, inputs, memory, room, y):
+            return False
+    series.read_off(memory, room, y, tick, 0.0)
+    return False
 
 
 @inlined
-def _step_of(constants, inputs, call, touch, kicked, axis, houses, owed, now, n, last):
+def _step_of(constants, inputs, call, touch, kicked, axis, w, houses, owed, now, n, last):
     """The next step: as long as the state allows; it starts at a multiple of its length, and ends at the row.
 
     Args:
@@ -185,41 +228,43 @@ def _step_of(constants, inputs, call, touch, kicked, axis, houses, owed, now, n,
         touch: The contact.
         kicked: Level of the last kick, -1 before the first.
         axis: Of the shaft.
+        w: Spin [rad/s].
         houses: Of the stator.
         owed: Level of the half flow that the last kick still owes, -1 for none.
         now: Tick of the row.
         n: Start, in shortest steps from the row on.
         last: The next row.
+
+    Returns:
+        The step; its level is NONE where it is not one for kicks.
     """
     begin = now + n * call.part_ticks
-    struck = inputs.hammer_start <= begin < inputs.hammer_end
     level = touch.wanted
     if touch.phase == FLIGHT:
         owed_s = span_of(call, owed) if owed >= 0 else 0.0
-        level = flight_level(constants, call, axis, houses, owed_s, struck)
-    if kicked < 0:
-        level = 0  # what the conjugate coordinates need is known after a kick
-    while n & ((1 << level) - 1) != 0 or n + (1 << level) > last:
-        level -= 1
-    count = 1 << level
-    return Step(
-        level, count, 2.0 * span_of(call, level), call.per_s / float(1 << level), begin, n + count, owed, struck
-    )
+        level = flight_level(constants, call, axis, w, houses, owed_s, longest_flight(call, call.tolerance, w))
+    if level != NONE:
+        if kicked < 0 or level == ANY:
+            level = 0  # what the conjugate coordinates need, and the contact's stiffness, is known after a kick
+        while n & ((1 << level) - 1) != 0 or n + (1 << level) > last:
+            level -= 1
+        if constants.levels.compliant and _struck(inputs, begin, begin + float(1 << level) * call.part_ticks):
+            level = NONE
+    count = 1 << max(level, 0)
+    return Step(level, count, 2.0 * call.half_s * count, call.per_s / count, begin, n + count, owed)
 
 
 @inlined
 def _flow_to_middle(
-    constants, inputs, call, shaft_table, house_table, step, aim, axis, w, theta, houses, touch, coordinates
+    constants, inputs, call, shaft_table, house_table, step, aim, axis, w, theta, houses, coordinates
 ):
     """The half flow that is still owed, the change of coordinates for a step of another length, and half a flow."""
     plant, level, owed = call.plant, step.level, step.owed
     inner = constants.levels.inner_house
     merged = owed == level
     conjugate, kicked = coordinates.conjugate, coordinates.kicked
-    depth, rate, ago = touch.depth, touch.rate, touch.ago
     if owed >= 0 and not merged:
         axis, w, theta, houses = flow(shaft_table, house_table, owed, inner, axis, w, theta, aim, houses)
-        ago = 0.0
     if level != kicked:
         # Each length of step has its own conjugate coordinates, at the ends of the steps.
         since = span_of(call, kicked) if kicked >= 0 else 0.0
@@ -227,16 +272,9 @@ def _flow_to_middle(
         axis, houses = processed(conjugate - step.h * step.h * (1.0 / 24.0), plant, carried, axis, houses)
         conjugate = step.h * step.h * (1.0 / 24.0)
         kicked = level
-    if touch.phase == FLIGHT and level <= GRID and not merged:
-        # Where an onset in the half step ahead is measured from.
-        ex, ey = eccentricity(constants, axis, houses)
-        motion = motion_of(constants, axis.px, axis.py, houses, ex, ey)
-        depth, rate, ago = motion.depth, motion.rate, 0.0
     at = level + 1 if merged else level
     axis, w, theta, houses = flow(shaft_table, house_table, at, inner, axis, w, theta, aim, houses)
-    ago += span_of(call, at)
-    touch = Touch(touch.phase, touch.slid, depth, rate, ago, touch.wanted, touch.factor)
-    return axis, w, theta, houses, touch, Coordinates(kicked, conjugate, coordinates.kick)
+    return axis, w, theta, houses, Coordinates(kicked, conjugate, coordinates.kick)
 
 
 @inlined
@@ -246,7 +284,7 @@ def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
     rotation = w - geometry.share  # theta'
     pull = lI * shaft.unbalance * rotation * rotation
     pull_x, pull_y = pull * direction.cosine, pull * direction.sine
-    force = lI * hammer_mean(inputs, step.begin, step.parts * call.part_ticks) if step.struck else 0.0
+    force = lI * hammer_mean(inputs, step.begin, step.parts * call.part_ticks)
     hammer_x, hammer_y = force * inputs.hammer_x, force * inputs.hammer_y
     Sx, Sy, ax, ay = smooth_forces(
         constants, call.plant, inputs.magnet_engaged, axis, pull_x + hammer_x, pull_y + hammer_y
@@ -260,29 +298,17 @@ def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
 
 @inlined
 def _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch):
-    """The contact's impulse: at an onset, in contact, at a lift-off, or none; and the contact after it."""
+    """The contact's impulse, or none in flight; and the contact after it."""
     h, r0 = step.h, constants.contact.clearance
     qx = axis.px + 0.5 * h * (smooth.ax + smooth.turning_x)
     qy = axis.py + 0.5 * h * (smooth.ay + smooth.turning_y)
-    impulse = Impulse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if touch.phase == FLIGHT:
+        return no_impulse(), touch
     ex, ey = eccentricity(constants, axis, houses)
-    if ex * ex + ey * ey > r0 * r0:
-        motion = motion_of(constants, qx, qy, houses, ex, ey)
-        missed = 0.0
-        if touch.phase == FLIGHT:
-            missed = begin_contact(constants, memory, touch, motion, h)
-            factor = damping_per_speed(memory[ONSET], constants.contact)
-            touch = Touch(FLIGHT, np.nan, touch.depth, touch.rate, touch.ago, min(step.level, GRID), factor)
-        return kick_contact(constants, call, memory, ledger, axis, houses, motion, w, touch, missed, step)
-    depth, rate = touch.depth, touch.rate
-    if touch.phase != FLIGHT:
-        motion = motion_of(constants, qx, qy, houses, ex, ey)
-        impulse = end_contact(constants, call.plant, ledger, touch, motion, memory[ONSET], h)
-        depth, rate = motion.depth, motion.rate
-    elif step.level <= GRID:
-        motion = motion_of(constants, qx, qy, houses, ex, ey)
-        depth, rate = motion.depth, motion.rate
-    return impulse, Touch(FLIGHT, touch.slid, depth, rate, 0.0, touch.wanted, touch.factor)
+    if ex * ex + ey * ey <= r0 * r0:
+        return no_impulse(), Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
+    motion = motion_of(constants, qx, qy, houses, ex, ey)
+    return kick_contact(constants, call, memory, ledger, axis, houses, motion, w, touch, step)
 
 
 @inlined
@@ -368,18 +394,6 @@ def _kick_shaft(
 
 
 @inlined
-def _write_row(constants, inputs, now, memory, phase, plant, coordinates, axis, w, theta, houses, y, dy, rows, row):
-    """The row of an instant, in the motion's own coordinates."""
-    own_axis, own_houses = processed(coordinates.conjugate, plant, coordinates.kick, axis, houses)
-    into_coordinates(constants, own_axis, w, theta, own_houses, y)
-    # Rigid impacts have no force over time.
-    seen = phase if constants.levels.compliant else FLIGHT
-    evaluate(constants, inputs, now, 0.0, memory[ONSET], seen, True, y, dy, rows[row, S.N_VECTOR :])
-    for i in range(S.N_VECTOR):
-        rows[row, i] = y[i]
-
-
-@inlined
 def _book(constants, y, ledger, work, axis, houses, moved, gained):
     """The integrals since the last row into y; `moved` [N m s] and `gained` [J] by the last flow of the spin."""
     house = constants.house
@@ -398,96 +412,151 @@ def _book(constants, y, ledger, work, axis, houses, moved, gained):
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST, nogil=True)
-def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
-    """See `rig.engines`."""
-    # params:
+def _kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last):
+    """Kicks from one instant on, as long as they may, at most up to the next row; the state there into y.
+
+    Args:
+        constants: Of the model.
+        inputs: Of this call.
+        call: What stays through the call.
+        memory: Of the engine.
+        shaft_table: Flows of shaft and drive.
+        ledger: Room for the integrals.
+        y: State and integrals at the start, in and out.
+        now: Tick of the row.
+        n: Start, in shortest steps from the row on.
+        last: The next row.
+
+    Returns:
+        Where they ended, in shortest steps from the row on.
+    """
     euler, inner, ideal = constants.levels.euler, constants.levels.inner_house, inputs.ideal_drive
-    Izz = constants.shaft.polar_inertia
-    plant = plant_of(constants, inputs, memory[REST], memory[SPRING_X], memory[SPRING_Y])
-    shaft_table = shaft_flows(plant, inputs.magnet_engaged, step_ticks * inputs.tick_s)
+    Izz, plant = constants.shaft.polar_inertia, call.plant
     house_table = memory[FLOWS:FLOWS_END].reshape(LEVELS, HOUSE_FLOW)
-    half_s = 0.5 * 2.0**-GRID * (step_ticks * inputs.tick_s)
-    call = Call(plant, step_ticks / 2.0**GRID, half_s, 0.5 / half_s)
-    # state in:
-    axis, w, theta, houses = kept(memory)
+    axis, w, theta, houses = _kept(memory)
     touch, coordinates, direction = _kept_state(constants, memory)
-    if inputs.magnet_engaged != (memory[ENGAGED] == 1.0):
-        # Another division into flow and kick has other conjugate coordinates.
-        axis, houses = processed(coordinates.conjugate, plant, coordinates.kick, axis, houses)
-        coordinates = Coordinates(-1, 0.0, Kick(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        memory[ENGAGED] = 1.0 if inputs.magnet_engaged else 0.0
-    ledger = np.zeros(S.N_VECTOR)
-    dy = np.empty(S.N_VECTOR)
+    # Integrals of this piece start at 0.
+    ledger[:] = 0.0
+    ledger[S.HOUSE_LOSS] = house_energy(constants, houses)
+    work = Work(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    # The unbalance's direction is turned step by step; its length is kept here.
+    q = 1.5 - 0.5 * (direction.cosine * direction.cosine + direction.sine * direction.sine)
+    direction = Direction(direction.cosine * q, direction.sine * q, direction.angle)
     kicks = 0.0
-    row = first = 0
-    while first < steps:
-        now = tick + first * step_ticks
-        _write_row(
-            constants, inputs, now, memory, touch.phase, plant, coordinates, axis, w, theta, houses, y, dy, rows, row
-        )
-        row += 1
+    owed = -1
+    while n < last:
+        step = _step_of(constants, inputs, call, touch, coordinates.kicked, axis, w, houses, owed, now, n, last)
+        if step.level == NONE:
+            break
+        before = (axis, w, theta, houses, coordinates, direction)
 
-        # The steps up to the next row. Integrals of this row start at 0.
-        ledger[:] = 0.0
-        ledger[S.HOUSE_LOSS] = house_energy(constants, houses)
-        work = Work(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        # The unbalance's direction is turned step by step; its length is kept here.
-        q = 1.5 - 0.5 * (direction.cosine * direction.cosine + direction.sine * direction.sine)
-        direction = Direction(direction.cosine * q, direction.sine * q, direction.angle)
-        last = min(stride, steps - first) * 2**GRID
-        n = 0
-        owed = -1
-        while n < last:
-            step = _step_of(constants, inputs, call, touch, coordinates.kicked, axis, houses, owed, now, n, last)
-
-            # Flow to the middle of the step. The drive's speed is that in the middle of the flow up to there.
-            middle = (n + 0.5 * step.parts) * call.part_ticks
-            back = 0.25 * step.parts if owed < 0 else 0.25 * (step.parts + (1 << owed))
-            aim = drive_speed(inputs, now, middle - back * call.part_ticks)
-            spin = w
-            if ideal:
-                w = aim
-            axis, w, theta, houses, touch, coordinates = _flow_to_middle(
-                constants, inputs, call, shaft_table, house_table, step, aim, axis, w, theta, houses, touch, coordinates
-            )
-            geometry = geometry_of(euler, axis)
-            if ideal:
-                w = drive_speed(inputs, now, middle) + geometry.share
-            gained, moved = 0.5 * Izz * (w * w - spin * spin), Izz * (w - spin)
-            cosine, sine = turned(direction.cosine, direction.sine, theta - direction.angle)
-            direction = Direction(cosine, sine, theta)
-
-            # The kick.
-            smooth = _smooth(constants, inputs, call, step, axis, geometry, w, direction)
-            impulse, touch = _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch)
-            axis, w, theta, kick, work = _kick_shaft(
-                constants, inputs, call, step, axis, geometry, w, theta, gained, moved, direction, smooth, impulse, work
-            )
-            coordinates = Coordinates(coordinates.kicked, coordinates.conjugate, kick)
-            if inner:
-                houses, near = house_kick(constants, plant, ledger, houses, impulse, step.h)
-                if near:
-                    touch = _touch_with(touch, touch.ago, min(touch.wanted, STRUCK))
-            kicks += 1.0
-            owed = step.level
-            n = step.end
-
-        # The half flow that is owed up to the row.
+        # Flow to the middle of the step. The drive's speed is that in the middle of the flow up to there.
+        middle = (n + 0.5 * step.parts) * call.part_ticks
+        back = 0.25 * step.parts if owed < 0 else 0.25 * (step.parts + (1 << owed))
+        aim = drive_speed(inputs, now, middle - back * call.part_ticks)
         spin = w
-        aim = drive_speed(inputs, now, (last - 0.25 * (1 << owed)) * call.part_ticks)
+        if ideal:
+            w = aim
+        axis, w, theta, houses, coordinates = _flow_to_middle(
+            constants, inputs, call, shaft_table, house_table, step, aim, axis, w, theta, houses, coordinates
+        )
+        geometry = geometry_of(euler, axis)
+        if ideal:
+            w = drive_speed(inputs, now, middle) + geometry.share
+        gained, moved = 0.5 * Izz * (w * w - spin * spin), Izz * (w - spin)
+        cosine, sine = turned(direction.cosine, direction.sine, theta - direction.angle)
+        direction = Direction(cosine, sine, theta)
+
+        # The kick.
+        smooth = _smooth(constants, inputs, call, step, axis, geometry, w, direction)
+        impulse, touch = _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch)
+        if touch.wanted == NONE:
+            axis, w, theta, houses, coordinates, direction = before
+            break
+        axis, w, theta, kick, work = _kick_shaft(
+            constants, inputs, call, step, axis, geometry, w, theta, gained, moved, direction, smooth, impulse, work
+        )
+        coordinates = Coordinates(coordinates.kicked, coordinates.conjugate, kick)
+        if inner:
+            houses, near = house_kick(constants, plant, ledger, houses, impulse, step.h)
+            if near and constants.levels.compliant:
+                touch = Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
+        kicks += 1.0
+        owed = step.level
+        n = step.end
+        if touch.wanted == NONE:
+            break
+
+    gained = moved = 0.0
+    if owed >= 0:
+        # The half flow that is owed.
+        spin = w
+        aim = drive_speed(inputs, now, (n - 0.25 * (1 << owed)) * call.part_ticks)
         if ideal:
             w = aim
         axis, w, theta, houses = flow(shaft_table, house_table, owed, inner, axis, w, theta, aim, houses)
-        touch = _touch_with(touch, touch.ago + span_of(call, owed), touch.wanted)
         if ideal:
-            w = drive_speed(inputs, now, last * call.part_ticks) + geometry_of(euler, axis).share
-        _book(constants, y, ledger, work, axis, houses, Izz * (w - spin), 0.5 * Izz * (w * w - spin * spin))
-        first += last // 2**GRID
-
-    # out:
+            w = drive_speed(inputs, now, n * call.part_ticks) + geometry_of(euler, axis).share
+        gained, moved = 0.5 * Izz * (w * w - spin * spin), Izz * (w - spin)
+    _book(constants, y, ledger, work, axis, houses, moved, gained)
     own_axis, own_houses = processed(coordinates.conjugate, plant, coordinates.kick, axis, houses)
     into_coordinates(constants, own_axis, w, theta, own_houses, y)
-    keep(memory, axis, w, theta, houses)
+    _keep(memory, axis, w, theta, houses)
     _keep_state(memory, touch, coordinates, direction)
     memory[STEPS] += kicks
     memory[EVALUATIONS] += kicks
+    return n
+
+
+@njit(cache=True, error_model="numpy")
+def _leave_kicks(constants, inputs, plant, memory, y):
+    """What the series need to know of the state that kicks have left."""
+    memory[MODE] = _SERIES
+    memory[STALLED] = memory[SLACK] = 0.0
+    if not constants.levels.compliant:
+        memory[PHASE] = FLIGHT
+    elif memory[PHASE] == ROLLING:
+        hold(constants, inputs, plant, y)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
+    """See `rig.engines`."""
+    plant = plant_of(constants, inputs, memory[REST], memory[SPRING_X], memory[SPRING_Y])
+    shaft_table = shaft_flows(plant, inputs.magnet_engaged, step_ticks * inputs.tick_s)
+    half_s = 0.5 * 2.0**-GRID * (step_ticks * inputs.tick_s)
+    call = Call(plant, step_ticks / 2.0**GRID, half_s, 0.5 / half_s, memory[LIMIT])
+    room = series.room_in(memory)
+    ledger = np.zeros(S.N_VECTOR)
+    changed = not series.same_inputs(inputs, memory)
+    if memory[SPAN] < 0.0 or (changed and memory[MODE] == _SERIES):
+        series.begin_series(constants, inputs, memory, room, y, tick, 0.0)
+    elif changed:
+        # Another division into flow and kick has other conjugate coordinates.
+        _enter_kicks(constants, memory, y, int(memory[PHASE]), int(memory[WANTED]))
+    row = first = 0
+    while first < steps:
+        now, ahead = tick + first * step_ticks, min(stride, steps - first)
+        end = now + ahead * step_ticks
+        if memory[MODE] == _SERIES:
+            _try_kicks(constants, inputs, call, memory, y, now, end)
+        # Rigid impacts have no force over time.
+        seen = int(memory[PHASE]) if constants.levels.compliant else FLIGHT
+        series.write_row(constants, inputs, memory, room, y, now, seen, rows, row)
+        row += 1
+        n, last = 0, ahead * 2**GRID
+        while n < last:
+            if memory[MODE] == _KICKS:
+                n = _kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last)
+                if n < last:
+                    at = now + n * call.part_ticks
+                    memory[AGAIN] = memory[ROLLS] = at + _SETTLED_S / inputs.tick_s
+                    _leave_kicks(constants, inputs, plant, memory, y)
+                    series.begin_series(constants, inputs, memory, room, y, int(math.floor(at)), at - math.floor(at))
+            elif _series_to(constants, inputs, plant, memory, room, y, end):
+                since = (memory[END_TICK] - now) + memory[END_FRACTION]
+                n = int(math.ceil(since / call.part_ticks))
+                _enter_kicks(constants, memory, y, ROLLING, GRID)
+            else:
+                n = last
+        first += ahead

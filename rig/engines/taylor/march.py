@@ -298,7 +298,7 @@ def read_off(memory, room, y, tick, fraction):
     s = time
     if time >= memory[SPAN]:
         s = memory[LENGTH]
-    elif memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
+    elif time > 0.0 and memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
         s = refine(Y, TIME, 0, time, 0.0, memory[LENGTH])
     series_at(Y, s, x)
     y[:] = x[: S.N_VECTOR]
