@@ -163,6 +163,16 @@ def _length(memory, Y, slowed):
 
 
 @njit(cache=True, error_model="numpy")
+def _law_length(memory, Y):
+    """How far the normal law and its losses hold in a series."""
+    tolerance, law, loss = memory[TOLERANCE], EVENTS + 2, S.CONTACT_LOSS
+    most = tolerance * max(1.0, abs(Y[0, law]))
+    last = max(abs(Y[ORDER - 1, law]) / most, abs(Y[ORDER - 1, loss]) / tolerance)
+    before = max(abs(Y[ORDER - 2, law]) / most, abs(Y[ORDER - 2, loss]) / tolerance)
+    return _SAFETY * min(max(last, 1e-200) ** (-1.0 / (ORDER - 1.0)), max(before, 1e-200) ** (-1.0 / (ORDER - 2.0)))
+
+
+@njit(cache=True, error_model="numpy")
 def _force_at(constants, inputs, memory, Y, s, x):
     """Normal force by the law, at s of a series [N]. Its own column says less: no length of step vouches for it."""
     series_at(Y, s, x)
@@ -227,6 +237,9 @@ def _next_series(constants, inputs, memory, room, y):
     h = _length(memory, Y, slowed)
     if not math.isfinite(h):
         return False
+    if slowed and not (constants.contact.exponent == 1.5 or constants.contact.exponent == 1.0):
+        # The law, by which events and losses go, has a radius that a motion it hardly moves yet does not show.
+        h = min(h, _law_length(memory, Y))
     # Never further than it holds: what a series says beyond its radius is no number to go on with.
     if h < _SHORTEST_S:
         memory[CEILING] += 1.0
