@@ -37,7 +37,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rig.engines.memory import EVALUATIONS, ONSET, PHASE, STEPS, TOLERANCE
+from rig.engines.memory import EVALUATIONS, ONSET, PHASE, STEPS
 from rig.engines.split.flow import GRID, HOUSE_FLOW, LEVELS, flow, house_flows, magnet_springs, shaft_flows
 from rig.engines.split.inner_motion import (
     FAST,
@@ -84,12 +84,12 @@ from rig.engines.split.place import (
     X0,
     Y0,
 )
-from rig.engines.split.rigid import LASTS, bounce, hold
+from rig.engines.split.rigid import bounce, hold, part
 from rig.engines.split.state import Call, Coordinates, Direction, Smooth, Step, Touch, Work
 from rig.engines.split.touch import house_kick, kick_contact, no_impulse
 from rig.engines.taylor import march as series
 from rig.engines.taylor.events import FIRST, NOTHING
-from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, SLACK, SPAN, STALLED
+from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, SLACK, SPAN
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT, ROLLING, damping_per_speed
 from rig.kernels.forces import drive_speed
@@ -100,6 +100,8 @@ _SERIES, _KICKS = 0.0, 1.0
 """Modes: series, which take everything; flow and kicks, where they may."""
 _SHARE = 1e-3
 """Part of the tolerance that one step of the series may err by: impacts make small errors a thousand times larger."""
+_OPEN = 1e-9
+"""Gap that ends a rigid contact [m]."""
 _SETTLED_S = 1e-3
 """A contact is one for kicks after this time without an event [s]; and if they had to leave it, after this time."""
 
@@ -200,7 +202,7 @@ def _series_to(constants, inputs, plant, memory, room, y, tick):
     """The series up to a tick, and the state there into y.
 
     Returns:
-        Whether a rigid contact has begun to last on the way, at the end of the series at hand; then y is the state there.
+        Whether a rigid contact has begun to last on the way, at the end of the series at hand; y is the state there.
     """
     rigid = not constants.levels.compliant
     while not series.holds(memory, tick, 0.0):
@@ -208,9 +210,12 @@ def _series_to(constants, inputs, plant, memory, room, y, tick):
             memory[ROLLS] = memory[END_TICK]
         if rigid and memory[EVENT] == FIRST:
             series.read_off(memory, room, y, memory[END_TICK], memory[END_FRACTION])
-            if bounce(constants, inputs, plant, memory, y) == LASTS:
+            if bounce(constants, inputs, plant, memory, room, y):
                 return True
-            series.begin_series(constants, inputs, memory, room, y, memory[END_TICK], memory[END_FRACTION])
+            end = int(memory[END_TICK])
+            series.begin_series(constants, inputs, memory, room, y, end, memory[END_FRACTION], True)
+            if not np.isfinite(y[0]):
+                return False
         elif not series.continue_series(constants, inputs, memory, room, y):
             return False
     series.read_off(memory, room, y, tick, 0.0)
@@ -255,9 +260,7 @@ def _step_of(constants, inputs, call, touch, kicked, axis, w, houses, owed, now,
 
 
 @inlined
-def _flow_to_middle(
-    constants, inputs, call, shaft_table, house_table, step, aim, axis, w, theta, houses, coordinates
-):
+def _flow_to_middle(constants, inputs, call, shaft_table, house_table, step, aim, axis, w, theta, houses, coordinates):
     """The half flow that is still owed, the change of coordinates for a step of another length, and half a flow."""
     plant, level, owed = call.plant, step.level, step.owed
     inner = constants.levels.inner_house
@@ -300,12 +303,14 @@ def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
 def _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch):
     """The contact's impulse, or none in flight; and the contact after it."""
     h, r0 = step.h, constants.contact.clearance
+    # A rigid contact may begin where rounding, or a chord of the arc, leaves a gap.
+    least = r0 if constants.levels.compliant else r0 - _OPEN
     qx = axis.px + 0.5 * h * (smooth.ax + smooth.turning_x)
     qy = axis.py + 0.5 * h * (smooth.ay + smooth.turning_y)
     if touch.phase == FLIGHT:
         return no_impulse(), touch
     ex, ey = eccentricity(constants, axis, houses)
-    if ex * ex + ey * ey <= r0 * r0:
+    if ex * ex + ey * ey <= least * least:
         return no_impulse(), Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
     motion = motion_of(constants, qx, qy, houses, ex, ey)
     return kick_contact(constants, call, memory, ledger, axis, houses, motion, w, touch, step)
@@ -510,13 +515,20 @@ def _kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last
 
 @njit(cache=True, error_model="numpy")
 def _leave_kicks(constants, inputs, plant, memory, y):
-    """What the series need to know of the state that kicks have left."""
+    """What the series need to know of the state that kicks have left.
+
+    Returns:
+        Whether a rigid contact ends there.
+    """
     memory[MODE] = _SERIES
-    memory[STALLED] = memory[SLACK] = 0.0
+    memory[SLACK] = 0.0
     if not constants.levels.compliant:
+        touched = memory[PHASE] != FLIGHT
         memory[PHASE] = FLIGHT
-    elif memory[PHASE] == ROLLING:
+        return touched and part(constants, inputs, plant, y)
+    if memory[PHASE] == ROLLING:
         hold(constants, inputs, plant, y)
+    return False
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -530,7 +542,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     ledger = np.zeros(S.N_VECTOR)
     changed = not series.same_inputs(inputs, memory)
     if memory[SPAN] < 0.0 or (changed and memory[MODE] == _SERIES):
-        series.begin_series(constants, inputs, memory, room, y, tick, 0.0)
+        series.begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
     elif changed:
         # Another division into flow and kick has other conjugate coordinates.
         _enter_kicks(constants, memory, y, int(memory[PHASE]), int(memory[WANTED]))
@@ -551,11 +563,12 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
                 if n < last:
                     at = now + n * call.part_ticks
                     memory[AGAIN] = memory[ROLLS] = at + _SETTLED_S / inputs.tick_s
-                    _leave_kicks(constants, inputs, plant, memory, y)
-                    series.begin_series(constants, inputs, memory, room, y, int(math.floor(at)), at - math.floor(at))
+                    ends = _leave_kicks(constants, inputs, plant, memory, y)
+                    whole = math.floor(at)
+                    series.begin_series(constants, inputs, memory, room, y, whole, at - whole, ends)
             elif _series_to(constants, inputs, plant, memory, room, y, end):
                 since = (memory[END_TICK] - now) + memory[END_FRACTION]
-                n = int(math.ceil(since / call.part_ticks))
+                n = math.ceil(since / call.part_ticks)
                 _enter_kicks(constants, memory, y, ROLLING, GRID)
             else:
                 n = last

@@ -5,6 +5,8 @@ from __future__ import annotations
 from numba import njit
 
 from rig.engines.events import latch_onset
+from rig.engines.memory import ONSET
+from rig.engines.method import rates
 from rig.engines.split.impulse import mobility_of
 from rig.engines.split.inner_motion import (
     FAST,
@@ -16,10 +18,15 @@ from rig.engines.split.inner_motion import (
     into_coordinates,
     motion_of,
 )
+from rig.engines.taylor.place import END_FRACTION, END_TICK
 from rig.kernels import signals as S
+from rig.kernels.contact import FLIGHT
 
-LEAVES, LASTS = range(2)
-"""What is behind an impact: flight, or a contact that lasts."""
+_PRESSED = 0.1
+"""Acceleration towards the ring from which on a contact can last [m/s^2]: less is a rounding error of the weight's."""
+_MOMENT_S = 1e-7
+_APART = 1e-9
+"""Least speed at which what leaves leaves [m/s]: 0 has rounding's sign."""
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -70,20 +77,30 @@ def _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt):
         y[S.HOUSE_IMPULSE_Y] -= jy
 
 
+@njit(cache=True, error_model="numpy")
+def _pressed(constants, inputs, memory, room, y):
+    """Acceleration of the closing gap in flight, at the end of the series at hand and the state y [m/s^2]."""
+    tick, fraction = int(memory[END_TICK]), memory[END_FRACTION]
+    rates(constants, inputs, tick, fraction, memory[ONSET], FLIGHT, True, y, room.dy, room.out)
+    before = room.out[S.PENETRATION_RATE]
+    rates(constants, inputs, tick, fraction, memory[ONSET], FLIGHT, True, y + _MOMENT_S * room.dy, room.dy, room.out)
+    return (room.out[S.PENETRATION_RATE] - before) / _MOMENT_S
+
+
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def bounce(constants, inputs, plant, memory, y):
+def bounce(constants, inputs, plant, memory, room, y):
     """An impact at the state y, whose gap is closed: Newton's restitution, and Coulomb's friction.
 
     The impulse across is what would end the sliding, within mu times the normal one.
 
     Returns:
-        LASTS where the shaft comes in no faster than the contact's speed floor, and stays; else LEAVES.
+        Whether the contact lasts: the shaft comes in no faster than the speed floor, and is pressed on.
     """
     contact, mu = constants.contact, plant.friction
     motion, m, sliding = _seen(constants, plant, y)
     latch_onset(memory, motion.rate, contact)
-    lasts = motion.rate <= contact.speed_floor
-    change = motion.rate if lasts else (1.0 + contact.restitution) * motion.rate
+    lasts = motion.rate <= contact.speed_floor and _pressed(constants, inputs, memory, room, y) > _PRESSED
+    change = motion.rate if lasts else (1.0 + contact.restitution) * max(motion.rate, 0.0) + _APART
     # Both conditions at once where it sticks; else the limit holds, and the normal condition with it.
     determinant = m.nn * m.tt - m.nt * m.nt
     jn = (change * m.tt - sliding * m.nt) / determinant
@@ -93,7 +110,7 @@ def bounce(constants, inputs, plant, memory, y):
         jn = change / (m.nn + way * m.nt)
         jt = way * jn
     _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt)
-    return LASTS if lasts else LEAVES
+    return lasts
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -101,3 +118,16 @@ def hold(constants, inputs, plant, y):
     """End the sliding at the state y of a contact that rolls: kicks leave it none in the mean of a step only."""
     motion, m, sliding = _seen(constants, plant, y)
     _strike(constants, inputs, plant, y, motion, m, sliding, 0.0, sliding / m.tt)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def part(constants, inputs, plant, y):
+    """See to it that a rigid contact that is over opens at the state y.
+
+    Returns:
+        Whether the gap is still closed by as much as a contact keeps it.
+    """
+    motion, m, sliding = _seen(constants, plant, y)
+    if motion.rate > -_APART:
+        _strike(constants, inputs, plant, y, motion, m, sliding, (motion.rate + _APART) / m.nn, 0.0)
+    return motion.depth > -_APART
