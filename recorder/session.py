@@ -10,12 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from recorder.captures import Captures, check_captures
+from recorder.captures import Captures, capture_path, check_captures
 from recorder.counts import NS, Counts
 from recorder.head import Beginning
 from recorder.payload import Payload
 from recorder.room import Limits
-from recorder.series import Series, check_series
+from recorder.series import Series, check_series, part_path
 from recorder.sink import Needs, Sink
 from recorder.summary import Progress, Summary
 from recorder.trigger import Capture
@@ -231,6 +231,13 @@ class RecordingSession:
         if not self._rig_lost:
             self._report(writer, done=True)  # lets the rig drop its cache at once
         return self._summary(writer, reason, trouble)
+
+    @property
+    def first_files(self) -> list[Path]:
+        """The file that it writes, or the first of several, for each trigger."""
+        if self._capture is not None:
+            return list(dict.fromkeys(capture_path(self.path, each, 1) for each in self._capture.triggers))
+        return [part_path(self.path, 0) if self._limits.rotates else self.path]
 
     def _ask(self, key: str) -> bytes:
         """Request a document, again for as long as a rig may take to answer."""

@@ -63,7 +63,9 @@ def init(
     *,
     host: Annotated[
         list[str] | None,
-        typer.Option(help="Name or address by which others reach the rig's computer; may be repeated."),
+        typer.Option(
+            metavar="HOST", help="Name or address by which others reach the rig's computer; may be repeated."
+        ),
     ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 365,
     truth: Annotated[

@@ -66,7 +66,8 @@ class Triggers:
         _triggers(
             "Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
             "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
-            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ..."
+            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
+            metavar="EVENT|LEVEL",
         ),
     ] = None
     pre_s: Annotated[
@@ -226,15 +227,17 @@ def run_session(session: RecordingSession) -> Summary:
 
     before = {number: signal.signal(number, stop) for number in ends}
     console = table_console(stderr=True)
-    told, begun, name = 0, False, f"recording {printable(session.path.name, 30)}"
+    told, begun, files = 0, False, session.first_files
+    more = "" if files == [session.path] else ", ..."
+    name = f"recording {printable(' or '.join(file.name for file in files), 30)}{more}"
     try:
         with console.status(plain(f"{name}: waiting for the rig")) as status:
 
             def show(progress: Progress) -> None:
                 nonlocal begun
                 if progress.rows and not begun and not console.is_terminal:
-                    begin = f"rig: recording {printable(str(session.path))}; Ctrl-C ends it well"
-                    echo(begin, err=True)  # scripts wait for this line
+                    into = " or ".join(map(str, files)) + more
+                    echo(f"rig: recording {into}; Ctrl-C ends it well", err=True)  # scripts wait for this line
                 begun = begun or progress.rows > 0
                 remark(progress.remarks)
                 lost = f"{progress.lost} lost"
@@ -279,7 +282,7 @@ def tell(summary: Summary) -> None:
             around = f" (around {triggers}, of {summary.received_s:.3f} s received)"
         echo(
             f"{files}: {summary.duration_s:.3f} s from {summary.first_time_s:.3f} s on{around}, "
-            f"{sum(sensors)} samples in {len(sensors)} streams, {truth} rows of truth, "
+            f"{sum(sensors)} samples in {len(sensors)} streams, {f'{truth} rows of' if truth else 'no'} truth, "
             f"{summary.size_bytes / 1e6:.1f} MB; ended: {summary.reason}"
         )
     if summary.removed:

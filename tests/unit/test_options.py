@@ -93,9 +93,9 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("rnu", "command must be one of `rig -h`, such as run; instead received 'rnu'"),
-        ("can lod", "command must be one of `rig can -h`, such as load; instead received 'lod'"),
-        ("run x --sed 1", "option must be one of `rig run -h`, such as --seed or --set; instead received '--sed'"),
+        ("rnu", "command must be one of `rig -h`, such as run, resume, rate (38 in all); instead received 'rnu'"),
+        ("can lod", "command must be one of `rig can -h`, such as load (3 in all); instead received 'lod'"),
+        ("run x --sed 1", "option must be one of `rig run -h`, such as --seed, --set, --speed (19 in all); instead received '--sed'"),
         ("run", "SCENE must be given: name of a scene, or the path of a scene file; instead received nothing"),
         ("stop now", "argument must be one that `rig stop` takes (see -h); instead received 'now'"),
         ("run x --set", "--set must be followed by a value; instead received nothing"),
