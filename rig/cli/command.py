@@ -180,7 +180,7 @@ def make_group(
     """
     app = typer.Typer(name=name, **_PLAIN)
     app.callback(cls=Group, help=help or callback.__doc__, invoke_without_command=True, context_settings=_SETTINGS)(
-        callback
+        grouped(callback)
     )
     group = typer.main.get_command(app)
     assert isinstance(group, Group)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -43,8 +42,6 @@ class Again(StrEnum):
 
 
 _PRE_S, _POST_S = 0.5, 2.0
-_LINK_S = 1.0
-"""Time that the connection to a rig that is there may take [s]."""
 _SPINNER = 2
 """Columns of the sign that something goes on, with the blank behind it."""
 
@@ -154,9 +151,6 @@ def record(
     history: Annotated[
         bool, typer.Option(help="From the start of the run on, as far as the rig's cache reaches.")
     ] = False,
-    wait_s: Annotated[
-        float, typer.Option(metavar="S", help="Wait that long for the rig to be there, in s.", min=0.0)
-    ] = 0.0,
     patience_s: Annotated[
         float,
         typer.Option(
@@ -190,7 +184,6 @@ def record(
             duration_s=duration_s,
             view_rate_hz=view_rate_hz,
             history=history,
-            wait_s=wait_s,
             patience_s=patience_s,
             force=force,
             limits=limits,
@@ -199,9 +192,7 @@ def record(
         )
 
     session_of(None)  # whatever is wrong with the options is said before a rig is looked for
-    with ExitStack() as stack:
-        with table_console(stderr=True).status(plain(f"waiting for a rig at {connection.connect}")):
-            client = stack.enter_context(connection.client(wait_s=max(_LINK_S, wait_s)))
+    with connection.client() as client:
         summary = run_session(session_of(client))
     tell(summary)
     if not summary.good:

@@ -26,7 +26,9 @@ def twins(
     import threading
 
     from drivers.twins import Twins
+    from rig.transport.endpoint import parse_loopback
 
+    parse_loopback(listen, field="--listen")  # whatever is wrong with the options is said before a rig is looked for
     done = threading.Event()
     with connection.client() as client, Twins(client) as serving:
         if zenoh or not (pty or can):

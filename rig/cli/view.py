@@ -29,7 +29,6 @@ def view(
     *,
     live: Annotated[bool, typer.Option("--live", help="View the running rig.")] = False,
     connection: Connection,
-    wait_s: Annotated[float, typer.Option(help="Wait that long for the rig to be there, in s (with --live).")] = 5.0,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
     save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening a viewer.")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a .png picture instead of opening a viewer.")] = None,
@@ -49,7 +48,7 @@ def view(
     try:
         with _interruptible():
             if live:
-                _view_live(connection, wait_s=wait_s, web=web, save=save)
+                _view_live(connection, web=web, save=save)
             elif files:
                 _view_file(files, web=web, save=save, screenshot=screenshot, at_s=at_s)
     except WindowError as error:
@@ -118,12 +117,12 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
             _wait_for_the_end(shown)
 
 
-def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path | None) -> None:
+def _view_live(connection: Connection, *, web: bool, save: Path | None) -> None:
     from recorder.viewer import blueprint, live, window
     from recorder.viewer.canvas import Canvas, new_stream
 
-    with connection.client(wait_s=wait_s) as client:
-        described = live.ask(client, wait_s=wait_s)
+    with connection.client() as client:
+        described = live.ask(client)
         stream = new_stream(f"rig at {connection.connect}")
         plan = blueprint.layout(described.table, described.geometry, live=True)
         if save is not None:

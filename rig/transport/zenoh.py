@@ -331,7 +331,9 @@ class ZenohClient:
         return NoReplyError(f"{self.endpoint} listens, but does not let us in {why}")
 
     def _no_reply(self) -> NoReplyError:
-        return NoReplyError(f"no rig answers at {self.endpoint}; start one with: rig run stable-run")
+        return NoReplyError(
+            f"no rig answers at {self.endpoint}; start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
+        )
 
     @property
     def connection(self) -> str | None:

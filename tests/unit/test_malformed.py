@@ -54,7 +54,7 @@ CASES = [
     scene("bad TOML", "duration_s = ", "scene.toml", "a TOML file"),
     scene("not text", b"\xff\xfe\x00", "scene.toml", "a TOML file"),
     scene("unknown field", "bogus = 1", "bogus", "a field that there is, such as "),
-    scene("unknown field in a part", "[drive]\nspeed = 1", "drive.speed", "a field that there is, such as "),
+    scene("unknown field in a part", "[drive]\nspeed = 1", "scene.toml: drive.speed", "such as speed_hz (3 in all)"),
     scene("part is no table", "drive = 3", "drive", "a valid dictionary"),
     scene("text for a number", 'duration_s = "long"', "duration_s", "a valid number"),
     scene("nan", "duration_s = nan", "duration_s", "a finite number"),
@@ -112,7 +112,7 @@ CASES = [
     scene("blow too hard", HAMMER + "force_n = 1e6", "force_n", "less than or equal to 1000"),
     scene("blow too long", HAMMER + "duration_ms = 51", "duration_ms", "less than or equal to 50"),
     scene("blow to nowhere", HAMMER + 'direction = "up"', "direction", "x, y, -x, -y, or an angle"),
-    scene("blow with a colour", HAMMER + "colour = 1", "colour", "a field that there is, such as "),
+    scene("blow with a colour", HAMMER + "colour = 1", "colour", "such as command, force_n, duration_ms, direction"),
     scene(
         "speed command above the drive's",
         '[[commands]]\nat_s = 0.1\ncommand = "speed"\nspeed_hz = 99',
@@ -196,7 +196,7 @@ CASES = [
         "unknown field",
         'base = "corrected"\n[contact]\nfriction = { value = 0.1, colour = 1 }',
         "friction.colour",
-        "left out",
+        "a field that there is, such as",
     ),
     parameters("section is a number", 'base = "corrected"\ncontact = 3', "contact", "a table of parameters"),
     # Changes on the command line.

@@ -93,9 +93,14 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("rnu", "command must be one of `rig -h`, such as run, resume, rate (38 in all); instead received 'rnu'"),
+        ("rnu", "command must be one of `rig -h`, such as run (38 in all); instead received 'rnu'"),
         ("can lod", "command must be one of `rig can -h`, such as load (3 in all); instead received 'lod'"),
-        ("run x --sed 1", "option must be one of `rig run -h`, such as --seed, --set, --speed (19 in all); instead received '--sed'"),
+        (
+            "run x --sed 1",
+            "option must be one of `rig run -h`, such as --seed, --set, --listen (19 in all); instead received '--sed'",
+        ),
+        ("can -z", "option must be one of `rig can -h`; instead received '-z'"),
+        ("speed 1 -z", "option must be one of `rig speed -h`, such as --connect, --tls; instead received '-z'"),
         ("run", "SCENE must be given: name of a scene, or the path of a scene file; instead received nothing"),
         ("stop now", "argument must be one that `rig stop` takes (see -h); instead received 'now'"),
         ("run x --set", "--set must be followed by a value; instead received nothing"),
@@ -106,6 +111,15 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
         ("view --live --wait-s nan", "--wait-s must be a number; instead received nan"),
         ("speed nan", "HZ must be a number; instead received nan"),
         ("record -o x.txt", "--output must be a file name that ends in .mcap; instead received 'x.txt'"),
+        (
+            "record -o x.mcap --trigger note --longest-s 1",
+            "--longest-s must be at least --pre-s and --post-s, 2.5, at most 1e6; instead received 1.0",
+        ),
+        (
+            "twins --listen 0.0.0.0:1",
+            "--listen must be on 127.0.0.1, since there is no password; from another machine: "
+            "ssh -L 1:127.0.0.1:1 USER@HOST (a rig also takes --expose); instead received '0.0.0.0:1'",
+        ),
         ("run hammer --seed -1", "--seed must be greater than or equal to 0; instead received -1"),
         ("view", "view must be given either a FILE or --live; instead received neither"),
         ("chart --quick --full", "--quick, --full must be one of the two; instead received both"),
