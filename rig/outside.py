@@ -6,6 +6,7 @@ fields with ranges and no others. What has passed is believed behind the door, a
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import math
@@ -20,7 +21,7 @@ from typing import Annotated, Any, BinaryIO, TypeVar, get_args
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rig.errors import InputError, Words, such_as
-from rig.text import printable
+from rig.text import nearest, printable
 
 DOCUMENT_BYTES = 16 << 20
 """Largest document that a rig or a recording may hold."""
@@ -129,6 +130,17 @@ def open_file(path: Path) -> BinaryIO:
         return number
 
     return open(path, "rb", opener=opener)
+
+
+def unreadable(path: Path, error: OSError) -> InputError:
+    """Why a file cannot be read, with those beside it that could have been meant, such as what was not finished."""
+    names: list[str] = []
+    if isinstance(error, FileNotFoundError):
+        with contextlib.suppress(OSError):
+            names = sorted(each.name for each in path.parent.iterdir() if path.suffix in each.name)
+    names = [name for name in names if name.startswith(f"{path.stem}.")][:3] or nearest(path.name, names)
+    such = f", such as {', '.join(str(path.with_name(name)) for name in names)}" if names else ""
+    return InputError("file", f"a file that can be read{such}", Words(f"{path} ({error.strerror})"))
 
 
 def read_toml(path: Path) -> dict[str, Any]:

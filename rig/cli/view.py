@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,8 +12,12 @@ import typer
 
 from rig.cli.connection import Connection
 from rig.cli.options import Force, OptionalRecordingFiles
-from rig.cli.tables import echo, progress_bar
+from rig.cli.progress import reporting
+from rig.cli.tables import echo
 from rig.errors import DiskError, InputError, RefusedError, Words, check_new_file, whole_file
+
+_EVERY_S = 5.0
+"""How often it is told how it goes, where that is no live line [s]."""
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -137,7 +139,13 @@ def _view_live(connection: Connection, *, web: bool, save: Path | None) -> None:
             _tell(shown, f"the rig at {connection.connect}")
             try:
                 view = live.LiveView(client, Canvas(stream), described, taken=shown.taken)
-                with _telling(shown) as tell:
+                with reporting() as reporter:
+
+                    def tell(text: str) -> None:
+                        if shown.page is not None:
+                            shown.page.title = f"rig: {text}"
+                        reporter.show(text, every_s=_EVERY_S)
+
                     reason = view.run(stop=lambda: not shown.open, tell=tell)
                 echo(reason)
             finally:
@@ -149,26 +157,6 @@ def _view_live(connection: Connection, *, web: bool, save: Path | None) -> None:
             finally:
                 if view.failed:
                     raise typer.Exit(1)
-
-
-@contextmanager
-def _telling(shown: Window) -> Iterator[Callable[[str], None]]:
-    """Say how it goes: as the title of a browser's page, and on stderr in a live line, or a line every 5 s."""
-    printed_s = -math.inf
-    live = sys.stderr.isatty()
-    with progress_bar(auto_refresh=False, transient=True, disable=not live) as bar:
-        task = bar.add_task("", total=None)
-
-        def tell(text: str) -> None:
-            nonlocal printed_s
-            if shown.page is not None:
-                shown.page.title = f"rig: {text}"
-            bar.update(task, description=text, refresh=live)
-            if not live and time.monotonic() - printed_s >= 5.0:
-                printed_s = time.monotonic()
-                echo(text, err=True)
-
-        yield tell
 
 
 def _window_of_file(screenshot: Path | None, *, web: bool) -> Window:

@@ -100,7 +100,10 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
             "option must be one of `rig run -h`, such as --seed, --set, --listen (19 in all); instead received '--sed'",
         ),
         ("can -z", "option must be one of `rig can -h`; instead received '-z'"),
-        ("speed 1 -z", "option must be one of `rig speed -h`, such as --connect, --tls; instead received '-z'"),
+        (
+            "speed 1 -z",
+            "option must be one of `rig speed -h`, such as --connect, --tls, --wait-s; instead received '-z'",
+        ),
         ("run", "SCENE must be given: name of a scene, or the path of a scene file; instead received nothing"),
         ("stop now", "argument must be one that `rig stop` takes (see -h); instead received 'now'"),
         ("run x --set", "--set must be followed by a value; instead received nothing"),
@@ -108,7 +111,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
         ("bench --runs 0", "--runs must be greater than or equal to 1; instead received 0"),
         ("bench --runs x", "--runs must be a valid integer; instead received 'x'"),
         ("run x --pace y", "--pace must be one of real-time, lockstep, free; instead received 'y'"),
-        ("view --live --wait-s nan", "--wait-s must be a number; instead received nan"),
+        ("view x.mcap --at-s nan", "--at-s must be a number; instead received nan"),
         ("speed nan", "HZ must be a number; instead received nan"),
         ("record -o x.txt", "--output must be a file name that ends in .mcap; instead received 'x.txt'"),
         (

@@ -171,6 +171,22 @@ def test_facts_have_no_heading() -> None:
     check_legible(table)
 
 
+@pytest.mark.parametrize("width", range(30, 60, 3))
+def test_a_number_and_its_unit_stay_on_one_line(width: int) -> None:
+    lines = lines_of(facts("so 3.5 kN", [("all", "it took 12.5 ms of 3 MB at 100 Hz, " * 9)]), width=width)
+    assert len(lines) > 5
+    assert not any(line.endswith(("12.5", "3", "100")) for line in lines), lines
+
+
+@pytest.mark.parametrize("command", [["scenes"], ["keys", "--json"], ["-h"]])
+def test_a_reader_that_has_gone_is_told_by_the_status_alone(command: list[str]) -> None:
+    ours, theirs = os.pipe()
+    os.close(ours)
+    found = subprocess.run([sys.executable, "-m", "rig", *command], stdout=theirs, stderr=subprocess.PIPE, timeout=120)
+    os.close(theirs)
+    assert (found.returncode, found.stderr) == (141, b"")
+
+
 def test_a_status_line_is_one_line_of_whole_parts() -> None:
     parts = ["  599.99 of 600 s", "late p99 0.12 max 123.45 ms", "clients 2"]
     assert fitted(parts, 80) == "  599.99 of 600 s  late p99 0.12 max 123.45 ms  clients 2"
