@@ -101,8 +101,8 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
         ),
         ("can -z", "option must be one of `rig can -h`; instead received '-z'"),
         (
-            "speed 1 -z",
-            "option must be one of `rig speed -h`, such as --connect, --tls, --wait-s; instead received '-z'",
+            "stop -z",
+            "option must be one of `rig stop -h`, such as --connect, --tls, --wait-s; instead received '-z'",
         ),
         ("run", "SCENE must be given: name of a scene, or the path of a scene file; instead received nothing"),
         ("stop now", "argument must be one that `rig stop` takes (see -h); instead received 'now'"),
