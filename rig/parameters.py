@@ -174,7 +174,7 @@ def _load(name: Any, field: str, loading: tuple[str, ...]) -> ParameterSet:
         return _own_set(name)
     path = Path(name) if isinstance(name, str) else None
     if path is None or path.suffix != ".toml" or not path.is_file():
-        known = f"one of {', '.join(set_names())}, or the path of a .toml file"
+        known = f"one of {', '.join(set_names())}, or the path of a .toml file that exists"
         raise InputError(field, f"the set that the file changes, {known}" if name is None else known, name)
     place = str(path.resolve())
     if place in loading:

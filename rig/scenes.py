@@ -292,7 +292,9 @@ def scene_path(name_or_path: str | Path) -> Path:
         path = Path(name_or_path)
         if path.suffix != ".toml" or not path.is_file():
             raise InputError(
-                "scene", f"one of {', '.join(scene_names())}, or the path of a .toml file", str(name_or_path)
+                "scene",
+                f"one of {', '.join(scene_names())}, or the path of a .toml file that exists",
+                str(name_or_path),
             )
     return path
 

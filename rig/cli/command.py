@@ -78,29 +78,55 @@ class _Command(_Page, TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         # A negative number is a value, not an option: whoever gets it explains what is wrong with it.
         ctx.ignore_unknown_options = any(map(_NEGATIVE.match, args))
-        ctx.allow_extra_args = True
-        if rest := super().parse_args(ctx, args):
-            raise InputError("argument", f"one that `{ctx.command_path}` takes (see -h)", rest[0])
+        ctx.allow_extra_args, escaped = True, "--" in args
+        rest = super().parse_args(ctx, args)
+        options = [name for param in self.params for name in param.opts if name.startswith("-")]
+        values = {param.name: ctx.params[param.name] for param in self.params}
+        given = {name: value if isinstance(value, list | tuple) else [value] for name, value in values.items()}
+        # Which is what an option that there is none has been taken for, then.
+        arguments = [each for param in self.params if param.param_type_name == "argument" for each in given[param.name]]
+        for each in map(str, [*arguments, *rest]):
+            if each.startswith("--") and not escaped:
+                raise UnknownNameError("option", f"one of `{ctx.command_path} -h`", each, options)
         for param in self.params:
-            value = ctx.params[param.name]
-            # No comparison refuses it: it would be waited for, or counted to, without end.
-            if any(isinstance(each, float) and each != each for each in (value if param.multiple else [value])):
-                raise InputError(shown_name(param), "a number", Words("nan"))
+            for each in given[param.name]:
+                # No comparison refuses it: it would be waited for, or counted to, without end.
+                if isinstance(each, float) and each != each:
+                    raise InputError(shown_name(param), "a number", Words("nan"))
+                if str(each) in options:
+                    raise InputError(shown_name(param), "followed by a value", str(each))
+        if rest:
+            raise InputError("argument", f"one that `{ctx.command_path}` takes (see -h)", rest[0])
         return rest
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
-        except RefusedError:
-            raise
-        except InputError as error:
-            # What is a field to whoever refused it is an option to whoever gave it.
-            options = {param.name: shown_name(param) for param in self.params if param.param_type_name == "option"}
-            name = error.field.replace("-", "_")
-            if name not in options or ctx.params[name] in (None, []):
+        except RefusedError as error:
+            field, _, must = str(error).partition(" must be ")
+            named = self._by_field("argument", "option").get(field.removeprefix(f"{ctx.info_name}."))
+            if named is None or "." not in field:
                 raise
-            must = re.sub(r"\b[a-z]+_\w+", lambda name: options.get(name[0], name[0]), error.must)
-            raise InputError(options[name], must, error.received) from None
+            raise RefusedError(f"{shown_name(named)} must be {must}") from None
+        except InputError as error:
+            named = self._by_field("option")
+            found = [named.get(field.replace("-", "_").removesuffix(".name")) for field in error.field.split(" and ")]
+            if None in found or all(ctx.params[param.name] in (None, []) for param in found):
+                raise
+            options = " and ".join(map(shown_name, found))
+            must = re.sub(
+                r"\b[a-z]+_\w+", lambda name: shown_name(named[name[0]]) if name[0] in named else name[0], error.must
+            )
+            raise InputError(options, must, error.received) from None
+
+    def _by_field(self, *kinds: str) -> dict[str, Any]:
+        """Arguments and options by what they are to whoever refuses their values: its fields."""
+        return {
+            name.lstrip("-").replace("-", "_"): param
+            for param in self.params
+            if param.param_type_name in kinds
+            for name in (param.name, *param.opts)
+        }
 
 
 class Group(_Page, TyperGroup):

@@ -120,7 +120,8 @@ class Serving:
         """
         if self.expose is None:
             if self.tls is not None or self.plaintext:
-                raise InputError("--tls" if self.tls is not None else "--plaintext", "given with --expose HOST", None)
+                option = "--tls" if self.tls is not None else "--plaintext"
+                raise InputError(option, "given with --expose HOST", Words("it alone"))
             return None
         if (self.tls is not None) == self.plaintext:
             made = f"rig keys init DIR --host {self.expose.partition(':')[0]}"

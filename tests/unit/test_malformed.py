@@ -235,7 +235,7 @@ CASES = [
         {"scene.txt": "seed = 1"},
     ),
     Case("no such set in an option", (*DROP, "--parameters", "nosuch"), "parameters", "one of corrected"),
-    Case("no such engine in an option", (*DROP, "--engine", "euler"), "engine.name", "one of split, rk8"),
+    Case("no such engine in an option", (*DROP, "--engine", "euler"), "--engine", "one of split, rk8"),
     Case("duration of -1", (*DROP, "--duration-s", "-1"), "--duration-s", "greater than 0"),
     Case("duration of nan", (*DROP, "--duration-s", "nan"), "--duration-s", "a number"),
     Case("duration of x", (*DROP, "--duration-s", "x"), "--duration-s", "valid"),

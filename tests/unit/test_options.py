@@ -17,6 +17,7 @@ from rig.cli.app import COMMANDS, GROUPS, rig
 from rig.cli.command import Group
 from rig.cli.completion import SCENE_KEYS, complete
 from rig.cli.options import names_of, pairs
+from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.scenes import Scene
 from tests.commands import said, shown
@@ -103,6 +104,28 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
         (
             "stop -z",
             "option must be one of `rig stop -h`, such as --connect, --tls, --wait-s; instead received '-z'",
+        ),
+        (
+            "info a.mcap -1 --frm 2",
+            "option must be one of `rig info -h`, such as --quick, --json, --wide; instead received '--frm'",
+        ),
+        ("import a.csv --template -o b", "--template must be followed by a value; instead received '-o'"),
+        (
+            f"cut {ROOT}/replays/sessions/hammer-6.2.mcap -o b.mcap --from 2 --to 1",
+            "--from and --to must be times, one before the other; instead received 2 and 1",
+        ),
+        (
+            "run hammer --engine rk5",
+            f"--engine must be one of {', '.join(ENGINES)}; instead received 'rk5'",
+        ),
+        (
+            "can load --can-bitrate x",
+            '--can-bitrate must be as "500k", "1M", or "1M/5M" for CAN FD; instead received \'x\'',
+        ),
+        (
+            "twins --can foo",
+            "--can must be INTERFACE:CHANNEL such as zenoh:can0, with ?NAME=VALUE&... for more settings; "
+            "instead received 'foo'",
         ),
         ("run", "SCENE must be given: name of a scene, or the path of a scene file; instead received nothing"),
         ("stop now", "argument must be one that `rig stop` takes (see -h); instead received 'now'"),
