@@ -263,13 +263,13 @@ def tell(summary: Summary) -> None:
         files = f"{summary.files[0]} to {summary.path.name} ({len(summary.files)} files)"
     elif not summary.files:
         files = f"{summary.path}: no file"
+    triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
     if summary.fired is not None and not summary.files:
-        came = "no trigger came" if not summary.fired else f"{summary.fired} triggers came"
-        echo(f"{came} in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
+        came = triggers if summary.fired else "no trigger"
+        echo(f"{came} came in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
     else:
         around = ""
         if summary.fired is not None:
-            triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
             around = f" (around {triggers}, of {summary.received_s:.3f} s received)"
         echo(
             f"{files}: {summary.duration_s:.3f} s from {summary.first_time_s:.3f} s on{around}, "

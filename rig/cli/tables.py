@@ -37,7 +37,7 @@ _LEAST = 20
 """What a text is wrapped to, at the least [characters]."""
 _WORTH = 48
 """The same of one that can be left out: in fewer it is not worth its lines."""
-_UNIT = re.compile(r"(?<=\d) (?=(%|°|ppm|[kMGmuµn]?(s|m|g|N|B|V|W|J|A|Pa|Hz|rad|bit)\b))")
+_UNIT = re.compile(r"(?<=\d)(?: (?:%|°|ppm\b|[kMGmuµn]?(?:s|m|g|N|B|V|W|J|A|Pa|Hz|rad|bit)\b))+")
 _KEPT = "\ue000"
 """A blank at which no line is broken; unlike one of Unicode's it is none to rich."""
 
@@ -76,9 +76,7 @@ def echo(text: object = "", *, err: bool = False) -> None:
 
 def _broken(line: str, width: int) -> list[str]:
     indent = line[: len(line) - len(line.lstrip())]
-    parts = textwrap.wrap(
-        _UNIT.sub(_KEPT, line), width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-    )
+    parts = textwrap.wrap(_kept(line), width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return [part.replace(_KEPT, " ") for part in parts]
 
 
@@ -137,7 +135,9 @@ class Table:
         from rich.text import Text
 
         room = options.max_width
-        rows = [([_kept(cell) for cell in cells], style) for cells, style in self.rows]
+        rows = [([cell.copy() for cell in cells], style) for cells, style in self.rows]
+        for cell in (cell for cells, _ in rows for cell in cells):
+            cell.plain = _kept(cell.plain)
         blocks = self._blocks(room, rows)
         lines = list(Text(self.title, "italic").wrap(console, room)) if self.title else []
         for number, widths in enumerate(blocks):
@@ -220,11 +220,9 @@ class Table:
         return widths
 
 
-def _kept(text: Text) -> Text:
+def _kept(text: str) -> str:
     """The same text, in which a number keeps its unit beside it."""
-    text = text.copy()
-    text.plain = _UNIT.sub(_KEPT, text.plain)
-    return text
+    return _UNIT.sub(lambda unit: unit[0].replace(" ", _KEPT), text)
 
 
 def _stacked(heading: str, width: int) -> list[str]:
@@ -288,7 +286,7 @@ def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
             super().print(*objects, **{"crop": False, **options})
 
         def render_str(self, text: str, **options: Any) -> Any:
-            kept = _UNIT.sub(_KEPT, _lines(text))
+            kept = _kept(_lines(text))
             return super().render_str(kept, **{**options, "markup": False, "emoji": False})
 
         def render(self, renderable: Any, options: Any = None) -> Any:
