@@ -58,10 +58,9 @@ class Connection:
 
         by_environment = self.tls is not None and os.environ.get(_TLS) == str(self.tls)
         deadline_s = time.monotonic() + self.wait_s
-        waiting = table_console(stderr=True).status(plain(f"waiting for a rig at {self.connect}"))
         try:
             with ExitStack() as stack:
-                with waiting if self.wait_s else nullcontext():
+                with self._waiting() if self.wait_s else nullcontext():
                     wait_s = max(_LINK_S, self.wait_s)
                     client = stack.enter_context(ZenohClient(self.connect, wait_s=wait_s, tls=self.tls))
                     # One that is being prepared listens already.
@@ -74,6 +73,9 @@ class Connection:
             if not by_environment or error.field != "--tls":
                 raise
             raise InputError(_TLS, error.must, error.received) from None
+
+    def _waiting(self) -> Any:
+        return table_console(stderr=True).status(plain(f"waiting for a rig at {self.connect}"))
 
     @contextmanager
     def console(self, command: str) -> Iterator[Console]:

@@ -16,14 +16,14 @@ from rig.cli.progress import reporting
 from rig.cli.tables import echo
 from rig.errors import DiskError, InputError, RefusedError, Words, check_new_file, whole_file
 
-_EVERY_S = 5.0
-"""How often it is told how it goes, where that is no live line [s]."""
-
 if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
 
     from recorder.viewer.window import Kind, Window
+
+_EVERY_S = 5.0
+"""How often it is told how it goes, where that is no live line [s]."""
 
 
 def view(
