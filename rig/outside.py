@@ -325,7 +325,8 @@ def input_error(error: ValidationError, where: str, model: type[BaseModel]) -> I
         name = str(context.get("discriminator")).strip("'")
         return InputError(f"{field}.{name}", f"one of {context.get('expected_tags')}", context.get("tag"))
     if first["type"] == "extra_forbidden":
-        message = such_as("a field that there is", first["loc"][-1], _fields([model], first["loc"][:-1]))
+        known = _fields([model], first["loc"][:-1])
+        message = such_as("a field that there is", first["loc"][-1], known) if known else "left out (it has no fields)"
     elif first["type"] == "missing":
         message = "given"
     return InputError(field, message, None if first["type"] == "missing" else first["input"])

@@ -110,8 +110,9 @@ class _Command(_Page, TyperCommand):
             raise RefusedError(f"{shown_name(named)} must be {must}") from None
         except InputError as error:
             named = self._by_field("option")
-            found = [named.get(field.replace("-", "_").removesuffix(".name")) for field in error.field.split(" and ")]
-            if None in found or all(ctx.params[param.name] in (None, []) for param in found):
+            fields = [field.replace("-", "_").removesuffix(".name") for field in error.field.split(" and ")]
+            found = [named[field] for field in fields if field in named]
+            if len(found) < len(fields) or all(ctx.params[param.name] in (None, []) for param in found):
                 raise
             options = " and ".join(map(shown_name, found))
             must = re.sub(

@@ -68,7 +68,7 @@ class Connection:
                         time.sleep(0.1)
                 yield client
         except NoReplyError as error:
-            source = f" (that is {_TLS})" if by_environment and str(self.tls) in str(error) else ""
+            source = f" (the keys are those of {_TLS})" if by_environment and str(self.tls) in str(error) else ""
             raise RefusedError(f"{error}{source}") from None
         except InputError as error:
             if not by_environment or error.field != "--tls":
