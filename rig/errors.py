@@ -54,13 +54,17 @@ class UnknownNameError(InputError, KeyError):
 
     def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:
         """Name the field, what it must be, the name that is none, and those that there are."""
-        known = list(dict.fromkeys(known))
-        near = nearest(name, known)
-        shown = near or known[:_MOST_NAMES]
-        more = f" ({len(known)} in all)" if len(known) > len(shown) else ""
-        super().__init__(field, f"{must}, such as {', '.join(shown)}{more}" if shown else must, name)
+        super().__init__(field, such_as(must, name, known), name)
 
     __str__ = ValueError.__str__  # of a KeyError, it would be in quotes
+
+
+def such_as(must: str, name: object, known: Iterable[str]) -> str:
+    """What a name that is none must be, with the nearest that there are, or all where none is near."""
+    known = list(dict.fromkeys(known))
+    shown = nearest(name, known) or known[:_MOST_NAMES]
+    more = f" ({len(known)} in all)" if len(known) > len(shown) else ""
+    return f"{must}, such as {', '.join(shown)}{more}" if shown else must
 
 
 class RefusedError(InputError):
@@ -99,14 +103,14 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
     Raises:
         InputError: Another ending, a folder that is missing or read-only, or an existing file.
     """
-    try:
-        path.with_name(path.name + PART_SUFFIX).exists()
-    except OSError as error:  # a name that is too long
-        raise InputError(field, "a file name that the system accepts", Words(f"{path} ({error.strerror})")) from None
     if path.suffix not in suffixes:
         *others, last = suffixes
         endings = f"{', '.join(others)} or {last}" if others else last
         raise InputError(field, f"a file name that ends in {endings}", str(path))
+    try:
+        path.with_name(path.name + PART_SUFFIX).exists()
+    except OSError as error:  # a name that is too long
+        raise InputError(field, "a file name that the system accepts", Words(f"{path} ({error.strerror})")) from None
     if not path.parent.is_dir():
         raise InputError(field, "in a folder that exists", str(path))
     if path.is_dir():

@@ -14,13 +14,12 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 from rig.channels import ChannelTable, check_signals, default_table
 from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand
 from rig.engines import ENGINES
-from rig.errors import InputError, Words
+from rig.errors import InputError, Words, such_as
 from rig.kernels.signals import COLUMN
 from rig.levels import ModelLevels
 from rig.outside import Written, check, parse_toml, read_toml, table_in
 from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
 from rig.pick import Pick, digest, equations_digest
-from rig.text import nearest
 
 SCENES = Path(__file__).with_name("scenes")
 _APART_S = 0.01
@@ -293,7 +292,9 @@ def scene_path(name_or_path: str | Path) -> Path:
         path = Path(name_or_path)
         if path.suffix != ".toml" or not path.is_file():
             raise InputError(
-                "scene", f"one of {', '.join(scene_names())}, or the path of a .toml file", str(name_or_path)
+                "scene",
+                f"one of {', '.join(scene_names())}, or the path of a .toml file that exists",
+                str(name_or_path),
             )
     return path
 
@@ -307,7 +308,7 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
             the parameter's own unit). Strings are read as TOML values where they are such.
 
     Raises:
-        InputError: The one thing that is wrong, with its field.
+        InputError: The one thing that is wrong, with its field, and its file unless that is among the overrides.
 
     Example:
         >>> scene = load_scene("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
@@ -321,9 +322,19 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
     data = {"name": path.stem, **read_toml(path)}
     for key, value in _keyed(overrides or {}):
         _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
+    try:
+        return _checked(data, list(overrides or {}))
+    except InputError as error:
+        if path.parent == SCENES or error.field in (overrides or {}):
+            raise
+        raise InputError(f"{path.name}: {error.field}", error.must, error.received) from None
+
+
+def _checked(data: dict[str, Any], overrides: list[str]) -> Scene:
+    """The scene of a file with overrides, if it can run."""
     scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
     if data.get("fidelity") == "auto":
-        scene = _with_pick(scene, data, [] if overrides is None else list(overrides))
+        scene = _with_pick(scene, data, overrides)
     # Parameters are checked here, so that a scene that loads can run.
     top = scene.load_parameters().entries["drive.top_speed"].value
     speeds = {"drive.speed_hz": [scene.drive.speed_hz], "drive.profile": [speed for _, speed in scene.drive.profile]}
@@ -404,10 +415,8 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
     for part in [*path, last]:
         known = getattr(fields, "model_fields", {})
         if part not in known:
-            close = nearest(key, [*_scene_keys(), *load_parameters().entries])
-            raise InputError(
-                key, "a field of a scene or a parameter" + (f", such as {', '.join(close)}" if close else ""), value
-            )
+            known = [*_scene_keys(), *load_parameters().entries]
+            raise InputError(key, such_as("a field of a scene or a parameter", key, known), value)
         fields = known[part].annotation
     place = data
     for part in path:

@@ -17,6 +17,8 @@ from rig.errors import DiskError, InputError, SimulationError, need_of_full
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
 
+_NO_READER = 141
+"""What a shell makes of a program that SIGPIPE has ended."""
 _INTERRUPTED = 130
 """What typer makes of Ctrl-C, and shells expect."""
 
@@ -136,10 +138,12 @@ def start(arguments: list[str] | None = None) -> None:
         if not (need := need_of_full(error)):
             raise
         _fail(f"this {need}")
-    except BrokenPipeError:
-        # The reader of our output has gone (`rig params | head`): nothing is wrong.
+    except (BrokenPipeError, SystemExit) as error:
+        # The reader of our output has gone (`rig params | head`), of which rich and typer make a status of their own.
+        if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
+            raise
         sys.stderr.close()
-        sys.exit(141)
+        sys.exit(_NO_READER)
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             _fail(str(InputError("file name", "one that the system accepts", error.filename)))

@@ -413,10 +413,13 @@ def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp
     [
         (["-o", "x.xls"], "--output must be a file name that ends in .mf4, .tdms, .uff"),
         (["-o", "no/x.csv"], "--output must be in a folder that exists"),
-        (["-o", "x.csv", "--channels", "disk_z"], "channel must be one of the recording's, such as disk_y"),
-        (["-o", "x.csv", "--channels", "foo"], "channel must be a channel of the recording, one of its groups (probes"),
-        (["-o", "x.csv", "--channels", "truth.nothing"], "channel must be one of truth.state, truth."),
-        (["-o", "x.csv", "--channels", "truth.state.foo"], "channel must be truth.state.COLUMN with one of "),
+        (["-o", "x.csv", "--channels", "disk_z"], "--channels must be one of the recording's, such as disk_y"),
+        (
+            ["-o", "x.csv", "--channels", "foo"],
+            "--channels must be a channel of the recording, one of its groups (probes",
+        ),
+        (["-o", "x.csv", "--channels", "truth.nothing"], "--channels must be one of truth.state, truth."),
+        (["-o", "x.csv", "--channels", "truth.state.foo"], "--channels must be truth.state.COLUMN with one of "),
         (["-o", "x.csv", "--unit", "mils"], "--unit must be engineering, volts or counts"),
         (["-o", "x.csv", "--method", "magic"], "--method must be polyphase or linear"),
         (["-o", "x.csv", "--from", "5"], "range must be in the recording, 0 to 0.11995 s; instead received 'from 5 s'"),

@@ -351,7 +351,7 @@ def select(
         stream = streams.get(key)
         if stream is None or stream.rows == 0:
             if channels and any(key.endswith(name.removeprefix("truth.")) for name in channels):
-                raise InputError("channel", "one with samples in the recording", key)
+                raise InputError("channels", "one with samples in the recording", key)
             continue
         table = _table(recording, key, numbers, stream, unit, from_s, to_s)
         if table is not None:
@@ -393,7 +393,7 @@ def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> di
     chosen: dict[str, set[int]] = {}
     for channel in [*channels, *(["truth"] if truth else [])]:
         if channel not in places:
-            raise InputError("channel", _near(channel, groups, truths), channel)
+            raise InputError("channels", _near(channel, groups, truths), channel)
         for key, c in places[channel]:
             chosen.setdefault(key, set()).add(c)
     order = [*(sensor_key(name) for name in groups), *(truth_key(name) for name in truths)]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rig.errors import InputError, RefusedError, Words
-from rig.outside import open_file
+from rig.outside import open_file, unreadable
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -129,7 +129,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
         with open_file(path) as file:
             empty = not file.read(1)
     except OSError as error:
-        raise InputError("file", "a file that can be read", Words(f"{path} ({error.strerror})")) from None
+        raise unreadable(path, error) from None
     if empty:
         raise InputError("file", "a file with something in it", str(path))
     if name != "delimited":
