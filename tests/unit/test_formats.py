@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import wave
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from recorder.writer import RecordingWriter
 from replays.recordings.export import write_run
 from replays.recordings.formats import clock
 from replays.recordings.formats.export import SUFFIXES, Written, export
+from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.selection import Selection, Unit, select
+from replays.recordings.formats.source import open_source
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.scenes import load_scene
@@ -293,6 +296,18 @@ def test_uff_by_pyuff(recording: Recording, tmp_path: Path) -> None:
         assert found["id5"].startswith(f"node {found['rsp_node']}: ")
         assert (found["ref_node"], found["ref_dir"]) == (0, 0)
         np.testing.assert_array_equal(found["data"], recording.samples(channel.group)[channel.name])
+
+
+def test_uff_begins_when_it_does_to_all_digits(recording: Recording, tmp_path: Path) -> None:
+    import pyuff
+
+    selection = select(recording, channels=["disk_x"])
+    late = replace(selection, tables=(replace(selection.tables[0], first_s=70_000.123456789),))
+    export(late, path := tmp_path / "late.uff")
+    source = open_source(path, FileOptions())
+    assert source.read(source.entries[0]).first_s == 70_000.123456789
+    head: Any = pyuff.UFF(str(path)).read_sets(0, header_only=True)
+    assert head["abscissa_min"] == pytest.approx(70_000.123457, abs=1e-6), "where another program looks"
 
 
 def test_csv_by_the_csv_module(recording: Recording, tmp_path: Path) -> None:
