@@ -18,6 +18,7 @@ import pytest
 from recorder.head import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
+from replays.recordings.experiment import Experiment
 from replays.recordings.export import write_run
 from replays.recordings.formats import clock
 from replays.recordings.formats.export import SUFFIXES, Written, export
@@ -113,7 +114,7 @@ def test_mdf_has_events_attachments_and_comments_that_a_person_reads(noted: Reco
         attached = {str(block.file_name): mdf.extract_attachment(n)[0] for n, block in enumerate(mdf.attachments)}
         assert json.loads(attached.pop("catalogue.json")) == noted.catalogue
         assert json.loads(attached.pop("parameters.json")) == noted.parameters
-        assert json.loads(attached.pop("scene.json")) == noted.scene
+        assert json.loads(attached.pop("scene.json")) == {**noted.scene, "taken": noted.commands}
         assert not attached
         about = str(mdf.header.description)
         assert about.startswith("Virtual rotor-stator rig, scene hammer (Hammer during a stable run")
@@ -133,14 +134,16 @@ def test_events_and_documents_go_where_a_format_has_a_place(noted: Recording, tm
         _, (made[suffix],) = written(noted, tmp_path / f"x{suffix}", "probes")
     told = TdmsFile.read_metadata(tmp_path / "x.tdms").properties
     assert told["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in HAPPENED]
-    assert json.loads(told["scene.json"]) == noted.scene
+    assert json.loads(told["scene.json"]) == {**noted.scene, "taken": noted.commands}
     metadata = parquet.read_schema(tmp_path / "x.parquet").metadata
     assert json.loads(metadata[b"parameters.json"]) == noted.parameters
     beside = json.loads((tmp_path / "x.csv.json").read_text())
     for events in (json.loads(metadata[b"events"]), beside["events"]):
         assert [(each["time_s"], each["event"]) for each in events] == [(time_s, name) for time_s, name, _ in HAPPENED]
         assert (events[2]["from"], events[3]["text"]) == ("a console", "bearing is wärm")
-    assert (beside["documents"]["scene"], beside["documents"]["catalogue"]) == (noted.scene, noted.catalogue)
+    assert beside["documents"]["scene"] == {**noted.scene, "taken": noted.commands}
+    assert beside["documents"]["catalogue"] == noted.catalogue
+    assert [(one["tick"], one["request"]) for one in noted.commands] == [(50_000, {"speed_hz": 5.2})]
     left_out = "5 events, catalogue, parameters and scene: left out, as UFF58 has no place for them"
     assert made[".uff"].documents == left_out
     assert made[".wav"].documents.endswith(": in x.wav.json")
@@ -157,6 +160,9 @@ def test_an_export_with_events_is_imported_again(suffix: str, noted: Recording, 
             main(["import", *arguments])
         assert end.value.code == 0
     found = Recording.open(again)
+    if suffix != ".uff":
+        commands = [{"at_s": one.at_s, **one.request.model_dump()} for one in Experiment.of(found).scene.commands]
+        assert commands[1:] == [{"at_s": 0.05, "command": "speed", "speed_hz": 5.2}], "what was sent is the scene's own"
     np.testing.assert_allclose(found.samples("probes").values, noted.samples("probes").values, rtol=0, atol=1e-6)
     assert len(json.dumps(found.scene["import"]["files"])) < 3_000, "without the rig's documents"
 

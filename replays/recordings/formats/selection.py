@@ -15,6 +15,7 @@ import numpy as np
 from recorder.reader import Recording
 from recorder.survey import Stream
 from replays.recordings.formats.history import ExportEvent, happenings
+from replays.recordings.formats.source import DOCUMENTS
 from rig.channels import Channel
 from rig.errors import InputError, Words
 from rig.text import nearest, printable
@@ -182,9 +183,11 @@ class Selection:
 
     @property
     def documents(self) -> dict[str, str]:
-        """The rig's catalogue, parameters and scene, by name, as the recording has them."""
-        names = ("catalogue.json", "parameters.json", "scene.json")
-        return {name: self.recording.attachments[name].decode() for name in names}
+        """The rig's catalogue, parameters and scene, by name; with the scene, all commands that were sent to it."""
+        texts = {name: self.recording.attachments[name].decode() for name in DOCUMENTS}
+        if commands := self.recording.commands:
+            texts["scene.json"] = json.dumps({**self.recording.scene, "taken": commands})
+        return texts
 
     @cached_property
     def start(self) -> datetime:

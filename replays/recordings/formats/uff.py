@@ -85,7 +85,9 @@ def look_into(path: Path, options: FileOptions) -> Source:
             raise ValueError(f"{len(values)} of {entry.rows} values")
         if int(data["abscissa_spacing"]) == 0:
             return FileSignal(values=values, times_s=np.array(data["x"], dtype=float)[: entry.rows])
-        return FileSignal(values=values, rate_hz=_rate_hz(data), first_s=_exact(data, "first_s") or float(data["abscissa_min"]))
+        return FileSignal(
+            values=values, rate_hz=_rate_hz(data), first_s=_exact(data, "first_s") or float(data["abscissa_min"])
+        )
 
     others = len(kinds) - len(entries)
     remarks = (f"{others} datasets that are no time history are passed over",) if others else ()
@@ -194,7 +196,8 @@ def _header(table: ExportTable, column: Column, selection: Selection, at: Degree
         column.name,
         column.label or "NONE",
         selection.start.strftime("%d-%b-%y %H:%M:%S"),
-        f"rate_hz={table.rate_hz:.17g} first_s={float(table.first_s)!r} scene={about['scene']} seed={about['seed']} parameters={about['parameter_set']}",
+        f"rate_hz={table.rate_hz:.17g} first_s={float(table.first_s)!r} scene={about['scene']} seed={about['seed']} "
+        f"parameters={about['parameter_set']}",
         f"node {at.node}: {at.place}; direction {at.direction}: {_ALONG[at.direction]}; group={table.name}",
     )
     lines = [
