@@ -107,14 +107,14 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
     Raises:
         InputError: Another ending, a folder that is missing or read-only, or an existing file.
     """
+    if path.suffix not in suffixes:  # also of a path without a name, such as "" and /
+        *others, last = suffixes
+        endings = f"{', '.join(others)} or {last}" if others else last
+        raise InputError(field, f"a file name that ends in {endings}", str(path))
     try:
         path.with_name(path.name + PART_SUFFIX).exists()
     except OSError as error:  # a name that is too long
         raise InputError(field, "a file name that the system accepts", Words(f"{path} ({error.strerror})")) from None
-    if path.suffix not in suffixes:
-        *others, last = suffixes
-        endings = f"{', '.join(others)} or {last}" if others else last
-        raise InputError(field, f"a file name that ends in {endings}", str(path))
     if not path.parent.is_dir():
         raise InputError(field, "in a folder that exists", str(path))
     if path.is_dir():

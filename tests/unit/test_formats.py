@@ -25,6 +25,7 @@ from replays.recordings.formats.export import SUFFIXES, Written, export
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.selection import Selection, Unit, select
 from replays.recordings.formats.source import open_source
+from replays.recordings.validation.comparison import validate
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.scenes import load_scene
@@ -415,6 +416,26 @@ def test_rows_that_are_missing_are_left_out_or_nan_never_made_up(gappy: Recordin
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
+def test_one_row_is_exported_and_none_is_told(suffix: str, recording: Recording, tmp_path: Path) -> None:
+    key = sensor_key("probes")
+    for rows in (0, 1):
+        path = tmp_path / f"{rows}.mcap"
+        with RecordingWriter(
+            path, catalogue=recording.catalogue, parameters=recording.parameters, scene=recording.scene
+        ) as writer:
+            for block in list(recording.blocks(key))[:rows]:
+                payload = encode_block(replace(block, values=np.ascontiguousarray(block.values[:1])))
+                writer.write(key, payload, 0)
+    _, made = written(Recording.open(tmp_path / "1.mcap"), tmp_path / f"x{suffix}")
+    assert made[0].tables[0][2] == 1
+    with pytest.raises(InputError, match=r"^file must be a recording with samples; instead received '.*0\.mcap'"):
+        written(Recording.open(tmp_path / "0.mcap"), tmp_path / f"y{suffix}")
+    with pytest.raises(InputError, match=r"^file must be a recording with two samples of a channel"):
+        validate(Recording.open(tmp_path / "1.mcap"))
+    assert not list(tmp_path.glob("y*"))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / f"x{suffix}"
     path.write_text("precious")
@@ -433,6 +454,7 @@ def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp
     ("arguments", "message"),
     [
         (["-o", "x.xls"], "--output must be a file name that ends in .mf4, .tdms, .uff"),
+        (["-o", ""], "--output must be a file name that ends in .mf4, .tdms, .uff"),
         (["-o", "no/x.csv"], "--output must be in a folder that exists"),
         (["-o", "x.csv", "--channels", "disk_z"], "channel must be one of the recording's, such as disk_y"),
         (["-o", "x.csv", "--channels", "foo"], "channel must be a channel of the recording, one of its groups (probes"),

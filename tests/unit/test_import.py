@@ -154,6 +154,7 @@ WITH_HOLES = [[0.0, 0.1, 0.2], [1.0, 2.0, math.nan], [math.nan, math.nan, 5.0]]
         (b"time,x [mm]\r\r\n0,1.5\r\r\n0.1,2.5\r\r\n0.2,3000\r\r\n", THREE),
         (b"time,x [mm]\n\n0,1.5\n0.1,2.5\n\n0.2,3000\n", THREE),
         ("time\tx [mm]\n0,0\t1,5\n0,1\t2,5\n0,2\t3000\n".encode("utf-16"), THREE),
+        (("time\tx [mm]\n" + "\n" * 196 + "0,0\t1,5\n0,1\t2,5\n0,2\t3000\n").encode("utf-16"), THREE),
         (b"time,x [mm],y\n0,1,\n0.1,2,\n0.2,,5\n", WITH_HOLES),
         (b"x [mm]\n1,5\n2,5\n3,5\n", [None, [1.5, 2.5, 3.5]]),
         (b"when,x [mm]\n10:00:00.0,1.5\n10:00:00.1,2.5\n10:00:00.2,3000\n", [[36000, 36000.1, 36000.2], THREE[1]]),

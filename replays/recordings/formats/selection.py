@@ -362,7 +362,9 @@ def select(
             tables.setdefault(("" if merged else key, table.rate_hz, offset), []).append(table)
     if not tables:
         held = [s for s in streams.values() if s.rows]
-        low, high = min((s.first_time_s for s in held), default=0.0), max((s.last_time_s for s in held), default=0.0)
+        if not held:
+            raise InputError("file", "a recording with samples", str(recording.path))
+        low, high = min(s.first_time_s for s in held), max(s.last_time_s for s in held)
         ends = [f"{word} {end:g} s" for word, end in (("from", from_s), ("to", to_s)) if end is not None]
         raise InputError("range", f"in the recording, {low:g} to {high:g} s", " ".join(ends) or Words("all of it"))
     return Selection(
