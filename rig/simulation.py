@@ -167,8 +167,7 @@ class Simulation:
         self._pending = sorted(
             ((self._on_grid(timed.at_s), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
         )
-        speed = self._segments[0].speed
-        self._y = self._initial_state(speed)
+        self._y = self._initial_state(self._segments[0].speed)
         self._memory = np.zeros(MEMORY)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None
