@@ -205,7 +205,7 @@ class Scene(Written):
             if 1_000_000 % rate or (1_000_000 // rate) % self.engine.step_us:
                 usual = (100_000, 50_000, 25_000, 20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
                 rates = [f"{other}" for other in usual if (1_000_000 // other) % self.engine.step_us == 0]
-                must = f"a rate whose period is a whole number of steps of {self.engine.step_us} us"
+                must = f"a rate whose period is a whole number of steps of {self.engine.step_us} us, engine.step_us"
                 hint = f" (such as {', '.join(rates[:6])} Hz)" if rates else ""
                 raise InputError(f"sensors.{field}", must + hint, rate)
         return self

@@ -720,21 +720,10 @@ def test_there_and_back_again(suffix: str, tmp_path: Path, capsys: pytest.Captur
     """rig simulate, export, import --template, import: the same values within half a count, by the commands alone."""
     source, other, back = tmp_path / "a.mcap", tmp_path / f"b{suffix}", tmp_path / "c.mcap"
     mapping = tmp_path / "m.toml"
+    changes = ("contact.friction=0.22", "drive.profile=[[0.0, 5.0], [1.0, 6.0]]", "engine.name=rk4")
+    otherwise = ["--parameters", "as-printed", *(word for change in changes for word in ("--set", change))]
     for arguments in (
-        [
-            "simulate",
-            "hammer",
-            "-o",
-            str(source),
-            "--duration-s",
-            "0.1",
-            "--set",
-            "contact.friction=0.22",
-            "--set",
-            "drive.profile=[[0.0, 5.0], [1.0, 6.0]]",
-            "--set",
-            "engine.name=rk4",
-        ],
+        ["simulate", "hammer", "-o", str(source), "--duration-s", "0.1", *otherwise],
         ["export", str(source), "-o", str(other)],
         ["import", str(other), "--template", str(mapping)],
         ["import", str(other), "-m", str(mapping), "-o", str(back)],

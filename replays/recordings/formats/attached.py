@@ -12,9 +12,9 @@ from replays.recordings.experiment import recorded_parameters
 from replays.recordings.formats.source import DOCUMENTS, Source
 from rig.channels import Channel
 from rig.commands import COMMANDS, check_command
-from rig.errors import InputError
 from rig.scenes import Scene, load_scene, parse_scene, scene_names
 from rig.simulation import TICK_RATE_HZ
+from rig.text import printable
 
 _OTHERWISE = "stable-run"
 """The scene whose differences are told of one that does not come with the rig."""
@@ -46,8 +46,8 @@ def attached(source: Source) -> Attached:
             for kind, model in documents.ATTACHED.items()
         }
         experiment = _experiment(read["scene"][0], read["parameters"][0], source)
-    except InputError as error:
-        return Attached(doubt=str(error))
+    except (ValueError, TypeError) as error:  # a time of another kind among them
+        return Attached(doubt=printable(str(error)))
     catalogue = read["catalogue"][1]
     assert isinstance(catalogue, documents.Catalogue)
     # Of what the rig has imported, filters were assumed.
@@ -59,8 +59,8 @@ def _experiment(told: dict[str, Any], recorded: dict[str, Any], source: Source) 
         return []
     scene = parse_scene({**document, **recorded_parameters(recorded, document), "fidelity": "given"})
     name = scene.name if scene.name in scene_names() else _OTHERWISE
-    base = load_scene(name, {"parameters": scene.parameters})
-    lines = [f"scene = {json.dumps(name)}"]
+    base = load_scene(name)
+    lines = [f"scene = {_toml(name)}"]
     if changes := _changes(scene, base):
         lines.append(f"set = {_table(changes)}")
     sent = [
@@ -87,7 +87,7 @@ def _changes(scene: Scene, base: Scene) -> dict[str, Any]:
             found |= {f"{key}.{name}": each for name, each in value.items() if other.get(name) != each}
         elif value != theirs[key]:
             found[key] = value
-    before = base.load_parameters().entries
+    before = load_scene(base, {"parameters": scene.parameters}).load_parameters().entries
     now = {key: entry.value for key, entry in scene.load_parameters().entries.items()}
     found |= {key: value for key, value in now.items() if before[key].value != value}
     return {key: value for key, value in found.items() if key not in _BY_IMPORT}
@@ -103,5 +103,9 @@ def _first_s(source: Source) -> float:
 
 
 def _table(values: dict[str, Any]) -> str:
+    return f"{{ {', '.join(f'{_toml(key)} = {_toml(value)}' for key, value in values.items())} }}"
+
+
+def _toml(value: Any) -> str:
     # JSON's texts, numbers, booleans and lists are TOML's too.
-    return f"{{ {', '.join(f'{json.dumps(key)} = {json.dumps(value)}' for key, value in values.items())} }}"
+    return json.dumps(value, ensure_ascii=False)
