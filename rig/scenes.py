@@ -204,7 +204,7 @@ class Scene(Written):
             if 1_000_000 % rate or (1_000_000 // rate) % self.engine.step_us:
                 usual = (100_000, 50_000, 25_000, 20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
                 rates = [f"{other}" for other in usual if (1_000_000 // other) % self.engine.step_us == 0]
-                must = f"a rate whose period is a whole number of steps of {self.engine.step_us} us"
+                must = f"a rate whose period is a whole number of steps of {self.engine.step_us} us, engine.step_us"
                 hint = f" (such as {', '.join(rates[:6])} Hz)" if rates else ""
                 raise InputError(f"sensors.{field}", must + hint, rate)
         return self
@@ -299,11 +299,11 @@ def scene_path(name_or_path: str | Path) -> Path:
     return path
 
 
-def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None) -> Scene:
-    """Load a scene by name, or a user's file by path.
+def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = None) -> Scene:
+    """Load a scene by name, or a user's file by path; one that is loaded stays as it is, or is changed.
 
     Args:
-        name_or_path: One of `scene_names()`, or a .toml file.
+        scene: One of `scene_names()`, a .toml file, or a loaded one.
         overrides: Changes by dotted key, of the scene (`drive.speed_hz`) or of its parameters (`contact.friction`, in
             the parameter's own unit). Strings are read as TOML values where they are such.
 
@@ -318,7 +318,9 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
         Traceback (most recent call last):
         rig.errors.InputError: drive.sped_hz must be a field of a scene or a parameter, such as drive.speed_hz, ...
     """
-    path = scene_path(name_or_path)
+    if isinstance(scene, Scene):
+        return scene if overrides is None else change_scene(scene, overrides)
+    path = scene_path(scene)
     data = {"name": path.stem, **read_toml(path)}
     for key, value in _keyed(overrides or {}):
         _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)

@@ -12,7 +12,7 @@ import typer
 from rig.cli import origin
 from rig.cli.command import Group, load_command, make_group, usage_error
 from rig.cli.tables import echo
-from rig.errors import DiskError, InputError, SimulationError, need_of_full
+from rig.errors import WHOLE_RIG, DiskError, InputError, SimulationError, lacks_full, need_of_full
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
@@ -88,10 +88,20 @@ GROUPS = {
 """The commands of those that are groups, whose own function is what they do without one."""
 
 
+NEED_FULL = (
+    "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
+    "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
+)  # fmt: skip
+"""The commands that a lean install does without; of `keys` it has `init`."""
+
+
 def rig() -> Group:
     """The command line."""
     about = "A virtual rotor-stator test rig: simulate, serve, hit, record, view and judge it."
-    return make_group("rig", COMMANDS, _load, _rig, about)
+    group = make_group("rig", COMMANDS, _load, _rig, about)
+    if lacks_full():
+        group.epilog = f"These need the whole rig, {WHOLE_RIG}: {', '.join(NEED_FULL)}."
+    return group
 
 
 def _load(name: str) -> Any:

@@ -88,7 +88,7 @@ def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
     from replays.recordings.formats.template import CHECK, example, template
 
     check_new_file(path, field="--template", suffixes=(".toml",), force=force)
-    check_not_among(files, path)
+    check_not_among(files, path, field="--template")
     text = template(files) if files else example()
     with whole_file(path) as draft:
         draft.write_text(text, encoding="utf-8")

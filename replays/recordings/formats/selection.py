@@ -15,6 +15,7 @@ import numpy as np
 from recorder.reader import Recording
 from recorder.survey import Stream
 from replays.recordings.formats.history import ExportEvent, happenings
+from replays.recordings.formats.source import DOCUMENTS
 from rig.channels import Channel
 from rig.errors import InputError, Words
 from rig.text import nearest, printable
@@ -182,9 +183,11 @@ class Selection:
 
     @property
     def documents(self) -> dict[str, str]:
-        """The rig's catalogue, parameters and scene, by name, as the recording has them."""
-        names = ("catalogue.json", "parameters.json", "scene.json")
-        return {name: self.recording.attachments[name].decode() for name in names}
+        """The rig's catalogue, parameters and scene, by name; with the scene, all commands that were sent to it."""
+        texts = {name: self.recording.attachments[name].decode() for name in DOCUMENTS}
+        if commands := self.recording.commands:
+            texts["scene.json"] = json.dumps({**self.recording.scene, "taken": commands})
+        return texts
 
     @cached_property
     def start(self) -> datetime:
@@ -359,7 +362,9 @@ def select(
             tables.setdefault(("" if merged else key, table.rate_hz, offset), []).append(table)
     if not tables:
         held = [s for s in streams.values() if s.rows]
-        low, high = min((s.first_time_s for s in held), default=0.0), max((s.last_time_s for s in held), default=0.0)
+        if not held:
+            raise InputError("file", "a recording with samples", str(recording.path))
+        low, high = min(s.first_time_s for s in held), max(s.last_time_s for s in held)
         ends = [f"{word} {end:g} s" for word, end in (("from", from_s), ("to", to_s)) if end is not None]
         raise InputError("range", f"in the recording, {low:g} to {high:g} s", " ".join(ends) or Words("all of it"))
     return Selection(
