@@ -1,4 +1,4 @@
-"""A journal of what has been measured: a line a result, on the disk as it comes, so that a study goes on where it was."""
+"""A journal of what has been measured: a line a result, on the disk as it comes, so that a study can go on."""
 
 from __future__ import annotations
 

@@ -193,7 +193,7 @@ def _houses(dice: _Dice, parameters: str) -> dict[str, Any]:
     return changes
 
 
-def _levels(dice: _Dice) -> dict[str, str]:
+def _levels(dice: _Dice) -> dict[str, Any]:
     weights = {"exact": 14.0, "smoothed": 2.5, "none": 2.0, "switch": 1.5}
     return {
         "magnet": dice.of({"map": 6.0, "cylinders": 2.0, "linear": 2.0}),

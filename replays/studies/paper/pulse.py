@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from replays.studies.ladder.quantity import QUANTITIES, Trace
+from replays.studies.run import end_with_parent
 from rig.errors import InputError
 from rig.offline import Run, simulate
 from rig.parameters import DEFAULT_SET, load_parameters

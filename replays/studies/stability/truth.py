@@ -54,9 +54,9 @@ def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, lim
         limit_s: Processor time of a run [s].
 
     Returns:
-        The scene; `distance` of the accurate runs, `odd`, which of them differs from two others; `growth` of a nudge
-        and `status`: decided, chaotic (undecided, with growth), undecided, or untold (no two accurate runs); `accurate` and
-        `tested`, a row a run.
+        The scene; `distance` of the accurate runs; `odd`, which of them differs from two others; `growth` of a nudge;
+        `status`: decided, chaotic (they differ, as a nudge would make them), undecided (they differ), or untold (no two
+        came to an end); `accurate` and `tested`, a row a run.
     """
     accurate: list[tuple[Task, Run]] = []
     for engine, tolerance in ACCURATE:
@@ -143,7 +143,4 @@ def _sparse(scene: Scene) -> Row:
     """What a scene has in another way than its defaults, complete enough to run it again."""
     given = scene_document(scene)
     defaults = scene_document(Scene())
-    keep = {key: value for key, value in given.items() if value != defaults[key] and key != "engine"}
-    return keep
-
-
+    return {key: value for key, value in given.items() if value != defaults[key] and key != "engine"}

@@ -23,7 +23,7 @@ _CHUNK_TICKS = 10_000
 """How far a run goes between two looks at the clock [ticks]."""
 _PATIENCE = 4.0
 """A process that says nothing for so many limits is ended: others may share the processor ..."""
-_COMPILING_S = 300.0
+COMPILING_S = 300.0
 """... and it may have to compile [s]."""
 
 
@@ -102,6 +102,14 @@ def nudged(scene: Scene, clearances: float) -> Scene:
 class Worker:
     """A process that does runs, one after the other; another takes its place where it hangs or dies."""
 
+    def __init__(self, *, compiling_s: float = COMPILING_S) -> None:
+        """It is started on entering.
+
+        Args:
+            compiling_s: Wall time added to the first run of each engine [s].
+        """
+        self._compiling_s = compiling_s
+
     def __enter__(self) -> Self:
         self._start()
         return self
@@ -111,7 +119,7 @@ class Worker:
 
     def run(self, task: Task) -> Run:
         """Do a run there."""
-        patience_s = _PATIENCE * task.limit_s + (0.0 if task.engine in self._compiled else _COMPILING_S)
+        patience_s = _PATIENCE * task.limit_s + (0.0 if task.engine in self._compiled else self._compiling_s)
         self._compiled.add(task.engine)
         try:
             self._pipe.send(task)
