@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import os
-import time
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from replays.studies.journal import Journal
 from replays.studies.random_scene import draw_scene
 from replays.studies.stability.sweep import NAME, chosen_numbers, summary, sweep
 from replays.studies.stability.truth import CHAOTIC, NUDGE, measure
-from replays.studies.stability.worker import Run, Task, Worker, nudged, run_task
+from replays.studies.stability.worker import Run, Task, Worker, end_after, nudged, run_task
 from rig.cli.main import main
 from rig.contacts import DAMPING, STIFFNESS
 from rig.engines import ENGINES
@@ -191,26 +190,36 @@ def test_a_run_over_its_limit_and_one_that_breaks_are_results(monkeypatch: pytes
     assert (broken.failure, broken.message.partition(":")[0]) == ("crash", "ZeroDivisionError")
 
 
-class _Acts:
-    """Does something where it is unpickled: in the worker."""
+class _Hangs:
+    """No scene: whoever asks for its fields never gets them."""
 
-    def __init__(self, *act: Any) -> None:
-        self._act = act
+    def model_dump(self) -> Any:
+        end_after(1.0)
+        while True:
+            pass
 
-    def __reduce__(self) -> Any:
-        return self._act[0], self._act[1:]
+
+class _Dies:
+    """No scene: whoever asks for its fields ends."""
+
+    def model_dump(self) -> Any:
+        os._exit(7)
 
 
 def test_a_process_that_hangs_or_dies_is_a_result() -> None:
-    short: Any = Task(SCENE, "rk4", limit_s=0.1)
-    with Worker(compiling_s=1.0) as worker:
-        hung = worker.run(short._replace(scene=_Acts(time.sleep, (60.0))))
-        died = worker.run(short._replace(scene=_Acts(os._exit, 7)))
+    lost: list[Any] = [_Hangs(), _Dies()]
+    with Worker() as worker:
+        hung, died = (worker.run(Task(scene, "rk4")) for scene in lost)
+        good = worker.run(Task(change_scene(SCENE, {"duration_s": 0.003}), "rk4"))
     assert (hung.failure, died.failure) == ("hang", "crash")
     assert "exit status 7" in died.message
-    with Worker() as worker:
-        good = worker.run(Task(change_scene(SCENE, {"duration_s": 0.003}), "rk4"))
     assert (good.failure, good.states.shape) == ("", (3, N_STATE))
+
+
+def test_a_run_is_given_its_limit_where_it_begins() -> None:
+    begun: list[bool] = []
+    run_task(Task(change_scene(SCENE, {"duration_s": 0.001}), "rk4"), lambda: begun.append(True))
+    assert begun == [True]
 
 
 def test_numbers_of_scenes_are_refused_unless_numbers(capsys: pytest.CaptureFixture[str]) -> None:

@@ -44,7 +44,7 @@ def asked(engine: str, tolerance: float = 0.0) -> float:
     return tolerance or ENGINES[engine].tolerance or ASKED
 
 
-def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, limit_s: float = 60.0) -> Row:
+def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, limit_s: float = 20.0) -> Row:
     """Run a scene by accurate engines and by those under test.
 
     Args:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import resource
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, Self
@@ -21,10 +25,10 @@ RATE_HZ = 1_000
 """Instants at which runs are compared [Hz]."""
 _CHUNK_TICKS = 10_000
 """How far a run goes between two looks at the clock [ticks]."""
-_PATIENCE = 4.0
-"""A process that says nothing for so many limits is ended: others may share the processor ..."""
-COMPILING_S = 300.0
-"""... and it may have to compile [s]."""
+_BEYOND_S = 2.0
+"""So much longer than a run may take, its process goes on: where it does not come back to the clock [s]."""
+_COMPILING_S = 300.0
+"""What the beginning of a run may take [s]."""
 
 
 class Task(NamedTuple):
@@ -36,7 +40,7 @@ class Task(NamedTuple):
     """Of an adaptive engine; 0: its own."""
     nudge: float = 0.0
     """By how many clearances the shaft starts farther along x."""
-    limit_s: float = 60.0
+    limit_s: float = 20.0
     """Processor time it may take [s]."""
 
 
@@ -57,8 +61,13 @@ class Run:
     """What `Simulation.health` tells at its end."""
 
 
-def run_task(task: Task) -> Run:
-    """Do a run, in this process."""
+def run_task(task: Task, begun: Callable[[], None] = lambda: None) -> Run:
+    """Do a run, in this process.
+
+    Args:
+        task: The run.
+        begun: Called where its first step is due, the engine being compiled.
+    """
     done, kept = Run(), []
     try:
         changes: dict[str, Any] = {f"sensors.{key}": value for key, value in bare_sensors(RATE_HZ).items()}
@@ -66,6 +75,7 @@ def run_task(task: Task) -> Run:
         scene = change_scene(task.scene, changes)
         simulation = Simulation(nudged(scene, task.nudge) if task.nudge else scene)
         _ = simulation.first_row  # compiles
+        begun()
     except InputError as error:
         return Run("refused", str(error))
     try:
@@ -102,14 +112,6 @@ def nudged(scene: Scene, clearances: float) -> Scene:
 class Worker:
     """A process that does runs, one after the other; another takes its place where it hangs or dies."""
 
-    def __init__(self, *, compiling_s: float = COMPILING_S) -> None:
-        """It is started on entering.
-
-        Args:
-            compiling_s: Wall time added to the first run of each engine [s].
-        """
-        self._compiling_s = compiling_s
-
     def __enter__(self) -> Self:
         self._start()
         return self
@@ -119,23 +121,20 @@ class Worker:
 
     def run(self, task: Task) -> Run:
         """Do a run there."""
-        patience_s = _PATIENCE * task.limit_s + (0.0 if task.engine in self._compiled else self._compiling_s)
-        self._compiled.add(task.engine)
         try:
             self._pipe.send(task)
-            if self._pipe.poll(patience_s):
-                return self._pipe.recv()
-            lost = Run("hang", f"no answer within {patience_s:.0f} s: the engine does not return")
+            return self._pipe.recv()
         except (EOFError, OSError):
             self._process.join()
-            lost = Run("crash", f"its process died (exit status {self._process.exitcode})")
+        status = self._process.exitcode
         self._end()
         self._start()
-        return lost
+        if status == -signal.SIGXCPU:
+            return Run("hang", f"does not return in {task.limit_s:g} s of processor time")
+        return Run("crash", f"its process died (exit status {status})")
 
     def _start(self) -> None:
         context = get_context("spawn")
-        self._compiled: set[str] = set()
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
         self._process.start()
@@ -151,4 +150,12 @@ def _serve(pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal's Ctrl-C is for the process that asks
     end_with_parent()
     while True:
-        pipe.send(run_task(pipe.recv()))
+        task = pipe.recv()
+        end_after(_COMPILING_S)
+        pipe.send(run_task(task, partial(end_after, task.limit_s + _BEYOND_S)))
+
+
+def end_after(limit_s: float) -> None:
+    """Have the system end this process when it has taken so much more processor time [s]; others' does not count."""
+    most = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(time.process_time() + limit_s), most))
