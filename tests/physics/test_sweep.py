@@ -119,6 +119,11 @@ def test_faults_of_a_run(shift: float, own: dict[str, Any], faults: list[str]) -
     assert all(found[kind] == [4] for kind in faults)
 
 
+def test_an_accurate_run_that_doubts_itself_stands_back() -> None:
+    row = measure(SCENE, [DEFAULT], stub({"rk8": 0.5}, rk8={"warnings": [DOUBT]}))
+    assert (row["status"], row["distance"], len(row["accurate"])) == ("decided", 0.0, 3)
+
+
 def test_an_engine_is_not_held_against_itself() -> None:
     row = measure(SCENE, ["taylor"], stub({"rk8": 1e-3}))
     assert row["tested"][0]["error"] == pytest.approx(1e-3)

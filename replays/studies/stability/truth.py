@@ -15,7 +15,7 @@ from rig.scenes import Scene, scene_document
 from rig.text import finite
 
 ACCURATE = (("taylor", 1e-10), ("rk8", 1e-9), ("tsit5", 1e-9))
-"""Engines and tolerances of the truth: the first two that take the scene. The next is asked where they differ."""
+"""Engines and tolerances of the truth: the first two that take the scene; the next where one doubts, or they differ."""
 AGREE = 1e-2
 """Scaled error up to which two accurate runs tell the same motion."""
 WRONG = 0.1
@@ -60,12 +60,13 @@ def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, lim
     """
     accurate: list[tuple[Task, Run]] = []
     for engine, tolerance in ACCURATE:
-        good = [done for _, done in accurate if not done.failure]
-        if len(good) >= 2 and (len(good) > 2 or _distance(*good[:2]) <= AGREE):
+        sure = [done for _, done in accurate if not done.failure and not doubted(done.health)]
+        if len(sure) >= 2 and _distance(*sure[:2]) <= AGREE:
             break
         task = Task(scene, engine, tolerance, limit_s=limit_s)
         accurate.append((task, run(task)))
     good = [(task, done) for task, done in accurate if not done.failure]
+    good.sort(key=lambda pair: doubted(pair[1].health))  # those that doubt themselves stand back
     distance = _distance(good[0][1], good[1][1]) if len(good) > 1 else None
     growth = _growth(*good[0], run) if good else None
     status = "untold"
