@@ -9,7 +9,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,7 +62,7 @@ def test_a_law_that_is_another_is_seen() -> None:
     assert measure(scene, [DEFAULT], other)["tested"][0]["error"] > 1e-3
 
 
-def stub(shifts: dict[str, float], *, grows: float = 1.0, **own: dict[str, Any]):
+def stub(shifts: dict[str, float], own: dict[str, dict[str, Any]] | None = None, *, grows: float = 1.0):
     """Runs that stand still, each engine's off by so much in the error's norm; `own`: other fields by engine."""
 
     def run(task: Task) -> Run:
@@ -70,7 +72,7 @@ def stub(shifts: dict[str, float], *, grows: float = 1.0, **own: dict[str, Any])
             states += NUDGE * np.geomspace(1.0, grows, 100)[:, None] * STATE_SCALE
         health = {"peak_normal_force_n": 100.0, "contacts": 3, "energy": {"residual_share": 0.0}, "warnings": []}
         fields: dict[str, Any] = {"states": states, "cpu_s": 0.01, "reached_s": 0.1, "health": health}
-        changes = own.get(task.engine, {})
+        changes = (own or {}).get(task.engine, {})
         fields["health"] = health | {key: changes[key] for key in changes if key in health}
         fields |= {key: changes[key] for key in changes if key not in health}
         return Run(**fields)
@@ -112,7 +114,7 @@ def test_status_of_a_scene(shifts: dict[str, float], grows: float, status: str, 
     ],
 )
 def test_faults_of_a_run(shift: float, own: dict[str, Any], faults: list[str]) -> None:
-    row = {"number": 4} | measure(SCENE, [DEFAULT], stub({DEFAULT: shift}, **{DEFAULT: own}))
+    row = {"number": 4} | measure(SCENE, [DEFAULT], stub({DEFAULT: shift}, {DEFAULT: own}))
     found = summary([row], [DEFAULT])["engines"][DEFAULT]
     kinds = ("wrong", "silent", "false_alarms", "absurd", "crashes", "hangs")
     assert [kind for kind in kinds if found[kind]] == faults
@@ -120,7 +122,7 @@ def test_faults_of_a_run(shift: float, own: dict[str, Any], faults: list[str]) -
 
 
 def test_an_accurate_run_that_doubts_itself_stands_back() -> None:
-    row = measure(SCENE, [DEFAULT], stub({"rk8": 0.5}, rk8={"warnings": [DOUBT]}))
+    row = measure(SCENE, [DEFAULT], stub({"rk8": 0.5}, {"rk8": {"warnings": [DOUBT]}}))
     assert (row["status"], row["distance"], len(row["accurate"])) == ("decided", 0.0, 3)
 
 
@@ -225,6 +227,19 @@ def test_a_run_is_given_its_limit_where_it_begins() -> None:
     begun: list[bool] = []
     run_task(Task(change_scene(SCENE, {"duration_s": 0.001}), "rk4"), lambda: begun.append(True))
     assert begun == [True]
+
+
+def test_command_tells_keeps_and_draws(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["stability", "--random", "1", "--seed", "7", "--only", "2", "--engines", DEFAULT, "-o", str(tmp_path)]
+    with pytest.raises(SystemExit, match="0"):
+        main([*command, "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert told["scenes"] == {"decided": 1, "chaotic": 0, "undecided": 0, "untold": 0}
+    assert told["engines"][DEFAULT]["told"] == 1
+    assert all(Path(picture).is_file() for picture in told["pictures"])
+    with pytest.raises(SystemExit, match="0"):
+        main(command)
+    assert "random scenes of seed 7: 1 decided, 0 chaotic" in capsys.readouterr().out
 
 
 def test_numbers_of_scenes_are_refused_unless_numbers(capsys: pytest.CaptureFixture[str]) -> None:
