@@ -143,7 +143,8 @@ def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
     yield (
         "\nQuantiles of the scaled error in decided scenes; within: share of those that are not chaotic with an error "
         "of at most 10 times what was asked for; silent: wrong by more than 0.1 without a warning; false: warned, and "
-        "within; speeds: simulated s over processor s. Untold: scenes that no two accurate engines take."
+        "within; speeds: simulated s over processor s. Untold: scenes that no two accurate engines take; "
+        "unbounded: those where the model makes energy without end, in which no fault counts."
     )
     for name, one in found["engines"].items():
         for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd"):

@@ -121,6 +121,14 @@ def test_faults_of_a_run(shift: float, own: dict[str, Any], faults: list[str]) -
     assert all(found[kind] == [4] for kind in faults)
 
 
+def test_where_the_model_has_no_end_no_fault_counts() -> None:
+    wild = {"peak_normal_force_n": 1e15}
+    run = stub({}, {"taylor": wild, "rk8": wild, DEFAULT: {"failure": "crash", "health": {}}})
+    row = {"number": 4} | measure(SCENE, [DEFAULT], run)
+    assert row["status"] == "unbounded"
+    assert summary([row], [DEFAULT])["engines"][DEFAULT]["crashes"] == []
+
+
 def test_an_accurate_run_that_doubts_itself_stands_back() -> None:
     row = measure(SCENE, [DEFAULT], stub({"rk8": 0.5}, {"rk8": {"warnings": [DOUBT]}}))
     assert (row["status"], row["distance"], len(row["accurate"])) == ("decided", 0.0, 3)
@@ -234,7 +242,7 @@ def test_command_tells_keeps_and_draws(tmp_path, capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit, match="0"):
         main([*command, "--json"])
     told = json.loads(capsys.readouterr().out)
-    assert told["scenes"] == {"decided": 1, "chaotic": 0, "undecided": 0, "untold": 0}
+    assert told["scenes"] == {"decided": 1, "chaotic": 0, "undecided": 0, "untold": 0, "unbounded": 0}
     assert told["engines"][DEFAULT]["told"] == 1
     assert all(Path(picture).is_file() for picture in told["pictures"])
     with pytest.raises(SystemExit, match="0"):

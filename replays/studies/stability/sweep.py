@@ -93,7 +93,9 @@ def summary(rows: list[Row], engines: list[str]) -> Row:
     for name in dict.fromkeys(one["engine"] for row in rows for one in row["accurate"]):
         by_name[f"{name} (accurate)"] = [(row, one) for row in rows for one in row["accurate"] if one["engine"] == name]
     return {
-        "scenes": {status: statuses.count(status) for status in ("decided", "chaotic", "undecided", "untold")},
+        "scenes": {
+            status: statuses.count(status) for status in ("decided", "chaotic", "undecided", "untold", "unbounded")
+        },
         "undecided": [
             {name: row[name] for name in ("number", "distance", "odd", "growth", "growth_per_s")}
             for row in rows
@@ -118,7 +120,7 @@ def _engine(runs: list[tuple[Row, Row]]) -> Row:
     """One engine over all scenes; a list of scenes is one of their numbers."""
 
     def scenes(kind: Callable[[Row], bool]) -> list[int]:
-        return [row["number"] for row, one in runs if kind(one)]
+        return [row["number"] for row, one in runs if kind(one) and row["status"] != "unbounded"]
 
     ran = [(row, one) for row, one in runs if one["failure"] != "refused"]
     told = [(row, one) for row, one in ran if one["error"] is not None]

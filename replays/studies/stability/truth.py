@@ -24,6 +24,8 @@ ASKED = 1e-3
 """... and what an engine of fixed steps is taken to be asked for."""
 _ABSURD, _LEAST_N = 20.0, 10.0
 """A peak force is absurd above so many times the accurate one, or this [N] where that is next to nothing."""
+UNBOUNDED_N = 1e9
+"""Above this accurate peak the model itself makes energy without end, as a gap that counts both houses can [N]."""
 NUDGE = 1e-7
 """By how many clearances the start is moved to see what becomes of it."""
 CHAOTIC = 1e5
@@ -55,8 +57,8 @@ def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, lim
 
     Returns:
         The scene; `distance` of the accurate runs; `odd`, which of them differs from two others; `growth` of a nudge;
-        `status`: decided, chaotic (they differ, as a nudge would make them), undecided (they differ), or untold (no two
-        came to an end); `accurate` and `tested`, a row a run.
+        `status`: decided, chaotic (they differ, as a nudge would make them), undecided (they differ), untold (no two
+        came to an end), or unbounded; `accurate` and `tested`, a row a run.
     """
     accurate: list[tuple[Task, Run]] = []
     for engine, tolerance in ACCURATE:
@@ -73,6 +75,8 @@ def measure(scene: Scene, engines: list[str], run: Callable[[Task], Run], *, lim
     if distance is not None:
         status = "decided" if distance <= AGREE else "chaotic" if growth and growth >= CHAOTIC else "undecided"
     peak = min((done.health["peak_normal_force_n"] for _, done in good), default=None)
+    if peak is not None and not peak <= UNBOUNDED_N:
+        status = "unbounded"
     tested = [Task(scene, engine, limit_s=limit_s) for engine in engines]
     truths = good if status == "decided" else []
     rows = [_row(task, run(task), truths, peak) for task in tested]
