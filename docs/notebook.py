@@ -33,7 +33,7 @@ for row, title, ((s, _), (r, edges_s)) in zip(axes, ("simulated", "recorded"), (
     row[1].set(
         title="Its last 0.3 s", xlim=(-150, 150), xlabel="backward - frequency [Hz] - forward", ylabel=f"[{unit}]"
     )
-    speed_hz, vector = rig.synchronous(r.times_s, r["disk_x"], edges_s)
+    speed_hz, vector = rig.synchronous(r["disk_x"], r.times_s, edges_s)
     row[2].plot(speed_hz, np.abs(vector), ".-")
     row[2].set(title=f"Run-up, {title}", xlabel="speed [Hz]", ylabel=f"1X of disk_x [{r.unit('disk_x')}]")
     row[3].plot(speed_hz, np.degrees(np.unwrap(np.angle(vector))), ".-")

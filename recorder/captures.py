@@ -232,4 +232,4 @@ class Captures(Sink):
         fired = {"triggers": json.dumps(writing.fired), "trigger_count": str(writing.count)}
         self._close(writing.writer, reason or f"captured{full}", {**(notes or {}), **fired})
         if not self.ended and self._capture.count is not None and self._number >= self._capture.count:
-            self.ended = f"{self._number} captures made"
+            self.ended = f"{self._number} capture{'s' * (self._number != 1)} made"

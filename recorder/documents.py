@@ -239,7 +239,7 @@ def read(model: type[Model], payload: bytes, *, field: str) -> tuple[dict[str, A
     try:
         return document, model.model_validate_json(payload, strict=True)
     except ValidationError as error:
-        raise input_error(error, field) from None
+        raise input_error(error, field, model) from None
 
 
 def document_in(topic: str, payload: bytes) -> dict[str, Any] | None:
@@ -273,7 +273,7 @@ def read_metadata(model: type[Model], entries: dict[str, str], *, field: str) ->
     try:
         return model.model_validate(entries)
     except ValidationError as error:
-        raise input_error(error, field) from None
+        raise input_error(error, field, model) from None
 
 
 def check_version(about: dict[str, str]) -> None:

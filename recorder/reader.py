@@ -113,6 +113,13 @@ class Recording:
         """The rig's events, in order of arrival."""
         return [event for _, event in self._documents(EVENTS)]
 
+    @property
+    def commands(self) -> list[dict[str, Any]]:
+        """Commands that came from outside, before the recording began and in it: id, tick, command, request."""
+        told = [*self.scene.get("taken", []), *(event for event in self.events if event.get("event") == "command")]
+        found = {one["id"]: {name: one[name] for name in ("id", "tick", "command", "request")} for one in told}
+        return [found[number] for number in sorted(found)]
+
     @cached_property
     def last_status(self) -> dict[str, Any] | None:
         """The last of the rig's status documents; None without one."""

@@ -16,7 +16,7 @@ from recorder.payload import block_in
 from recorder.records import COPY, MAGIC, Chunk, DamagedError, messages, read_contents, unpack
 from rig import intake
 from rig.errors import InputError, Words
-from rig.outside import open_file, read_json
+from rig.outside import open_file, read_json, unreadable
 from rig.wire import Block
 
 _OURS = "a recording made by `rig record`"
@@ -173,7 +173,7 @@ class RecordingFile:
         except InputError:
             raise
         except OSError as error:
-            raise InputError("file", "a file that can be read", Words(f"{self.path} ({error.strerror})")) from None
+            raise unreadable(self.path, error) from None
         except DamagedError as error:
             must = "an intact recording (`rig recover` passes over what is damaged)"
             raise InputError("file", must, Words(f"{self.path} ({error})")) from None

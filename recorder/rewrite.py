@@ -26,7 +26,7 @@ from recorder.reader import Recording
 from recorder.records import COPY
 from recorder.writer import RecordingWriter
 from rig.errors import PART_SUFFIX, InputError, Words, check_not_among
-from rig.outside import open_file
+from rig.outside import open_file, unreadable
 from rig.wire import EDGES, SENSORS, TRUTH, Block, encode_block, schema_of
 
 _TELL_EVERY = 5000
@@ -292,7 +292,7 @@ def _unlocked(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.filename != str(path):
             raise
-        raise InputError("file", "a file that can be read", Words(f"{path} ({error.strerror})")) from None
+        raise unreadable(path, error) from None
 
 
 def _narrowed(

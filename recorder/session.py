@@ -10,12 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from recorder.captures import Captures, check_captures
+from recorder.captures import Captures, capture_path, check_captures
 from recorder.counts import NS, Counts
 from recorder.head import Beginning
 from recorder.payload import Payload
 from recorder.room import Limits
-from recorder.series import Series, check_series
+from recorder.series import Series, check_series, part_path
 from recorder.sink import Needs, Sink
 from recorder.summary import Progress, Summary
 from recorder.trigger import Capture
@@ -25,7 +25,7 @@ from rig.bounded_queue import BoundedQueue
 from rig.errors import InputError
 from rig.intake import Catalogue, Intake
 from rig.text import printable
-from rig.transport import Client, NoReplyError
+from rig.transport import Client
 from rig.transport.clients import Reporter
 
 Document = dict[str, Any]
@@ -102,7 +102,6 @@ class RecordingSession:
         duration_s: float | None = None,
         view_rate_hz: float = 500.0,
         history: bool = False,
-        wait_s: float = 0.0,
         patience_s: float | None = None,
         force: bool = False,
         limits: Limits | None = None,
@@ -121,7 +120,6 @@ class RecordingSession:
             view_rate_hz: Rate of the plottable messages [Hz]; 0 writes none.
             history: Also record what the rig's cache still holds from before; rows since the start of the run that it
                 no longer holds count as lost.
-            wait_s: How long a rig may take to answer at the beginning [s]: one that is being prepared listens already.
             patience_s: How long a rig that is lost may take to be there again [s]; the same run is then recorded on,
                 with a gap. None: `RETURN_S`.
             force: Replace an existing file.
@@ -137,8 +135,6 @@ class RecordingSession:
         if duration_s is not None and not duration_s > 0.0:
             raise InputError("duration_s", "above 0", duration_s)
         check_view_rate(view_rate_hz)
-        if not wait_s >= 0.0:
-            raise InputError("wait_s", "at least 0", wait_s)
         patience_s = RETURN_S if patience_s is None else patience_s
         if not patience_s >= 0.0:
             raise InputError("patience_s", "at least 0", patience_s)
@@ -157,7 +153,6 @@ class RecordingSession:
         self._duration_s = duration_s
         self._view_rate_hz = view_rate_hz
         self._history = history
-        self._wait_s = wait_s
         self._patience_s = patience_s
         self._force = force
         self._wall_ns = wall_ns
@@ -206,7 +201,7 @@ class RecordingSession:
             InputError: The file cannot be created.
         """
         asked = (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE)
-        catalogue, parameters, scene = (wire.decode_document(self._ask(key)) for key in asked)
+        catalogue, parameters, scene = (wire.decode_document(self._client.request(key)) for key in asked)
         promised = Catalogue.read(catalogue)
         self._rig = self._client.rig
         writer = self._open_sink(promised, catalogue, parameters, scene)
@@ -232,16 +227,12 @@ class RecordingSession:
             self._report(writer, done=True)  # lets the rig drop its cache at once
         return self._summary(writer, reason, trouble)
 
-    def _ask(self, key: str) -> bytes:
-        """Request a document, again for as long as a rig may take to answer."""
-        deadline_s = self._monotonic_s() + self._wait_s
-        while True:
-            try:
-                return self._client.request(key)
-            except NoReplyError:
-                if self._stop_reason or self._monotonic_s() >= deadline_s:
-                    raise
-                time.sleep(0.05)
+    @property
+    def first_files(self) -> list[Path]:
+        """The file that it writes, or the first of several, for each trigger."""
+        if self._capture is not None:
+            return list(dict.fromkeys(capture_path(self.path, each, 1) for each in self._capture.triggers))
+        return [part_path(self.path, 0) if self._limits.rotates else self.path]
 
     def _open_sink(self, promised: Catalogue, catalogue: Document, parameters: Document, scene: Document) -> Sink:
         def open_file(path: Path, scene: Document, beginning: Beginning) -> RecordingWriter:

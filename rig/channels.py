@@ -172,7 +172,7 @@ def parse_table(text: str) -> ChannelTable:
             groups[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": rows}
         return ChannelTable.model_validate({"groups": groups})
     except ValidationError as error:
-        raise input_error(error, "channel table") from None
+        raise input_error(error, "channel table", ChannelTable) from None
     except KeyError as error:
         raise InputError(f"channel table: {error.args[0]}", "given", None) from None
     except (TypeError, AttributeError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 from rig.text import Words as Words
@@ -14,6 +15,8 @@ PART_SUFFIX = ".part"
 """What a file's name ends in while it is being written."""
 FULL = frozenset({"scipy", "numba", "rerun", "matplotlib", "pyarrow", "jinja2", "fpdf"})
 """What the extra `full` brings, by the names that are imported: what talks to a rig does without."""
+WHOLE_RIG = "pip install 'rotor-stator-rig[full]'"
+"""How to get it."""
 _LONGEST_LINE = 5000
 _MOST_NAMES = 12
 
@@ -54,13 +57,17 @@ class UnknownNameError(InputError, KeyError):
 
     def __init__(self, field: str, must: str, name: object, known: Iterable[str]) -> None:
         """Name the field, what it must be, the name that is none, and those that there are."""
-        known = list(dict.fromkeys(known))
-        near = nearest(name, known)
-        shown = near or known[:_MOST_NAMES]
-        more = f" ({len(known)} in all)" if len(known) > len(shown) else ""
-        super().__init__(field, f"{must}, such as {', '.join(shown)}{more}" if shown else must, name)
+        super().__init__(field, such_as(must, name, known), name)
 
     __str__ = ValueError.__str__  # of a KeyError, it would be in quotes
+
+
+def such_as(must: str, name: object, known: Iterable[str]) -> str:
+    """What a name that is none must be, with the nearest that there are, or all where none is near."""
+    known = list(dict.fromkeys(known))
+    shown = nearest(name, known) or known[:_MOST_NAMES]
+    more = f" ({len(known)} in all)" if len(known) > len(shown) else ""
+    return f"{must}, such as {', '.join(shown)}{more}" if shown else must
 
 
 class RefusedError(InputError):
@@ -82,9 +89,14 @@ class DiskError(RuntimeError):
 
 def need_of_full(error: ModuleNotFoundError) -> str | None:
     """What to say where a part of the whole rig was left out on purpose; None where something else is not there."""
-    if (error.name or "").partition(".")[0] not in FULL:
+    if (name := (error.name or "").partition(".")[0]) not in FULL:
         return None
-    return f"needs {error.name}, which comes with the whole rig: pip install 'rotor-stator-rig[full]'"
+    return f"needs {name}, which comes with the whole rig: {WHOLE_RIG}"
+
+
+def lacks_full() -> bool:
+    """Whether a part of the whole rig is not installed; nothing is imported."""
+    return any(find_spec(module) is None for module in FULL)
 
 
 def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: bool) -> None:
@@ -99,14 +111,14 @@ def check_new_file(path: Path, *, field: str, suffixes: tuple[str, ...], force: 
     Raises:
         InputError: Another ending, a folder that is missing or read-only, or an existing file.
     """
+    if path.suffix not in suffixes:  # also of a path without a name, such as "" and /
+        *others, last = suffixes
+        endings = f"{', '.join(others)} or {last}" if others else last
+        raise InputError(field, f"a file name that ends in {endings}", str(path))
     try:
         path.with_name(path.name + PART_SUFFIX).exists()
     except OSError as error:  # a name that is too long
         raise InputError(field, "a file name that the system accepts", Words(f"{path} ({error.strerror})")) from None
-    if path.suffix not in suffixes:
-        *others, last = suffixes
-        endings = f"{', '.join(others)} or {last}" if others else last
-        raise InputError(field, f"a file name that ends in {endings}", str(path))
     if not path.parent.is_dir():
         raise InputError(field, "in a folder that exists", str(path))
     if path.is_dir():

@@ -13,7 +13,7 @@ import numpy as np
 from rig.channels import ChannelTable
 from rig.kernels.signals import COLUMN, ROW
 from rig.samples import Samples, place
-from rig.scenes import Scene, change_scene, load_scene, parse_scene
+from rig.scenes import Scene, load_scene, parse_scene
 from rig.simulation import Frame, Simulation, energy_balance
 
 NAMES = tuple(COLUMN)
@@ -158,10 +158,7 @@ def simulate(
         >>> run.samples["disk_x"].shape, run.samples.unit("disk_x")
         ((1000,), 'mm')
     """
-    if not isinstance(scene, Scene):
-        scene = load_scene(scene, changes)
-    elif changes:
-        scene = change_scene(scene, changes)
+    scene = load_scene(scene, changes)
     if duration_s is not None:
         scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})
     simulation = Simulation(scene)

@@ -6,6 +6,7 @@ fields with ranges and no others. What has passed is believed behind the door, a
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import math
@@ -15,12 +16,12 @@ import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, TypeVar
+from typing import Annotated, Any, BinaryIO, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from rig.errors import InputError, Words
-from rig.text import printable
+from rig.errors import InputError, Words, such_as
+from rig.text import nearest, printable
 
 DOCUMENT_BYTES = 16 << 20
 """Largest document that a rig or a recording may hold."""
@@ -129,6 +130,17 @@ def open_file(path: Path) -> BinaryIO:
         return number
 
     return open(path, "rb", opener=opener)
+
+
+def unreadable(path: Path, error: OSError) -> InputError:
+    """Why a file cannot be read, with those beside it that could have been meant, such as what was not finished."""
+    names: list[str] = []
+    if isinstance(error, FileNotFoundError):
+        with contextlib.suppress(OSError):
+            names = sorted(each.name for each in path.parent.iterdir() if path.suffix in each.name)
+    names = [name for name in names if name.startswith(f"{path.stem}.")][:3] or nearest(path.name, names)
+    such = f", such as {', '.join(str(path.with_name(name)) for name in names)}" if names else ""
+    return InputError("file", f"a file that can be read{such}", Words(f"{path} ({error.strerror})"))
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -260,7 +272,7 @@ def check(model: type[Model], document: Any, *, field: str, most_bytes: int = 10
     try:
         return model.model_validate(document)
     except ValidationError as error:
-        raise input_error(error, field) from None
+        raise input_error(error, field, model) from None
 
 
 # What pydantic puts into the place of an error beside the names that stand in the file: branches of a union.
@@ -282,7 +294,24 @@ def _place(parts: tuple[str | int, ...], kind: str) -> list[str]:
     return found
 
 
-def input_error(error: ValidationError, where: str) -> InputError:
+def _fields(models: list[type[BaseModel]], parts: tuple[str | int, ...]) -> list[str]:
+    """Names of the fields at a place in documents of some models; all of them where several could stand there."""
+    for part in parts:
+        fields = [field for each in models for name, field in each.model_fields.items() if name == part]
+        models = [inner for field in fields for inner in _models(field.annotation)] or models
+        # The one of a union that its tag names.
+        tagged = (each for each in models if get_args(next(iter(each.model_fields.values())).annotation) == (part,))
+        models = list(tagged) or models
+    return [name for each in models for name in each.model_fields]
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [inner for part in get_args(annotation) for inner in _models(part)]
+
+
+def input_error(error: ValidationError, where: str, model: type[BaseModel]) -> InputError:
     """The first complaint of a validation as the one line that users see."""
     first = error.errors()[0]
     cause = first.get("ctx", {}).get("error")
@@ -296,7 +325,8 @@ def input_error(error: ValidationError, where: str) -> InputError:
         name = str(context.get("discriminator")).strip("'")
         return InputError(f"{field}.{name}", f"one of {context.get('expected_tags')}", context.get("tag"))
     if first["type"] == "extra_forbidden":
-        message = "left out (there is no such field)"
+        known = _fields([model], first["loc"][:-1])
+        message = such_as("a field that there is", first["loc"][-1], known) if known else "left out (it has no fields)"
     elif first["type"] == "missing":
         message = "given"
     return InputError(field, message, None if first["type"] == "missing" else first["input"])

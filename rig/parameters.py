@@ -21,9 +21,8 @@ from pydantic import (
     field_validator,
 )
 
-from rig.errors import InputError, UnknownNameError
+from rig.errors import InputError, UnknownNameError, such_as
 from rig.outside import check, read_toml
-from rig.text import nearest
 
 SETS = Path(__file__).with_name("sets")
 DEFAULT_SET = "corrected"
@@ -129,7 +128,7 @@ class ParameterSet:
         entries = dict(self.entries)
         for key, value in changes.items():
             if key not in entries:
-                raise InputError(key, f"a parameter of the set ({_nearest(key, entries)})", value)
+                raise InputError(key, such_as("a parameter of the set", key, entries), value)
             if isinstance(value, bool) or not isinstance(value, int | float | str):
                 raise InputError(key, _accepts(entries[key]), value)
             value = value if isinstance(value, str) else float(value)
@@ -175,7 +174,7 @@ def _load(name: Any, field: str, loading: tuple[str, ...]) -> ParameterSet:
         return _own_set(name)
     path = Path(name) if isinstance(name, str) else None
     if path is None or path.suffix != ".toml" or not path.is_file():
-        known = f"one of {', '.join(set_names())}, or the path of a .toml file"
+        known = f"one of {', '.join(set_names())}, or the path of a .toml file that exists"
         raise InputError(field, f"the set that the file changes, {known}" if name is None else known, name)
     place = str(path.resolve())
     if place in loading:
@@ -203,11 +202,8 @@ def _parse(name: str, data: dict[str, Any], path: Path, loading: tuple[str, ...]
             # A bare number is a user's short form of a table with only a value.
             given = fields if isinstance(fields, dict) else {"value": fields, "kind": "assumed", "source": path.name}
             if not foundation and key not in entries:
-                raise InputError(
-                    f"{path.name}: {key}",
-                    f"a parameter of the set {base} ({_nearest(key, entries)})",
-                    given.get("value"),
-                )
+                must = such_as(f"a parameter of the set {base}", key, entries)
+                raise InputError(f"{path.name}: {key}", must, given.get("value"))
             known = entries[key].model_dump() if key in entries else {}
             for fixed in ("range", "rules"):
                 if fixed in given and known:
@@ -235,8 +231,3 @@ def _check(key: str, entry: Parameter) -> None:
         good = low <= value <= high and (entry.unit != "count" or float(value).is_integer())
     if not good:
         raise InputError(key, _accepts(entry), value)
-
-
-def _nearest(key: str, entries: dict[str, Parameter]) -> str:
-    close = nearest(key, entries)
-    return f"such as {', '.join(close)}" if close else "see `rig params`"

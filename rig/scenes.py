@@ -14,13 +14,12 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 from rig.channels import ChannelTable, check_signals, default_table
 from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand
 from rig.engines import ENGINES
-from rig.errors import InputError, Words
+from rig.errors import InputError, Words, such_as
 from rig.kernels.signals import COLUMN
 from rig.levels import ModelLevels
 from rig.outside import Written, check, parse_toml, read_toml, table_in
 from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
 from rig.pick import Pick, digest, equations_digest
-from rig.text import nearest
 
 SCENES = Path(__file__).with_name("scenes")
 _APART_S = 0.01
@@ -205,7 +204,7 @@ class Scene(Written):
             if 1_000_000 % rate or (1_000_000 // rate) % self.engine.step_us:
                 usual = (100_000, 50_000, 25_000, 20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
                 rates = [f"{other}" for other in usual if (1_000_000 // other) % self.engine.step_us == 0]
-                must = f"a rate whose period is a whole number of steps of {self.engine.step_us} us"
+                must = f"a rate whose period is a whole number of steps of {self.engine.step_us} us, engine.step_us"
                 hint = f" (such as {', '.join(rates[:6])} Hz)" if rates else ""
                 raise InputError(f"sensors.{field}", must + hint, rate)
         return self
@@ -293,21 +292,23 @@ def scene_path(name_or_path: str | Path) -> Path:
         path = Path(name_or_path)
         if path.suffix != ".toml" or not path.is_file():
             raise InputError(
-                "scene", f"one of {', '.join(scene_names())}, or the path of a .toml file", str(name_or_path)
+                "scene",
+                f"one of {', '.join(scene_names())}, or the path of a .toml file that exists",
+                str(name_or_path),
             )
     return path
 
 
-def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None) -> Scene:
-    """Load a scene by name, or a user's file by path.
+def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = None) -> Scene:
+    """Load a scene by name, or a user's file by path; one that is loaded stays as it is, or is changed.
 
     Args:
-        name_or_path: One of `scene_names()`, or a .toml file.
+        scene: One of `scene_names()`, a .toml file, or a loaded one.
         overrides: Changes by dotted key, of the scene (`drive.speed_hz`) or of its parameters (`contact.friction`, in
             the parameter's own unit). Strings are read as TOML values where they are such.
 
     Raises:
-        InputError: The one thing that is wrong, with its field.
+        InputError: The one thing that is wrong, with its field, and its file unless that is among the overrides.
 
     Example:
         >>> scene = load_scene("hammer", {"drive.speed_hz": 5.2, "contact.friction": 0.3})
@@ -317,13 +318,25 @@ def load_scene(name_or_path: str | Path, overrides: dict[str, Any] | None = None
         Traceback (most recent call last):
         rig.errors.InputError: drive.sped_hz must be a field of a scene or a parameter, such as drive.speed_hz, ...
     """
-    path = scene_path(name_or_path)
+    if isinstance(scene, Scene):
+        return scene if overrides is None else change_scene(scene, overrides)
+    path = scene_path(scene)
     data = {"name": path.stem, **read_toml(path)}
     for key, value in _keyed(overrides or {}):
         _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
+    try:
+        return _checked(data, list(overrides or {}))
+    except InputError as error:
+        if path.parent == SCENES or error.field in (overrides or {}):
+            raise
+        raise InputError(f"{path.name}: {error.field}", error.must, error.received) from None
+
+
+def _checked(data: dict[str, Any], overrides: list[str]) -> Scene:
+    """The scene of a file with overrides, if it can run."""
     scene = parse_scene({**data, "fidelity": "given"} if data.get("fidelity") == "auto" else data)
     if data.get("fidelity") == "auto":
-        scene = _with_pick(scene, data, [] if overrides is None else list(overrides))
+        scene = _with_pick(scene, data, overrides)
     # Parameters are checked here, so that a scene that loads can run.
     top = scene.load_parameters().entries["drive.top_speed"].value
     speeds = {"drive.speed_hz": [scene.drive.speed_hz], "drive.profile": [speed for _, speed in scene.drive.profile]}
@@ -404,10 +417,8 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
     for part in [*path, last]:
         known = getattr(fields, "model_fields", {})
         if part not in known:
-            close = nearest(key, [*_scene_keys(), *load_parameters().entries])
-            raise InputError(
-                key, "a field of a scene or a parameter" + (f", such as {', '.join(close)}" if close else ""), value
-            )
+            known = [*_scene_keys(), *load_parameters().entries]
+            raise InputError(key, such_as("a field of a scene or a parameter", key, known), value)
         fields = known[part].annotation
     place = data
     for part in path:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
-from rig.scenes import Scene, rig_table, scene_document
+from rig.scenes import Scene, load_scene, rig_table, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
 from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key
@@ -118,14 +119,14 @@ class Simulation:
 
     Example:
         >>> import rig
-        >>> simulation = rig.Simulation(rig.load_scene("hammer"))
+        >>> simulation = rig.Simulation("hammer")  # or a scene of `rig.load_scene`
         >>> frame = simulation.advance(100 * simulation.block_ticks)
         >>> simulation, frame.samples["probes"].values.shape, frame.rows.shape  # ADC counts; the model's signals [SI]
         (Simulation(hammer: at 0.05 of 2 s), (1000, 4), (2000, 66))
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene | str | Path) -> None:
+        self.scene = scene = load_scene(scene)
         self.tick_rate_hz = TICK_RATE_HZ
         self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
@@ -166,8 +167,7 @@ class Simulation:
         self._pending = sorted(
             ((self._on_grid(timed.at_s), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
         )
-        speed = self._segments[0].speed
-        self._y = self._initial_state(speed)
+        self._y = self._initial_state(self._segments[0].speed)
         self._memory = np.zeros(MEMORY)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None

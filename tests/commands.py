@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 from rich.cells import cell_len
-from rich.console import Console
 
 from rig.cli.main import main
 from rig.cli.tables import Table, table_console
@@ -18,8 +17,9 @@ TERMINAL = 80
 
 def lines_of(table: Table, *, width: int | None = TERMINAL) -> list[str]:
     """What a terminal of this width shows of a table, or what comes out of a pipe."""
-    console = Console(file=io.StringIO(), width=width or table_console(wide=True).width)
-    console.print(table, crop=False)
+    console = table_console(wide=True)
+    console.file, console.width = io.StringIO(), width or console.width
+    console.print(table)
     return console.file.getvalue().splitlines()  # type: ignore[attr-defined]
 
 

@@ -59,18 +59,17 @@ class Described:
         return self.catalogue.table
 
 
-def ask(client: Client, *, wait_s: float = 2.0) -> Described:
+def ask(client: Client) -> Described:
     """Ask the rig that a client is connected to.
 
     Args:
         client: The rig.
-        wait_s: How long it may take to answer [s]: a rig that is being prepared listens already.
 
     Raises:
         NoReplyError: No rig answers.
         InputError: What answers is no rig of this version.
     """
-    catalogue = Catalogue.read(wire.decode_document(client.request(wire.CATALOGUE, timeout_s=max(wait_s, 0.5))))
+    catalogue = Catalogue.read(wire.decode_document(client.request(wire.CATALOGUE)))
     parameters = wire.decode_document(client.request(wire.PARAMETERS))
     contact = catalogue.truth.get("contact")
     return Described(

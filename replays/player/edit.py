@@ -82,7 +82,7 @@ class Edit:
     ) -> dict[str, Any]:
         for name in [*(channels or ()), *names]:
             if name not in table.channels:
-                raise InputError("channel", f"one of {', '.join(table.channels)}", name)
+                raise InputError("channels", f"one of {', '.join(table.channels)}", name)
         if channels is not None and (not channels or len(set(channels)) != len(channels)):
             raise InputError("channels", "at least one, each once", ",".join(channels))
         chosen = list(table.channels if channels is None else channels)

@@ -51,11 +51,19 @@ class Experiment:
             raise InputError("file", "a recording of this rig, with the scene it ran and samples", str(recording.path))
         duration_s = max(_end_s(recording), 1.0 / TICK_RATE_HZ)
         scene = parse_scene(
-            {**document, **_parameters(recording, document), "duration_s": duration_s, "fidelity": "given"}
+            {
+                **document,
+                **recorded_parameters(recording.parameters, document),
+                "duration_s": duration_s,
+                "fidelity": "given",
+            }
         )
-        return cls(
-            scene=scene, commands=_sent(recording), first_s=min(float(stream.first_time_s) for stream in streams)
-        )
+        sent = [
+            SentCommand(one["tick"], one["command"], dict(one["request"]))
+            for one in recording.commands
+            if one["command"] in COMMANDS
+        ]
+        return cls(scene=scene, commands=tuple(sent), first_s=min(float(stream.first_time_s) for stream in streams))
 
     def changed(self, changes: dict[str, Any]) -> Experiment:
         """The same with other values of scene or parameters, by dotted key, each in its own unit.
@@ -104,9 +112,13 @@ def _end_s(recording: Recording) -> float:
     return math.floor(max(ends) * TICK_RATE_HZ + 0.5) / TICK_RATE_HZ
 
 
-def _parameters(recording: Recording, document: dict[str, Any]) -> dict[str, Any]:
-    """The scene's fields that give the recorded parameters, whatever has become of the files that they were from."""
-    recorded = {key: entry["value"] for key, entry in recording.parameters["values"].items()}
+def recorded_parameters(parameters: dict[str, Any], document: dict[str, Any]) -> dict[str, Any]:
+    """The scene's fields that give the recorded parameters, whatever has become of the files that they were from.
+
+    Raises:
+        InputError: This version does not know one of them.
+    """
+    recorded = {key: entry["value"] for key, entry in parameters["values"].items()}
     name, changes = document.get("parameters", DEFAULT_SET), document.get("set", {})
     if name in set_names():
         now = load_parameters(name).override(changes) if changes else load_parameters(name)
@@ -118,14 +130,3 @@ def _parameters(recording: Recording, document: dict[str, Any]) -> dict[str, Any
         raise InputError("file", "a recording whose parameters this version knows", ", ".join(unknown))
     different = {key: value for key, value in recorded.items() if base[key].value != value}
     return {"parameters": DEFAULT_SET, "set": different}
-
-
-def _sent(recording: Recording) -> tuple[SentCommand, ...]:
-    """The commands that came from outside: before the recording began, and in it."""
-    taken = recording.scene.get("taken", [])
-    told = [event for event in recording.events if event.get("event") == "command"]
-    found: dict[int, SentCommand] = {}
-    for entry in [*taken, *told]:
-        if entry.get("command") in COMMANDS:
-            found[int(entry["id"])] = SentCommand(int(entry["tick"]), str(entry["command"]), dict(entry["request"]))
-    return tuple(found[number] for number in sorted(found))

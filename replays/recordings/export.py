@@ -56,7 +56,9 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
     check_run_output(path, force=force)
     if path.suffix == ".mcap":
         return McapRun(path, simulation, force=force)
-    return _TableRun(path, simulation, columnar.ParquetRows if path.suffix == ".parquet" else delimited.CsvRows)
+    if path.suffix == ".parquet":
+        return _TableRun(path, simulation, columnar.ParquetRows)
+    return _TableRun(path, simulation, lambda draft, schema: delimited.CsvRows(draft, schema.names))
 
 
 def write_run(

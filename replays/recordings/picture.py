@@ -77,7 +77,7 @@ def draw(recording: Recording, path: Path) -> None:
     ax.legend(loc="upper right")
 
     ax = axes[2, 2]
-    times, frequency, amplitude = waterfall(probes.times_s, *disk, probes.rate_hz)
+    times, frequency, amplitude = waterfall(*disk, probes.rate_hz, probes.times_s)
     level = 20 * np.log10(np.maximum(amplitude * 1e3, 1e-2))
     mesh = ax.pcolormesh(frequency, times, level, shading="nearest", cmap="viridis", vmin=-20, vmax=65, rasterized=True)
     figure.colorbar(mesh, ax=ax, label="level [dB re 1 µm]", pad=0.02)

@@ -109,7 +109,7 @@ def measured(recording: Recording, sensors: SensorChoice, *, longest_s: float = 
         longest_s: How much of it, from the first sample on [s].
 
     Raises:
-        InputError: It holds no channel that the model knows.
+        InputError: It holds no two samples of a channel that the model knows.
     """
     found = {}
     ideal = sensors.chain == "ideal"
@@ -117,7 +117,7 @@ def measured(recording: Recording, sensors: SensorChoice, *, longest_s: float = 
     for name, group in recording.table.groups.items():
         columns = [c for c, channel in enumerate(group.channels) if channel.signal in COLUMN]
         samples = recording.samples(name)
-        if not columns or not len(samples.times_s):
+        if not columns or len(samples.times_s) < 2:
             continue
         order = np.argsort(samples.index, kind="stable")
         order = order[samples.times_s[order] < samples.times_s[order[0]] + longest_s]
@@ -137,7 +137,7 @@ def measured(recording: Recording, sensors: SensorChoice, *, longest_s: float = 
             ideal=ideal,
         )
     if not found:
-        raise InputError("file", "a recording with a channel that the model knows", str(recording.path))
+        raise InputError("file", "a recording with two samples of a channel that the model knows", str(recording.path))
     return found
 
 

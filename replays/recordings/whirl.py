@@ -59,7 +59,7 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
         )
     times = probes.times_s[kept]
     ring_x, ring_y = (probes[name][kept] * 1e-3 for name in ("ring_x", "ring_y"))
-    frequency = whirl_frequency(times, ring_x, ring_y)
+    frequency = whirl_frequency(ring_x, ring_y, times)
     spin = (len(edges) - 1) / (edges[-1] - edges[0])
     radius = float(np.hypot(ring_x, ring_y).mean())
     law = -spin * shaft_radius_m(recording) / radius
@@ -69,7 +69,7 @@ def whirl_figures(recording: Recording, from_s: float, to_s: float) -> WhirlFigu
         from_s=from_s,
         to_s=to_s,
         frequency_hz=frequency,
-        disk_frequency_hz=whirl_frequency(times, probes["disk_x"][kept], probes["disk_y"][kept]),
+        disk_frequency_hz=whirl_frequency(probes["disk_x"][kept], probes["disk_y"][kept], times),
         spin_hz=float(spin),
         radius_m=radius,
         law_hz=float(law),

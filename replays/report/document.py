@@ -165,10 +165,10 @@ def check_suffix(path: Path) -> None:
         raise InputError("report", f"a file name that ends in {' or '.join(SUFFIXES)}", str(path))
 
 
-def check_report(path: Path, *, force: bool) -> None:
+def check_report(path: Path, *, force: bool, field: str = "report") -> None:
     """Refuse a file that no report can be written to, before anything is computed.
 
     Raises:
         InputError: Another suffix, a folder that is missing or read-only, or an existing file.
     """
-    check_new_file(path, field="report", suffixes=SUFFIXES, force=force)
+    check_new_file(path, field=field, suffixes=SUFFIXES, force=force)

@@ -12,11 +12,13 @@ import typer
 from rig.cli import origin
 from rig.cli.command import Group, load_command, make_group, usage_error
 from rig.cli.tables import echo
-from rig.errors import DiskError, InputError, SimulationError, need_of_full
+from rig.errors import WHOLE_RIG, DiskError, InputError, SimulationError, lacks_full, need_of_full
 
 # Wrong options and arguments; typer names only these two of its own exceptions, which have moved between its versions.
 _UsageError: Any = typer.BadParameter.__base__
 
+_NO_READER = 141
+"""What a shell makes of a program that SIGPIPE has ended."""
 _INTERRUPTED = 130
 """What typer makes of Ctrl-C, and shells expect."""
 
@@ -86,10 +88,20 @@ GROUPS = {
 """The commands of those that are groups, whose own function is what they do without one."""
 
 
+NEED_FULL = (
+    "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
+    "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
+)  # fmt: skip
+"""The commands that a lean install does without; of `keys` it has `init`."""
+
+
 def rig() -> Group:
     """The command line."""
     about = "A virtual rotor-stator test rig: simulate, serve, hit, record, view and judge it."
-    return make_group("rig", COMMANDS, _load, _rig, about)
+    group = make_group("rig", COMMANDS, _load, _rig, about)
+    if lacks_full():
+        group.epilog = f"These need the whole rig, {WHOLE_RIG}: {', '.join(NEED_FULL)}."
+    return group
 
 
 def _load(name: str) -> Any:
@@ -136,10 +148,12 @@ def start(arguments: list[str] | None = None) -> None:
         if not (need := need_of_full(error)):
             raise
         _fail(f"this {need}")
-    except BrokenPipeError:
-        # The reader of our output has gone (`rig params | head`): nothing is wrong.
+    except (BrokenPipeError, SystemExit) as error:
+        # The reader of our output has gone (`rig params | head`), of which rich and typer make a status of their own.
+        if not isinstance(error, BrokenPipeError) and not isinstance(error.__context__, BrokenPipeError):
+            raise
         sys.stderr.close()
-        sys.exit(141)
+        sys.exit(_NO_READER)
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             _fail(str(InputError("file name", "one that the system accepts", error.filename)))

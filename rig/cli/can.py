@@ -54,9 +54,9 @@ def hub(
     """
     from drivers.can.bus.hub import Hub
     from drivers.can.bus.model import BusModel
-    from drivers.can.bus.timing import speed as parse_speed
     from drivers.can.interface import HubBus
     from rig.cli.can_outlets import CanOutlets
+    from rig.cli.can_output import bit_rates
     from rig.errors import InputError
     from rig.transport.endpoint import parse_loopback
     from rig.transport.zenoh import ZenohServer
@@ -64,7 +64,7 @@ def hub(
     parse_loopback(listen, field="--listen")
     if len(set(channels)) < len(channels):
         raise InputError("CHANNEL", "named once each", " ".join(channels))
-    rates = parse_speed(speed)
+    rates = bit_rates(speed, field="--speed")
     models = [BusModel(rates, error_rate=error_rate, seed=seed + number) for number in range(len(channels))]
     with ZenohServer(listen) as server, ExitStack() as stack:
         hubs = [Hub(model, name, server, acknowledge=acknowledge) for model, name in zip(models, channels, strict=True)]

@@ -44,11 +44,11 @@ class CanMessages:
         Raises:
             InputError: There is no such rate.
         """
-        from drivers.can.bus.timing import speed
         from drivers.can.schedule import schedule_from
 
         schedule = schedule_from(classic=self.can_classic, fd=self.can_fd, rate_hz=self.can_rate)
-        return schedule, speed(self.can_bitrate or ("1M" if schedule.fd_hz is None else "1M/8M"))
+        usual = "1M" if schedule.fd_hz is None else "1M/8M"
+        return schedule, bit_rates(self.can_bitrate or usual, field="--can-bitrate")
 
 
 @dataclass(frozen=True)
@@ -255,6 +255,20 @@ class CanOutput:
         ):
             self._hub, self._open_more = hub, partial(HubBus, hub)
             yield bus
+
+
+def bit_rates(text: str, *, field: str) -> Speed:
+    """Bit rates of a bus, such as 1M/8M, that an option gives.
+
+    Raises:
+        InputError: There are no such rates.
+    """
+    from drivers.can.bus.timing import speed
+
+    try:
+        return speed(text)
+    except InputError as error:
+        raise InputError(field, error.must, error.received) from None
 
 
 def parse_spec(spec: str) -> tuple[str, str, dict[str, Any]]:

@@ -41,7 +41,7 @@ def chart(
         return
     mode = "full" if full else "quick"
     with reporting(compiles=True) as reporter:
-        reporter.say("references")
+        reporter.show("references")
         outcome = make_chart(
             output,
             mode=mode,

@@ -8,21 +8,26 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from enum import Enum
 from importlib import import_module
 from keyword import iskeyword
-from typing import Any
+from pathlib import Path
+from typing import Any, get_args
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from rig.cli.groups import grouped
-from rig.errors import InputError, RefusedError, Words
-from rig.text import nearest
+from rig.errors import InputError, RefusedError, UnknownNameError, Words
 
 _PLAIN: dict[str, Any] = {"add_completion": False, "rich_markup_mode": None}
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 _NEGATIVE = re.compile(r"-\.?(\d|inf$|nan$)", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?[\d.]+|nan|inf")
+_PLAINER = ((r"([^\s;[]+)<=x<=", r"\1 to "), (r"x>=(?=\S+\])", "at least "), (r"(\[default: )\((.+)\)", r"\1\2"))
+"""What typer says of a value, and what a person would."""
+_UNITS = {"s", "ms", "hz", "n", "mb"}
+"""What the name of an option may end in, if its value has a unit."""
 
 
 class _Page:
@@ -50,7 +55,10 @@ class _Page:
             if (record := param.get_help_record(ctx)) is not None:
                 title = getattr(param, "rich_help_panel", None) or f"{param.param_type_name.capitalize()}s"
                 name = shown_name(param) if param.param_type_name == "argument" else record[0]
-                sections.setdefault(title, []).append((name, record[1]))
+                says = record[1]
+                for typed, plain in _PLAINER:
+                    says = re.sub(typed, plain, says)
+                sections.setdefault(title, []).append((name, says))
         _write(sections, formatter)
 
 
@@ -70,28 +78,56 @@ class _Command(_Page, TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         # A negative number is a value, not an option: whoever gets it explains what is wrong with it.
         ctx.ignore_unknown_options = any(map(_NEGATIVE.match, args))
-        ctx.allow_extra_args = True
-        if rest := super().parse_args(ctx, args):
-            raise InputError("argument", f"one that `{ctx.command_path}` takes (see -h)", rest[0])
+        ctx.allow_extra_args, escaped = True, "--" in args
+        rest = super().parse_args(ctx, args)
+        options = [name for param in self.params for name in param.opts if name.startswith("-")]
+        values = {param.name: ctx.params[param.name] for param in self.params}
+        given = {name: value if isinstance(value, list | tuple) else [value] for name, value in values.items()}
+        # Which is what an option that there is none has been taken for, then.
+        arguments = [each for param in self.params if param.param_type_name == "argument" for each in given[param.name]]
+        for each in map(str, [*arguments, *rest]):
+            if each.startswith("--") and not escaped:
+                raise UnknownNameError("option", f"one of `{ctx.command_path} -h`", each, options)
         for param in self.params:
-            value = ctx.params[param.name]
-            # No comparison refuses it: it would be waited for, or counted to, without end.
-            if any(isinstance(each, float) and each != each for each in (value if param.multiple else [value])):
-                raise InputError(shown_name(param), "a number", Words("nan"))
+            for each in given[param.name]:
+                # No comparison refuses it: it would be waited for, or counted to, without end.
+                if isinstance(each, float) and each != each:
+                    raise InputError(shown_name(param), "a number", Words("nan"))
+                if str(each) in options:
+                    raise InputError(shown_name(param), "followed by a value", str(each))
+        if rest:
+            raise InputError("argument", f"one that `{ctx.command_path}` takes (see -h)", rest[0])
         return rest
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
-        except RefusedError:
-            raise
-        except InputError as error:
-            # What is a field to whoever refused it is an option to whoever gave it.
-            option = f"--{error.field.replace('_', '-')}"
-            given = (param for param in self.params if option in param.opts and ctx.params[param.name] != param.default)
-            if next(given, None) is None:
+        except RefusedError as error:
+            field, _, must = str(error).partition(" must be ")
+            named = self._by_field("argument", "option").get(field.removeprefix(f"{ctx.info_name}."))
+            if named is None or "." not in field:
                 raise
-            raise InputError(option, error.must, error.received) from None
+            raise RefusedError(f"{shown_name(named)} must be {must}") from None
+        except InputError as error:
+            named = self._by_field("option")
+            fields = [field.replace("-", "_").removesuffix(".name") for field in error.field.split(" and ")]
+            found = [named[field] for field in fields if field in named]
+            if len(found) < len(fields) or all(ctx.params[param.name] in (None, []) for param in found):
+                raise
+            options = " and ".join(map(shown_name, found))
+            must = re.sub(
+                r"\b[a-z]+_\w+", lambda name: shown_name(named[name[0]]) if name[0] in named else name[0], error.must
+            )
+            raise InputError(options, must, error.received) from None
+
+    def _by_field(self, *kinds: str) -> dict[str, Any]:
+        """Arguments and options by what they are to whoever refuses their values: its fields."""
+        return {
+            name.lstrip("-").replace("-", "_"): param
+            for param in self.params
+            if param.param_type_name in kinds
+            for name in (param.name, *param.opts)
+        }
 
 
 class Group(_Page, TyperGroup):
@@ -113,13 +149,12 @@ class Group(_Page, TyperGroup):
         """The command of a name.
 
         Raises:
-            InputError: There is none.
+            UnknownNameError: There is none.
         """
         names = self.list_commands(ctx)
         if cmd_name in names:
             return self.load(cmd_name)
-        near = nearest(cmd_name, names) or names
-        raise InputError("command", f"one of `{ctx.command_path} -h`, such as {' or '.join(near[:2])}", cmd_name)
+        raise UnknownNameError("command", f"one of `{ctx.command_path} -h`", cmd_name, names)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """The options, then the commands."""
@@ -135,7 +170,23 @@ def load_command(module: str, name: str) -> Any:
     function = grouped(getattr(import_module(f"rig.cli.{module}{'_' * iskeyword(module)}"), name))
     app = typer.Typer(**_PLAIN)
     app.command(shown, cls=_Command, context_settings=_SETTINGS)(function)
-    return typer.main.get_command(app)
+    command = typer.main.get_command(app)
+    for param in command.params:
+        if param.metavar is None and param.param_type_name == "option" and not getattr(param, "is_flag", False):
+            param.metavar = _metavar(str(param.name), get_args(function.__annotations__[param.name])[0])
+    return command
+
+
+def _metavar(name: str, hint: Any) -> str:
+    """What the help calls the value of an option."""
+    kinds = get_args(hint) or (hint,)
+    if isinstance(kinds[0], type) and issubclass(kinds[0], Enum):
+        return "|".join(each.value for each in kinds[0])
+    if Path in kinds:
+        return "FILE"
+    if (unit := name.rpartition("_")[2]) in _UNITS:
+        return unit.upper()
+    return "NUMBER" if {int, float} & {*kinds} else "TEXT"
 
 
 def make_group(
@@ -156,7 +207,7 @@ def make_group(
     """
     app = typer.Typer(name=name, **_PLAIN)
     app.callback(cls=Group, help=help or callback.__doc__, invoke_without_command=True, context_settings=_SETTINGS)(
-        callback
+        grouped(callback)
     )
     group = typer.main.get_command(app)
     assert isinstance(group, Group)
@@ -169,8 +220,9 @@ def usage_error(error: Any) -> str:
     page, kind = f"`{error.ctx.command_path if error.ctx is not None else 'rig'} -h`", type(error).__name__
     wrong = error.__cause__.errors()[0] if hasattr(error.__cause__, "errors") else None
     if kind == "NoSuchOption":
-        near = " or ".join([name for name in error.possibilities or () if name.startswith("--")][:2])
-        found = InputError("option", f"one of {page}" + f", such as {near}" * bool(near), error.option_name)
+        known = [] if error.ctx is None else [name for param in error.ctx.command.params for name in param.opts]
+        options = (name for name in known if name.startswith("-"))
+        found: InputError = UnknownNameError("option", f"one of {page}", error.option_name, options)
     elif kind == "MissingParameter":
         says = (error.param.help or page).rstrip(".")
         found = InputError(shown_name(error.param), f"given: {says[0].lower()}{says[1:]}", None)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +15,7 @@ import typer
 from rig.cli.display import end_with, showing
 from rig.cli.groups import panel
 from rig.cli.signals import stopping_on_signals
-from rig.cli.tables import echo
+from rig.cli.tables import echo, plain, table_console
 from rig.errors import InputError, RefusedError, Words
 from rig.transport import DEFAULT_ENDPOINT, EXPOSED_PORT, NoReplyError
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from rig.transport.zenoh import Exposure, ZenohClient, ZenohServer
 
 _exposure = panel("For other computers")
+_TLS = "RIG_TLS"
+_LINK_S = 1.0
+"""Time that the connection to a rig that is there may take [s]."""
 
 
 @dataclass(frozen=True)
@@ -35,28 +39,44 @@ class Connection:
     connect: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where the rig listens.")] = DEFAULT_ENDPOINT
     tls: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR", envvar="RIG_TLS", help="Folder with the keys of a role, for a rig that is exposed."
-        ),
+        typer.Option(metavar="DIR", envvar=_TLS, help="Folder with the keys of a role, for a rig that is exposed."),
     ] = None
+    wait_s: Annotated[
+        float, typer.Option(metavar="S", min=0.0, help="Wait that long for the rig to be there, in s.")
+    ] = 0.0
 
     @contextmanager
-    def client(self, *, wait_s: float = 1.0) -> Iterator[ZenohClient]:
+    def client(self) -> Iterator[ZenohClient]:
         """A client of the rig, closed afterwards.
 
-        Args:
-            wait_s: How long to wait for the rig to be there [s].
-
         Raises:
+            InputError: There are no such keys.
             RefusedError: No rig answers there, or it denies this.
         """
         from rig.transport.zenoh import ZenohClient
+        from rig.wire import ALIVE
 
+        by_environment = self.tls is not None and os.environ.get(_TLS) == str(self.tls)
+        deadline_s = time.monotonic() + self.wait_s
         try:
-            with ZenohClient(self.connect, wait_s=wait_s, tls=self.tls) as client:
+            with ExitStack() as stack:
+                with self._waiting() if self.wait_s else nullcontext():
+                    wait_s = max(_LINK_S, self.wait_s)
+                    client = stack.enter_context(ZenohClient(self.connect, wait_s=wait_s, tls=self.tls))
+                    # One that is being prepared listens already.
+                    while time.monotonic() < deadline_s and not client.tokens(ALIVE):
+                        time.sleep(0.1)
                 yield client
         except NoReplyError as error:
-            raise RefusedError(str(error)) from None
+            source = f" (the keys are those of {_TLS})" if by_environment and str(self.tls) in str(error) else ""
+            raise RefusedError(f"{error}{source}") from None
+        except InputError as error:
+            if not by_environment or error.field != "--tls":
+                raise
+            raise InputError(_TLS, error.must, error.received) from None
+
+    def _waiting(self) -> Any:
+        return table_console(stderr=True).status(plain(f"waiting for a rig at {self.connect}"))
 
     @contextmanager
     def console(self, command: str) -> Iterator[Console]:
@@ -103,7 +123,8 @@ class Serving:
         """
         if self.expose is None:
             if self.tls is not None or self.plaintext:
-                raise InputError("--tls" if self.tls is not None else "--plaintext", "given with --expose HOST", None)
+                option = "--tls" if self.tls is not None else "--plaintext"
+                raise InputError(option, "given with --expose HOST", Words("it alone"))
             return None
         if (self.tls is not None) == self.plaintext:
             made = f"rig keys init DIR --host {self.expose.partition(':')[0]}"

@@ -23,11 +23,15 @@ def export(
         typer.Option("--channels", metavar="NAME,...", help="Only these channels, groups, or truth.TABLE[.COLUMN]."),
     ] = None,
     truth: Annotated[bool, typer.Option("--truth", help="The model's true state as well.")] = False,
-    unit: Annotated[str, typer.Option(help="engineering, volts or counts.")] = "engineering",
+    unit: Annotated[
+        str, typer.Option(metavar="engineering|volts|counts", help="What the numbers are.")
+    ] = "engineering",
     from_s: FromS = None,
     to_s: ToS = None,
     rate_hz: Annotated[float | None, typer.Option(help="Bring all channels to this rate, in Hz.")] = None,
-    method: Annotated[str, typer.Option(help="How: polyphase (band-limited) or linear.")] = "polyphase",
+    method: Annotated[
+        str, typer.Option(metavar="polyphase|linear", help="How that is done: polyphase is band-limited.")
+    ] = "polyphase",
     force: Force = False,
 ) -> None:
     """Write a recording as MDF4, TDMS, UFF58b, CSV, Parquet or WAV, or its parts as one, with units and calibration.

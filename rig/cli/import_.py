@@ -9,7 +9,7 @@ import typer
 
 from rig.cli.options import Force
 from rig.cli.tables import Form, echo, echo_json, new_table
-from rig.errors import InputError, Words, check_not_among, whole_file
+from rig.errors import InputError, Words, check_new_file, check_not_among, whole_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -85,11 +85,10 @@ def import_(
 
 
 def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
-    from replays.recordings.formats.export import check_output
     from replays.recordings.formats.template import CHECK, example, template
 
-    check_output(path, force=force, suffixes=(".toml",))
-    check_not_among(files, path)
+    check_new_file(path, field="--template", suffixes=(".toml",), force=force)
+    check_not_among(files, path, field="--template")
     text = template(files) if files else example()
     with whole_file(path) as draft:
         draft.write_text(text, encoding="utf-8")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rig.cli.options import Force, Wide
-from rig.cli.tables import Table, echo, echo_document, new_table, table_console
+from rig.cli.options import Force
+from rig.cli.tables import Form, Table, echo, echo_document, echo_json, new_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,7 +23,7 @@ def keys(
     context: typer.Context,
     *,
     markdown: Annotated[bool, typer.Option("--markdown", help="As the Markdown source of rig/KEYS.md.")] = False,
-    wide: Wide = False,
+    form: Form,
 ) -> None:
     """Show every key, message and unit of the rig's streams, and who may use them; or make certificates (`init`)."""
     if context.invoked_subcommand is not None:
@@ -32,7 +33,10 @@ def keys(
     if markdown:
         echo_document(page())
         return
-    console = table_console(wide=wide)
+    if form.as_json:
+        echo_json(_document(page()))
+        return
+    console = form.console()
     for part in _parts(page()):
         console.print(part)
 
@@ -58,12 +62,32 @@ def _parts(page: str) -> Iterator[Table | Text | str]:
             yield from lines
 
 
+def _document(page: str) -> dict[str, list[dict[str, Any]]]:
+    """The rows of a page's tables, each by its headings, under what they are of."""
+    found, title = {}, ""
+    for part in _parts(page):
+        if isinstance(part, Table):
+            columns = [_values([cells[at].plain for cells, _ in part.rows]) for at in range(len(part.headings))]
+            found[title] = [dict(zip(part.headings, row, strict=True)) for row in zip(*columns, strict=True)]
+        elif not isinstance(part, str):
+            title = part.plain.replace("`", "").partition(":")[0]
+    return found
+
+
+def _values(texts: list[str]) -> list[Any]:
+    """A column, as numbers where all of it is."""
+    try:
+        return [json.loads(text) for text in texts]
+    except ValueError:
+        return list(texts)
+
+
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder.")],
     *,
     host: Annotated[
         list[str] | None,
-        typer.Option(help="Name or address by which others reach the rig's computer; may be repeated."),
+        typer.Option(metavar="HOST", help="Name or address by which others reach the rig's computer; may be repeated."),
     ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="How long the certificates are valid.")] = 365,
     truth: Annotated[

@@ -40,7 +40,7 @@ def paper(
     from replays.studies.paper.findings import find, steps
 
     if output is not None:
-        check_report(output, force=force)
+        check_report(output, force=force, field="--output")
     if pictures is not None:
         check_folder(pictures, field="--pictures")
     with reporting(compiles=True) as reporter:

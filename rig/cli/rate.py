@@ -10,10 +10,10 @@ from rig.cli.connection import Connection, show
 
 
 def rate(
-    x: Annotated[float, typer.Argument(metavar="X", help="Recorded seconds a second, 0.01 to 1000.")],
+    rate: Annotated[float, typer.Argument(metavar="X", help="Recorded seconds a second, 0.01 to 1000.")],
     *,
     connection: Connection,
 ) -> None:
     """Set how fast the replay of a recording goes."""
     with connection.console("rate") as rig:
-        show(rig.rate(x), "rate")
+        show(rig.rate(rate), "rate")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -43,8 +42,6 @@ class Again(StrEnum):
 
 
 _PRE_S, _POST_S = 0.5, 2.0
-_LINK_S = 1.0
-"""Time that the connection to a rig that is there may take [s]."""
 _SPINNER = 2
 """Columns of the sign that something goes on, with the blank behind it."""
 
@@ -66,7 +63,8 @@ class Triggers:
         _triggers(
             "Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
             "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
-            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ..."
+            "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
+            metavar="EVENT|LEVEL",
         ),
     ] = None
     pre_s: Annotated[
@@ -153,9 +151,6 @@ def record(
     history: Annotated[
         bool, typer.Option(help="From the start of the run on, as far as the rig's cache reaches.")
     ] = False,
-    wait_s: Annotated[
-        float, typer.Option(metavar="S", help="Wait that long for the rig to be there, in s.", min=0.0)
-    ] = 0.0,
     patience_s: Annotated[
         float,
         typer.Option(
@@ -189,7 +184,6 @@ def record(
             duration_s=duration_s,
             view_rate_hz=view_rate_hz,
             history=history,
-            wait_s=wait_s,
             patience_s=patience_s,
             force=force,
             limits=limits,
@@ -198,9 +192,7 @@ def record(
         )
 
     session_of(None)  # whatever is wrong with the options is said before a rig is looked for
-    with ExitStack() as stack:
-        with table_console(stderr=True).status(plain(f"waiting for a rig at {connection.connect}")):
-            client = stack.enter_context(connection.client(wait_s=max(_LINK_S, wait_s)))
+    with connection.client() as client:
         summary = run_session(session_of(client))
     tell(summary)
     if not summary.good:
@@ -226,15 +218,17 @@ def run_session(session: RecordingSession) -> Summary:
 
     before = {number: signal.signal(number, stop) for number in ends}
     console = table_console(stderr=True)
-    told, begun, name = 0, False, f"recording {printable(session.path.name, 30)}"
+    told, begun, files = 0, False, session.first_files
+    more = "" if files == [session.path] else ", ..."
+    name = f"recording {printable(' or '.join(file.name for file in files), 30)}{more}"
     try:
         with console.status(plain(f"{name}: waiting for the rig")) as status:
 
             def show(progress: Progress) -> None:
                 nonlocal begun
                 if progress.rows and not begun and not console.is_terminal:
-                    begin = f"rig: recording {printable(str(session.path))}; Ctrl-C ends it well"
-                    echo(begin, err=True)  # scripts wait for this line
+                    into = " or ".join(map(str, files)) + more
+                    echo(f"rig: recording {into}; Ctrl-C ends it well", err=True)  # scripts wait for this line
                 begun = begun or progress.rows > 0
                 remark(progress.remarks)
                 lost = f"{progress.lost} lost"
@@ -269,17 +263,17 @@ def tell(summary: Summary) -> None:
         files = f"{summary.files[0]} to {summary.path.name} ({len(summary.files)} files)"
     elif not summary.files:
         files = f"{summary.path}: no file"
+    triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
     if summary.fired is not None and not summary.files:
-        came = "no trigger came" if not summary.fired else f"{summary.fired} triggers came"
-        echo(f"{came} in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
+        came = triggers if summary.fired else "no trigger"
+        echo(f"{came} came in {summary.received_s:.3f} s; nothing was written; ended: {summary.reason}")
     else:
         around = ""
         if summary.fired is not None:
-            triggers = "1 trigger" if summary.fired == 1 else f"{summary.fired} triggers"
             around = f" (around {triggers}, of {summary.received_s:.3f} s received)"
         echo(
             f"{files}: {summary.duration_s:.3f} s from {summary.first_time_s:.3f} s on{around}, "
-            f"{sum(sensors)} samples in {len(sensors)} streams, {truth} rows of truth, "
+            f"{sum(sensors)} samples in {len(sensors)} streams, {f'{truth} rows of' if truth else 'no'} truth, "
             f"{summary.size_bytes / 1e6:.1f} MB; ended: {summary.reason}"
         )
     if summary.removed:

@@ -28,12 +28,15 @@ def recover(
     """
     from recorder.draft import check_destination
     from recorder.rewrite import recovered_path
+    from rig.outside import open_file, unreadable
 
     if output is not None and len(files) > 1:
         raise InputError("--output", "used with one FILE", Words(f"{len(files)} files"))
     for file in files:
-        if not file.is_file():
-            raise InputError("file", "a file that can be read", str(file))
+        try:
+            open_file(file).close()
+        except OSError as error:
+            raise unreadable(file, error) from None
     broken = [file for file in files if force or not _is_whole(file)]
     outputs = [output or recovered_path(file) for file in broken]
     for new in outputs:

@@ -10,10 +10,10 @@ from rig.cli.connection import Connection, show
 
 
 def seek(
-    seconds: Annotated[float, typer.Argument(help="Simulated time in the recording, in s.")],
+    time_s: Annotated[float, typer.Argument(metavar="SECONDS", help="Simulated time in the recording, in s.")],
     *,
     connection: Connection,
 ) -> None:
     """Let the replay of a recording go on from another position; one that is paused stays so."""
     with connection.console("seek") as rig:
-        show(rig.seek(seconds), "seek")
+        show(rig.seek(time_s), "seek")

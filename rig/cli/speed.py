@@ -10,10 +10,12 @@ from rig.cli.connection import Connection, show
 
 
 def speed(
-    hz: Annotated[float, typer.Argument(metavar="HZ", help="Spin speed [Hz], approached at the drive's ramp rate.")],
+    speed_hz: Annotated[
+        float, typer.Argument(metavar="HZ", help="Spin speed [Hz], approached at the drive's ramp rate.")
+    ],
     *,
     connection: Connection,
 ) -> None:
     """Set the spin speed of a running rig."""
     with connection.console("speed") as rig:
-        show(rig.speed(hz), f"speed {hz:g} Hz")
+        show(rig.speed(speed_hz), f"speed {speed_hz:g} Hz")

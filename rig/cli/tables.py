@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from rich.segment import Segment
     from rich.text import Text
 
+    _Rows = list[tuple[list[Text], str]]
+
 _ENDLESS = 1_000_000
 """Width of a pipe [characters]."""
 _GAP = 2
@@ -35,6 +37,9 @@ _LEAST = 20
 """What a text is wrapped to, at the least [characters]."""
 _WORTH = 48
 """The same of one that can be left out: in fewer it is not worth its lines."""
+_UNIT = re.compile(r"(?<=\d)(?: (?:%|°|ppm\b|[kMGmuµn]?(?:s|m|g|N|B|V|W|J|A|Pa|Hz|rad|bit)\b))+")
+_KEPT = "\ue000"
+"""A blank at which no line is broken; unlike one of Unicode's it is none to rich."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,8 @@ def echo(text: object = "", *, err: bool = False) -> None:
 
 def _broken(line: str, width: int) -> list[str]:
     indent = line[: len(line) - len(line.lstrip())]
-    return textwrap.wrap(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    parts = textwrap.wrap(_kept(line), width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return [part.replace(_KEPT, " ") for part in parts]
 
 
 def echo_document(text: str) -> None:
@@ -113,7 +119,7 @@ class Table:
         self.headings = [printable(heading.removeprefix(">")) for heading in headings]
         self._right = [heading.startswith(">") for heading in headings]
         self.wrapped, self.spare, self.keys = wrapped, spare, keys
-        self.rows: list[tuple[list[Text], str]] = []
+        self.rows: _Rows = []
 
     def add_row(self, *cells: str | Text, style: str = "") -> None:
         """Add a row: a cell for each column, or one across all of them."""
@@ -129,12 +135,15 @@ class Table:
         from rich.text import Text
 
         room = options.max_width
-        blocks = self._blocks(room)
+        rows = [([cell.copy() for cell in cells], style) for cells, style in self.rows]
+        for cell in (cell for cells, _ in rows for cell in cells):
+            cell.plain = _kept(cell.plain)
+        blocks = self._blocks(room, rows)
         lines = list(Text(self.title, "italic").wrap(console, room)) if self.title else []
         for number, widths in enumerate(blocks):
             lines += [Text()] if number else []
             lines += self._head(widths)
-            for cells, style in self.rows:
+            for cells, style in rows:
                 if len(cells) < len(self.headings):
                     lines += cells[0].wrap(console, room)
                     continue
@@ -170,27 +179,27 @@ class Table:
             part.align("right" if self._right[at] else "left", widths[at])
         return Text(" " * _GAP, style).join(parts.values())
 
-    def _blocks(self, room: int) -> list[dict[int, int]]:
+    def _blocks(self, room: int, rows: _Rows) -> list[dict[int, int]]:
         """Widths by the number of their columns: of all, or without spare ones, or in blocks below each other."""
         columns = list(range(len(self.headings)))
         for spare in (None, *self.spare):
             columns = [at for at in columns if at != spare]
-            widths = self._widths(columns, room)
+            widths = self._widths(columns, room, rows)
             if _total(widths) <= room:
                 return [widths]
         keys, blocks = columns[: self.keys], [columns[: self.keys + 1]]
         for at in columns[self.keys + 1 :]:
-            if _total(self._widths([*blocks[-1], at], room)) <= room:
+            if _total(self._widths([*blocks[-1], at], room, rows)) <= room:
                 blocks[-1].append(at)
             else:
                 blocks.append([*keys, at])
-        return [self._widths(block, room) for block in blocks]
+        return [self._widths(block, room, rows) for block in blocks]
 
-    def _widths(self, columns: Iterable[int], room: int) -> dict[int, int]:
+    def _widths(self, columns: Iterable[int], room: int, rows: _Rows) -> dict[int, int]:
         """Widths of columns beside each other: as they would like to be, or as narrow as they can be."""
         wanted, widths = {}, {}
         for at in columns:
-            cells = [cells[at] for cells, _ in self.rows if len(cells) == len(self.headings)]
+            cells = [cells[at] for cells, _ in rows if len(cells) == len(self.headings)]
             words = _stacked(self.headings[at], 1)
             whole = max((cell.cell_len for cell in cells), default=1)
             wanted[at] = max(whole, len(self.headings[at]))
@@ -209,6 +218,11 @@ class Table:
         while _total(widths) < room and (narrow := [at for at in widths if widths[at] < wanted[at]]):
             widths[max(narrow, key=lambda at: wanted[at] / widths[at])] += 1
         return widths
+
+
+def _kept(text: str) -> str:
+    """The same text, in which a number keeps its unit beside it."""
+    return _UNIT.sub(lambda unit: unit[0].replace(" ", _KEPT), text)
 
 
 def _stacked(heading: str, width: int) -> list[str]:
@@ -272,15 +286,15 @@ def table_console(*, wide: bool = False, stderr: bool = False) -> Console:
             super().print(*objects, **{"crop": False, **options})
 
         def render_str(self, text: str, **options: Any) -> Any:
-            return super().render_str(_lines(text), **{**options, "markup": False, "emoji": False})
+            kept = _kept(_lines(text))
+            return super().render_str(kept, **{**options, "markup": False, "emoji": False})
 
         def render(self, renderable: Any, options: Any = None) -> Any:
             for segment in super().render(renderable, options):
-                text = segment.text
-                if segment.control or text == "\n" or text.isprintable():
+                if segment.control or segment.text == "\n":
                     yield segment
                 else:
-                    yield Segment(_lines(text), segment.style)
+                    yield Segment(_lines(segment.text.replace(_KEPT, " ")), segment.style)
 
     terminal = (sys.stderr if stderr else sys.stdout).isatty()
     width = None if terminal and not wide else _ENDLESS

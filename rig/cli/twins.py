@@ -26,7 +26,13 @@ def twins(
     import threading
 
     from drivers.twins import Twins
+    from rig.cli.can_output import parse_spec
+    from rig.transport.endpoint import parse_loopback
 
+    # Whatever is wrong with the options is said before a rig is looked for.
+    parse_loopback(listen, field="--listen")
+    if can is not None:
+        parse_spec(can)
     done = threading.Event()
     with connection.client() as client, Twins(client) as serving:
         if zenoh or not (pty or can):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +12,8 @@ import typer
 
 from rig.cli.connection import Connection
 from rig.cli.options import Force, OptionalRecordingFiles
-from rig.cli.tables import echo, progress_bar
+from rig.cli.progress import reporting
+from rig.cli.tables import echo
 from rig.errors import DiskError, InputError, RefusedError, Words, check_new_file, whole_file
 
 if TYPE_CHECKING:
@@ -23,13 +22,15 @@ if TYPE_CHECKING:
 
     from recorder.viewer.window import Kind, Window
 
+_EVERY_S = 5.0
+"""How often it is told how it goes, where that is no live line [s]."""
+
 
 def view(
     files: OptionalRecordingFiles = None,
     *,
     live: Annotated[bool, typer.Option("--live", help="View the running rig.")] = False,
     connection: Connection,
-    wait_s: Annotated[float, typer.Option(help="Wait that long for the rig to be there, in s (with --live).")] = 5.0,
     web: Annotated[bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")] = False,
     save: Annotated[Path | None, typer.Option(help="Write an .rrd file instead of opening a viewer.")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a .png picture instead of opening a viewer.")] = None,
@@ -49,7 +50,7 @@ def view(
     try:
         with _interruptible():
             if live:
-                _view_live(connection, wait_s=wait_s, web=web, save=save)
+                _view_live(connection, web=web, save=save)
             elif files:
                 _view_file(files, web=web, save=save, screenshot=screenshot, at_s=at_s)
     except WindowError as error:
@@ -118,12 +119,12 @@ def _view_file(files: list[Path], *, web: bool, save: Path | None, screenshot: P
             _wait_for_the_end(shown)
 
 
-def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path | None) -> None:
+def _view_live(connection: Connection, *, web: bool, save: Path | None) -> None:
     from recorder.viewer import blueprint, live, window
     from recorder.viewer.canvas import Canvas, new_stream
 
-    with connection.client(wait_s=wait_s) as client:
-        described = live.ask(client, wait_s=wait_s)
+    with connection.client() as client:
+        described = live.ask(client)
         stream = new_stream(f"rig at {connection.connect}")
         plan = blueprint.layout(described.table, described.geometry, live=True)
         if save is not None:
@@ -138,7 +139,13 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
             _tell(shown, f"the rig at {connection.connect}")
             try:
                 view = live.LiveView(client, Canvas(stream), described, taken=shown.taken)
-                with _telling(shown) as tell:
+                with reporting() as reporter:
+
+                    def tell(text: str) -> None:
+                        if shown.page is not None:
+                            shown.page.title = f"rig: {text}"
+                        reporter.show(text, every_s=_EVERY_S)
+
                     reason = view.run(stop=lambda: not shown.open, tell=tell)
                 echo(reason)
             finally:
@@ -150,26 +157,6 @@ def _view_live(connection: Connection, *, wait_s: float, web: bool, save: Path |
             finally:
                 if view.failed:
                     raise typer.Exit(1)
-
-
-@contextmanager
-def _telling(shown: Window) -> Iterator[Callable[[str], None]]:
-    """Say how it goes: as the title of a browser's page, and on stderr in a live line, or a line every 5 s."""
-    printed_s = -math.inf
-    live = sys.stderr.isatty()
-    with progress_bar(auto_refresh=False, transient=True, disable=not live) as bar:
-        task = bar.add_task("", total=None)
-
-        def tell(text: str) -> None:
-            nonlocal printed_s
-            if shown.page is not None:
-                shown.page.title = f"rig: {text}"
-            bar.update(task, description=text, refresh=live)
-            if not live and time.monotonic() - printed_s >= 5.0:
-                printed_s = time.monotonic()
-                echo(text, err=True)
-
-        yield tell
 
 
 def _window_of_file(screenshot: Path | None, *, web: bool) -> Window:

@@ -331,7 +331,8 @@ class ZenohClient:
         return NoReplyError(f"{self.endpoint} listens, but does not let us in {why}")
 
     def _no_reply(self) -> NoReplyError:
-        return NoReplyError(f"no rig answers at {self.endpoint}; start one with: rig run stable-run")
+        start = "start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
+        return NoReplyError(f"no rig answers at {self.endpoint}; {start}")
 
     @property
     def connection(self) -> str | None:

@@ -283,7 +283,7 @@ with can.Bus("can0", interface="zenoh", endpoint=sys.argv[1]) as bus:
     [
         (("can 0",), "channel must be letters"),
         (("can0", "can0"), "CHANNEL must be named once each"),
-        (("can0", "--speed", "fast"), "bit rate must be"),
+        (("can0", "--speed", "fast"), "--speed must be as"),
         (("can0", "--listen", "0.0.0.0:7999"), "ssh -L 7999:127.0.0.1:7999"),
     ],
 )

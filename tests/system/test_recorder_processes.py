@@ -280,7 +280,7 @@ def test_a_trigger_makes_a_file_of_its_own(tmp_path):
         rig.server.publish(EVENTS, encode_document({"event": "hammer", "tick": tick, "time_s": tick / 1e6}))
         output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
-    assert "ended: 1 captures made" in output
+    assert "ended: 1 capture made" in output
     (path,) = tmp_path.iterdir()
     stream_ = Recording.open(path).streams[PROBES]
     assert stream_.first_time_s == pytest.approx(tick / 1e6 - 0.2, abs=0.011)

@@ -236,7 +236,8 @@ def test_without_a_rig_every_command_says_so_in_one_line(arguments: tuple[str, .
     endpoint = free_endpoint()
     with pytest.raises(RefusedError) as caught:
         invoke(endpoint, *arguments)
-    assert str(caught.value) == f"no rig answers at {endpoint}; start one with: rig run stable-run"
+    start = "start one with: rig run stable-run (--wait-s 60 waits for one that still compiles)"
+    assert str(caught.value) == f"no rig answers at {endpoint}; {start}"
 
 
 def test_a_malformed_endpoint_is_refused() -> None:

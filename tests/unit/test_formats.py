@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import wave
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,14 @@ import pytest
 from recorder.head import Beginning
 from recorder.reader import Recording
 from recorder.writer import RecordingWriter
+from replays.recordings.experiment import Experiment
 from replays.recordings.export import write_run
 from replays.recordings.formats import clock
 from replays.recordings.formats.export import SUFFIXES, Written, export
+from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.selection import Selection, Unit, select
+from replays.recordings.formats.source import open_source
+from replays.recordings.validation.comparison import validate
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.scenes import load_scene
@@ -110,7 +115,7 @@ def test_mdf_has_events_attachments_and_comments_that_a_person_reads(noted: Reco
         attached = {str(block.file_name): mdf.extract_attachment(n)[0] for n, block in enumerate(mdf.attachments)}
         assert json.loads(attached.pop("catalogue.json")) == noted.catalogue
         assert json.loads(attached.pop("parameters.json")) == noted.parameters
-        assert json.loads(attached.pop("scene.json")) == noted.scene
+        assert json.loads(attached.pop("scene.json")) == {**noted.scene, "taken": noted.commands}
         assert not attached
         about = str(mdf.header.description)
         assert about.startswith("Virtual rotor-stator rig, scene hammer (Hammer during a stable run")
@@ -130,14 +135,16 @@ def test_events_and_documents_go_where_a_format_has_a_place(noted: Recording, tm
         _, (made[suffix],) = written(noted, tmp_path / f"x{suffix}", "probes")
     told = TdmsFile.read_metadata(tmp_path / "x.tdms").properties
     assert told["events"].splitlines() == [f"{time_s:.6f} s  {text}" for time_s, _, text in HAPPENED]
-    assert json.loads(told["scene.json"]) == noted.scene
+    assert json.loads(told["scene.json"]) == {**noted.scene, "taken": noted.commands}
     metadata = parquet.read_schema(tmp_path / "x.parquet").metadata
     assert json.loads(metadata[b"parameters.json"]) == noted.parameters
     beside = json.loads((tmp_path / "x.csv.json").read_text())
     for events in (json.loads(metadata[b"events"]), beside["events"]):
         assert [(each["time_s"], each["event"]) for each in events] == [(time_s, name) for time_s, name, _ in HAPPENED]
         assert (events[2]["from"], events[3]["text"]) == ("a console", "bearing is wärm")
-    assert (beside["documents"]["scene"], beside["documents"]["catalogue"]) == (noted.scene, noted.catalogue)
+    assert beside["documents"]["scene"] == {**noted.scene, "taken": noted.commands}
+    assert beside["documents"]["catalogue"] == noted.catalogue
+    assert [(one["tick"], one["request"]) for one in noted.commands] == [(50_000, {"speed_hz": 5.2})]
     left_out = "5 events, catalogue, parameters and scene: left out, as UFF58 has no place for them"
     assert made[".uff"].documents == left_out
     assert made[".wav"].documents.endswith(": in x.wav.json")
@@ -154,6 +161,9 @@ def test_an_export_with_events_is_imported_again(suffix: str, noted: Recording, 
             main(["import", *arguments])
         assert end.value.code == 0
     found = Recording.open(again)
+    if suffix != ".uff":
+        commands = [{"at_s": one.at_s, **one.request.model_dump()} for one in Experiment.of(found).scene.commands]
+        assert commands[1:] == [{"at_s": 0.05, "command": "speed", "speed_hz": 5.2}], "what was sent is the scene's own"
     np.testing.assert_allclose(found.samples("probes").values, noted.samples("probes").values, rtol=0, atol=1e-6)
     assert len(json.dumps(found.scene["import"]["files"])) < 3_000, "without the rig's documents"
 
@@ -295,6 +305,18 @@ def test_uff_by_pyuff(recording: Recording, tmp_path: Path) -> None:
         np.testing.assert_array_equal(found["data"], recording.samples(channel.group)[channel.name])
 
 
+def test_uff_begins_when_it_does_to_all_digits(recording: Recording, tmp_path: Path) -> None:
+    import pyuff
+
+    selection = select(recording, channels=["disk_x"])
+    late = replace(selection, tables=(replace(selection.tables[0], first_s=70_000.123456789),))
+    export(late, path := tmp_path / "late.uff")
+    source = open_source(path, FileOptions())
+    assert source.read(source.entries[0]).first_s == 70_000.123456789
+    head: Any = pyuff.UFF(str(path)).read_sets(0, header_only=True)
+    assert head["abscissa_min"] == pytest.approx(70_000.123457, abs=1e-6), "where another program looks"
+
+
 def test_csv_by_the_csv_module(recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     written(recording, path)
@@ -394,6 +416,26 @@ def test_rows_that_are_missing_are_left_out_or_nan_never_made_up(gappy: Recordin
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
+def test_one_row_is_exported_and_none_is_told(suffix: str, recording: Recording, tmp_path: Path) -> None:
+    key = sensor_key("probes")
+    for rows in (0, 1):
+        path = tmp_path / f"{rows}.mcap"
+        with RecordingWriter(
+            path, catalogue=recording.catalogue, parameters=recording.parameters, scene=recording.scene
+        ) as writer:
+            for block in list(recording.blocks(key))[:rows]:
+                payload = encode_block(replace(block, values=np.ascontiguousarray(block.values[:1])))
+                writer.write(key, payload, 0)
+    _, made = written(Recording.open(tmp_path / "1.mcap"), tmp_path / f"x{suffix}")
+    assert made[0].tables[0][2] == 1
+    with pytest.raises(InputError, match=r"^file must be a recording with samples; instead received '.*0\.mcap'"):
+        written(Recording.open(tmp_path / "0.mcap"), tmp_path / f"y{suffix}")
+    with pytest.raises(InputError, match=r"^file must be a recording with two samples of a channel"):
+        validate(Recording.open(tmp_path / "1.mcap"))
+    assert not list(tmp_path.glob("y*"))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp_path: Path) -> None:
     path = tmp_path / f"x{suffix}"
     path.write_text("precious")
@@ -412,11 +454,15 @@ def test_export_that_fails_leaves_nothing(suffix: str, recording: Recording, tmp
     ("arguments", "message"),
     [
         (["-o", "x.xls"], "--output must be a file name that ends in .mf4, .tdms, .uff"),
+        (["-o", ""], "--output must be a file name that ends in .mf4, .tdms, .uff"),
         (["-o", "no/x.csv"], "--output must be in a folder that exists"),
-        (["-o", "x.csv", "--channels", "disk_z"], "channel must be one of the recording's, such as disk_y"),
-        (["-o", "x.csv", "--channels", "foo"], "channel must be a channel of the recording, one of its groups (probes"),
-        (["-o", "x.csv", "--channels", "truth.nothing"], "channel must be one of truth.state, truth."),
-        (["-o", "x.csv", "--channels", "truth.state.foo"], "channel must be truth.state.COLUMN with one of "),
+        (["-o", "x.csv", "--channels", "disk_z"], "--channels must be one of the recording's, such as disk_y"),
+        (
+            ["-o", "x.csv", "--channels", "foo"],
+            "--channels must be a channel of the recording, one of its groups (probes",
+        ),
+        (["-o", "x.csv", "--channels", "truth.nothing"], "--channels must be one of truth.state, truth."),
+        (["-o", "x.csv", "--channels", "truth.state.foo"], "--channels must be truth.state.COLUMN with one of "),
         (["-o", "x.csv", "--unit", "mils"], "--unit must be engineering, volts or counts"),
         (["-o", "x.csv", "--method", "magic"], "--method must be polyphase or linear"),
         (["-o", "x.csv", "--from", "5"], "range must be in the recording, 0 to 0.11995 s; instead received 'from 5 s'"),

@@ -154,6 +154,7 @@ WITH_HOLES = [[0.0, 0.1, 0.2], [1.0, 2.0, math.nan], [math.nan, math.nan, 5.0]]
         (b"time,x [mm]\r\r\n0,1.5\r\r\n0.1,2.5\r\r\n0.2,3000\r\r\n", THREE),
         (b"time,x [mm]\n\n0,1.5\n0.1,2.5\n\n0.2,3000\n", THREE),
         ("time\tx [mm]\n0,0\t1,5\n0,1\t2,5\n0,2\t3000\n".encode("utf-16"), THREE),
+        (("time\tx [mm]\n" + "\n" * 196 + "0,0\t1,5\n0,1\t2,5\n0,2\t3000\n").encode("utf-16"), THREE),
         (b"time,x [mm],y\n0,1,\n0.1,2,\n0.2,,5\n", WITH_HOLES),
         (b"x [mm]\n1,5\n2,5\n3,5\n", [None, [1.5, 2.5, 3.5]]),
         (b"when,x [mm]\n10:00:00.0,1.5\n10:00:00.1,2.5\n10:00:00.2,3000\n", [[36000, 36000.1, 36000.2], THREE[1]]),
@@ -719,8 +720,10 @@ def test_there_and_back_again(suffix: str, tmp_path: Path, capsys: pytest.Captur
     """rig simulate, export, import --template, import: the same values within half a count, by the commands alone."""
     source, other, back = tmp_path / "a.mcap", tmp_path / f"b{suffix}", tmp_path / "c.mcap"
     mapping = tmp_path / "m.toml"
+    changes = ("contact.friction=0.22", "drive.profile=[[0.0, 5.0], [1.0, 6.0]]", "engine.name=rk4")
+    otherwise = ["--parameters", "as-printed", *(word for change in changes for word in ("--set", change))]
     for arguments in (
-        ["simulate", "hammer", "-o", str(source), "--duration-s", "0.1"],
+        ["simulate", "hammer", "-o", str(source), "--duration-s", "0.1", *otherwise],
         ["export", str(source), "-o", str(other)],
         ["import", str(other), "--template", str(mapping)],
         ["import", str(other), "-m", str(mapping), "-o", str(back)],
@@ -731,6 +734,9 @@ def test_there_and_back_again(suffix: str, tmp_path: Path, capsys: pytest.Captur
         assert end.value.code == 0, capsys.readouterr().err
     a, b = Recording.open(source), Recording.open(back)
     assert list(b.table.groups) == list(a.table.groups)
+    if suffix != ".uff":  # which has no place for the scene
+        assert Experiment.of(b).scene == Experiment.of(a).scene
+        assert b.table.channels["inner_x"].bandwidth_hz == a.table.channels["inner_x"].bandwidth_hz
     for name in a.table.groups:
         ours, theirs = a.samples(name), b.samples(name)
         assert (theirs.names, theirs.units, theirs.rate_hz) == (ours.names, ours.units, ours.rate_hz)
@@ -797,7 +803,7 @@ X = '[channels.disk_x]\nsource = "x"\n'
         (X + "unit = 'N'\n", "m.toml: channels.disk_x.unit must be a unit of length"),
         (X + "unit = 'furlong'\n", "m.toml: channels.disk_x.unit must be one of m, cm, mm"),
         (X + "sign = 2\n", "m.toml: channels.disk_x.sign must be"),
-        (X + "colour = 'red'\n", "m.toml: channels.disk_x.colour must be left out (there is no such field)"),
+        (X + "colour = 'red'\n", "m.toml: channels.disk_x.colour must be a field that there is, such as "),
         ("[channels.disk_x]\nsource = 'y'\n", "m.toml: channels.disk_x.unit must be a unit of length"),
         (
             "[channels.disk_x]\nsource = 'y'\nsensitivity = '7.87'\n",

@@ -7,24 +7,24 @@ import subprocess
 import sys
 import tomllib
 from importlib.metadata import packages_distributions
+from pathlib import Path
 
-from rig.errors import FULL
+import pytest
+
+from rig.errors import FULL, WHOLE_RIG
 from tests.processes import ROOT
 
 LEAN = """
 import sys
 
-class Lean:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {full!r}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
-
-sys.meta_path.insert(0, Lean())
+sys.modules |= dict.fromkeys({full!r})  # neither imported nor found
 """
+RECORDING = ROOT / "replays/sessions/hammer-5.2.mcap"
 CLIENTS = (
     "drivers.daq", "drivers.console", "drivers.twins", "drivers.force.driver", "drivers.sources.can",
     "drivers.can.interface", "recorder.session", "recorder.reader", "recorder.rewrite", "replays.player",
     "rig.cli.record", "rig.cli.status", "rig.cli.info", "rig.cli.twins", "rig.transport.zenoh",
+    "replays.recordings.formats.delimited",
 )  # fmt: skip
 
 
@@ -51,3 +51,44 @@ def test_what_needs_the_whole_rig_says_how_to_get_it() -> None:
     assert done.returncode == 2
     assert re.fullmatch(f"rig: this needs {need}\n", done.stderr)
     assert re.search(f"rig.simulate needs {need}", lean("import rig; rig.simulate('hammer')").stderr)
+
+
+NEEDING = {
+    "import": "{rec} --template x.toml", "validate": "{rec}", "identify": "{rec} --fit contact.friction",
+    "view": "{rec}", "sessions": "-o {folder}", "run": "hammer", "simulate": "hammer -o {folder}/x.mcap",
+    "can": "hub c0", "ladder": "hammer -q whirl_frequency -t 0.1", "paper": "-o {folder}/x.html",
+}  # fmt: skip
+"""What commands are given that do not go without."""
+
+
+def test_the_help_names_the_commands_that_need_the_whole_rig(tmp_path: Path) -> None:
+    from rig.cli.app import COMMANDS, NEED_FULL
+
+    shown = " ".join(lean("from rig.cli.main import main; main(['-h'])").stdout.split())
+    assert shown.endswith(f"{WHOLE_RIG}: {', '.join(NEED_FULL)}.")
+    assert set(NEED_FULL) <= {name for commands in COMMANDS.values() for name in commands}
+    given = {name: NEEDING.get(name, "").format(rec=RECORDING, folder=tmp_path).split() for name in NEED_FULL}
+    done = lean(
+        f"from rig.cli.main import main\nfor name, rest in {given!r}.items():\n"
+        "    try:\n        main([name, *rest])\n    except SystemExit as end:\n        print(name, end.code)"
+    )
+    assert done.stdout.split("\n")[:-1] == [f"{name} 2" for name in NEED_FULL], done.stderr
+    assert len(re.findall("^rig: this needs .* comes with the whole rig", done.stderr, re.MULTILINE)) == len(NEED_FULL)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_csv_of_the_lean_install_is_that_of_the_whole_rig(tmp_path: Path) -> None:
+    from rig.cli.main import main
+
+    for unit in ("engineering", "counts"):
+        arguments = ["export", str(RECORDING), "--to", "0.05", "--unit", unit, "-o"]
+        done = lean(f"from rig.cli.main import main; main({[*arguments, str(tmp_path / 'lean.csv'), '--force']!r})")
+        assert (done.returncode, done.stderr) == (0, "")
+        with pytest.raises(SystemExit) as end:
+            main([*arguments, str(tmp_path / "whole.csv"), "--force"])
+        assert end.value.code == 0
+        ours, theirs = ((tmp_path / f"{name}.csv").read_text().splitlines() for name in ("lean", "whole"))
+        assert ours[0] == theirs[0]
+        assert [[*map(float, line.split(","))] for line in ours[1:]] == [
+            [*map(float, line.split(","))] for line in theirs[1:]
+        ]

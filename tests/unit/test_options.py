@@ -17,6 +17,7 @@ from rig.cli.app import COMMANDS, GROUPS, rig
 from rig.cli.command import Group
 from rig.cli.completion import SCENE_KEYS, complete
 from rig.cli.options import names_of, pairs
+from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.scenes import Scene
 from tests.commands import said, shown
@@ -93,9 +94,39 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("rnu", "command must be one of `rig -h`, such as run; instead received 'rnu'"),
-        ("can lod", "command must be one of `rig can -h`, such as load; instead received 'lod'"),
-        ("run x --sed 1", "option must be one of `rig run -h`, such as --seed or --set; instead received '--sed'"),
+        ("rnu", "command must be one of `rig -h`, such as run (38 in all); instead received 'rnu'"),
+        ("can lod", "command must be one of `rig can -h`, such as load (3 in all); instead received 'lod'"),
+        (
+            "run x --sed 1",
+            "option must be one of `rig run -h`, such as --seed, --set, --listen (19 in all); instead received '--sed'",
+        ),
+        ("can -z", "option must be one of `rig can -h`; instead received '-z'"),
+        (
+            "stop -z",
+            "option must be one of `rig stop -h`, such as --connect, --tls, --wait-s; instead received '-z'",
+        ),
+        (
+            "info a.mcap -1 --frm 2",
+            "option must be one of `rig info -h`, such as --quick, --json, --wide; instead received '--frm'",
+        ),
+        ("import a.csv --template -o b", "--template must be followed by a value; instead received '-o'"),
+        (
+            f"cut {ROOT}/replays/sessions/hammer-6.2.mcap -o b.mcap --from 2 --to 1",
+            "--from and --to must be times, one before the other; instead received 2 and 1",
+        ),
+        (
+            "run hammer --engine rk5",
+            f"--engine must be one of {', '.join(ENGINES)}; instead received 'rk5'",
+        ),
+        (
+            "can load --can-bitrate x",
+            '--can-bitrate must be as "500k", "1M", or "1M/5M" for CAN FD; instead received \'x\'',
+        ),
+        (
+            "twins --can foo",
+            "--can must be INTERFACE:CHANNEL such as zenoh:can0, with ?NAME=VALUE&... for more settings; "
+            "instead received 'foo'",
+        ),
         ("run", "SCENE must be given: name of a scene, or the path of a scene file; instead received nothing"),
         ("stop now", "argument must be one that `rig stop` takes (see -h); instead received 'now'"),
         ("run x --set", "--set must be followed by a value; instead received nothing"),
@@ -103,9 +134,18 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
         ("bench --runs 0", "--runs must be greater than or equal to 1; instead received 0"),
         ("bench --runs x", "--runs must be a valid integer; instead received 'x'"),
         ("run x --pace y", "--pace must be one of real-time, lockstep, free; instead received 'y'"),
-        ("view --live --wait-s nan", "--wait-s must be a number; instead received nan"),
+        ("view x.mcap --at-s nan", "--at-s must be a number; instead received nan"),
         ("speed nan", "HZ must be a number; instead received nan"),
         ("record -o x.txt", "--output must be a file name that ends in .mcap; instead received 'x.txt'"),
+        (
+            "record -o x.mcap --trigger note --longest-s 1",
+            "--longest-s must be at least --pre-s and --post-s, 2.5, at most 1e6; instead received 1.0",
+        ),
+        (
+            "twins --listen 0.0.0.0:1",
+            "--listen must be on 127.0.0.1, since there is no password; from another machine: "
+            "ssh -L 1:127.0.0.1:1 USER@HOST (a rig also takes --expose); instead received '0.0.0.0:1'",
+        ),
         ("run hammer --seed -1", "--seed must be greater than or equal to 0; instead received -1"),
         ("view", "view must be given either a FILE or --live; instead received neither"),
         ("chart --quick --full", "--quick, --full must be one of the two; instead received both"),

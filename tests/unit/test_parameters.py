@@ -107,7 +107,7 @@ def test_override_refuses_what_is_neither_number_nor_rule(value: object) -> None
 
 
 def test_unknown_key_names_its_neighbours() -> None:
-    with pytest.raises(InputError, match=r"contact\.frictoin must be a parameter of the set .*contact\.friction"):
+    with pytest.raises(InputError, match=r"contact\.frictoin must be a parameter of the set, .*contact\.friction"):
         DEFAULT.override({"contact.frictoin": 0.1})
 
 

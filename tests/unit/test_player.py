@@ -370,7 +370,7 @@ def test_the_truth_can_stay_out(track: Track) -> None:
         ({"keys": {PROBES: wire.truth_key("a")}}, "remap must be to a key for the same kind"),
         ({"keys": {PROBES: "elsewhere"}}, "remap must be to a key for the same kind"),
         ({"keys": {PROBES: wire.sensor_key("forces")}}, "remap must be to a key that nothing else has"),
-        ({"channels": ["nothing"]}, "channel must be one of"),
+        ({"channels": ["nothing"]}, "channels must be one of"),
         ({"channels": ["disk_x", "disk_x"]}, "channels must be at least one, each once"),
         ({"names": {"disk_x": "disk_y"}}, "rename must be to names that no other channel has"),
     ],

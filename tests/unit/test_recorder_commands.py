@@ -212,7 +212,7 @@ def test_a_triggered_recording_counts_what_it_kept(capsys):
 
 def test_remarks_are_printed_once(capsys):
     class Session:
-        path = Path("run.mcap")
+        path, first_files = Path("run.mcap"), [Path("run.mcap")]
 
         def run(self, show: Callable[[Progress], None]) -> Summary:
             for remarks in ((), ("first",), ("first",), ("first", "second")):

@@ -270,3 +270,12 @@ def test_an_mcap_of_somebody_else_is_refused(tmp_path):
 def test_what_cannot_be_read_is_refused(tmp_path, name):
     with pytest.raises(InputError, match="file must be a file that can be read"):
         Recording.open(tmp_path / name)
+
+
+def test_what_was_not_finished_is_named_where_it_is_asked_for_by_its_name_in_the_end(tmp_path):
+    for name in ("a.mcap.part", "run.0000.mcap", "run.mcap.part", "run.toml"):
+        (tmp_path / name).touch()
+    for asked, named in (("a.mcap", "a.mcap.part"), ("run.mcap", f"run.0000.mcap, {tmp_path}/run.mcap.part")):
+        with pytest.raises(InputError) as caught:
+            Recording.open(tmp_path / asked)
+        assert caught.value.must == f"a file that can be read, such as {tmp_path}/{named}"

@@ -26,7 +26,6 @@ from rig.wire import (
     CATALOGUE,
     CLIENTS,
     EVENTS,
-    PARAMETERS,
     STATUS,
     Gap,
     decode_document,
@@ -482,15 +481,14 @@ def test_without_a_rig_there_is_no_file(path):
     assert list(path.parent.iterdir()) == []
 
 
-def test_a_rig_that_is_being_prepared_is_waited_for(path):
-    client = ScriptedClient()
-    reply = client.replies.pop(PARAMETERS)
-    session = RecordingSession(client, path, wait_s=10.0)
-    threading.Timer(0.2, client.replies.__setitem__, (PARAMETERS, reply)).start()
-    assert record(session, client, play(client, list(stream(5)))).reason == "completed"
-    del client.replies[PARAMETERS]
-    with pytest.raises(InputError, match="wait_s must be at least 0"):
-        RecordingSession(client, path, force=True, wait_s=-1.0)
+def test_what_will_be_written_is_named(path):
+    client, triggers = ScriptedClient(), tuple(map(Trigger.parse, ("hammer", "disk_x>1", "disk_x<0")))
+    assert RecordingSession(client, path).first_files == [path]
+    parts = RecordingSession(client, path, limits=Limits(rotate_s=1.0)).first_files
+    captures = RecordingSession(client, path, capture=Capture(triggers)).first_files
+    assert [file.name.removeprefix(path.stem) for file in (*parts, *captures)] == [
+        *(".0000.mcap", ".hammer-001.mcap", ".disk_x-001.mcap")
+    ]
 
 
 def test_around_triggers_the_summary_tells_what_is_in_the_files(path):

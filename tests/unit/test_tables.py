@@ -46,8 +46,7 @@ def test_command_prints_tables_that_are_legible(arguments: list[Any], capsys: py
     printed = shown(capsys, *arguments)
     assert len(printed.splitlines()) > 4
     assert not any(mark in printed for mark in "…│┃─━\x1b")
-    if arguments != ["keys"]:
-        json.loads(shown(capsys, *arguments, "--json"))
+    assert json.loads(shown(capsys, *arguments, "--json"))
 
 
 def test_an_encoding_that_lacks_a_character_shows_it_escaped() -> None:
@@ -172,6 +171,22 @@ def test_facts_have_no_heading() -> None:
     check_legible(table)
 
 
+@pytest.mark.parametrize("width", range(30, 60, 3))
+def test_a_number_and_its_unit_stay_on_one_line(width: int) -> None:
+    lines = lines_of(facts("so 3.5 kN", [("all", "it took 12.5 ms of 3 MB at 100 N s/m, " * 9)]), width=width)
+    assert len(lines) > 5
+    assert not any(line.endswith(("12.5", "3", "100", "100 N")) for line in lines), lines
+
+
+@pytest.mark.parametrize("command", [["scenes"], ["keys", "--json"], ["-h"]])
+def test_a_reader_that_has_gone_is_told_by_the_status_alone(command: list[str]) -> None:
+    ours, theirs = os.pipe()
+    os.close(ours)
+    found = subprocess.run([sys.executable, "-m", "rig", *command], stdout=theirs, stderr=subprocess.PIPE, timeout=120)
+    os.close(theirs)
+    assert (found.returncode, found.stderr) == (141, b"")
+
+
 def test_a_status_line_is_one_line_of_whole_parts() -> None:
     parts = ["  599.99 of 600 s", "late p99 0.12 max 123.45 ms", "clients 2"]
     assert fitted(parts, 80) == "  599.99 of 600 s  late p99 0.12 max 123.45 ms  clients 2"
@@ -230,7 +245,7 @@ def test_compiling_is_told_as_long_as_it_lasts() -> None:
 
 
 def test_every_command_with_tables_has_the_same_options(capsys: pytest.CaptureFixture[str]) -> None:
-    """What prints a table takes --wide, and --json but for a page and what is made of two processes."""
+    """What prints a table takes --wide and --json, but for what is made of two processes."""
     found = set()
     for path in sorted(Path(next(iter(rig.cli.__path__))).glob("*.py")):
         calls = {ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)}
@@ -243,4 +258,4 @@ def test_every_command_with_tables_has_the_same_options(capsys: pytest.CaptureFi
     for name, command in commands.items():
         _, usage, _ = said(capsys, *command, "--help")
         assert "--wide" in usage, name
-        assert ("--json" in usage) == (name != "keys"), name
+        assert "--json" in usage, name

@@ -9,16 +9,19 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from rig.cli.connection import Connection
 from rig.errors import InputError
 from rig.transport import NoReplyError
 from rig.transport.endpoint import backlog_of, parse_endpoint
 from rig.transport.recovery import Recovery
 from rig.transport.zenoh import ZenohClient, ZenohServer
+from rig.wire import ALIVE
 from tests.processes import free_endpoint
 from tests.waiting import until
 
@@ -78,6 +81,24 @@ def test_without_a_rig_the_error_names_the_endpoint_and_the_way_out() -> None:
     endpoint = free_endpoint()
     with pytest.raises(NoReplyError, match=rf"no rig answers at {endpoint}; start one with: rig run"):
         ZenohClient(endpoint, wait_s=0.1)
+
+
+def test_a_command_waits_for_a_rig_that_listens_until_it_is_ready(server: ZenohServer) -> None:
+    announced = threading.Timer(0.5, server.announce)
+    announced.start()
+    with Connection(server.endpoint, wait_s=20.0).client() as client:
+        assert client.tokens(ALIVE)
+        assert announced.finished.is_set()
+
+
+def test_keys_that_the_environment_names_are_told_so(server: ZenohServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RIG_TLS", "nowhere")
+    for folder, name in (("nowhere", "RIG_TLS"), ("other", "--tls")):
+        with (
+            pytest.raises(InputError, match=f"^{name} must be a folder"),
+            Connection(server.endpoint, tls=Path(folder)).client(),
+        ):
+            pass
 
 
 def test_a_client_waits_for_a_rig_that_comes_later() -> None:

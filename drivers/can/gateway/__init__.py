@@ -91,7 +91,7 @@ class Gateway:
         try:
             table = ChannelTable.model_validate(catalogue.table)
         except pydantic.ValidationError as error:
-            raise input_error(error, "catalogue.table") from None
+            raise input_error(error, "catalogue.table", ChannelTable) from None
         self._tick_rate_hz = catalogue.tick_rate_hz
         self._messages = default_messages().by_name
         self._rate_hz, self._steps = steps(table, schedule)

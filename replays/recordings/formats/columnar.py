@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -154,8 +154,6 @@ class ParquetWriter(export.FormatWriter):
 
     merged = True
     sparse = True
-    rows: Callable[[Path, Any], Any] = ParquetRows
-    """What takes the rows: has `write` and `close`."""
 
     def __init__(self, path: Path, selection: Selection) -> None:
         import pyarrow
@@ -169,7 +167,7 @@ class ParquetWriter(export.FormatWriter):
         events = json.dumps([event.document for event in selection.events])
         whole = {"rig": json.dumps({**selection.metadata, "rate_hz": table.rate_hz}), "events": events}
         whole |= selection.documents
-        self._file = type(self).rows(path, pyarrow.schema(fields, metadata=whole))
+        self._file = ParquetRows(path, pyarrow.schema(fields, metadata=whole))
 
     def write(self, table: ExportTable, chunk: ExportChunk) -> None:
         """Take rows; those that no stream has are left out."""

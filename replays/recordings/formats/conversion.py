@@ -94,10 +94,12 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     groups, zero_s = place(taken, mapping, low_s, high_s)
     rotate(groups, mapping, remarks)
     table, counts, present, channels = quantise(groups)
-    lead_s = mapping.experiment.lead if mapping.experiment is not None else 0
+    lead_s = mapping.experiment.lead if mapping.experiment is not None else 0.0
+    if any(abs(lead_s * group.rate_hz - round(lead_s * group.rate_hz)) > 1e-6 for group in groups.values()):
+        raise InputError("experiment.lead_s", "a whole number of samples", lead_s)
     zero_s -= lead_s
     if lead_s:
-        remarks.append(f"time zero lies {lead_s} s before the first sample: so long the scene runs, to have settled")
+        remarks.append(f"time zero lies {lead_s:g} s before the first sample: so long the scene runs, to have settled")
     first_tick = {name: round((group.start_s - zero_s) * TICK_RATE_HZ) for name, group in groups.items()}
     edges = _edges(log, zero_s, groups)
     since = tuple(replace(pulse, at_s=pulse.at_s - zero_s) for pulse in pulses)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from rig.text import printable
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
+    from replays.recordings.formats.selection import Selection
 
 
 def look_into(path: Path, options: FileOptions) -> Source:
@@ -173,24 +174,23 @@ def _quoted(name: str) -> str:
 class CsvRows:
     """A CSV file that grows by rows: numbers in the fewest digits that give them back, on two threads."""
 
-    def __init__(self, path: Path, schema: Any) -> None:
-        from pyarrow import csv
+    def __init__(self, path: Path, names: Sequence[str], *, whole: Collection[str] = ()) -> None:
+        """Write the headings.
 
-        self._csv = csv
-        self._schema = schema
+        Args:
+            path: The file.
+            names: Headings of the columns.
+            whole: Those of whole numbers, of which a missing one is nan and left empty.
+        """
+        self._whole = [name in whole for name in names]
         self._file = path.open("wb")
-        self._file.write((",".join(f'"{_quoted(name)}"' for name in schema.names) + "\n").encode())
+        self._file.write((",".join(f'"{_quoted(name)}"' for name in names) + "\n").encode())
         # Formatting a number takes ten times as long as simulating it, and needs no lock.
         self._background = Background(self._file.write, threads=2)
 
     def write(self, columns: Sequence[np.ndarray]) -> None:
         """Take rows, column by column, each shape (n,)."""
-        self._background.call(self._format, columnar.arrow_table(columns, self._schema))
-
-    def _format(self, table: Any) -> bytes:
-        buffer = io.BytesIO()
-        self._csv.write_csv(table, buffer, self._csv.WriteOptions(include_header=False))
-        return buffer.getvalue()
+        self._background.call(_lines, columns, self._whole)
 
     def close(self) -> None:
         """Write what is left."""
@@ -200,8 +200,30 @@ class CsvRows:
             self._file.close()
 
 
+def _lines(columns: Sequence[np.ndarray], whole: Sequence[bool]) -> bytes:
+    """Rows as text; without pyarrow, which a lean install lacks, a fifth as fast."""
+    try:
+        import pyarrow
+        from pyarrow import csv
+    except ModuleNotFoundError:
+        texts = [
+            ["" if value != value else f"{value:.0f}" for value in column] if integer else map(repr, column)
+            for column, integer in zip((np.asarray(each).tolist() for each in columns), whole, strict=True)
+        ]
+        return "".join(",".join(row) + "\n" for row in zip(*texts, strict=True)).encode()
+    kinds = [pyarrow.int32() if integer else pyarrow.float64() for integer in whole]
+    schema = pyarrow.schema([(f"{c}", kind) for c, kind in enumerate(kinds)])
+    buffer = io.BytesIO()
+    csv.write_csv(columnar.arrow_table(columns, schema), buffer, csv.WriteOptions(include_header=False))
+    return buffer.getvalue()
+
+
 class CsvWriter(columnar.ParquetWriter):
     """A CSV file: `time [s]` and a column a channel."""
 
     sidecar = True
-    rows = CsvRows
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        columns = selection.tables[0].columns
+        counts = [column.heading for column in columns if selection.unit == "counts" and column.source is not None]
+        self._file = CsvRows(path, ["time [s]", *(column.heading for column in columns)], whole=counts)

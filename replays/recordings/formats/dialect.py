@@ -184,6 +184,7 @@ def _head(path: Path, encoding: str | None) -> tuple[str, str, tuple[str, ...]]:
         raw = b"".join(file.readline(1 << 16) for _ in range(_HEAD_LINES))
     if encoding is None and raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         encoding = "utf-16"
+        raw = raw[: len(raw) // 2 * 2]  # a line that was cut behind the first byte of its end
     if b"\0" in raw and encoding is None:
         raise InputError("file", "a text file", Words(f"{path}, which is binary"))
     try:

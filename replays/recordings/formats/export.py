@@ -136,7 +136,7 @@ def export(
         for table in part.tables:
             names = [column.name for column in table.columns]
             if len(set(names)) < len(names):
-                raise InputError("channel", "given once", names)
+                raise InputError("channels", "given once each", names)
             if not kind.sparse and (missing := part.missing[table.name]) > table.rows // 2 + _MOST_MISSING:
                 must = f"one of which a {path.suffix} file can hold the gaps (--from and --to choose)"
                 raise InputError("range", must, Words(f"{missing} rows missing in {table.name}"))

@@ -207,16 +207,16 @@ class ExperimentMapping(_Section):
     """Speed of the drive [Hz]; measured: the mean of the channel `speed`, or of the edges, before the first command."""
     commands: tuple[dict[str, Any], ...] | Literal["scene", "detected"] = "scene"
     """Commands with at_s in the recording's time; those of the scene; or the hammer pulses that were found."""
-    lead_s: Annotated[int, Field(ge=0, le=60)] | None = None
+    lead_s: Annotated[FiniteFloat, Field(ge=0.0, le=60.0)] | None = None
     """The recording's time zero lies so long before its first sample [s]: the scene runs from there, and what its own
     start stirs up has died out. Left out: 5 where hammer pulses were found in a running rig, else 0."""
 
     @property
-    def lead(self) -> int:
+    def lead(self) -> float:
         """The same, as a number [s]."""
         if self.lead_s is not None:
             return self.lead_s
-        return 5 if self.commands == "detected" else 0
+        return 5.0 if self.commands == "detected" else 0.0
 
 
 class Mapping(_Section):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.recordings.formats import export
-from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz, library
+from replays.recordings.formats.source import DOCUMENTS, Entry, FileSignal, Source, damaged, even_rate_hz, library
 from rig import units
 
 if TYPE_CHECKING:
@@ -56,11 +56,21 @@ def look_into(path: Path, options: FileOptions) -> Source:
             return _signal(mdf, group, index)
 
     remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
-    about = {"version": str(mdf.version), "comment": str(mdf.header.description or "")}
+    about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
     return Source(
         path=path, format=f"MDF {mdf.version}", entries=tuple(entries), read=read, start=mdf.header.start_time,
         about={key: text for key, text in about.items() if text}, remarks=remarks,
     )  # fmt: skip
+
+
+def _documents(mdf: Any) -> dict[str, str]:
+    """What `rig export` has attached."""
+    found = {}
+    for index, attachment in enumerate(getattr(mdf, "attachments", ())):
+        if attachment.file_name in DOCUMENTS:
+            content, *_ = mdf.extract_attachment(index=index)
+            found[attachment.file_name] = bytes(content).decode(errors="replace")
+    return found
 
 
 def _open(path: Path) -> Any:

@@ -15,6 +15,7 @@ import numpy as np
 from recorder.reader import Recording
 from recorder.survey import Stream
 from replays.recordings.formats.history import ExportEvent, happenings
+from replays.recordings.formats.source import DOCUMENTS
 from rig.channels import Channel
 from rig.errors import InputError, Words
 from rig.text import nearest, printable
@@ -182,9 +183,11 @@ class Selection:
 
     @property
     def documents(self) -> dict[str, str]:
-        """The rig's catalogue, parameters and scene, by name, as the recording has them."""
-        names = ("catalogue.json", "parameters.json", "scene.json")
-        return {name: self.recording.attachments[name].decode() for name in names}
+        """The rig's catalogue, parameters and scene, by name; with the scene, all commands that were sent to it."""
+        texts = {name: self.recording.attachments[name].decode() for name in DOCUMENTS}
+        if commands := self.recording.commands:
+            texts["scene.json"] = json.dumps({**self.recording.scene, "taken": commands})
+        return texts
 
     @cached_property
     def start(self) -> datetime:
@@ -351,7 +354,7 @@ def select(
         stream = streams.get(key)
         if stream is None or stream.rows == 0:
             if channels and any(key.endswith(name.removeprefix("truth.")) for name in channels):
-                raise InputError("channel", "one with samples in the recording", key)
+                raise InputError("channels", "one with samples in the recording", key)
             continue
         table = _table(recording, key, numbers, stream, unit, from_s, to_s)
         if table is not None:
@@ -359,7 +362,9 @@ def select(
             tables.setdefault(("" if merged else key, table.rate_hz, offset), []).append(table)
     if not tables:
         held = [s for s in streams.values() if s.rows]
-        low, high = min((s.first_time_s for s in held), default=0.0), max((s.last_time_s for s in held), default=0.0)
+        if not held:
+            raise InputError("file", "a recording with samples", str(recording.path))
+        low, high = min(s.first_time_s for s in held), max(s.last_time_s for s in held)
         ends = [f"{word} {end:g} s" for word, end in (("from", from_s), ("to", to_s)) if end is not None]
         raise InputError("range", f"in the recording, {low:g} to {high:g} s", " ".join(ends) or Words("all of it"))
     return Selection(
@@ -393,7 +398,7 @@ def _wanted(recording: Recording, channels: Sequence[str], *, truth: bool) -> di
     chosen: dict[str, set[int]] = {}
     for channel in [*channels, *(["truth"] if truth else [])]:
         if channel not in places:
-            raise InputError("channel", _near(channel, groups, truths), channel)
+            raise InputError("channels", _near(channel, groups, truths), channel)
         for key, c in places[channel]:
             chosen.setdefault(key, set()).add(c)
     order = [*(sensor_key(name) for name in groups), *(truth_key(name) for name in truths)]

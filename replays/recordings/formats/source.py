@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rig.errors import InputError, RefusedError, Words
-from rig.outside import open_file
+from rig.outside import DOCUMENT_BYTES, open_file, read_json, unreadable
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -31,6 +32,8 @@ _FORMATS = {
 }  # fmt: skip
 _MOST_ABOUT = 2000
 """Longest text that is taken over of what a file tells of itself [characters]; longer ones are documents."""
+DOCUMENTS = ("catalogue.json", "parameters.json", "scene.json")
+"""What `rig export` attaches."""
 _MOST_HZ = 1e9
 _MOST_S = 1e12
 
@@ -102,6 +105,7 @@ class Source:
         read: Reads the values of one of them.
         start: When its time zero was, if it tells.
         about: What it tells of itself.
+        documents: The rig's own by name, as text, where `rig export` has made the file.
         remarks: What had to be assumed to read it.
         options: What the mapping has to say of the file so that it is read so again.
     """
@@ -112,6 +116,7 @@ class Source:
     read: Callable[[Entry], FileSignal]
     start: datetime | None = None
     about: dict[str, str] = field(default_factory=dict)
+    documents: dict[str, str] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     options: dict[str, str | int] = field(default_factory=dict)
 
@@ -129,7 +134,7 @@ def open_source(path: Path, options: FileOptions) -> Source:
         with open_file(path) as file:
             empty = not file.read(1)
     except OSError as error:
-        raise InputError("file", "a file that can be read", Words(f"{path} ({error.strerror})")) from None
+        raise unreadable(path, error) from None
     if empty:
         raise InputError("file", "a file with something in it", str(path))
     if name != "delimited":
@@ -159,7 +164,22 @@ def open_source(path: Path, options: FileOptions) -> Source:
         if one.name != new.name
     ]
     about = {key: text for key, text in source.about.items() if len(text) <= _MOST_ABOUT}
-    return replace(source, entries=distinct, read=read, about=about, remarks=(*source.remarks, *twice))
+    documents = {name: source.about[name] for name in DOCUMENTS if name in source.about} or _beside(path)
+    return replace(
+        source, entries=distinct, read=read, about=about, documents=documents, remarks=(*source.remarks, *twice)
+    )
+
+
+def _beside(path: Path) -> dict[str, str]:
+    """The rig's documents in FILE.json, where `rig export` puts them beside a format without a place for them."""
+    try:
+        with open_file(path.with_name(path.name + ".json")) as file:
+            told = read_json(file.read(DOCUMENT_BYTES + 1)).get("documents")
+    except (OSError, InputError):  # there is none, or it is another program's
+        return {}
+    found = told if isinstance(told, dict) else {}
+    kinds = {name: found.get(name.removesuffix(".json")) for name in DOCUMENTS}
+    return {name: json.dumps(document) for name, document in kinds.items() if isinstance(document, dict)}
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from importlib.resources import files as files_of
 from pathlib import Path
 
+from replays.recordings.formats.attached import attached
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import Entry, Source, open_source
 from rig import units
@@ -54,16 +55,25 @@ def template(files: Sequence[Path], options: FileOptions | None = None) -> str:
         start = "" if source.start is None else f", from {source.start.isoformat()}"
         lines.append(f"# {source.path.name}: {source.format}, {len(source.entries)} signals{start}")
         lines += [f"#   {remark}" for remark in source.remarks]
-    told = sources[0].options
-    if told:
-        lines += ["", "[file]", *(f"{key} = {_quoted(value)}" for key, value in told.items())]
+    if dialect := sources[0].options:
+        lines += ["", "[file]", *(f"{key} = {_quoted(value)}" for key, value in dialect.items())]
     lines += ["", *_rates([entry for source in sources for entry in source.entries])]
     taken: set[str] = set()
-    for source in sources:
+    known = [attached(source) for source in sources]
+    for source, told in zip(sources, known, strict=True):
         for entry in source.entries:
             lines += ["", *_channel(entry, source, taken, rig=set(rig), several=len(sources) > 1)]
+            if (channel := told.channels.get(entry.name)) is not None:
+                lines += [f"bandwidth_hz = {channel.bandwidth_hz!r}"]
+                lines += [f"highpass_hz = {channel.highpass_hz!r}"] * bool(channel.highpass_hz)
+    if known[0].experiment:
+        lines += ["", f"[experiment]    # as attached to {sources[0].path.name}", *known[0].experiment]
+    elif known[0].doubt:
+        lines += ["", f"# Of what is attached to {sources[0].path.name} no [experiment] is made: {known[0].doubt}"]
     lines += ["", "# Take away the `# ` of what you need:"]
     for table in _TABLES:
+        if any(line.startswith(table) for line in lines):
+            continue
         lines += ["#", *(f"# {line}" for line in _example_of(table))]
     return "\n".join(lines) + "\n"
 

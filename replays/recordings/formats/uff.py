@@ -33,7 +33,8 @@ _DELIMITER, _BLANK = b"    -1", b"\0\x1a\r\n "
 """What stands before and behind a dataset, and what may follow it."""
 _TAIL = 4096
 """Bytes at the end of a file in which that is looked for."""
-_EXACT_RATE = re.compile(r"rate_hz=([0-9.eE+-]+)")
+_EXACT = r"\b{}=([0-9.eE+-]+)"
+"""How our files tell what the header has few digits for."""
 _START = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S")
 _TIME, _GENERAL, _UNKNOWN = 17, 1, 0
 _ORDINATE = {
@@ -84,7 +85,9 @@ def look_into(path: Path, options: FileOptions) -> Source:
             raise ValueError(f"{len(values)} of {entry.rows} values")
         if int(data["abscissa_spacing"]) == 0:
             return FileSignal(values=values, times_s=np.array(data["x"], dtype=float)[: entry.rows])
-        return FileSignal(values=values, rate_hz=_rate_hz(data), first_s=float(data["abscissa_min"]))
+        return FileSignal(
+            values=values, rate_hz=_rate_hz(data), first_s=_exact(data, "first_s") or float(data["abscissa_min"])
+        )
 
     others = len(kinds) - len(entries)
     remarks = (f"{others} datasets that are no time history are passed over",) if others else ()
@@ -102,11 +105,13 @@ def _ends(path: Path) -> bool:
 
 
 def _rate_hz(head: dict) -> float | None:
-    exact = _EXACT_RATE.search(str(head.get("id4", "")))
-    if exact:
-        return float(exact[1])  # the header has six digits of the step only
     step = float(head["abscissa_inc"])
-    return 1.0 / step if head["abscissa_spacing"] and step > 0.0 else None
+    return _exact(head, "rate_hz") or (1.0 / step if head["abscissa_spacing"] and step > 0.0 else None)
+
+
+def _exact(head: dict, name: str) -> float | None:
+    found = re.search(_EXACT.format(name), str(head.get("id4", "")))
+    return float(found[1]) if found else None
 
 
 def _start(texts: list[str]) -> datetime | None:
@@ -191,7 +196,8 @@ def _header(table: ExportTable, column: Column, selection: Selection, at: Degree
         column.name,
         column.label or "NONE",
         selection.start.strftime("%d-%b-%y %H:%M:%S"),
-        f"rate_hz={table.rate_hz:.17g} scene={about['scene']} seed={about['seed']} parameters={about['parameter_set']}",
+        f"rate_hz={table.rate_hz:.17g} first_s={float(table.first_s)!r} scene={about['scene']} seed={about['seed']} "
+        f"parameters={about['parameter_set']}",
         f"node {at.node}: {at.place}; direction {at.direction}: {_ALONG[at.direction]}; group={table.name}",
     )
     lines = [
@@ -200,12 +206,17 @@ def _header(table: ExportTable, column: Column, selection: Selection, at: Degree
         *(f"{_ascii(text, 80):<80}" for text in texts),
         f"{1:5d}{0:10d}{0:5d}{0:10d} {_ascii(column.name, 10):<10}{at.node:10d}{at.direction:4d}"
         f" {'NONE':<10}{0:10d}{0:4d}",
-        f"{4:10d}{table.rows:10d}{1:10d}{table.first_s:13.5E}{1.0 / table.rate_hz:13.5E}{0.0:13.5E}",
+        f"{4:10d}{table.rows:10d}{1:10d}{_real(table.first_s):>13}{_real(1.0 / table.rate_hz):>13}{0.0:13.5E}",
         f"{_TIME:10d}{0:5d}{0:5d}{0:5d} {'Time':<20} {'s':<20}",
         f"{kind:10d}{length:5d}{force:5d}{0:5d} {_ascii(column.name, 20):<20} {_ascii(column.unit, 20):<20}",
         *(f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':<20} {'NONE':<20}" for _ in range(2)),
     ]
     return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def _real(value: float) -> str:
+    """A number with the most digits that a field of 13 columns holds behind a blank."""
+    return next(text for digits in range(12, 0, -1) if len(text := f"{value:#.{digits}G}") < 13)
 
 
 def _ascii(text: str, width: int) -> str:

@@ -89,7 +89,7 @@ _DISK = ("disk_x", "disk_y")
 
 
 def _whirl(view: View) -> float:
-    return whirl_frequency(view.times_s["ring_x"], view.values["ring_x"], view.values["ring_y"])
+    return whirl_frequency(view.values["ring_x"], view.values["ring_y"], view.times_s["ring_x"])
 
 
 def _impacts(view: View) -> float:

@@ -98,7 +98,7 @@ def _whirl_frequency(trace: Trace) -> float:
     if _contact_fraction_settled(trace) < 0.5:
         return math.nan
     x, y = trace.settled("ring_x"), trace.settled("ring_y")
-    return whirl_frequency(trace.times_s[-trace.settled_rows :], x, y, about=0.0)
+    return whirl_frequency(x, y, trace.times_s[-trace.settled_rows :], about=0.0)
 
 
 def _contact_fraction_settled(trace: Trace) -> float:

@@ -198,7 +198,7 @@ def keeps_whirling(constants: Constants, y0: np.ndarray, spin: float) -> bool:
 
     def whirl_hz(begin_s: float) -> float:
         part = (motion.times > begin_s) & (motion.times <= begin_s + 0.1)
-        return whirl_frequency(motion.times[part], x[part], y[part], about=0.0)
+        return whirl_frequency(x[part], y[part], motion.times[part], about=0.0)
 
     return whirl_hz(0.9) < (1.0 - _SLOWER) * whirl_hz(0.4)  # both are negative
 

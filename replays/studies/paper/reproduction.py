@@ -146,7 +146,7 @@ def _whirl_numbers(run: Run) -> dict[str, float]:
         "orbit_ring": float(np.hypot(run["ring_x"], run["ring_y"])[last].mean() * 1e3),
         "orbit_disk": float(np.abs(run["disk_x"][last]).max() * 1e3),
         "spin_lowest": float(run["spin_rate"][after].min() / (2.0 * math.pi)),
-        "whirl_hz": abs(whirl_frequency(run.times_s[last], run["ring_x"][last], run["ring_y"][last])),
+        "whirl_hz": abs(whirl_frequency(run["ring_x"][last], run["ring_y"][last], run.times_s[last])),
         "whirl_per_spin": abs(truth.whirl_hz) / truth.spin_hz,
         "spectrum_hz": float(frequencies[np.argmax(amplitude)]),
         "steady": truth.ripple_n / truth.normal_n,
@@ -171,4 +171,4 @@ def _speed_numbers(found: dict[float, Outcome]) -> dict[str, float]:
 
 def spectra(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Full spectra of the disk's probes over time, as `rig.orbit.waterfall` gives them [mm]."""
-    return waterfall(run.times_s, run.samples["disk_x"], run.samples["disk_y"], float(_RATE_HZ))
+    return waterfall(run.samples["disk_x"], run.samples["disk_y"], float(_RATE_HZ), run.times_s)
