@@ -165,11 +165,11 @@ class Simulation:
         self._engaged = scene.initial.magnets
         self._pulse: tuple[HammerCommand, int, int] | None = None
         self._pending = sorted(
-            ((self._on_grid(timed.at_s), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
+            ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
         )
         self._y = self._initial_state(self._segments[0].speed)
         self._memory = np.zeros(MEMORY)
-        self._rows = np.empty((0, S.N_ROW))
+        self._rows, self._spare = np.empty((0, S.N_ROW)), np.empty((1, S.N_ROW))
         self._last: np.ndarray | None = None
 
     def __repr__(self) -> str:
@@ -205,8 +205,7 @@ class Simulation:
         events: list[dict[str, Any]] = []
         while self.tick < end:
             self._take_effect(events)
-            stop = min(end, self._next_change())
-            self._run(rows[(self.tick - start) // self.row_ticks : (stop - start) // self.row_ticks], stop - self.tick)
+            self._run(rows, start, min(end, self._next_change()))
         self._last = rows[-1].copy()
         if not np.isfinite(self._y).all():
             raise SimulationError(
@@ -261,8 +260,8 @@ class Simulation:
         balance = energy_balance(last[None, :], first)
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
         warnings = []
-        if abs(residual) > ENERGY_ALARM * max(dissipated, 1e-6):
-            text = f"energy residual {residual:.2e} J is above {ENERGY_ALARM:g} of what was dissipated"
+        if abs(residual) > self._method.energy * max(dissipated, 1e-6):
+            text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of what was dissipated"
             if abs(residual) > BRANCH_ALARM * max(dissipated, 1e-6) and self._memory[CONTACTS] > 1:
                 text += "; after contacts, a wrong branch is suspected"
             warnings.append(text)
@@ -360,13 +359,9 @@ class Simulation:
             )
         return self.model.state(ring_x=x, ring_y=y, spin=spin)
 
-    def _on_grid(self, time_s: float) -> int:
-        # The first row at or after the time asked for.
-        return math.ceil(round(time_s * TICK_RATE_HZ) / self.row_ticks) * self.row_ticks
-
     def _profile(self) -> list[_Segment]:
         drive = self.scene.drive
-        points = [(self._on_grid(time), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))]
+        points = [(round(time * TICK_RATE_HZ), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))]
         segments = [
             _Segment(tick=t0, speed=w0, slope=(w1 - w0) / (t1 - t0) * TICK_RATE_HZ)
             for (t0, w0), (t1, w1) in pairwise(points)
@@ -389,8 +384,8 @@ class Simulation:
                         event | {"event": "warning", "text": "a hammer pulse of the scene found the hammer in a pulse"}
                     )
                     continue
-                length = max(1, round(command.duration_ms * 1e-3 * TICK_RATE_HZ / self.row_ticks)) * self.row_ticks
-                self._pulse = (command, self.tick, self.tick + length)
+                length = round(command.duration_ms * 1e-3 * TICK_RATE_HZ)
+                self._pulse = (command, self.tick, self.tick + max(1, length))
             elif isinstance(command, SpeedCommand):
                 self._ramp_to(2.0 * math.pi * command.speed_hz)
             else:
@@ -400,7 +395,7 @@ class Simulation:
     def _ramp_to(self, target: float) -> None:
         segment = self._segment()
         now = segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
-        length = self._on_grid(abs(target - now) / self.model.parameters["drive.ramp_rate"])
+        length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
         hold = _Segment(tick=self.tick + length, speed=target, slope=0.0)
         slope = (target - now) / length * TICK_RATE_HZ if length else 0.0
         self._segments = [_Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
@@ -422,6 +417,8 @@ class Simulation:
     def _next_change(self) -> int:
         ticks = [segment.tick for segment in self._segments if segment.tick > self.tick]
         ticks += [tick for tick, _ in self._pending]
+        if self._pulse is not None and self._pulse[2] > self.tick:
+            ticks.append(self._pulse[2])
         return min(ticks, default=2**62)
 
     def _inputs(self) -> Inputs:
@@ -444,12 +441,21 @@ class Simulation:
             magnet_engaged=self._engaged,
         )
 
-    def _run(self, rows: np.ndarray, ticks: int) -> None:
-        self._engine.advance(
-            self.model.constants, self._inputs(), self._y, self._memory, self.tick, self._step_ticks,
-            ticks // self._step_ticks, self._stride, rows,
-        )  # fmt: skip
-        self.tick += ticks
+    def _run(self, rows: np.ndarray, start: int, stop: int) -> None:
+        # Commands live on ticks, rows only observe: off the rows' grid the steps are what fits, and no row is kept.
+        while self.tick < stop:
+            row, beyond = divmod(self.tick - start, self.row_ticks)
+            whole = 0 if beyond else (stop - self.tick) // self.row_ticks
+            if whole:
+                out, step, steps = rows[row : row + whole], self._step_ticks, whole * self._stride
+            else:
+                ticks = min(stop - self.tick, self.row_ticks - beyond)
+                step = math.gcd(ticks, self._step_ticks)
+                out, steps = self._spare if beyond else rows[row : row + 1], ticks // step
+            stride = self._stride if whole else steps
+            constants, inputs = self.model.constants, self._inputs()
+            self._engine.advance(constants, inputs, self._y, self._memory, self.tick, step, steps, stride, out)
+            self.tick += steps * step
 
     def _sample(self, rows: np.ndarray, start: int) -> dict[str, Block]:
         rate = self.scene.sensors.rate_hz

@@ -29,6 +29,8 @@ class Method(NamedTuple):
     contacts: tuple[str, ...] = ("compliant",)
     longest_us: int = 1000
     """Longest step at which its error estimate can be trusted [us]; above it a run says so."""
+    energy: float = 1e-3
+    """Share of what was dissipated up to which its ledger may be open."""
 
 
 _BY_STATE = ("none", "smoothed", "switch")
@@ -41,6 +43,7 @@ ENGINES = {
         ("none", "exact"),
         ("impact", "compliant"),
         100,
+        5e-3,
     ),
     "rk8": Method("Dormand-Prince 8(5,3), events located", 25, 1e-8, (*_BY_STATE, "exact")),
     "taylor": Method("Taylor series of order 16, events as roots", 25, 1e-9, ("none", "smoothed", "exact")),

@@ -62,6 +62,7 @@ from rig.engines.split.place import (
     COS,
     FLOWS,
     FLOWS_END,
+    GRID_TICKS,
     KICK,
     KICKED,
     LAST_STEP,
@@ -113,6 +114,13 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     memory[LIMIT] = tolerance
     # The shaft's flow is linear about its rest on the magnets.
     memory[REST], memory[SPRING_X], memory[SPRING_Y] = magnet_springs(constants)
+    _prepare_flows(constants, inputs, memory, step_ticks)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _prepare_flows(constants, inputs, memory, step_ticks):
+    """Flows of the houses for steps of another grid."""
+    memory[GRID_TICKS] = step_ticks
     house_flows(constants, step_ticks * inputs.tick_s, memory[FLOWS:FLOWS_END].reshape(LEVELS, HOUSE_FLOW))
 
 
@@ -540,11 +548,13 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     call = Call(plant, step_ticks / 2.0**GRID, half_s, 0.5 / half_s, memory[LIMIT])
     room = series.room_in(memory)
     ledger = np.zeros(S.N_VECTOR)
-    changed = not series.same_inputs(inputs, memory)
+    changed, regridded = not series.same_inputs(inputs, memory), step_ticks != memory[GRID_TICKS]
+    if regridded:
+        _prepare_flows(constants, inputs, memory, float(step_ticks))
     if memory[SPAN] < 0.0 or (changed and memory[MODE] == _SERIES):
         series.begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
-    elif changed:
-        # Another division into flow and kick has other conjugate coordinates.
+    elif memory[MODE] == _KICKS and (changed or regridded):
+        # Another division into flow and kick, or another grid, has other conjugate coordinates.
         _enter_kicks(constants, memory, y, int(memory[PHASE]), int(memory[WANTED]))
     row = first = 0
     while first < steps:

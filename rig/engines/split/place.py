@@ -29,6 +29,8 @@ KICK = next(_next)
 """The last kick (`rig.engines.split.kick.Kick`): eight numbers."""
 COS, SIN, TURNED = (KICK + 8 + i for i in range(3))
 """Direction of the unbalance, and the spin angle that it is for."""
-FLOWS = TURNED + 1
+GRID_TICKS = TURNED + 1
+"""The grid's own step, for which ..."""
+FLOWS = GRID_TICKS + 1
 FLOWS_END = FLOWS + HOUSE_FLOW * LEVELS
-"""Flows of the houses."""
+"""... these are the flows of the houses."""
