@@ -12,9 +12,10 @@ import numpy as np
 
 from rig.channels import ChannelTable
 from rig.kernels.signals import COLUMN, ROW
+from rig.motion import energy_balance
 from rig.samples import Samples, place
 from rig.scenes import Scene, load_scene, parse_scene
-from rig.simulation import Frame, Simulation, energy_balance
+from rig.simulation import Frame, Simulation
 
 NAMES = tuple(COLUMN)
 _MUST = "one of the model's signals (those of the sensors are in run.samples)"

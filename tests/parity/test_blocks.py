@@ -196,6 +196,6 @@ def test_cuts_change_no_bit_with_any_engine(engine: str) -> None:
         )
         rows = [simulation.advance(length).rows.copy() for _ in range(120_000 // length)]
         assert simulation.health()["contacts"] > 0
-        return np.concatenate(rows).tobytes(), simulation._y.tobytes(), simulation._memory.tobytes()
+        return np.concatenate(rows).tobytes(), simulation._motion.y.tobytes(), simulation._motion.memory.tobytes()
 
     assert motion(1_000) == motion(120_000)

@@ -29,8 +29,9 @@ from rig.contacts import restitution_factor
 from rig.kernels import signals as S
 from rig.kernels.contact import FORWARD, SMOOTHED, TOUCHING, ring_force
 from rig.model import build_model
+from rig.motion import DISSIPATED
 from rig.offline import frames
-from rig.simulation import DISSIPATED, Simulation
+from rig.simulation import Simulation
 
 from . import reference
 

@@ -94,7 +94,7 @@ def test_order_on_the_smooth_problem(engine: str, monkeypatch: pytest.MonkeyPatc
     constants, inputs = simulation.model.constants, simulation._inputs()
 
     def swing(name: str, step: int) -> np.ndarray:
-        module, y, memory = load_engine(name), simulation._y.copy(), np.zeros(MEMORY)
+        module, y, memory = load_engine(name), simulation._motion.y.copy(), np.zeros(MEMORY)
         rows = np.empty((7, S.N_ROW))
         module.start(constants, inputs, y, memory, float(step), ENGINES[name].tolerance)
         module.advance(constants, inputs, y, memory, 0, step, 56_000 // step, 8_000 // step, rows)
@@ -130,11 +130,11 @@ def test_split_is_of_order_two_on_every_scene(name: str) -> None:
 
     def run(engine: str, **choice: Any) -> tuple[np.ndarray, Simulation]:
         simulation = ready(scene, engine, **changes, **choice)
-        simulation.tick, simulation._y = first.tick, first._y.copy()
+        simulation.tick, simulation._motion.y = first.tick, first._motion.y.copy()
         return motion(simulation, duration_s), simulation
 
     exact, reference = run("rk8", engine__step_us=5, engine__tolerance=1e-13)
-    assert (reference._memory[CONTACTS] > 0) == (name != "stable run")
+    assert (reference._motion.memory[CONTACTS] > 0) == (name != "stable run")
     # Impacts and stick make single errors scatter by several times: many steps. Below 8 us the scenes with impacts
     # flatten out (2e-7 after the first impacts, 2e-6 at 1 us after the start of the whirl), for a reason not known.
     steps = [50, 40, 25, 20, 10, 8]
@@ -147,7 +147,7 @@ def test_split_is_of_order_two_on_every_scene(name: str) -> None:
 def test_rolling_holds_the_sliding_speed_at_zero(engine: str) -> None:
     simulation = ready("hammer", engine)
     simulation.advance(200_000)
-    assert simulation._memory[PHASE] == ROLLING
+    assert simulation._motion.memory[PHASE] == ROLLING
     rows = simulation.advance(300_000).rows
     assert (rows[:, S.COLUMN["normal_force"]] > 0.0).all()
     assert np.abs(rows[:, S.COLUMN["friction_force"]]).max() > 1.0
@@ -190,7 +190,7 @@ def test_linearly_implicit_engine_holds_at_any_smoothing_speed(smoothing_speed: 
     exact = motion(ready("hammer", "rk8"), 0.15)
     implicit = ready("hammer", "rosenbrock", smoothing_speed, model__friction="smoothed")
     assert distance(motion(implicit, 0.15), exact) < 4e-3
-    assert implicit._memory[CEILING] == 0.0
+    assert implicit._motion.memory[CEILING] == 0.0
     assert abs(implicit.health()["energy"]["residual_share"]) < 3e-5
 
     # An explicit step of 25 us is some hundred times too long: what it adds is energy, and the ledger says so.
@@ -201,7 +201,7 @@ def test_linearly_implicit_engine_holds_at_any_smoothing_speed(smoothing_speed: 
     if smoothing_speed == 1e-4:
         adaptive = ready("hammer", "rk8", smoothing_speed, model__friction="smoothed")
         motion(adaptive, 0.15)
-        assert adaptive._memory[EVALUATIONS] > 2.0 * implicit._memory[EVALUATIONS]
+        assert adaptive._motion.memory[EVALUATIONS] > 2.0 * implicit._motion.memory[EVALUATIONS]
 
 
 @pytest.mark.parametrize(
@@ -214,4 +214,4 @@ def test_other_friction_laws(engine: str, friction: str) -> None:
     choice = {} if ENGINES[engine].tolerance else {"engine__step_us": 1}
     run = ready("hammer", engine, model__friction=friction, **choice)
     assert distance(motion(run, 0.034), exact) < (1e-4 if ENGINES[engine].tolerance else 2e-2)
-    assert run._memory[CONTACTS] >= 1.0
+    assert run._motion.memory[CONTACTS] >= 1.0

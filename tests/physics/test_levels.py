@@ -23,8 +23,9 @@ import numpy as np
 import pytest
 
 from rig.kernels.signals import COLUMN
+from rig.motion import energy_balance
 from rig.scenes import load_scene
-from rig.simulation import Simulation, energy_balance
+from rig.simulation import Simulation
 
 BARE: dict[str, Any] = {
     "sensors.chain": "ideal", "sensors.groups": ["hammer"], "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000,

@@ -22,6 +22,8 @@ _CONTACT = 0.35
 """... and the square of that of the contact's own, where it is settled; ..."""
 _AT = 1e-4
 """... at this tolerance; both go with its fourth root, for what is left is of order 4."""
+_STABLE = 0.6
+"""The most of it, whatever the tolerance: the houses' own modes take the kicks in up to twice as far."""
 _SWING = 5.0
 """How many times the tolerance the swing may err by: it dies out, where errors of an impact grow."""
 _OVER = 1.5
@@ -104,7 +106,7 @@ def contact_level(call, arm, wanted, h, before, slow, change, stiff, taken):
     """
     if call.tolerance == 0.0:
         return GRID
-    most = _CONTACT * math.sqrt(call.tolerance / _AT)
+    most = min(_CONTACT * math.sqrt(call.tolerance / _AT), _STABLE)
     level = wanted
     if wanted == ANY:
         level, grown = NONE, h
