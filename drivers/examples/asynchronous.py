@@ -13,8 +13,9 @@ async def main(rig: str = "zenoh:127.0.0.1:7460", instruments: str = "zenoh:127.
         async with await AsyncForce.open(instruments) as force:
             await force.configure(channels=["P_N"])
             await force.start()
-            one, other = await asyncio.gather(force.read(2000), daq.aread(2000))
-    shift = one.index - other.index
+            one, other = await asyncio.gather(force.read(1000), daq.aread(1000))
+            while abs(shift := one.index - other.index) > 500:  # one of them began long before the other
+                one, other = (one, await daq.aread(1000)) if shift > 0 else (await force.read(1000), other)
     difference = abs(one.values[max(-shift, 0) :][:500] - other.values[max(shift, 0) :][:500]).max()
     print(f"largest difference {difference} {one.units[0]}")
     return difference

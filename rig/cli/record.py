@@ -227,7 +227,7 @@ def run_session(session: RecordingSession) -> Summary:
             def show(progress: Progress) -> None:
                 nonlocal begun
                 if progress.rows and not begun and not console.is_terminal:
-                    into = " or ".join(map(str, files)) + more
+                    into = printable(" or ".join(map(str, files))) + more
                     echo(f"rig: recording {into}; Ctrl-C ends it well", err=True)  # scripts wait for this line
                 begun = begun or progress.rows > 0
                 remark(progress.remarks)

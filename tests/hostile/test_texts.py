@@ -371,7 +371,8 @@ def test_a_recording_to_such_a_path_is_made(name: str, capsys: pytest.CaptureFix
         show(progress)
         return summary
 
-    assert run_session(SimpleNamespace(path=Path(name), run=run, stop=lambda _: None)) is summary  # type: ignore[arg-type]
+    session = SimpleNamespace(path=Path(name), first_files=[Path(name)], run=run, stop=lambda _: None)
+    assert run_session(session) is summary  # type: ignore[arg-type]
     printed_safely(capsys.readouterr().err)
 
 

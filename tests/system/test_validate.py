@@ -61,7 +61,7 @@ def test_json_and_another_engine(recording: Path, capsys: pytest.CaptureFixture[
         (["--set", "contact.frction=1"], "contact.frction must be"),
         (["--criteria", "missing.toml"], "missing.toml must be a readable file"),
         (["--report", "r.txt"], "--report must be a file name that ends in"),
-        (["--engine", "euler"], "engine.name must be"),
+        (["--engine", "euler"], "--engine must be one of"),
     ],
 )
 def test_wrong_input_ends_in_2(

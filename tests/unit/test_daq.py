@@ -24,6 +24,7 @@ from drivers.can.schedule import Schedule
 from drivers.can.signals import default_messages
 from drivers.console import Console
 from drivers.daq import Aligner, Daq
+from drivers.force.driver import AsyncForce
 from drivers.link import LinkTimeoutError
 from drivers.samples import Pile, Samples, StreamEndedError, follow
 from drivers.sources.can import CanSource, Layout
@@ -507,9 +508,18 @@ def test_example_callback(live: tuple[str, str]) -> None:
     assert main(live[0], seconds=2.0) > 100
 
 
-def test_example_asynchronous(live: tuple[str, str]) -> None:
+@pytest.mark.parametrize(("late", "name"), [(None, ""), (AsyncForce, "read"), (Daq, "aread")])
+def test_example_asynchronous(live: tuple[str, str], late: Any, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However much later one of the two begins: the first read passes over rows."""
     from drivers.examples.asynchronous import main
 
+    async def held_up(reader: Any, rows: int) -> Samples:
+        monkeypatch.undo()
+        await getattr(reader, name)(3000)
+        return await getattr(reader, name)(rows)
+
+    if late:
+        monkeypatch.setattr(late, name, held_up)
     assert asyncio.run(main(*live)) == 0.0
 
 
