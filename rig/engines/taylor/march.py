@@ -201,13 +201,12 @@ def _note_peak(constants, inputs, memory, Y, x):
             low, high = before, s
             for _ in range(30):
                 middle = 0.5 * (low + high)
-                value, slope_middle = column_at(Y, FORCE, 0, middle)
-                if slope_middle > 0.0:
+                if column_at(Y, FORCE, 0, middle)[1] > 0.0:
                     low = middle
                 else:
                     high = middle
-            if value > peak:
-                peak = max(peak, _force_at(constants, inputs, memory, Y, middle, x))
+            if column_at(Y, FORCE, 0, high)[0] > peak:
+                peak = max(peak, _force_at(constants, inputs, memory, Y, high, x))
         before, slope_before = s, slope
     memory[PEAK_FORCE] = peak
 
