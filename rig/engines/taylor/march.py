@@ -13,7 +13,7 @@ Contact. delta^1.5 has branch points at onset and lift-off, next to which a seri
 nearer one: a hundred steps a contact. While it slides, the series is therefore in tau with dt = s dtau, s the root of
 delta, itself a state, s' = delta'/2 by tau: the force goes as s^3, onset and lift-off are simple zeros of s, and an
 impact takes some 16 steps. (Levi-Civita and Sundman treat collisions of bodies so.) Where the law's exponent is neither
-1 nor 1.5, contacts begin at a depth of 1e-14 m. Rolling ends before the lift-off and stays with time.
+1 nor 1.5, contacts begin at a depth of 1e-11 of the clearance. Rolling ends before the lift-off and stays with time.
 
 Steps run on beyond the rows, which are read off the series; so the memory holds one. Where the inputs change, it is
 dropped at that instant. So neither calls nor the density of rows change a bit of the motion.
