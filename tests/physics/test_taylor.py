@@ -274,9 +274,9 @@ def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
     one, other = (
         simulate("hammer", {**changes, "engine.name": name}, duration_s=0.05).simulation for name in ("taylor", "rk8")
     )
-    assert one._memory[CONTACTS] == other._memory[CONTACTS] > 1
-    assert np.abs(scaled(one._y[: S.N_STATE]) - scaled(other._y[: S.N_STATE])).max() < 1e-6
-    assert one._memory[STEPS] < 400
+    assert one._motion.memory[CONTACTS] == other._motion.memory[CONTACTS] > 1
+    assert np.abs(scaled(one._motion.y[: S.N_STATE]) - scaled(other._motion.y[: S.N_STATE])).max() < 1e-6
+    assert one._motion.memory[STEPS] < 400
     assert not one.health()["warnings"]
 
 
