@@ -17,7 +17,6 @@ from numba import njit
 from rig.kernels import signals as S
 from rig.kernels.axis import angles_of, axis_of
 from rig.kernels.contact import NO_FRICTION
-from rig.kernels.magnet import magnet_force
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 """What the compiler may do beyond the rules of IEEE 754: fuse, reorder, take reciprocals. One build makes the same bits
@@ -93,8 +92,6 @@ class Plant(NamedTuple):
     loose_v: float  # displacement at which a vertical transducer comes loose [m]
     loose_h: float  # the same, horizontal [m]
     tightest: float  # root of twice the houses' energy at which one of them can come loose [J^0.5]
-    pull: float  # no less than what weight and magnets make of the shaft at the ring [m/s^2]
-    swing: float  # no less than the rate of its swing on the magnets [1/s]
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -118,13 +115,6 @@ def plant_of(constants, inputs, rest, spring_x, spring_y):
     spin_mobility = 0.0 if ideal else R * R * per_Izz
     loose_v = 2.0 * house.preload / house.pair_stiffness_vertical
     loose_h = 2.0 * house.preload / house.pair_stiffness_horizontal
-    # At the edge of the ring, twice over.
-    weight = -shaft.mass * shaft.gravity * shaft.arm_centre
-    edge = lB / lA * (contact.clearance + math.sqrt(contact.offset_x**2 + contact.offset_y**2))
-    held = lB * abs(magnet_force(0.0, -edge, magnet)[1]) if engaged else 0.0
-    pull = 2.0 * lA * per_Ixx * (abs(weight) + held)
-    stiffness = abs(magnet_force(0.0, -1.01 * edge, magnet)[1] - magnet_force(0.0, -edge, magnet)[1]) / (0.01 * edge)
-    swing = math.sqrt(lB * lB * stiffness * per_Ixx) if engaged else 0.0
     return Plant(
         per_Ixx,
         per_Izz,
@@ -135,7 +125,7 @@ def plant_of(constants, inputs, rest, spring_x, spring_y):
         spin_mobility,
         1.0 / (mobility + per_inner + spin_mobility),
         shaft.polar_inertia * per_Ixx,
-        weight,
+        -shaft.mass * shaft.gravity * shaft.arm_centre,
         rest if engaged else 0.0,
         spring_x if engaged else 0.0,
         spring_y if engaged else 0.0,
@@ -149,8 +139,6 @@ def plant_of(constants, inputs, rest, spring_x, spring_y):
             loose_v * math.sqrt(house.pair_stiffness_vertical),
             loose_h * math.sqrt(house.pair_stiffness_horizontal),
         ),
-        pull,
-        swing,
     )
 
 

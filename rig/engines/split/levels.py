@@ -9,6 +9,7 @@ import math
 
 from rig.engines.split.flow import GRID, LEVELS
 from rig.engines.split.inner_motion import eccentricity, house_energy, inlined
+from rig.kernels.magnet import magnet_force
 
 NONE, ANY = -1, -2
 """No level: the step is not one for kicks; or whichever the contact asks for, which is known after a kick."""
@@ -16,7 +17,7 @@ _SHORTEST = GRID - 1
 """Shortest step that a contact is worth; below it the series are no slower."""
 _NEAREST = GRID
 """Shortest flight that is worth it."""
-_FLIGHT = 0.3
+_FLIGHT = 0.04
 """Angle that the shaft's fastest swing, or its spin, may turn by in a step of flight [rad], ..."""
 _CONTACT = 0.35
 """... and the square of that of the contact's own, where it is settled; ..."""
@@ -41,31 +42,34 @@ def span_of(call, level):
 
 
 @inlined
-def longest_flight(call, tolerance, spin):
-    """Longest step of flight that keeps the tolerance [s]; 0 tolerance: the grid's own."""
-    if tolerance == 0.0:
-        return 2.0 * span_of(call, GRID)
-    return _FLIGHT * math.sqrt(math.sqrt(tolerance / _AT)) / max(call.plant.swing, abs(spin))
-
-
-@inlined
-def flight_level(constants, call, axis, spin, houses, owed_s, longest_s):
+def flight_level(constants, inputs, call, axis, spin, houses, owed_s):
     """Level of the next step in flight: as long as the gap cannot close in it; NONE where it may.
+
+    The bound is on half of the gap: up to there the magnets pull no harder, and swing the shaft no faster, than there.
 
     Args:
         constants: Of the model.
+        inputs: Of this call.
         call: What stays through the call.
         axis: Of the shaft.
         spin: w [rad/s].
         houses: Of the stator.
         owed_s: Flow that the last kick still owes [s].
-        longest_s: Longest step [s].
     """
-    plant, shaft = call.plant, constants.shaft
-    pull = plant.pull + 2.0 * plant.arm * shaft.arm_ring * shaft.arm_disk * shaft.unbalance * spin * spin
+    plant, shaft, lA = call.plant, constants.shaft, constants.shaft.arm_ring
     ex, ey = eccentricity(constants, axis, houses)
-    free = constants.contact.clearance - math.sqrt(ex * ex + ey * ey)
-    speed = shaft.arm_ring * math.sqrt(axis.px * axis.px + axis.py * axis.py)
+    half = 0.5 * (constants.contact.clearance - math.sqrt(ex * ex + ey * ey))
+    if half <= 0.0:
+        return NONE
+    torque, swing = abs(plant.weight), 0.0
+    if inputs.magnet_engaged:
+        place = shaft.arm_magnet * (math.sqrt(axis.ux * axis.ux + axis.uy * axis.uy) + half / lA)
+        held = abs(magnet_force(0.0, -place, constants.magnet)[1])
+        stiffness = (abs(magnet_force(0.0, -1.01 * place, constants.magnet)[1]) - held) / (0.01 * place)
+        torque += shaft.arm_magnet * held
+        swing = shaft.arm_magnet * math.sqrt(max(0.0, stiffness) * plant.per_Ixx)
+    pull = plant.arm * lA * (torque + 2.0 * shaft.arm_disk * shaft.unbalance * spin * spin)
+    speed = lA * math.sqrt(axis.px * axis.px + axis.py * axis.py)
     if constants.levels.inner_house:
         ringing = math.sqrt(2.0 * house_energy(constants, houses))
         # Transducers that come loose are no part of the flow.
@@ -73,12 +77,15 @@ def flight_level(constants, call, axis, spin, houses, owed_s, longest_s):
             return NONE
         outer = constants.contact.gap_counts_outer * math.sqrt(plant.per_outer)
         speed += ringing * (math.sqrt(plant.per_inner) + outer)
+    longest_s = 2.0 * span_of(call, GRID)
+    if call.tolerance > 0.0:
+        longest_s = _FLIGHT * math.sqrt(math.sqrt(call.tolerance / _AT)) / max(swing, abs(spin))
     level = NONE
     longer = _NEAREST
     while longer < LEVELS - 1:
         t = 2.0 * span_of(call, longer)
         reach = owed_s + 2.0 * t
-        if t > longest_s or free < reach * (speed + pull * reach):
+        if t > longest_s or half < reach * (speed + pull * reach):
             break
         level = longer
         longer += 1

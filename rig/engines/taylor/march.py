@@ -64,7 +64,7 @@ from rig.kernels.contact import FLIGHT, ROLLING, TOUCHING, held_speed, normal_fo
 from rig.kernels.forces import drive_speed
 
 _SAFETY = 0.9
-_LONGEST_S, _SHORTEST_S = 2e-2, 1e-12
+_LONGEST_S, _SHORTEST_S = 6e-2, 1e-12
 """Longest step, and the shortest that is no sign of trouble [s], in the variable of the series."""
 _ROUNDING = 1e-16
 """Tolerance that no step can vouch for."""
