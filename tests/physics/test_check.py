@@ -49,5 +49,5 @@ def test_contacts_missed_are_a_wrong_branch(contacts: tuple[int, int], wrong: bo
 
 def test_adaptive_engine_is_checked_by_its_tolerance() -> None:
     found = check(load_scene("hammer", {"duration_s": 0.1, "engine.name": "rk8", "engine.tolerance": 1e-6}))
-    assert "1e-08" in found.line()
+    assert "rk8 at tolerance 1e-07" in found.line()
     assert 0.0 < found.error < 1e-3
