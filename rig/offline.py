@@ -19,7 +19,7 @@ from rig.scenes import Scene, load_scene, parse_scene
 from rig.simulation import DISSIPATED, STORED, SUPPLIED, Frame, Simulation, energy_balance
 
 NAMES = tuple(COLUMN)
-_MUST = "one of the signals that it keeps of the model (those of the sensors are in run.samples)"
+_MUST = "one of the signals it keeps of the model (those of the sensors are in run.samples)"
 _MOST_ROWS = 100_000
 """Rows of which the energy ledger is drawn up at a time."""
 
@@ -57,7 +57,7 @@ class Run:
         '1.57 mm'
         >>> run["disk_z"]
         Traceback (most recent call last):
-        rig.errors.UnknownNameError: name must be one of the signals that it keeps of the model (...), such as disk_y, ...
+        rig.errors.UnknownNameError: name must be one of the signals it keeps of the model (...), such as disk_y, ...
         >>> run.energy()
         Samples(stored, supplied, dissipated, residual [J]; 1000 rows at 20000 Hz, 0 to 0.04995 s)
     """

@@ -185,7 +185,7 @@ def test_a_run_keeps_the_columns_that_are_named_where_they_are_to_go(tmp_path: P
     few = simulate("hammer", duration_s=0.05, signals=["disk_x"], folder=str(folder))
     np.testing.assert_array_equal(some.signals, mine)
     assert (few.names, few.signals.shape) == (("disk_x",), (1000, 1))
-    with pytest.raises(UnknownNameError, match=r"^name must be one of the signals that it keeps"):
+    with pytest.raises(UnknownNameError, match=r"^name must be one of the signals it keeps"):
         few["normal_force"]
     with pytest.raises(InputError, match=r"^signals must be with kinetic_energy, .* for an energy ledger"):
         few.energy()

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, get_args
 
+from replays.studies.ladder import settings
 from replays.studies.ladder.measurement import Candidate, Measurement, check_reads, measure, saving
 from replays.studies.ladder.quantity import QUANTITIES, Value
 from rig.engines import ENGINES
@@ -32,13 +33,6 @@ STAND_INS = ("smoothed", "switch")
 """Friction laws that stand in for the exact one: measured, not picked, for they spare no work."""
 WORTH = 0.1
 """What is left out saves more than this part of the cost; costs this close are the same."""
-_REFERENCE = ("rk8", 25, 1e-10)
-_UNLIKE = "split"
-"""Another method in other coordinates, at its finest; it converges the models that the reference's cannot take."""
-_FINEST = 1e-3
-"""Of an engine's own tolerance; an engine without one is at its finest with steps of 1 us."""
-_GRIDS = (1000, 500, 250, 200, 125, 100, 50, 25, 20, 10, 5)
-_STEPS = (1, 2, 5, 10, 20, 25, 40, 50, 100)
 _SPARE = 0.2
 """Part of the budget that is left to the verification."""
 
@@ -158,8 +152,8 @@ def search(
             picked = _cheapest(work, passing)
         else:
             break
-    given = work.run(_given(scene), sensors={})
-    full = work.run(standard.full.with_engine(*_usual(scene, standard.full, _REFERENCE[0])), sensors={})
+    given = work.run(settings.as_given(scene), sensors={})
+    full = work.run(standard.full.with_engine(*settings.usual(scene, standard.full, settings.REFERENCE[0])), sensors={})
     own = _as_given(work, standard)
     if own.passes and work.saving(picked.measured.candidate, own.measured.candidate) <= WORTH:
         picked, savings = own, {}
@@ -219,8 +213,8 @@ class _Work:
 
     def usual(self, candidate: Candidate) -> Candidate:
         """A model on the first engine that takes it."""
-        engine = next(engine for engine in ENGINES if _takes(engine, candidate))
-        return candidate.with_engine(*_usual(self.scene, candidate, engine))
+        engine = next(engine for engine in ENGINES if settings.takes(engine, candidate))
+        return candidate.with_engine(*settings.usual(self.scene, candidate, engine))
 
     def saving(self, simpler: Candidate, fuller: Candidate) -> float:
         """Part of the cost of the fuller one that the simpler one saves."""
@@ -281,8 +275,8 @@ def _standard(work: _Work) -> _Standard:
     """
     # Of model levels the last choice is full, of the drive the scene's own.
     levels: Any = {name: choices[-1] for name, choices in LEVELS.items() if name != "drive"}
-    full = Candidate(ModelLevels(**levels), work.scene.drive.mode, *_REFERENCE)
-    other = full.with_engine(*_finest(_UNLIKE))
+    full = Candidate(ModelLevels(**levels), work.scene.drive.mode, *settings.REFERENCE)
+    other = full.with_engine(*settings.finest(settings.UNLIKE))
     work.progress(f"full model, {full.method}, and {other.method} beside it")
     reference = work.run(full)
     unlike = work.run(other, runs=1)
@@ -324,7 +318,7 @@ def _one_at_a_time(work: _Work, standard: _Standard, keep: tuple[str, ...]) -> d
         for choice in choices[: choices.index(full.model[level])]:
             lowered = full.with_model(**{level: choice})
             work.progress(f"{level} {choice}")
-            converged = work.run(_converged(lowered), runs=1)
+            converged = work.run(settings.converged(lowered), runs=1)
             cost = work.cost(lowered)
             part = 1.0 - cost.cpu_s / top.cpu_s
             note = "stands in for exact" if choice in STAND_INS else f"saves {max(part, 0.0):.0%}"
@@ -343,7 +337,7 @@ def _together(
         combined = standard.full.with_model(**chosen)
         label = ", ".join(f"{level} {choice}" for level, choice in chosen.items()) or "full model"
         work.progress(f"together: {label}")
-        converged = work.run(_converged(combined), runs=1) if chosen else standard.reference
+        converged = work.run(settings.converged(combined), runs=1) if chosen else standard.reference
         errors, cost = standard.model_errors(converged), work.cost(combined)
         work.steps.append(standard.step("together", label, converged, errors, cost=cost))
         if work.steps[-1].passes:
@@ -387,7 +381,7 @@ def _put_back(
 
     def placed(levels: dict[str, str], other: dict[str, str]) -> Candidate:
         both = [standard.full.with_model(**each) for each in (levels, other)]
-        if setting is None or not all(_takes(setting.engine, each) for each in both):
+        if setting is None or not all(settings.takes(setting.engine, each) for each in both):
             return work.usual(both[0])
         return both[0].with_engine(setting.engine, setting.step_us, setting.tolerance)
 
@@ -412,8 +406,8 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
     """
     passing: list[tuple[Step, int]] = []
     complete = True
-    for place, (engine, settings) in enumerate(_settings(work.scene, best.candidate).items()):
-        for step_us, tolerance in settings:
+    for place, (engine, tried) in enumerate(settings.tried(work.scene, best.candidate).items()):
+        for step_us, tolerance in tried:
             if work.left_s <= _SPARE * work.budget_s and passing:
                 complete = False
                 break
@@ -446,9 +440,9 @@ def _cheapest(work: _Work, passing: list[tuple[Step, int]]) -> Step:
 
 def _as_given(work: _Work, standard: _Standard) -> Step:
     """The scene's own model, engine and step, as they would run in the place of the pick."""
-    own = _given(work.scene)
+    own = settings.as_given(work.scene)
     work.progress("the scene as it is given")
-    converged, done = work.run(_converged(own), runs=1), work.run(own, sensors=work.sensors)
+    converged, done = work.run(settings.converged(own), runs=1), work.run(own, sensors=work.sensors)
     work.steps.append(standard.step("given", f"as given: {own.method}", done, standard.all_errors(done, converged)))
     return work.steps[-1]
 
@@ -459,56 +453,5 @@ def _preference(entry: tuple[Step, int]) -> tuple[float, ...]:
     return place, -step.measured.candidate.step_us, -step.measured.candidate.tolerance
 
 
-def _takes(engine: str, candidate: Candidate) -> bool:
-    method = ENGINES[engine]
-    return candidate.levels.friction in method.frictions and candidate.levels.contact in method.contacts
-
-
 def _alike(one: Measurement, other: Measurement) -> bool:
     return one.ending is not None and other.ending is not None and one.ending.alike(other.ending)
-
-
-def _converged(candidate: Candidate) -> Candidate:
-    """A model on the engine of the reference, or on the unlike one at its finest where that cannot take it."""
-    return candidate.with_engine(*(_REFERENCE if _takes(_REFERENCE[0], candidate) else _finest(_UNLIKE)))
-
-
-def _finest(engine: str) -> tuple[str, int, float]:
-    method = ENGINES[engine]
-    return (engine, method.step_us, _FINEST * method.tolerance) if method.tolerance else (engine, 1, 0.0)
-
-
-def _usual(scene: Scene, candidate: Candidate, engine: str) -> tuple[str, int, float]:
-    """An engine at its own tolerance, and its own step or the longest below it that fits the sample rates."""
-    method = ENGINES[engine]
-    steps = (step for step in _GRIDS if step <= method.step_us and _fits(scene, candidate, engine, step))
-    return engine, next(steps, method.step_us), method.tolerance
-
-
-def _given(scene: Scene) -> Candidate:
-    return Candidate(scene.model, scene.drive.mode, scene.engine.name, scene.engine.step_us, scene.engine.tolerance)
-
-
-def _settings(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float]]]:
-    """Steps, or tolerances, of every engine that takes a model and fits the sample rates, the finest first."""
-    settings: dict[str, list[tuple[int, float]]] = {}
-    for engine, method in ENGINES.items():
-        if not _takes(engine, candidate):
-            continue
-        if method.tolerance:
-            grids = [step for step in _GRIDS if step <= method.step_us and _fits(scene, candidate, engine, step)]
-            scales = (1e-2, 1.0, 1e2)
-            settings[engine] = [(grids[0], method.tolerance * scale) for scale in scales] if grids else []
-        else:
-            steps = [step for step in _STEPS if 0.2 * method.step_us <= step <= 4.0 * method.step_us]
-            settings[engine] = [(step, 0.0) for step in steps if _fits(scene, candidate, engine, step)]
-    return settings
-
-
-def _fits(scene: Scene, candidate: Candidate, engine: str, step_us: int) -> bool:
-    try:
-        for sensors in ({}, None):  # as it will run, and as it is measured
-            candidate.with_engine(engine, step_us, 0.0).scene(scene, sensors=sensors)
-    except InputError:
-        return False
-    return True
