@@ -73,11 +73,11 @@ class Pick(Written):
     def apply(self, data: dict[str, Any]) -> dict[str, Any]:
         """The fields of a scene with the pick's in their place."""
         levels = {name: getattr(self, name) for name in ModelLevels.model_fields}
-        engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
+        engine = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
         return {
             **data,
             "model": levels,
-            "engine": engine,
+            "engine": {**table_in(data, "engine"), **engine},
             "drive": {**table_in(data, "drive"), "mode": self.drive},
             "sensors": {**table_in(data, "sensors"), "chain": self.sensors},
         }

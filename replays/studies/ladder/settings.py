@@ -64,7 +64,7 @@ def tried(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float
 def _fits(scene: Scene, candidate: Candidate, engine: str, step_us: int) -> bool:
     try:
         for sensors in ({}, None):  # as it will run, and as it is measured
-            candidate.with_engine(engine, step_us, 0.0).scene(scene, sensors=sensors)
+            candidate.with_engine(engine, step_us, ENGINES[engine].tolerance).scene(scene, sensors=sensors)
     except InputError:
         return False
     return True
