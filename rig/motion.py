@@ -96,8 +96,8 @@ class Accuracy:
     doubted_s: float | None = None
     _first: tuple[float, float] | None = None
 
-    def compare(self, rows: np.ndarray, companion: np.ndarray, times_s: np.ndarray) -> float | None:
-        """Take note of both runs at the same instants.
+    def compare(self, rows: np.ndarray, companion: np.ndarray, times_s: np.ndarray) -> str | None:
+        """Take note of both runs at the same instants, one after the other.
 
         Args:
             rows: Observed rows, shape (n, N_ROW).
@@ -105,20 +105,20 @@ class Accuracy:
             times_s: Instants [s], shape (n,).
 
         Returns:
-            The instant at which the run came into doubt [s], if it did so now.
+            What to say, if the run has come into doubt in these.
         """
         away = (rows[:, : S.N_STATE] - companion[:, : S.N_STATE]) / S.STATE_SCALE
-        distances = np.sqrt(np.mean(away**2, axis=1))
-        self.estimate = max(self.estimate, float(distances.max(initial=0.0)))
-        for time, distance in zip(times_s.tolist(), distances.tolist(), strict=True):
+        said = None
+        for time, distance in zip(times_s.tolist(), np.sqrt(np.mean(away**2, axis=1)).tolist(), strict=True):
+            self.estimate = max(self.estimate, distance)
             if self._first is None and distance > _FIRST:
                 self._first = time, distance
             elif self._first is not None and self._first[1] < distance < _LOST:
                 self.grown_per_s = math.log(distance / self._first[1]) / (time - self._first[0])
-        if self.doubted_s is not None or self.estimate <= DOUBT * self.tolerance:
-            return None
-        self.doubted_s = float(times_s[np.argmax(distances > DOUBT * self.tolerance)])
-        return self.doubted_s
+            if self.doubted_s is None and self.estimate > DOUBT * self.tolerance:
+                self.doubted_s = time
+                said = self.warning()
+        return said
 
     def document(self) -> dict[str, float | None]:
         """As JSON."""

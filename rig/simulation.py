@@ -215,7 +215,7 @@ class Simulation:
                 f"the state is no longer finite at {self._lost_s(rows, start):.6f} s; {self._method.advice}"
             )
         if self._companion is not None:
-            events += self._doubts(rows, companion, start)
+            events = sorted(events + self._doubts(rows, companion, start), key=lambda event: event["tick"])
         return Frame(
             tick=start,
             ticks=ticks,
@@ -234,10 +234,9 @@ class Simulation:
     def _doubts(self, rows: np.ndarray, companion: np.ndarray, start: int) -> list[dict[str, Any]]:
         every = self.block_ticks // self.row_ticks
         times_s = (start + self.block_ticks * np.arange(len(companion))) / TICK_RATE_HZ
-        since_s = self._accuracy.compare(rows[::every], companion, times_s)
-        if since_s is None:
+        text, since_s = self._accuracy.compare(rows[::every], companion, times_s), self._accuracy.doubted_s
+        if text is None or since_s is None:
             return []
-        text = self._accuracy.warning()
         return [{"event": "warning", "tick": round(since_s * TICK_RATE_HZ), "time_s": since_s, "text": text}]
 
     def submit(self, name: str, request: dict[str, Any]) -> int:

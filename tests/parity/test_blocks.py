@@ -95,8 +95,14 @@ def whole() -> Whole:
 
 
 def test_there_is_something_to_compare(whole: Whole) -> None:
-    assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "release"]
-    assert [event["tick"] for event in whole.events] == [20_000, 150_000, 205_000, 400_000]
+    # A hard blow on a rolling shaft: its error estimate comes above ten times the tolerance, which is an event too.
+    assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "warning", "release"]
+    assert [event["tick"] for event in whole.events if event["event"] != "warning"] == [
+        20_000,
+        150_000,
+        205_000,
+        400_000,
+    ]
     assert whole.health["contacts"] > 10
     assert len(whole.edges) == 3
     assert len(whole.rows) == END // 25

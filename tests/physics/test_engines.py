@@ -138,7 +138,7 @@ def test_split_keeps_its_tolerance_on_every_scene(name: str) -> None:
     assert all(error < 10.0 * tolerance for error, tolerance in zip(errors, tolerances, strict=True)), errors
 
 
-# Where kicks alone have been of order 1, or wrong: hard blows, lost preload, another gap, another exponent, grazing sets.
+# Where kicks alone have been of order 1, or wrong: hard blows, lost preload, another gap, other exponents and sets.
 HARD: dict[str, dict[str, Any]] = {
     "300 N": {"commands": [{"at_s": 0.02, "command": "hammer", "force_n": 300.0, "duration_ms": 5.0}]},
     "lost preload": {"house.preload": 300.0},
