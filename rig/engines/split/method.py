@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from rig.engines.memory import PHASE
-from rig.engines.split.flow import GRID, HOUSE_FLOW, LEVELS, house_flows, magnet_springs, shaft_flows
+from rig.engines.split.flow import GRID, house_flows, magnet_springs, shaft_flows
 from rig.engines.split.inner_motion import (
     FAST,
     eccentricity,
@@ -66,7 +66,6 @@ _SETTLED_S = 1e-3
 """A contact is one for kicks after this time without an event [s]; and if they had to leave it, after this time."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: the series, and the flows for this step."""
     series.start(constants, inputs, y, memory, step_ticks, _SHARE * tolerance if tolerance > 0.0 else 1e-9)
@@ -76,11 +75,10 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     _prepare_flows(constants, inputs, memory, step_ticks)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
 def _prepare_flows(constants, inputs, memory, step_ticks):
     """Flows of the houses for steps of another grid."""
     memory[GRID_TICKS] = step_ticks
-    house_flows(constants, step_ticks * inputs.tick_s, memory[FLOWS:FLOWS_END].reshape(LEVELS, HOUSE_FLOW))
+    memory[FLOWS:FLOWS_END] = house_flows(constants, step_ticks * inputs.tick_s).ravel()
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -160,18 +158,24 @@ def _leave_kicks(constants, inputs, plant, memory, y):
     return False
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """See `rig.engines`."""
+    regridded = step_ticks != memory[GRID_TICKS]
+    if regridded:
+        _prepare_flows(constants, inputs, memory, step_ticks)
+    _advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows, regridded)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows, regridded):
+    """The same, on flows for this grid; `regridded` says that they are new."""
     plant = plant_of(constants, inputs, memory[REST], memory[SPRING_X], memory[SPRING_Y])
     shaft_table = shaft_flows(plant, inputs.magnet_engaged, step_ticks * inputs.tick_s)
     half_s = 0.5 * 2.0**-GRID * (step_ticks * inputs.tick_s)
     call = Call(plant, step_ticks / 2.0**GRID, half_s, 0.5 / half_s, memory[LIMIT])
     room = series.room_in(memory)
     ledger = np.zeros(S.N_VECTOR)
-    changed, regridded = not series.same_inputs(inputs, memory), step_ticks != memory[GRID_TICKS]
-    if regridded:
-        _prepare_flows(constants, inputs, memory, float(step_ticks))
+    changed = not series.same_inputs(inputs, memory)
     if memory[SPAN] < 0.0 or (changed and memory[MODE] == _SERIES):
         series.begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
     elif memory[MODE] == _KICKS and (changed or regridded):
