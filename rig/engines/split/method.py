@@ -53,6 +53,7 @@ from rig.engines.taylor.events import FIRST, NOTHING
 from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, SLACK, SPAN
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT, ROLLING
+from rig.kernels.geometry import gap
 
 ORDER = 2
 
@@ -153,6 +154,8 @@ def _leave_kicks(constants, inputs, plant, memory, y):
         touched = memory[PHASE] != FLIGHT
         memory[PHASE] = FLIGHT
         return touched and part(constants, inputs, plant, y)
+    if memory[PHASE] != FLIGHT and gap(constants, y)[0] <= 0.0:
+        memory[PHASE] = FLIGHT
     if memory[PHASE] == ROLLING:
         hold(constants, inputs, plant, y)
     return False

@@ -150,13 +150,16 @@ def _make_series(constants, inputs, memory, room):
 def _length(memory, Y, slowed):
     """How far a series holds: its last two terms stay within the tolerance."""
     tolerance = memory[TOLERANCE]
-    last = before = 0.0
+    last = before = known = 0.0
     for i in range(S.N_STATE):
+        known += Y[ORDER, i]
         last = max(last, abs(Y[ORDER, i]) * PER_SCALE[i])
         before = max(before, abs(Y[ORDER - 1, i]) * PER_SCALE[i])
     if slowed:
         last = max(last, abs(Y[ORDER, TIME]) / _SCALE_T, abs(Y[ORDER, ROOT]) / _SCALE_ROOT)
         before = max(before, abs(Y[ORDER - 1, TIME]) / _SCALE_T, abs(Y[ORDER - 1, ROOT]) / _SCALE_ROOT)
+    if not math.isfinite(known):  # max leaves out what is none
+        return math.nan
     return _SAFETY * min(
         (tolerance / max(last, 1e-200)) ** (1.0 / ORDER), (tolerance / max(before, 1e-200)) ** (1.0 / (ORDER - 1.0))
     )
