@@ -98,7 +98,8 @@ class EngineChoice(Written):
         name = data.get("name", next(iter(ENGINES))) if isinstance(data, dict) else None
         if not isinstance(name, str) or (method := ENGINES.get(name)) is None:
             return data
-        return {"step_us": method.step_us, "tolerance": method.tolerance, "companion": method.companion, **data}
+        own = {"step_us": method.step_us, "companion": method.companion, **data}
+        return {**own, "tolerance": data.get("tolerance") or method.tolerance}  # 0 is what recordings of 0.1 say
 
 
 @cache
