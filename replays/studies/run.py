@@ -122,3 +122,19 @@ def run_scene(
             kept.clear()
         kept.append(frame.rows[::every].copy())
     return Timed(np.concatenate(kept), wall_s, cpu_s)
+
+
+def end_with_parent() -> None:
+    """A worker would wait for work for ever when the process that started it was killed."""
+    import os
+    from multiprocessing import parent_process
+    from threading import Thread
+
+    parent = parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()

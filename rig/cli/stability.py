@@ -1,10 +1,11 @@
-"""`rig stability`: trials of every engine, each with its expected verdict; maps of where they hold and fail."""
+"""`rig stability`: trials of every engine, each with an expected verdict; maps of where they hold; random scenes."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,21 +23,40 @@ def stability(
     *,
     only: Annotated[
         str | None,
-        typer.Option("--only", metavar="T3,T7", help="Only these trials; pictures stay whole."),
+        typer.Option("--only", metavar="T3,T7", help="Only these trials; pictures stay whole. With --random: scenes."),
     ] = None,
     engines: Annotated[str | None, typer.Option("--engines", metavar="ENGINE,...", help="Only these engines.")] = None,
     full: Annotated[
         bool, typer.Option("--full/--quick", help="Long ladders and fine maps (some minutes), or the short ones.")
     ] = False,
+    random: Annotated[
+        int | None,
+        typer.Option("--random", metavar="N", min=1, help="Random scenes 0 to N-1 instead, against accurate runs."),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the random scenes.")] = 1,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="Draw the maps as well, as PNG and SVG.")
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FOLDER",
+            help="Draw the maps as well, as PNG and SVG. With --random: keep what is measured, and go on from it.",
+        ),
     ] = None,
     form: Form,
 ) -> None:
-    """Test where integration methods fail; exit status 1 if any does not do what theory expects."""
+    """Test where integration methods fail; exit status 1 if any does not do what theory expects.
+
+    With --random, every engine runs random scenes, wide over all parameters, laws and levels, against two accurate
+    engines that agree: exit status 1 if the first engine is wrong without a warning, or fails.
+    """
     from replays.studies.stability.table import chosen_engines, chosen_trials, run_trials
 
-    trials, names = chosen_trials(only), chosen_engines(engines)
+    names = chosen_engines(engines)
+    if random is not None:
+        _sweep(random, seed, only, names, output, form)
+        return
+    trials = chosen_trials(only)
     cells: list[Cell] = []
     pictures: list[Path] = []
     with reporting(compiles=True) as reporter:
@@ -62,6 +82,83 @@ def stability(
             echo(f"picture  {path}")
     if wrong:
         raise typer.Exit(1)
+
+
+def _sweep(count: int, seed: int, only: str | None, engines: list[str], folder: Path | None, form: Form) -> None:
+    from replays.studies.stability.sweep import chosen_numbers, summary, sweep
+
+    numbers, rows, interrupted = chosen_numbers(only, count), [], False
+    with reporting() as reporter:
+        reporter.begin(len(numbers))
+        try:
+            for row in sweep(numbers, seed=seed, engines=engines, folder=folder):
+                rows.append(row)
+                reporter.step(f"scene {row['number']}: {row['status']}")
+        except KeyboardInterrupt:
+            interrupted = True
+    found = summary(rows, engines)
+    pictures: list[Path] = []
+    if folder is not None and found["scenes"]["decided"]:
+        from replays.studies.stability.sweep_figure import draw_sweep
+
+        pictures = draw_sweep(folder, rows, engines)
+    if form.as_json:
+        echo_json({"seed": seed, **found, "pictures": [str(path) for path in pictures]})
+    else:
+        console = form.console()
+        console.print(sweep_table(found, seed))
+        for line in _sweep_lines(found):
+            echo(line)
+        for path in pictures:
+            echo(f"picture  {path}")
+    if interrupted:
+        echo("stopped; the same command with the same -o FOLDER goes on from here", err=True)
+        raise typer.Exit(130)
+    own = found["engines"][engines[0]]
+    if any(own[kind] for kind in ("silent", "crashes", "hangs", "absurd")):
+        raise typer.Exit(1)
+
+
+def sweep_table(found: dict[str, Any], seed: int) -> Table:
+    """What each engine did in random scenes."""
+    from replays.studies.stability.sweep import QUANTILES
+
+    scenes = found["scenes"]
+    table = new_table(
+        f"random scenes of seed {seed}: " + ", ".join(f"{number} {status}" for status, number in scenes.items()),
+        "engine", ">told", *(f">{share:.0%}" for share in QUANTILES), ">within", ">silent", ">false", ">crash", ">hang",
+        ">absurd", ">slowest", ">median",
+    )  # fmt: skip
+    for name, one in found["engines"].items():
+        errors = [f"{error:.0e}" for error in one["error"] or []] or ["-"] * len(QUANTILES)
+        within = "-" if one["within"] is None else f"{one['within']:.0%}"
+        faults = [str(len(one[kind])) for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd")]
+        speeds = ["-" if speed is None else f"{speed:.3g}" for speed in (one["slowest"], one["median_speed"])]
+        table.add_row(name, str(one["told"]), *errors, within, *faults, *speeds)
+    return table
+
+
+def _sweep_lines(found: dict[str, Any]) -> Iterator[str]:
+    """What the table's columns are, and which scenes stand behind its numbers."""
+    yield (
+        "\nQuantiles of the scaled error in decided scenes; within: share of those that are not chaotic with an error "
+        "of at most 10 times what was asked for; silent: wrong by more than 0.1 without a warning; false: warned, and "
+        "within; speeds: simulated s over processor s. Untold: scenes that no two accurate engines take; "
+        "unbounded: those where the model makes energy without end, in which no fault counts."
+    )
+    for name, one in found["engines"].items():
+        for kind in ("silent", "false_alarms", "crashes", "hangs", "absurd"):
+            if one[kind]:
+                yield f"{name}, {kind.replace('_', ' ')}: scenes {', '.join(map(str, one[kind]))}"
+        for reason, number in one["refused"].items():
+            if "accurate" not in name:
+                yield f"{name} refuses {number}: {reason}"
+    for scene in found["undecided"]:
+        odd = f", {scene['odd']} alone" if scene["odd"] else ""
+        yield (
+            f"undecided: scene {scene['number']}, accurate runs differ by {scene['distance']:.1e}{odd}; "
+            f"a nudge grows {scene['growth'] or math.nan:.1e} times"
+        )
 
 
 def _show(cells: list[Cell], names: list[str], console: Console) -> None:

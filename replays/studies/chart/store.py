@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
-import os
 import platform
 from pathlib import Path
 from typing import Any
 
 from replays.studies import provenance
-from rig.errors import InputError, Words
+from replays.studies.journal import Journal
+from rig.errors import InputError
 
 KEY = ("mode", "panel", "phase", "case", "method", "rung")
 """Columns that tell one point from another."""
@@ -43,39 +42,11 @@ class Store:
         Raises:
             InputError: It cannot be written, or is a file.
         """
-        if folder.exists() and not folder.is_dir():
-            raise InputError("output", "a folder", Words(f"{folder}, which is a file"))
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError("output", "a folder that can be made", Words(f"{folder} ({error.strerror})")) from None
-        if not os.access(folder, os.W_OK):
-            raise InputError("output", "a folder that can be written", str(folder))
         self.folder, self.stem = folder, stem
         self.stamp = stamp()
-        self._rows: dict[tuple[Any, ...], Row] = {}
-        self.outdated = 0
-        if fresh:
-            self._journal.unlink(missing_ok=True)
-        self._load()
-
-    @property
-    def _journal(self) -> Path:
-        return self.folder / f"{self.stem}.journal.jsonl"
-
-    def _load(self) -> None:
-        if not self._journal.is_file():
-            return
-        text = self._journal.read_text(encoding="utf-8")
-        if text and not text.endswith("\n"):  # the last line of a run that was killed
-            text = text[: text.rfind("\n") + 1]
-            self._journal.write_text(text, encoding="utf-8")
-        for line in text.splitlines():
-            row = json.loads(line)
-            if row.get("code") != self.stamp["code"]:
-                self.outdated += 1
-                continue
-            self._rows[tuple(row[name] for name in KEY)] = row
+        self._journal = Journal(folder, f"{stem}.journal.jsonl", self.stamp["code"], fresh=fresh)
+        self.outdated = self._journal.outdated
+        self._rows = {tuple(row[name] for name in KEY): row for row in self._journal.rows}
 
     def has(self, key: tuple[Any, ...]) -> bool:
         """Whether a point has been measured."""
@@ -92,8 +63,7 @@ class Store:
             # JSON has no words for what is not finite; an empty field says the same.
             if isinstance(value, float) and not math.isfinite(value):
                 whole[name] = None
-        with self._journal.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(whole) + "\n")
+        self._journal.add(whole)
         self._rows[tuple(whole[name] for name in KEY)] = whole
 
     def write(self, mode: str) -> list[Path]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from replays.studies.ladder.quantity import QUANTITIES, Trace
+from replays.studies.run import end_with_parent
 from rig.errors import InputError
 from rig.offline import Run, simulate
 from rig.parameters import DEFAULT_SET, load_parameters
@@ -226,26 +227,10 @@ def outcomes(
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_end_with_parent)
+    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=end_with_parent)
     try:
         for pulse, result in zip(pulses, pool.map(outcome, pulses, chunksize=4), strict=True):
             tell(pulse.label)
             yield result
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """A worker would wait for work for ever when the process that started it was killed."""
-    import os
-    from multiprocessing import parent_process
-    from threading import Thread
-
-    parent = parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-        os._exit(1)
-
-    Thread(target=watch, daemon=True).start()
