@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,13 +12,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rig.channels import ChannelTable
-from rig.kernels.signals import COLUMN, ROW
+from rig.errors import InputError, UnknownNameError, Words, whole_file
+from rig.kernels.signals import COLUMN, N_ROW, ROW
 from rig.samples import Samples, place
 from rig.scenes import Scene, load_scene, parse_scene
-from rig.simulation import Frame, Simulation, energy_balance
+from rig.simulation import DISSIPATED, STORED, SUPPLIED, Frame, Simulation, energy_balance
 
 NAMES = tuple(COLUMN)
-_MUST = "one of the model's signals (those of the sensors are in run.samples)"
+_MUST = "one of the signals it keeps of the model (those of the sensors are in run.samples)"
+_MOST_ROWS = 100_000
+"""Rows of which the energy ledger is drawn up at a time."""
 
 
 class SentCommand(NamedTuple):
@@ -35,7 +39,8 @@ class Run:
     Attributes:
         simulation: The simulation at its end (model, scene, engine memory).
         times_s: Instants of the signals [s], shape (n,).
-        signals: Every state, force and energy of the model, SI, shape (n, N_ROW); `run["normal_force"]` is one column.
+        signals: States, forces and energies of the model, SI, shape (n, columns); `run["normal_force"]` is one column.
+        names: Names of the model's signals that were kept, all by default; the sensors' are `run.samples.names`.
         samples: What each sensor showed, at the same instants, in its own unit; `run.samples.to_si()` has SI.
         counts: The same as the converter gave it, int32.
         edges_s: Keyphasor edges [s], shape (turns,).
@@ -52,7 +57,7 @@ class Run:
         '1.57 mm'
         >>> run["disk_z"]
         Traceback (most recent call last):
-        rig.errors.UnknownNameError: name must be one of the model's signals (...), such as disk_y, ...
+        rig.errors.UnknownNameError: name must be one of the signals it keeps of the model (...), such as disk_y, ...
         >>> run.energy()
         Samples(stored, supplied, dissipated, residual [J]; 1000 rows at 20000 Hz, 0 to 0.04995 s)
     """
@@ -60,6 +65,7 @@ class Run:
     simulation: Simulation
     times_s: np.ndarray
     signals: np.ndarray
+    names: tuple[str, ...]
     samples: Samples
     counts: Samples
     edges_s: np.ndarray
@@ -69,27 +75,22 @@ class Run:
         """One signal of the model [SI], shape (n,).
 
         Raises:
-            UnknownNameError: There is no such signal; it is a KeyError.
+            UnknownNameError: There is no such signal, or it was not kept; it is a KeyError.
         """
-        return self.signals[:, place(name, NAMES, must=_MUST)]
+        return self.signals[:, place(name, self.names, must=_MUST)]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(NAMES)
+        return iter(self.names)
 
     def unit(self, name: str) -> str:
         """SI unit of one signal of the model, `run[name]`."""
-        return ROW[place(name, NAMES, must=_MUST)].unit
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the model's signals; those of the sensors are `run.samples.names`."""
-        return NAMES
+        return ROW[COLUMN[self.names[place(name, self.names, must=_MUST)]]].unit
 
     def __repr__(self) -> str:
         scene = self.simulation.scene
         return (
             f"Run({scene.name}: {len(self.times_s) / scene.sensors.rate_hz:g} s, {len(self.times_s)} rows at "
-            f"{scene.sensors.rate_hz} Hz of {len(NAMES)} signals and {len(self.samples.names)} channels; "
+            f"{scene.sensors.rate_hz} Hz of {len(self.names)} signals and {len(self.samples.names)} channels; "
             f"{scene.engine.name} {scene.engine.step_us} us, seed {scene.seed})"
         )
 
@@ -99,10 +100,25 @@ class Run:
         return self.simulation.table
 
     def energy(self) -> Samples:
-        """Energy ledger: stored, supplied, dissipated, residual [J], shape (n, 4)."""
-        ledger = energy_balance(self.signals, self.signals[0])
-        values, units = np.column_stack(list(ledger.values())), ("J",) * len(ledger)
-        return replace(self.samples, name="energy", values=values, names=tuple(ledger), units=units)
+        """Energy ledger: stored, supplied, dissipated, residual [J], shape (n, 4).
+
+        Raises:
+            InputError: The run does not keep all signals of the ledger.
+        """
+        lacking = [name for name in (*STORED, *SUPPLIED, *DISSIPATED) if name not in self.names]
+        if lacking:
+            raise InputError("signals", f"with {', '.join(lacking)} for an energy ledger", list(self.names))
+        columns, parts = [COLUMN[name] for name in self.names], []
+        first = np.zeros(N_ROW)
+        first[columns] = self.signals[0]
+        for begin in range(0, len(self.signals), _MOST_ROWS):
+            kept = self.signals[begin : begin + _MOST_ROWS]
+            rows = np.zeros((len(kept), N_ROW))
+            rows[:, columns] = kept
+            parts.append(energy_balance(rows, first))
+        names = tuple(parts[0])
+        values = np.column_stack([np.concatenate([part[name] for part in parts]) for name in names])
+        return replace(self.samples, name="energy", values=values, names=names, units=("J",) * len(names))
 
 
 def frames(simulation: Simulation, *, chunk_s: float = 0.1, commands: Iterable[SentCommand] = ()) -> Iterator[Frame]:
@@ -129,6 +145,8 @@ def simulate(
     changes: dict[str, Any] | None = None,
     *,
     duration_s: float | None = None,
+    signals: Iterable[str] | None = None,
+    folder: str | Path | None = None,
     commands: Iterable[SentCommand] = (),
     progress: Callable[[float], None] | None = None,
 ) -> Run:
@@ -138,6 +156,9 @@ def simulate(
         scene: What to run: a scene that comes with the rig by its name, the path of a .toml file, or a loaded one.
         changes: Other values by dotted key, of the scene or of its parameters, as for `rig.load_scene`.
         duration_s: Another duration than the scene's [s].
+        signals: Names of the model's signals to keep; all of them unless given.
+        folder: Where signals.npy, samples.npy and counts.npy are written (a new one is made), to be read from there row
+            by row as they are used; in memory unless given.
         commands: What is sent on the way, as for `frames`.
         progress: Called with the part done, 0 to 1.
 
@@ -145,8 +166,9 @@ def simulate(
         The run; signals are kept at the sensors' rate.
 
     Raises:
-        InputError: There is no such scene, or a value is none that it can have.
+        InputError: There is no such scene, signal or folder, or a value is none that it can have.
         SimulationError: The state became non-finite.
+        DiskError: The disk refused.
 
     Example:
         >>> import rig
@@ -157,34 +179,41 @@ def simulate(
         '3e+03 N'
         >>> run.samples["disk_x"].shape, run.samples.unit("disk_x")
         ((1000,), 'mm')
+        >>> rig.simulate("hammer", duration_s=0.05, signals=["normal_force"])
+        Run(hammer: 0.05 s, 1000 rows at 20000 Hz of 1 signals and 15 channels; split 25 us, seed 1)
     """
+    names = NAMES if signals is None else _names(signals)
     scene = load_scene(scene, changes)
     if duration_s is not None:
         scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})
     simulation = Simulation(scene)
     every = simulation.tick_rate_hz // scene.sensors.rate_hz // simulation.row_ticks
-    signals, edges, events = [], [], []
-    counts: dict[str, list[np.ndarray]] = {group: [] for group in simulation.table.groups}
-    for frame in frames(simulation, commands=commands):
-        signals.append(frame.rows[::every].copy())
-        for group, block in frame.samples.items():
-            counts[group].append(block.values)
-        if frame.edges is not None:
-            edges.append((frame.edges.tick + frame.edges.values[:, 0]) / simulation.tick_rate_hz)
-        events += frame.events
-        if progress is not None:
-            progress(simulation.tick / simulation.end_tick)
+    n = simulation.end_tick // (every * simulation.row_ticks)
     table = simulation.table
-    whole = {group: np.concatenate(blocks) for group, blocks in counts.items()}
-    rows = np.concatenate(signals)
-    index = np.arange(len(rows))
+    channels = [channel for group in table.groups.values() for channel in group.channels]
+    columns = slice(None) if names == NAMES else [COLUMN[name] for name in names]
+    edges, events = [], []
+    with ExitStack() as stack:
+        kept = _Rows(stack, folder, "signals", (n, len(names)), np.float64)
+        shown = _Rows(stack, folder, "samples", (n, len(channels)), np.float64)
+        counts = _Rows(stack, folder, "counts", (n, len(channels)), np.int32)
+        for frame in frames(simulation, commands=commands):
+            kept.add(frame.rows[::every, columns])
+            blocks = {name: frame.samples[name].values for name in table.groups}
+            counts.add(np.hstack(list(blocks.values())))
+            shown.add(np.hstack([table.groups[name].engineering(block) for name, block in blocks.items()]))
+            if frame.edges is not None:
+                edges.append((frame.edges.tick + frame.edges.values[:, 0]) / simulation.tick_rate_hz)
+            events += frame.events
+            if progress is not None:
+                progress(simulation.tick / simulation.end_tick)
+    index = np.arange(n)
     times_s = index / scene.sensors.rate_hz
-    channels = [channel for group in whole for channel in table.groups[group].channels]
     samples = Samples(
         name="sensors",
         times_s=times_s,
         index=index,
-        values=np.hstack([table.groups[group].engineering(block) for group, block in whole.items()]),
+        values=shown.array(),
         names=tuple(channel.name for channel in channels),
         units=tuple(channel.unit for channel in channels),
         rate_hz=float(scene.sensors.rate_hz),
@@ -192,9 +221,52 @@ def simulate(
     return Run(
         simulation=simulation,
         times_s=times_s,
-        signals=rows,
+        signals=kept.array(),
+        names=names,
         samples=samples,
-        counts=replace(samples, values=np.hstack(list(whole.values())), units=("count",) * len(channels)),
+        counts=replace(samples, values=counts.array(), units=("count",) * len(channels)),
         edges_s=np.concatenate(edges) if edges else np.empty(0),
         events=events,
     )
+
+
+def _names(signals: Iterable[str]) -> tuple[str, ...]:
+    if isinstance(signals, str) or not isinstance(signals, Iterable):
+        raise InputError("signals", "a list of names of the model's signals", signals)
+    names = tuple(signals)
+    for name in names:
+        if name not in NAMES:
+            raise UnknownNameError("signals", "names of the model's signals", name, NAMES)
+    return names
+
+
+class _Rows:
+    """Rows that come block by block, into memory or into a .npy file that is then read where it lies."""
+
+    def __init__(
+        self, stack: ExitStack, folder: str | Path | None, name: str, shape: tuple[int, int], dtype: type
+    ) -> None:
+        self._seen, self._file = 0, None
+        if folder is None:
+            self._values = np.empty(shape, dtype)
+            return
+        try:
+            Path(folder).mkdir(exist_ok=True)
+        except (OSError, TypeError, ValueError) as error:
+            raise InputError("folder", "a folder, or a new one in a folder that exists", Words(error)) from None
+        self._path = Path(folder) / f"{name}.npy"
+        self._file = stack.enter_context(stack.enter_context(whole_file(self._path)).open("wb"))
+        header = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(self._file, header)
+
+    def add(self, block: np.ndarray) -> None:
+        """Add a block of rows."""
+        if self._file is None:
+            self._values[self._seen : self._seen + len(block)] = block
+            self._seen += len(block)
+        else:
+            self._file.write(block.tobytes())
+
+    def array(self) -> np.ndarray:
+        """All of them, when the last has come."""
+        return self._values if self._file is None else np.load(self._path, mmap_mode="r")

@@ -51,11 +51,11 @@ class Pick(Written):
     step_us: int
     engine_tolerance: FiniteFloat = 0.0
     quantities: tuple[PickedQuantity, ...]
-    wall_s: FiniteFloat
-    """Wall time of a simulated second of the pick, with the scene's sensors [s]."""
-    wall_given_s: FiniteFloat
+    cpu_s: FiniteFloat
+    """Processor time of a simulated second of the pick, with its sensors [s]."""
+    cpu_given_s: FiniteFloat
     """The same of the scene as it is given [s]."""
-    wall_full_s: FiniteFloat
+    cpu_full_s: FiniteFloat
     """The same of the full model on the engine of the reference [s]."""
     reference_engine: str = ""
     unlike_engine: str = ""
@@ -73,11 +73,11 @@ class Pick(Written):
     def apply(self, data: dict[str, Any]) -> dict[str, Any]:
         """The fields of a scene with the pick's in their place."""
         levels = {name: getattr(self, name) for name in ModelLevels.model_fields}
-        engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
+        engine = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
         return {
             **data,
             "model": levels,
-            "engine": engine,
+            "engine": {**table_in(data, "engine"), **engine},
             "drive": {**table_in(data, "drive"), "mode": self.drive},
             "sensors": {**table_in(data, "sensors"), "chain": self.sensors},
         }

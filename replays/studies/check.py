@@ -1,4 +1,4 @@
-"""How far a run can be trusted: the same scene again by finer steps, held against it."""
+"""How far a run can be trusted: the same scene again, finer, held against it."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 from replays.studies.peers.problem import scaled_error
 from replays.studies.run import bare_sensors, run_scene
 from rig.engines import ENGINES
+from rig.errors import InputError
 from rig.kernels.signals import N_STATE
 from rig.scenes import Scene, parse_scene
 from rig.simulation import Simulation
 
 ANOTHER_BRANCH = 0.1
 """Scaled error from which the two runs are no longer the same motion."""
-_ADAPTIVE = 1e-2
-"""An adaptive engine's tolerance is multiplied by this."""
+_FINER = 0.1
+"""The tolerance of an engine that has one is multiplied by this; steps of one that has none are halved."""
 
 
 @dataclass(frozen=True)
@@ -51,27 +52,38 @@ class Check:
         return f"error {self.error:.1e} of 1 against {self.finer}; {self.contacts[0]} and {self.contacts[1]} contacts"
 
 
+def finer(scene: Scene) -> dict[str, float]:
+    """What to change of a scene's engine to have it finer.
+
+    Raises:
+        InputError: There is no finer step.
+    """
+    engine = scene.engine
+    if ENGINES[engine.name].tolerance:
+        return {"tolerance": engine.tolerance * _FINER}
+    if engine.step_us < 2:
+        raise InputError("engine.step_us", "at least 2, for a check by finer steps", engine.step_us)
+    sample_us = 1_000_000 // scene.sensors.truth_rate_hz
+    return {"step_us": max(n for n in range(1, engine.step_us // 2 + 1) if sample_us % n == 0)}
+
+
 def check(scene: Scene) -> Check:
     """Run a scene twice without sensors, as it is and finer.
 
     Args:
         scene: The scene.
+
+    Raises:
+        InputError: There is no finer step.
     """
-    engine, method = scene.engine, ENGINES[scene.engine.name]
-    if method.tolerance:
-        finer = {"tolerance": engine.tolerance * _ADAPTIVE, "step_us": engine.step_us}
-        words = f"{engine.name} at tolerance {finer['tolerance']:.0e}"
-    else:
-        sample_us = 1_000_000 // scene.sensors.truth_rate_hz
-        step = max(n for n in range(1, max(1, engine.step_us // 2) + 1) if sample_us % n == 0)
-        finer = {"tolerance": engine.tolerance, "step_us": step}
-        words = f"{engine.name} at {step} us"
-    coarse, fine = _states(scene, {}), _states(scene, finer)
+    changes = finer(scene)
+    setting = f"tolerance {changes['tolerance']:.2g}" if "tolerance" in changes else f"{changes['step_us']} us"
+    coarse, fine = _states(scene, {}), _states(scene, changes)
     n = min(len(coarse[0]), len(fine[0]))
     errors = np.array([scaled_error(a[None, :], b[None, :]) for a, b in zip(coarse[0][:n], fine[0][:n], strict=True)])
     parted = np.flatnonzero(errors > ANOTHER_BRANCH)
     return Check(
-        finer=words,
+        finer=f"{scene.engine.name} at {setting}",
         error=float(np.sqrt(np.mean(errors**2))),
         parted_s=float(parted[0]) / scene.sensors.truth_rate_hz if len(parted) else None,
         contacts=(coarse[1], fine[1]),

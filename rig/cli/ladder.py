@@ -37,7 +37,7 @@ def ladder(
         list[str] | None, typer.Option(metavar="LEVEL", help="A level that stays as full as it is; may be repeated.")
     ] = None,
     changes: Changes = None,
-    runs: Annotated[int, typer.Option(min=1, help="Timed runs of each candidate.")] = 3,
+    runs: Annotated[int, typer.Option(min=1, help="Timed runs of each candidate.")] = 5,
     budget_s: Annotated[float, typer.Option(min=1.0, help="Wall time allowed, in s.")] = 300.0,
     form: Form,
 ) -> None:
@@ -102,10 +102,12 @@ def _show(document: dict[str, Any], console: Console) -> None:
         )
     own = ", ".join(f"{entry['as_given_error']:.1e}" if entry["as_given_error"] is not None else "infinite"
                     for entry in document["quantities"])  # fmt: skip
+    saved = ", ".join(f"{level} {pick[level]} saves {part:.0%}" for level, part in document["savings"].items())
+    echo(f"  {saved or 'nothing is left out'}; outcome {document['picked']['outcome']} as of the full model")
     echo(
-        f"  a simulated second takes {pick['wall_s'] * 1e3:.3g} ms with the picked sensors, "
-        f"{pick['wall_given_s'] * 1e3:.3g} ms as the scene is given (errors {own} in {', '.join(names)}), "
-        f"{pick['wall_full_s'] * 1e3:.3g} ms on the full model by {document['full']['engine']}"
+        f"  a simulated second takes {pick['cpu_s'] * 1e3:.3g} ms of processor time with the picked sensors, "
+        f"{pick['cpu_given_s'] * 1e3:.3g} ms as the scene is given (errors {own} in {', '.join(names)}), "
+        f"{pick['cpu_full_s'] * 1e3:.3g} ms on the full model by {document['full']['engine']}"
     )
     if pick["sensors"] == "ideal":
         echo("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
@@ -137,7 +139,7 @@ def levels_table(document: dict[str, Any]) -> Table:
         table.add_row(
             ("together: " if step["stage"] == "together" else "") + step["label"],
             *errors,
-            f"{step['cost']['wall_s'] * 1e3:.2f}",
+            f"{step['cost']['cpu_s'] * 1e3:.2f}",
             f"{step['cost']['ns_a_step']:.0f}",
             step["cost"]["engine"],
             "passes" if step["passes"] else "fails",
@@ -156,16 +158,16 @@ def engines_table(document: dict[str, Any]) -> Table:
         spare=("remark", "ns a step"),
     )
     for step in document["steps"]:
-        if step["stage"] not in ("engine", "verified"):
+        if step["stage"] not in ("engine", "given"):
             continue
         errors = [
             f"{_error(step['errors']['numerical'][name])}, {_error(step['errors']['total'][name])}" for name in names
         ]
-        wall, ns = step["wall_s"], step["ns_a_step"]
+        cpu, ns = step["cpu_s"], step["ns_a_step"]
         table.add_row(
-            step["label"] + (" as it will run" if step["stage"] == "verified" else ""),
+            step["label"],
             *errors,
-            "-" if wall is None else f"{wall * 1e3:.2f}",
+            "-" if cpu is None else f"{cpu * 1e3:.2f}",
             "-" if ns is None else f"{ns:.0f}",
             "passes" if step["passes"] else "fails",
             step["note"],

@@ -17,7 +17,12 @@ def simulate(
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write: .mcap, .parquet or .csv.")],
     scene_changes: SceneChanges,
-    check: Annotated[bool, typer.Option("--check", help="Run it again by finer steps and tell the error.")] = False,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Run it again, finer: tells the error; status 1 where a wrong branch is suspected."
+        ),
+    ] = False,
     force: Force = False,
 ) -> None:
     """Simulate a scene as fast as it goes and write it to a file: every state, force and sensor, with units."""
@@ -31,6 +36,10 @@ def simulate(
 
         check_run_output(output, force=force)
         loaded = load_scene(scene, scene_changes.overrides())
+        if check:
+            from replays.studies.check import finer
+
+            finer(loaded)  # refused before a long run
 
         from rig.simulation import Simulation
 
@@ -51,14 +60,13 @@ def simulate(
         f"{output.stat().st_size / 1e6:.1f} MB; {health['contacts']} contacts, "
         f"energy residual {energy['residual_j']:.1e} J of {energy['dissipated_j']:.3g} J dissipated"
     )
-    warnings = health["warnings"]
+    for warning in health["warnings"]:
+        echo(f"warning: {warning}", err=True)
     if check:
         from replays.studies.check import check as check_scene
 
         checked = check_scene(loaded)
         if checked.wrong_branch:
-            warnings = [*warnings, checked.line()]
-        else:
-            echo(f"checked: {checked.line()}")
-    for warning in warnings:
-        echo(f"warning: {warning}", err=True)
+            echo(f"warning: {checked.line()}", err=True)
+            raise typer.Exit(1)
+        echo(f"checked: {checked.line()}")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from replays.studies.check import Check, check
 from replays.studies.peers.problem import scaled_error
+from rig.cli.main import main
+from rig.errors import InputError
 from rig.kernels.signals import N_STATE
 from rig.offline import simulate
 from rig.scenes import load_scene
@@ -47,7 +50,22 @@ def test_contacts_missed_are_a_wrong_branch(contacts: tuple[int, int], wrong: bo
     assert Check(finer="x", error=1e-3, parted_s=None, contacts=contacts).wrong_branch == wrong
 
 
+def test_a_suspected_wrong_branch_is_a_failed_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rates = ("--set", "sensors.rate_hz=1000", "--set", "sensors.truth_rate_hz=1000", "--duration-s", "0.3")
+    coarse = ("--engine", "verlet", "--set", "engine.step_us=50")
+    with pytest.raises(SystemExit) as end:
+        main(["simulate", "hammer", "--check", "-o", str(tmp_path / "x.csv"), *rates, *coarse])
+    assert end.value.code == 1
+    assert "warning: a wrong branch is suspected after" in capsys.readouterr().err
+    assert (tmp_path / "x.csv").stat().st_size > 1000, "what was simulated is kept"
+
+
+def test_steps_that_cannot_be_finer_are_refused_before_the_run() -> None:
+    with pytest.raises(InputError, match=r"engine\.step_us must be at least 2, .*received 1"):
+        check(load_scene("hammer", {"engine.name": "rk4", "engine.step_us": 1}))
+
+
 def test_adaptive_engine_is_checked_by_its_tolerance() -> None:
     found = check(load_scene("hammer", {"duration_s": 0.1, "engine.name": "rk8", "engine.tolerance": 1e-6}))
-    assert "1e-08" in found.line()
+    assert "rk8 at tolerance 1e-07" in found.line()
     assert 0.0 < found.error < 1e-3

@@ -167,6 +167,42 @@ def test_a_scene_is_given_by_name_by_path_or_as_it_is(tmp_path: Path) -> None:
         simulate("hammer", {"drive.sped_hz": 5.2})
 
 
+def test_a_run_keeps_the_columns_that_are_named_where_they_are_to_go(tmp_path: Path) -> None:
+    whole, folder = simulate("hammer", duration_s=0.25), tmp_path / "run"
+    ledger = [name for name in whole.names if name.endswith(("energy", "work", "loss"))]
+    some = simulate("hammer", duration_s=0.25, signals=("normal_force", *ledger), folder=folder)
+    np.testing.assert_array_equal(some["normal_force"], whole["normal_force"])
+    np.testing.assert_array_equal(some.energy().values, whole.energy().values)
+    for one, other in ((some.samples, whole.samples), (some.counts, whole.counts)):
+        assert one.values.dtype == other.values.dtype
+        np.testing.assert_array_equal(one.values, other.values)
+    np.testing.assert_array_equal(np.load(folder / "signals.npy"), some.signals)
+    assert isinstance(some.signals, np.memmap)
+    assert sorted(file.name for file in folder.iterdir()) == ["counts.npy", "samples.npy", "signals.npy"]
+    assert some.unit("normal_force") == "N"
+    # Another run into the same folder leaves what the first one has in its hands.
+    mine = np.array(some.signals)
+    few = simulate("hammer", duration_s=0.05, signals=["disk_x"], folder=str(folder))
+    np.testing.assert_array_equal(some.signals, mine)
+    assert (few.names, few.signals.shape) == (("disk_x",), (1000, 1))
+    with pytest.raises(UnknownNameError, match=r"^name must be one of the signals it keeps"):
+        few["normal_force"]
+    with pytest.raises(InputError, match=r"^signals must be with kinetic_energy, .* for an energy ledger"):
+        few.energy()
+    (tmp_path / "file").write_text("")
+    refused: list[tuple[dict[str, Any], str]] = [
+        ({"signals": "disk_x"}, "signals must be a list of names"),
+        ({"signals": 3}, "signals must be a list of names"),
+        ({"signals": ["disk_z"]}, "signals must be names of the model's signals, such as disk_y"),
+        ({"folder": tmp_path / "file"}, "folder must be a folder, or a new one in a folder that exists"),
+        ({"folder": tmp_path / "no" / "such"}, "folder must be a folder, or a new one in a folder that exists"),
+        ({"folder": 3}, "folder must be a folder, or a new one in a folder that exists"),
+    ]
+    for wrong, says in refused:
+        with pytest.raises(InputError, match=f"^{says}"):
+            simulate("hammer", duration_s=0.05, **wrong)
+
+
 def test_times_are_those_of_the_samples(run: Run) -> None:
     np.testing.assert_allclose(run.samples.times_s, np.arange(40_000) / 20_000, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(run.times_s, run.samples.times_s)

@@ -58,7 +58,7 @@ def _range(ladder: Ladder, name: str) -> tuple[float, float]:
 
 def _dress(axes: Any, ladder: Ladder, name: str) -> tuple[float, float]:
     low, high = _range(ladder, name)
-    quantity, tolerance = QUANTITIES[name], ladder.tolerances[name]
+    tolerance = ladder.tolerances[name]
     axes.set_xscale("log")
     axes.set_xlim(low, high)
     axes.axvspan(low, tolerance, color="0.95", zorder=0)
@@ -67,7 +67,7 @@ def _dress(axes: Any, ladder: Ladder, name: str) -> tuple[float, float]:
     own = ladder.reference_errors[name]
     if own > low:
         axes.axvline(own, color=_OWN, lw=2.0, zorder=1)
-    axes.set_xlabel(f"error, part of {quantity.scale_title} [1]")
+    axes.set_xlabel("error, part of its value [1]")
     return low, high
 
 
@@ -114,21 +114,21 @@ def _draw_work(axes: Any, levels: list[Step]) -> None:
         cost = step.cost
         if cost is None:
             continue
-        wall = cost.wall_s * 1e3
-        axes.barh(row, wall, height=0.6, color=traits(cost.candidate.engine).colour, zorder=2)
+        spent = cost.cpu_s * 1e3
+        axes.barh(row, spent, height=0.6, color=traits(cost.candidate.engine).colour, zorder=2)
         axes.plot([cost.spread_s[0] * 1e3, cost.spread_s[1] * 1e3], [row, row], color="0.2", lw=1.4, zorder=3)
-        told = f"{float(f'{wall:.3g}'):g}  ({cost.candidate.label})"
+        told = f"{float(f'{spent:.3g}'):g}  ({cost.candidate.label})"
         axes.annotate(
-            told, (max(wall, cost.spread_s[1] * 1e3), row), xytext=(4, 0),
+            told, (max(spent, cost.spread_s[1] * 1e3), row), xytext=(4, 0),
             textcoords="offset points", va="center", fontsize=9,
         )  # fmt: skip
-    walls = [wall * 1e3 for step in levels if step.cost for wall in step.cost.spread_s]
+    spans = [spent * 1e3 for step in levels if step.cost for spent in step.cost.spread_s]
     axes.set_xscale("log")
-    axes.set_xlim(0.5 * min(walls), (max(walls) / min(walls)) ** 1.2 * 4.0 * max(walls))
+    axes.set_xlim(0.5 * min(spans), (max(spans) / min(spans)) ** 1.2 * 4.0 * max(spans))
     axes.set_ylim(len(levels) - 0.4, -0.6)
     axes.set_yticks(range(len(levels)), [""] * len(levels))
     axes.grid(visible=False, axis="y")
-    axes.set_xlabel("wall time of a simulated second [ms]")
+    axes.set_xlabel("processor time of a simulated second [ms]")
     axes.set_title("What each level costs by the\nfirst engine that takes it")
 
 
@@ -137,24 +137,21 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, first: bool) -> None:
     for step in ladder.steps:
         if step.stage == "single" and step.cost is not None:
             place = _placed(step.errors.model[name], low, high)
-            axes.plot(place, step.cost.wall_s * 1e3, marker="x", ms=6, color="0.45", ls="none", zorder=2)
+            axes.plot(place, step.cost.cpu_s * 1e3, marker="x", ms=6, color="0.45", ls="none", zorder=2)
     engines: dict[str, list[Step]] = {}
     for step in ladder.steps:
         if step.stage == "engine" and not step.measured.failure:
             engines.setdefault(step.measured.candidate.engine, []).append(step)
     for engine, steps in engines.items():
         color, marker = traits(engine).colour, traits(engine).marker
-        walls = [step.measured.wall_s * 1e3 for step in steps]
+        spent = [step.measured.cpu_s * 1e3 for step in steps]
         numerical = [_placed(step.errors.numerical[name], low, high) for step in steps]
         total = [_placed(step.errors.total[name], low, high) for step in steps]
-        axes.plot(numerical, walls, color=color, marker=marker, mfc="white", ms=6, ls=":", lw=1.0, zorder=3)
-        axes.plot(total, walls, color=color, marker=marker, ms=6, lw=1.6, zorder=3, label=engine)
+        axes.plot(numerical, spent, color=color, marker=marker, mfc="white", ms=6, ls=":", lw=1.0, zorder=3)
+        axes.plot(total, spent, color=color, marker=marker, ms=6, lw=1.6, zorder=3, label=engine)
     picked, errors = ladder.picked, ladder.picked_errors
-    chosen = next(
-        step for step in ladder.steps if step.stage == "engine" and step.measured.candidate == picked.candidate
-    )
     axes.plot(
-        _placed(errors.total[name], low, high), chosen.measured.wall_s * 1e3, marker="*", ms=18,
+        _placed(errors.total[name], low, high), picked.cpu_s * 1e3, marker="*", ms=18,
         color=traits(picked.candidate.engine).colour, mec=BLACK, ls="none", zorder=4,
         label=f"pick: {picked.candidate.label}",
     )  # fmt: skip
@@ -166,7 +163,7 @@ def _draw_cost(axes: Any, ladder: Ladder, name: str, *, first: bool) -> None:
     axes.set_yscale("log")
     for formatted in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         formatted(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "125" else "")
-    axes.set_ylabel("wall time of a simulated second [ms]" if first else "")
+    axes.set_ylabel("processor time of a simulated second [ms]" if first else "")
     axes.annotate(
         "cannot give it", (high / 2.8, 1.0), xycoords=("data", "axes fraction"), xytext=(0, -4),
         textcoords="offset points", ha="center", va="top", fontsize=9, rotation=90, color="0.4",
@@ -191,20 +188,20 @@ def _write_evidence(axes: Any, ladder: Ladder) -> None:
             f"  total error {errors.total[name]:.1e} of {tolerance:g} allowed",
             f"  model {errors.model[name]:.1e}, numerical {errors.numerical[name]:.1e}",
         ]
-    axes.set_title("Pick, verified as it will run")
+    axes.set_title("Pick, as it will run")
     axes.text(0.0, 0.98, "\n".join(lines), transform=axes.transAxes, va="top", fontsize=9.5)
 
 
 def _caption(ladder: Ladder) -> str:
     """What was held against what, and where."""
     names = ", ".join(name.replace("_", " ") for name in ladder.tolerances)
-    pick, given, full = (run.wall_s * 1e3 for run in (ladder.picked, ladder.given, ladder.full))
+    pick, given, full = (run.cpu_s * 1e3 for run in (ladder.picked, ladder.given, ladder.full))
     text = (
-        "Times are medians without sensors, lines from least to largest; with sensors the pick takes "
-        f"{pick:.3g} ms, the scene as given {given:.3g} ms, the full model {full:.3g} ms by "
-        f"{ladder.full.candidate.label}. Errors of {names} against the full model by "
+        f"Processor times are medians as it will run, sensors {ladder.sensors}, lines from least to largest: the pick "
+        f"takes {pick:.3g} ms; with the scene's sensors the scene as given {given:.3g} ms, the full model {full:.3g} "
+        f"ms by {ladder.full.candidate.label}. Errors of {names} against the full model by "
         f"{ladder.reference.candidate.label}, whose own error is its distance to "
-        f"{ladder.unlike.candidate.label}. * not picked: stands in for another, or spares nothing. Seed "
+        f"{ladder.unlike.candidate.label}. * with a remark in the table. Seed "
         f"{ladder.scene.seed}; {len(ladder.steps)} candidates tried in {ladder.spent_s:.0f} s"
         f"{'' if ladder.complete else ' (budget spent)'}; {python_line()}."
     )

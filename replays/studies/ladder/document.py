@@ -28,7 +28,6 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
                 "unit": QUANTITIES[name].unit,
                 "phase": QUANTITIES[name].phase,
                 "how": QUANTITIES[name].title,
-                "errors_are_parts_of": QUANTITIES[name].scale_title,
                 "tolerance": tolerance,
                 "reference": _number(ladder.reference.values[name]),
                 "unlike": _number(ladder.unlike.values[name]),
@@ -43,6 +42,8 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
             "unlike": ladder.unlike.candidate.method,
             "model": ladder.reference.candidate.model,
         },
+        "outcome": ladder.reference.ending.word if ladder.reference.ending else None,
+        "savings": {level: _digits(part) for level, part in ladder.savings.items()},
         "steps": [
             {
                 "stage": step.stage,
@@ -93,9 +94,9 @@ def pick_of(ladder: Ladder) -> Pick:
             )
             for name, tolerance in ladder.tolerances.items()
         ),
-        wall_s=_digits(picked.wall_s),
-        wall_given_s=_digits(ladder.given.wall_s),
-        wall_full_s=_digits(ladder.full.wall_s),
+        cpu_s=_digits(picked.cpu_s),
+        cpu_given_s=_digits(ladder.given.cpu_s),
+        cpu_full_s=_digits(ladder.full.cpu_s),
         reference_engine=ladder.reference.candidate.method,
         unlike_engine=ladder.unlike.candidate.method,
         date=found["date"],
@@ -126,9 +127,11 @@ def _run(measured: Measurement, simulated_s: float) -> dict[str, Any]:
     return {
         "engine": measured.candidate.method,
         "values": {name: _number(value) for name, value in measured.values.items()},
-        "wall_s": _number(measured.wall_s),
-        "wall_least_s": _number(measured.spread_s[0]),
-        "wall_most_s": _number(measured.spread_s[1]),
+        "outcome": measured.ending.word if measured.ending else None,
+        "contact_share": measured.ending.contact_share if measured.ending else None,
+        "cpu_s": _number(measured.cpu_s),
+        "cpu_least_s": _number(measured.spread_s[0]),
+        "cpu_most_s": _number(measured.spread_s[1]),
         "runs": measured.runs,
         "steps": measured.steps,
         "ns_a_step": _number(measured.step_ns(simulated_s)),

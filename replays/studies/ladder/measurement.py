@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.ladder.quantity import QUANTITIES, Trace, Value
+from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending
 from replays.studies.run import bare_sensors, run_scene
 from rig.engines import ENGINES
 from rig.errors import InputError, SimulationError
@@ -23,7 +23,9 @@ GRID_TICKS = 1_000
 _FINEST_ROW_US = 25
 """The first impact is looked for on rows this far apart, or a fixed step apart [us]."""
 _ENOUGH_S = 1.0
-"""No further run is timed once this much wall time is spent on one candidate."""
+"""No further run is timed once this much processor time is spent on one candidate."""
+_LEAST_S = 0.1
+"""Two candidates are compared for at least this much processor time."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +94,8 @@ class Measurement:
     Attributes:
         candidate: Which one.
         values: By quantity; nan where it has none, or cannot give it.
-        trace: The run's rows.
-        wall_s: Wall time of a simulated second, median of the runs, compiling apart [s].
+        ending: How the run ends.
+        cpu_s: Processor time of a simulated second, median of the runs, compiling apart [s].
         spread_s: Least and largest of the same.
         runs: Runs timed.
         steps: Steps of the engine.
@@ -103,8 +105,8 @@ class Measurement:
 
     candidate: Candidate
     values: dict[str, Value]
-    trace: Trace | None
-    wall_s: float
+    ending: Ending | None
+    cpu_s: float
     spread_s: tuple[float, float]
     runs: int
     steps: int
@@ -112,8 +114,8 @@ class Measurement:
     failure: str = ""
 
     def step_ns(self, simulated_s: float) -> float:
-        """Wall time of a step [ns]."""
-        return self.wall_s * simulated_s / max(self.steps, 1) * 1e9
+        """Processor time of a step [ns]."""
+        return self.cpu_s * simulated_s / max(self.steps, 1) * 1e9
 
 
 def measure(
@@ -131,17 +133,17 @@ def measure(
         scene: The scene as it is given.
         candidate: What to run it on.
         quantities: What to read.
-        runs: Runs to time, fewer where they take long.
+        runs: Runs to time, fewer where they take long; 1 for values alone, whose time is a rough one.
         sensors: Changes to the scene's own sensors; None to leave the sensors out.
         limit_s: Wall time after which a run is given up as a failure [s].
     """
     placed = candidate.scene(scene, sensors=sensors)
     Simulation(placed).warm_up()  # compiling is no part of the cost
     simulated_s = Simulation(placed).end_tick * 1e-6
-    walls: list[float] = []
+    spent: list[float] = []
     trace, health = None, {}
     try:
-        while len(walls) < runs and (not walls or sum(walls) < _ENOUGH_S):
+        while len(spent) < runs and (not spent or sum(spent) < _ENOUGH_S):
             simulation = Simulation(placed)
             _ = simulation.first_row
             first = trace is None
@@ -151,8 +153,8 @@ def measure(
             done = run_scene(
                 simulation, block_ticks=blocks * simulation.block_ticks, every=every, keep=first, limit_s=limit_s
             )
-            if not first or runs == 1 or done.wall_s > _ENOUGH_S:
-                walls.append(done.wall_s)
+            if not first or runs == 1 or done.cpu_s > _ENOUGH_S:
+                spent.append(done.cpu_s)
             if first:
                 health = simulation.health()
                 trace = _trace(scene, candidate, simulation, done.rows, health, "first_impact_time" in quantities)
@@ -160,7 +162,7 @@ def measure(
         nothing: dict[str, Value] = dict.fromkeys(quantities, math.nan)
         return Measurement(candidate, nothing, None, math.nan, (math.nan, math.nan), 0, 0, math.nan, str(error))
     assert trace is not None
-    each = [wall / simulated_s for wall in walls]
+    each = [seconds / simulated_s for seconds in spent]
     values = {
         name: math.nan
         if QUANTITIES[name].needs_force and candidate.levels.contact == "impact"
@@ -170,13 +172,38 @@ def measure(
     return Measurement(
         candidate=candidate,
         values=values,
-        trace=trace,
-        wall_s=statistics.median(each),
+        ending=ending(trace),
+        cpu_s=statistics.median(each),
         spread_s=(min(each), max(each)),
         runs=len(each),
         steps=health["steps"],
         residual_share=health["energy"]["residual_share"],
     )
+
+
+def saving(
+    scene: Scene, simpler: Candidate, fuller: Candidate, *, runs: int, sensors: dict[str, Any], limit_s: float
+) -> float:
+    """Part of the processor time of a fuller candidate that a simpler one saves, as both will run [1].
+
+    Medians of runs that take turns, so that what else the machine does falls on both; more than `runs` where they are
+    short. Both have been measured before, and are compiled.
+    """
+    placed = [candidate.scene(scene, sensors=sensors) for candidate in (simpler, fuller)]
+    spent: list[list[float]] = []
+    total_s = 0.0
+    while total_s < (_ENOUGH_S if len(spent) < runs else _LEAST_S):
+        turn = []
+        for each in placed:
+            simulation = Simulation(each)
+            _ = simulation.first_row
+            blocks = max(1, 100_000 // simulation.block_ticks)
+            done = run_scene(simulation, block_ticks=blocks * simulation.block_ticks, keep=False, limit_s=limit_s)
+            turn.append(done.cpu_s)
+        spent.append(turn)
+        total_s += sum(turn)
+    medians = np.median(spent, axis=0)
+    return float(1.0 - medians[0] / medians[1])
 
 
 def _trace(

@@ -18,6 +18,12 @@ SETTLED = 0.25
 """The settled phase is this last part of a run."""
 ROLLS = 0.02
 """A contact rolls while it slides by less than this part of the surface's speed."""
+LASTS = 0.5
+"""Contact lasts where it is more than this part of the settled phase: then it turns, or rests, and rolls or slides."""
+STAYS = 0.95
+"""... and is for good from here on: a partial rub below."""
+SAME_SHARE = 0.1
+"""Parts of the settled phase in contact that are this close are the same outcome."""
 Value = float | str
 
 
@@ -56,6 +62,52 @@ class Trace(NamedTuple):
         return float(self.times_s[-1] - self.times_s[-self.settled_rows])
 
 
+class Ending(NamedTuple):
+    """How a run ends: what its settled phase is like. A simpler model has to keep that, whatever it is asked for."""
+
+    touches: bool
+    contact_share: float
+    """Part of the settled milliseconds with contact [1]."""
+    turns: float
+    """Turns of the shaft around the ring in the settled phase, forward positive [1]."""
+    rolling_share: float
+    """Part of the settled phase in which it rolls [1]."""
+
+    @property
+    def word(self) -> str:
+        """Flight, bounces, partial rub, resting, or a rolling or sliding whirl of either direction."""
+        if not self.touches or self.contact_share <= LASTS:
+            return "bounces" if self.touches else "flight"
+        if self.contact_share < STAYS:
+            return "partial rub"
+        rolls = "rolling" if self.rolling_share > 0.5 else "sliding"
+        return f"{rolls} {'forward' if self.turns > 0.0 else 'backward'} whirl" if abs(self.turns) >= 1.0 else "resting"
+
+    def alike(self, other: Ending) -> bool:
+        """Whether both are one outcome; what lies on both sides of a word's limit, but close, is."""
+        if self.touches != other.touches or abs(self.contact_share - other.contact_share) > SAME_SHARE:
+            return False
+        if min(self.contact_share, other.contact_share) <= LASTS:
+            return True
+        one, two = (math.copysign(abs(turns) >= 1.0, turns) for turns in (self.turns, other.turns))
+        turned = one == two or abs(self.turns - other.turns) < 0.5
+        return turned and abs(self.rolling_share - other.rolling_share) <= 0.5
+
+
+def ending(trace: Trace) -> Ending:
+    """How a run ends."""
+    # By the impulse: an impact law touches without being in contact at any instant.
+    pushed = np.diff(trace.settled("contact_impulse")) > 0.0
+    angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
+    rolls = ~_slides(trace)[-trace.settled_rows :]
+    return Ending(
+        touches=bool(pushed.any()),
+        contact_share=float(np.mean(pushed)),
+        turns=float(angle[-1] - angle[0]) / (2.0 * math.pi),
+        rolling_share=float(np.mean(rolls)),
+    )
+
+
 @dataclass(frozen=True)
 class Quantity:
     """One quantity.
@@ -66,8 +118,6 @@ class Quantity:
         phase: Part of the run that it belongs to.
         title: What it is and how it is read.
         read: Reads it off a run; nan where the run has none.
-        scale: What an error is a part of; None: the reference's own value.
-        scale_title: The same in words.
         needs_force: True where a rigid impact, which has no force over time, cannot give it.
         resolution: Of the reading itself [unit].
     """
@@ -77,21 +127,18 @@ class Quantity:
     phase: str
     title: str
     read: Callable[[Trace], Value]
-    scale: Callable[[Trace], float] | None = None
-    scale_title: str = "its value"
     needs_force: bool = False
     resolution: float = 0.0
 
-    def error(self, value: Value, reference: Value, trace: Trace) -> float:
-        """Distance of a value from the reference's as a part of the scale; infinite where one of them has none."""
+    def error(self, value: Value, reference: Value) -> float:
+        """Distance of a value from the reference's as a part of the latter; infinite where one of them has none."""
         if isinstance(value, str) or isinstance(reference, str):
             return 0.0 if value == reference else math.inf
         if value == reference:
             return 0.0
-        scale = abs(reference) if self.scale is None else self.scale(trace)
-        if not (math.isfinite(value) and math.isfinite(reference)) or scale == 0.0:
+        if not (math.isfinite(value) and math.isfinite(reference)) or reference == 0.0:
             return math.inf
-        return abs(value - reference) / scale
+        return abs(value - reference) / abs(reference)
 
 
 def _whirl_frequency(trace: Trace) -> float:
@@ -127,9 +174,12 @@ def _dissipated(trace: Trace) -> float:
     return float(sum(trace.column(name)[-1] for name in DISSIPATED))
 
 
+def _slides(trace: Trace) -> np.ndarray:
+    return np.abs(trace.column("sliding_speed")) > ROLLS * trace.surface_radius * np.abs(trace.column("theta_rate"))
+
+
 def _time_to_roll(trace: Trace) -> float:
-    slides = np.abs(trace.column("sliding_speed")) > ROLLS * trace.surface_radius * np.abs(trace.column("theta_rate"))
-    loose = slides | (trace.column("penetration") <= 0.0)
+    loose = _slides(trace) | (trace.column("penetration") <= 0.0)
     if loose[-1]:
         return math.nan
     return float(trace.times_s[np.flatnonzero(loose)[-1] + 1]) if loose.any() else 0.0
@@ -183,7 +233,7 @@ QUANTITIES = {
         Quantity("mean_normal_force", "N", _LAST, "the engine's own contact impulse over time", _mean_force),
         Quantity(
             "force_ripple", "N", _LAST, "RMS of the normal force about its mean, every 1 ms", _ripple,
-            scale=_mean_force, scale_title="the mean normal force", needs_force=True,
+            needs_force=True,
         ),
         Quantity(
             "reaction_amplitude", "N", _LAST, "sqrt(2) RMS of P_E - P_W about its mean, every 1 ms", _reaction,
@@ -196,8 +246,7 @@ QUANTITIES = {
         Quantity("contact_impulse", "N s", "whole run", "the engine's own integral of the normal force",
                  _whole("contact_impulse")),
         Quantity("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipated),
-        Quantity("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction,
-                 scale=lambda _: 1.0, scale_title="1"),
+        Quantity("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction),
         Quantity(
             "time_to_roll", "s", "transient", f"until it rolls for good (slip below {ROLLS:.0%}), to 1 ms",
             _time_to_roll, resolution=1e-3,

@@ -2,7 +2,8 @@
 
 Never all combinations, and never the sum of single errors: what is picked has been run. Model errors compare converged
 runs; numerical errors compare one model on two engines; the total compares the pick with the full model's reference.
-The path depends on errors alone, but for the last choice between engines, where a tenth in cost decides nothing.
+Whatever is asked for, a pick ends as the full model does, and leaves out only what saves more than a tenth of its cost:
+processor time as it will run, with the scene's sensors.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, get_args
 
-from replays.studies.ladder.measurement import Candidate, Measurement, check_reads, measure
-from replays.studies.ladder.quantity import QUANTITIES, Trace, Value
+from replays.studies.ladder import settings
+from replays.studies.ladder.measurement import Candidate, Measurement, check_reads, measure, saving
+from replays.studies.ladder.quantity import QUANTITIES, Value
 from rig.engines import ENGINES
 from rig.errors import InputError
 from rig.levels import ModelLevels
@@ -29,15 +31,8 @@ SENSORS = "sensors"
 KEEPABLE = (*LEVELS, SENSORS)
 STAND_INS = ("smoothed", "switch")
 """Friction laws that stand in for the exact one: measured, not picked, for they spare no work."""
-TIE = 1.1
-"""Costs this close are the same: timings have no finer meaning."""
-COSTLIER = 1.25
-"""A lowered level that takes this many times the steps of the higher one spares nothing."""
-_REFERENCE = ("rk8", 25, 1e-10)
-_UNLIKE = ("split", 1, 0.0)
-"""Another method in other coordinates; the converged engine of models that the reference's cannot take."""
-_GRIDS = (1000, 500, 250, 200, 125, 100, 50, 25, 20, 10, 5)
-_STEPS = (1, 2, 5, 10, 20, 25, 40, 50, 100)
+WORTH = 0.1
+"""What is left out saves more than this part of the cost; costs this close are the same."""
 _SPARE = 0.2
 """Part of the budget that is left to the verification."""
 
@@ -71,7 +66,7 @@ class Step:
     errors: Errors
     passes: bool
     cost: Measurement | None = None
-    """On an engine for use, where `measured` is a converged run."""
+    """As it will run, where `measured` is a converged run."""
     note: str = ""
 
 
@@ -88,6 +83,7 @@ class Ladder:
         steps: Everything tried, in order.
         picked: What is picked, as it will run.
         picked_errors: Its errors.
+        savings: By level left out, the part of the cost that this saves.
         given: The scene as it is given.
         given_errors: Its total errors.
         full: The full model on the engine of the reference, with the scene's own sensors.
@@ -104,6 +100,7 @@ class Ladder:
     steps: tuple[Step, ...]
     picked: Measurement
     picked_errors: Errors
+    savings: dict[str, float]
     given: Measurement
     given_errors: dict[str, float]
     full: Measurement
@@ -117,7 +114,7 @@ def search(
     tolerances: dict[str, float],
     *,
     keep: tuple[str, ...] = (),
-    runs: int = 3,
+    runs: int = 5,
     budget_s: float = 300.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Ladder:
@@ -132,20 +129,34 @@ def search(
         progress: Told what is tried.
 
     Raises:
-        InputError: The scene has no such quantity, the tolerance is below the reference's own error, no combination
-            meets it, or the budget ends before there is a pick.
+        InputError: The scene has no such quantity or ends in no certain way, the tolerance is below the reference's own
+            error, no combination meets it, or the budget ends before there is a pick.
     """
     for name in keep:
         if name not in KEEPABLE:
             raise InputError("--keep", f"one of {', '.join(KEEPABLE)}", name)
-    work = _Work(scene, tolerances, runs, budget_s, progress)
+    chain = scene.sensors.chain if SENSORS in keep else "ideal"
+    work = _Work(scene, tolerances, runs, budget_s, progress, {"chain": chain})
     standard = _standard(work)
-    best = _together(work, standard, _one_at_a_time(work, standard, keep))
-    passing, complete = _engines(work, standard, best)
-    given = work.run(_given(scene), sensors={})
-    full = work.run(standard.full.with_engine(*_usual("rk8")), sensors={})
-    sensors = scene.sensors.chain if SENSORS in keep else "ideal"
-    picked = _verified(work, standard, best, passing, sensors)
+    single = _one_at_a_time(work, standard, keep)
+    chosen, best = _together(work, standard, single, {level: next(iter(choices)) for level, choices in single.items()})
+    picked, complete = None, True
+    while True:
+        fuller, savings = _put_back(work, standard, single, chosen, picked.measured.candidate if picked else None)
+        if fuller != chosen:
+            chosen, best = _together(work, standard, single, fuller)
+            picked = None
+        elif picked is None:
+            work.steps = [step for step in work.steps if step.stage != "engine"]
+            passing, complete = _engines(work, standard, best)
+            picked = _cheapest(work, passing)
+        else:
+            break
+    given = work.run(settings.as_given(scene), sensors={})
+    full = work.run(standard.full.with_engine(*settings.usual(scene, standard.full, settings.REFERENCE[0])), sensors={})
+    own = _as_given(work, standard)
+    if own.passes and work.saving(picked.measured.candidate, own.measured.candidate) <= WORTH:
+        picked, savings = own, {}
     return Ladder(
         scene=scene,
         tolerances=tolerances,
@@ -155,10 +166,11 @@ def search(
         steps=tuple(work.steps),
         picked=picked.measured,
         picked_errors=picked.errors,
+        savings=savings,
         given=given,
         given_errors=standard.against(given.values, standard.reference.values),
         full=full,
-        sensors=sensors,
+        sensors=chain,
         spent_s=work.spent_s,
         complete=complete,
     )
@@ -173,6 +185,8 @@ class _Work:
     runs: int
     budget_s: float
     progress: Callable[[str], None]
+    sensors: dict[str, Any]
+    """As the pick will run."""
     steps: list[Step] = field(default_factory=list)
     _begin: float = field(default_factory=time.perf_counter)
 
@@ -194,8 +208,17 @@ class _Work:
         return measure(self.scene, candidate, list(self.tolerances), **options)
 
     def cost(self, candidate: Candidate) -> Measurement:
-        """A model on the first engine that takes it, at that engine's own step."""
-        return self.run(candidate.with_engine(*_usual(_cheap_engine(candidate))))
+        """A model as it will run, on the first engine that takes it, at that engine's own step."""
+        return self.run(self.usual(candidate), sensors=self.sensors)
+
+    def usual(self, candidate: Candidate) -> Candidate:
+        """A model on the first engine that takes it."""
+        engine = next(engine for engine in ENGINES if settings.takes(engine, candidate))
+        return candidate.with_engine(*settings.usual(self.scene, candidate, engine))
+
+    def saving(self, simpler: Candidate, fuller: Candidate) -> float:
+        """Part of the cost of the fuller one that the simpler one saves."""
+        return saving(self.scene, simpler, fuller, runs=self.runs, sensors=self.sensors, limit_s=self.left_s)
 
 
 class _Standard(NamedTuple):
@@ -208,11 +231,10 @@ class _Standard(NamedTuple):
     """What the reference itself may be wrong by."""
     allowed: dict[str, float]
     """The tolerances less that."""
-    trace: Trace
 
     def against(self, values: dict[str, Value], others: dict[str, Value]) -> dict[str, float]:
         """Errors of some values against others."""
-        return {name: QUANTITIES[name].error(values[name], others[name], self.trace) for name in values}
+        return {name: QUANTITIES[name].error(values[name], others[name]) for name in values}
 
     def model_errors(self, converged: Measurement) -> Errors:
         """Errors of a model by a converged run of it."""
@@ -226,31 +248,48 @@ class _Standard(NamedTuple):
             self.against(done.values, self.reference.values),
         )
 
-    def step(self, stage: str, label: str, measured: Measurement, errors: Errors, **more: Any) -> Step:
-        """One thing tried, with its verdict."""
-        passes = not measured.failure and errors.worst(self.allowed) <= 1.0
-        return Step(stage, label, measured, errors, passes, **more)
+    def step(
+        self,
+        stage: str,
+        label: str,
+        measured: Measurement,
+        errors: Errors,
+        *,
+        cost: Measurement | None = None,
+        note: str = "",
+    ) -> Step:
+        """One thing tried, with its verdict: errors within the tolerances, and the outcome of the full model."""
+        alike = _alike(measured, self.reference)
+        passes = not measured.failure and errors.worst(self.allowed) <= 1.0 and alike
+        if not alike and measured.ending is not None:
+            note = f"another outcome: {measured.ending.word}"
+        return Step(stage, label, measured, errors, passes, cost=cost, note=measured.failure or note)
 
 
 def _standard(work: _Work) -> _Standard:
     """The full model by two unlike engines.
 
     Raises:
-        InputError: One of them fails, the scene has no such quantity, or a tolerance is finer than their distance.
+        InputError: One of them fails, they end in different ways, the scene has no such quantity, or a tolerance is
+            finer than their distance.
     """
     # Of model levels the last choice is full, of the drive the scene's own.
     levels: Any = {name: choices[-1] for name, choices in LEVELS.items() if name != "drive"}
-    full = Candidate(ModelLevels(**levels), work.scene.drive.mode, *_REFERENCE)
-    work.progress(f"full model, {full.method}, and {_UNLIKE[0]} {_UNLIKE[1]} us beside it")
+    full = Candidate(ModelLevels(**levels), work.scene.drive.mode, *settings.REFERENCE)
+    other = full.with_engine(*settings.finest(settings.UNLIKE))
+    work.progress(f"full model, {full.method}, and {other.method} beside it")
     reference = work.run(full)
-    unlike = work.run(full.with_engine(*_UNLIKE), runs=1)
+    unlike = work.run(other, runs=1)
     for measured in (reference, unlike):
         if measured.failure:
             must = f"one that the reference can run ({measured.failure})"
             raise InputError("scene", must, measured.candidate.method)
     check_reads(work.scene, reference)
-    assert reference.trace is not None  # it has not failed
-    standard = _Standard(full, reference, unlike, {}, {}, reference.trace)
+    if not _alike(reference, unlike):
+        endings = [measured.ending.word for measured in (reference, unlike) if measured.ending]
+        must = f"one that two accurate engines end alike ({' and '.join(endings)} are chance)"
+        raise InputError("scene", must, work.scene.name)
+    standard = _Standard(full, reference, unlike, {}, {})
     distances = standard.against(unlike.values, reference.values)
     own = {name: max(error, _resolution(name, reference)) for name, error in distances.items()}
     for name, error in own.items():
@@ -270,48 +309,93 @@ def _resolution(name: str, reference: Measurement) -> float:
 
 
 def _one_at_a_time(work: _Work, standard: _Standard, keep: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Lower every level alone; by level, the choices that pass and spare work, each with its worst error."""
+    """Lower every level alone; by level, the choices that pass, each with its worst error."""
     full, steps = standard.full, work.steps
-    top = work.run(full.with_engine(*_usual("split")))
+    top = work.cost(full)
     steps.append(standard.step("full", "full model", standard.reference, Errors(total=standard.errors), cost=top))
     passing: dict[str, dict[str, float]] = {}
     for level, choices in LEVELS.items():
         for choice in choices[: choices.index(full.model[level])]:
             lowered = full.with_model(**{level: choice})
             work.progress(f"{level} {choice}")
-            converged = work.run(_converged(lowered), runs=1)
+            converged = work.run(settings.converged(lowered), runs=1)
             cost = work.cost(lowered)
-            stand_in = choice in STAND_INS
-            # By count, not by clock: the way down has to be the same each time.
-            costlier = not stand_in and cost.steps > COSTLIER * top.steps
-            note = "stands in for exact, spares no work" if stand_in else "spares nothing" if costlier else ""
+            part = 1.0 - cost.cpu_s / top.cpu_s
+            note = "stands in for exact" if choice in STAND_INS else f"saves {max(part, 0.0):.0%}"
             errors = standard.model_errors(converged)
-            step = standard.step("single", f"{level} {choice}", converged, errors, cost=cost, note=note)
-            steps.append(step)
-            if step.passes and not stand_in and not costlier and level not in keep:
+            steps.append(standard.step("single", f"{level} {choice}", converged, errors, cost=cost, note=note))
+            if steps[-1].passes and choice not in STAND_INS and level not in keep:
                 passing.setdefault(level, {})[choice] = errors.worst(standard.allowed)
     return passing
 
 
-def _together(work: _Work, standard: _Standard, single: dict[str, dict[str, float]]) -> Measurement:
-    """Lower all levels that pass alone; while they fail together the worst goes back up. The model, converged."""
-    chosen = {level: next(iter(choices)) for level, choices in single.items()}
+def _together(
+    work: _Work, standard: _Standard, single: dict[str, dict[str, float]], chosen: dict[str, str]
+) -> tuple[dict[str, str], Measurement]:
+    """Lower some levels together; while they fail together the worst goes back up. What is left, and it converged."""
     while True:
         combined = standard.full.with_model(**chosen)
         label = ", ".join(f"{level} {choice}" for level, choice in chosen.items()) or "full model"
         work.progress(f"together: {label}")
-        converged = work.run(_converged(combined), runs=1) if chosen else standard.reference
+        converged = work.run(settings.converged(combined), runs=1) if chosen else standard.reference
         errors, cost = standard.model_errors(converged), work.cost(combined)
         work.steps.append(standard.step("together", label, converged, errors, cost=cost))
         if work.steps[-1].passes:
-            return converged
+            return chosen, converged
         worst = max(chosen, key=lambda level: single[level][chosen[level]])
-        choices = list(single[worst])
-        higher = choices[choices.index(chosen[worst]) + 1 :]
-        if higher:
-            chosen[worst] = higher[0]
-        else:
-            del chosen[worst]
+        chosen = _raised(chosen, worst, next(iter(_above(single, chosen, worst)), None))
+
+
+def _above(single: dict[str, dict[str, float]], chosen: dict[str, str], level: str) -> list[str]:
+    """What passes alone of a level and is fuller than what is chosen, but for the full choice."""
+    choices = list(single[level])
+    return choices[choices.index(chosen[level]) + 1 :]
+
+
+def _raised(chosen: dict[str, str], level: str, choice: str | None) -> dict[str, str]:
+    """The same with a fuller choice of a level, None for the full one, which is not left out."""
+    others = {name: other for name, other in chosen.items() if name != level}
+    return others if choice is None else {**chosen, level: choice}
+
+
+def _put_back(
+    work: _Work,
+    standard: _Standard,
+    single: dict[str, dict[str, float]],
+    chosen: dict[str, str],
+    setting: Candidate | None,
+) -> tuple[dict[str, str], dict[str, float]]:
+    """Put back what saves no more than a tenth: of each level the fullest choice that costs as good as the same.
+
+    Args:
+        work: The search.
+        standard: What everything is held against.
+        single: By level, what passes alone.
+        chosen: By level, what is left out now.
+        setting: Engine and step that are picked; None for the usual ones.
+
+    Returns:
+        What is still left out, and how much of the cost each of that saves.
+    """
+    savings: dict[str, float] = {}
+
+    def placed(levels: dict[str, str], other: dict[str, str]) -> Candidate:
+        both = [standard.full.with_model(**each) for each in (levels, other)]
+        if setting is None or not all(settings.takes(setting.engine, each) for each in both):
+            return work.usual(both[0])
+        return both[0].with_engine(setting.engine, setting.step_us, setting.tolerance)
+
+    for level in list(chosen):
+        for choice in (None, *reversed(_above(single, chosen, level))):
+            fuller = _raised(chosen, level, choice)
+            work.progress(f"what {level} {chosen[level]} saves")
+            part = work.saving(placed(chosen, fuller), placed(fuller, chosen))
+            if part <= WORTH:
+                chosen = fuller
+                savings.pop(level, None)
+                break
+            savings.setdefault(level, part)
+    return chosen, savings
 
 
 def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[tuple[Step, int]], bool]:
@@ -322,17 +406,17 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
     """
     passing: list[tuple[Step, int]] = []
     complete = True
-    for place, (engine, settings) in enumerate(_settings(work.scene, best.candidate).items()):
-        for step_us, tolerance in settings:
+    for place, (engine, tried) in enumerate(settings.tried(work.scene, best.candidate).items()):
+        for step_us, tolerance in tried:
             if work.left_s <= _SPARE * work.budget_s and passing:
                 complete = False
                 break
             candidate = best.candidate.with_engine(engine, step_us, tolerance)
             work.progress(candidate.method)
             # What takes longer than the reference is of no interest, and may be a stall.
-            done = work.run(candidate, limit_s=max(1.0, 5.0 * standard.reference.wall_s * work.scene.duration_s))
-            errors = standard.all_errors(done, best)
-            step = standard.step("engine", candidate.method, done, errors, note=done.failure)
+            limit_s = max(1.0, 5.0 * standard.reference.cpu_s * work.scene.duration_s)
+            done = work.run(candidate, sensors=work.sensors, limit_s=limit_s)
+            step = standard.step("engine", candidate.method, done, standard.all_errors(done, best))
             work.steps.append(step)
             if not step.passes:
                 break
@@ -340,28 +424,27 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
     return passing, complete
 
 
-def _verified(
-    work: _Work, standard: _Standard, best: Measurement, passing: list[tuple[Step, int]], sensors: str
-) -> Step:
-    """The cheapest, run as it will run; where that fails, the next.
+def _cheapest(work: _Work, passing: list[tuple[Step, int]]) -> Step:
+    """The cheapest of what passes.
 
     Raises:
-        InputError: None of them passes.
+        InputError: Nothing does.
     """
-    passing = list(passing)
-    while passing:
-        least = min(step.measured.wall_s for step, _ in passing)
-        near = [entry for entry in passing if entry[0].measured.wall_s <= TIE * least]
-        taken = min(near, key=_preference)
-        work.progress(f"verifying {taken[0].label} as it will run")
-        done = work.run(taken[0].measured.candidate, sensors={"chain": sensors})
-        errors = standard.all_errors(done, best)
-        work.steps.append(standard.step("verified", taken[0].label, done, errors, note=done.failure))
-        if work.steps[-1].passes:
-            return work.steps[-1]
-        passing.remove(taken)
-    must = "wider: no engine meets it on the levels that do"
-    raise InputError("--tolerance", must, list(work.tolerances.values()))
+    if not passing:
+        must = "wider: no engine meets it on the levels that do"
+        raise InputError("--tolerance", must, list(work.tolerances.values()))
+    least = min(step.measured.cpu_s for step, _ in passing)
+    near = [entry for entry in passing if (1.0 - WORTH) * entry[0].measured.cpu_s <= least]
+    return min(near, key=_preference)[0]
+
+
+def _as_given(work: _Work, standard: _Standard) -> Step:
+    """The scene's own model, engine and step, as they would run in the place of the pick."""
+    own = settings.as_given(work.scene)
+    work.progress("the scene as it is given")
+    converged, done = work.run(settings.converged(own), runs=1), work.run(own, sensors=work.sensors)
+    work.steps.append(standard.step("given", f"as given: {own.method}", done, standard.all_errors(done, converged)))
+    return work.steps[-1]
 
 
 def _preference(entry: tuple[Step, int]) -> tuple[float, ...]:
@@ -370,50 +453,5 @@ def _preference(entry: tuple[Step, int]) -> tuple[float, ...]:
     return place, -step.measured.candidate.step_us, -step.measured.candidate.tolerance
 
 
-def _takes(engine: str, candidate: Candidate) -> bool:
-    method = ENGINES[engine]
-    return candidate.levels.friction in method.frictions and candidate.levels.contact in method.contacts
-
-
-def _converged(candidate: Candidate) -> Candidate:
-    """A model on the engine of the reference, or on the unlike one at its finest where that cannot take it."""
-    return candidate.with_engine(*(_REFERENCE if _takes(_REFERENCE[0], candidate) else _UNLIKE))
-
-
-def _cheap_engine(candidate: Candidate) -> str:
-    """The default engine, or the first that takes the model."""
-    return next(engine for engine in ENGINES if _takes(engine, candidate))
-
-
-def _usual(engine: str) -> tuple[str, int, float]:
-    method = ENGINES[engine]
-    return engine, method.step_us, method.tolerance
-
-
-def _given(scene: Scene) -> Candidate:
-    return Candidate(scene.model, scene.drive.mode, scene.engine.name, scene.engine.step_us, scene.engine.tolerance)
-
-
-def _settings(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float]]]:
-    """Steps, or tolerances, of every engine that takes a model and fits the sample rates, the finest first."""
-    settings: dict[str, list[tuple[int, float]]] = {}
-    for engine, method in ENGINES.items():
-        if not _takes(engine, candidate):
-            continue
-        if method.tolerance:
-            grids = [step for step in _GRIDS if step <= method.step_us and _fits(scene, candidate, engine, step)]
-            scales = (1e-2, 1.0, 1e2)
-            settings[engine] = [(grids[0], method.tolerance * scale) for scale in scales] if grids else []
-        else:
-            steps = [step for step in _STEPS if 0.2 * method.step_us <= step <= 4.0 * method.step_us]
-            settings[engine] = [(step, 0.0) for step in steps if _fits(scene, candidate, engine, step)]
-    return settings
-
-
-def _fits(scene: Scene, candidate: Candidate, engine: str, step_us: int) -> bool:
-    try:
-        for sensors in ({}, None):  # as it will run, and as it is measured
-            candidate.with_engine(engine, step_us, 0.0).scene(scene, sensors=sensors)
-    except InputError:
-        return False
-    return True
+def _alike(one: Measurement, other: Measurement) -> bool:
+    return one.ending is not None and other.ending is not None and one.ending.alike(other.ending)
