@@ -9,6 +9,8 @@
 | one impact                             | its quadrature, to 1e-9                                  |
 | first impacts under Coulomb's friction | heyoka on equations of its own                           |
 | the two laws of a contact left open    | rk8, which steps through them in time                    |
+| blows along a line, nothing turning    | rk8's impacts, with friction and without                 |
+| rolling in a stiff, linear contact     | the friction that is needed, whatever the depth          |
 | steps of an impact                     | some 16, whatever is asked of the onset                  |
 | error over a ladder of tolerances      | falls with every rung                                    |
 | energy residual                        | 0, within some tolerances                                |
@@ -260,3 +262,36 @@ def test_the_peak_is_the_laws_own_for_every_exponent(stiffness: str) -> None:
     assert peaks[0]["peak_normal_force_n"] == pytest.approx(peaks[1]["peak_normal_force_n"], rel=3e-3)
     assert peaks[0]["contacts"] == peaks[1]["contacts"]
     assert not peaks[0]["warnings"]
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.22])
+@pytest.mark.parametrize("force", [300.0, 320.0, 330.0])
+def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
+    # Where the sliding speed is 0 to the last bit, phases that change at one depth change back at once.
+    blow = {"at_s": 0.018, "command": "hammer", "force_n": force, "duration_ms": 1.0, "direction": "y"}
+    changes = {**QUIET, "model.stator": "rigid", "drive.speed_hz": 0.0, "ring.clearance": 0.2685, "commands": [blow]}
+    changes |= {"contact.restitution": 0.9478, "contact.friction": friction}
+    one, other = (
+        simulate("hammer", {**changes, "engine.name": name}, duration_s=0.05).simulation for name in ("taylor", "rk8")
+    )
+    assert one._memory[CONTACTS] == other._memory[CONTACTS] > 1
+    assert np.abs(scaled(one._y[: S.N_STATE]) - scaled(other._y[: S.N_STATE])).max() < 1e-6
+    assert one._memory[STEPS] < 400
+    assert not one.health()["warnings"]
+
+
+def test_a_stiff_linear_contact_rolls() -> None:
+    rows = []
+    for name in ("taylor", "rk8"):
+        law = {"contact__stiffness": 5.8e11, "contact__damping_factor": "kelvin-voigt"}
+        simulation = ready("drop", name, **law)
+        simulation.advance(310_000)  # to rest, 20 pm deep
+        parts = []
+        for force in (2.0, 100.0):  # along the ring: friction holds the shaft against one of them
+            simulation.submit("hammer", {"force_n": force, "duration_ms": 2.0, "direction": "x"})
+            parts.append(simulation.advance(10_000).rows.copy())
+        rows.append(np.concatenate(parts))
+    one, other = (each[:, S.N_VECTOR + S.FRICTION_FORCE] for each in rows)
+    assert np.abs(other).max() > 7.0
+    np.testing.assert_allclose(one, other, atol=0.01)
+    assert np.abs(scaled(rows[0][:, : S.N_STATE] - rows[1][:, : S.N_STATE])).max() < 1e-4

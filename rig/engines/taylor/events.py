@@ -30,14 +30,18 @@ from rig.kernels.geometry import State, eccentricity_of, pose_of
 NOTHING, FIRST, _SECOND, _THIRD, _HOUSE_NS, _HOUSE_EW = range(6)
 """What ends a series: a length or a corner of the hammer's; a zero of one of the events' functions; a transducer."""
 
-_FRICTIONLESS = 1e-9
-"""Depth [m] up to which a contact that does not slide has no friction: rolling needs a normal force."""
+_FRICTIONLESS_S = 1e-9
+"""Time [s] after an onset and before a lift-off in which a contact that does not slide has no friction: rolling needs a
+normal force. No depth says so: in a stiff contact, the load's own may be any. Shorter than any contact by far, as the
+series of a rolling one (in time) shrink toward both."""
 _AT_REST = 1e-9
-"""Sliding speed [m/s] at the onset below which a contact does not slide."""
+"""Sliding speed over that of the penetration below which a contact that begins does not slide."""
 _SLOWEST = 1e-6
-"""Speed of an onset [m/s] below which the contact begins at the depth ..."""
-_LEAST_ROOT = 1e-7
-"""... of this squared: there dt = s dtau would stand still."""
+"""Speed of an onset [m/s] below which the contact begins at the least depth ..."""
+_LEAST_DEPTH = 1e-11
+"""... over the clearance: at 0, dt = s dtau would stand still."""
+_TOLD_DEPTH = 1e-10
+"""Depth over the clearance from which on a difference of distances tells it."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -62,6 +66,12 @@ def ring_at(constants, inputs, x):
 
 
 @njit(cache=True, error_model="numpy")
+def _holds_at_rest(constants):
+    """Whether friction may keep the sliding speed at 0."""
+    return constants.levels.friction == EXACT and constants.contact.friction > 0.0
+
+
+@njit(cache=True, error_model="numpy")
 def enter_events(constants, memory, Y):
     """Functions that fall through 0 where an event happens, of what the series has in their columns."""
     contact, phase = constants.contact, int(memory[PHASE])
@@ -74,17 +84,18 @@ def enter_events(constants, memory, Y):
         second[0] = third[0] = 1.0
         return
     if phase == ROLLING:
-        first[0] -= _FRICTIONLESS
         for k in range(ORDER):
+            # The depth that short time ahead.
+            first[k] += _FRICTIONLESS_S * (k + 1.0) * first[k + 1]
             friction, limit = second[k], contact.friction * Y[k, FORCE]
             second[k], third[k] = limit - friction, limit + friction
         return
-    speed = second[0]
-    sign = 1.0 if phase == FORWARD else -1.0
+    speed, sign = second[0], 0.0
     if phase == TOUCHING:
-        sign = 0.0
         if constants.levels.friction == SMOOTHED and abs(speed) > 4.0 * contact.smoothing_speed:
             sign = math.copysign(1.0, speed)
+    elif _holds_at_rest(constants):
+        sign = 1.0 if phase == FORWARD else -1.0
     away = memory[SLACK] != 0.0
     for k in range(ORDER):
         first[k] = Y[k, ROOT]
@@ -98,11 +109,11 @@ def enter_events(constants, memory, Y):
     elif phase == TOUCHING:
         # Far out the tanh is 1 to rounding, and no coefficient tells of the turn ahead: halve the way to it.
         second[0] = 0.5 * abs(speed)
-    if phase == TOUCHING and constants.levels.friction == EXACT and Y[1, ROOT] > 0.0:
-        # Frictionless up to that depth, on the way in.
+    if phase == TOUCHING and _holds_at_rest(constants) and Y[1, ROOT] > 0.0:
+        # Frictionless up to the depth of that time, on the way in: s' = delta'/2.
         for k in range(ORDER + 1):
             second[k] = -Y[k, ROOT]
-        second[0] += math.sqrt(_FRICTIONLESS)
+        second[0] += math.sqrt(_FRICTIONLESS_S * 2.0 * Y[1, ROOT])
 
 
 @njit(cache=True, error_model="numpy")
@@ -124,7 +135,7 @@ def _settle(constants, inputs, memory, x, y, dy, out):
 def change_phase(constants, inputs, memory, x, y, dy, out):
     """Go over to what is behind the event that has ended a series, at the state x where it happens."""
     event, phase = int(memory[EVENT]), int(memory[PHASE])
-    contact, exact = constants.contact, constants.levels.friction == EXACT
+    contact = constants.contact
     memory[EVENT] = NOTHING
     known = memory[KNOWN : KNOWN + 3]
     for i in range(3):
@@ -135,11 +146,11 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
     if phase == FLIGHT:
         if event == FIRST:
             latch_onset(memory, rate, contact)
-            memory[PHASE] = slides if abs(sliding) > _AT_REST else TOUCHING
+            memory[PHASE] = slides if abs(sliding) > _AT_REST * rate else TOUCHING
             x[ROOT] = 0.0
             known[0] = 1.0
             if rate < _SLOWEST or not (contact.exponent == 1.5 or contact.exponent == 1.0):
-                x[ROOT] = _LEAST_ROOT
+                x[ROOT] = math.sqrt(_LEAST_DEPTH * contact.clearance)
                 known[0] = 0.0
     elif memory[SLACK] != 0.0:
         if event == FIRST:
@@ -162,15 +173,15 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
         memory[SLACK] = 1.0
         memory[CLAMPS] += 1.0
         known[2] = 1.0
-    elif event == _SECOND and exact:
-        if phase == TOUCHING and abs(sliding) > _AT_REST:
+    elif event == _SECOND and _holds_at_rest(constants):
+        if phase == TOUCHING and abs(sliding) > _AT_REST * abs(rate):
             memory[PHASE] = slides
         else:
             _settle(constants, inputs, memory, x, y, dy, out)
     # The depth itself, where it can be told, so that its root does not drift.
     slowed = memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING
-    if slowed and (depth > 1e-10 or phase == ROLLING or memory[SPAN] < 0.0):
-        x[ROOT] = math.sqrt(max(depth, 1e-14))
+    if slowed and (depth > _TOLD_DEPTH * contact.clearance or phase == ROLLING or memory[SPAN] < 0.0):
+        x[ROOT] = math.sqrt(max(depth, _LEAST_DEPTH * contact.clearance))
     house = constants.house
     memory[NORTH] = memory[EAST] = 0.0
     if constants.levels.inner_house:

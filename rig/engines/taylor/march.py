@@ -13,7 +13,7 @@ Contact. delta^1.5 has branch points at onset and lift-off, next to which a seri
 nearer one: a hundred steps a contact. While it slides, the series is therefore in tau with dt = s dtau, s the root of
 delta, itself a state, s' = delta'/2 by tau: the force goes as s^3, onset and lift-off are simple zeros of s, and an
 impact takes some 16 steps. (Levi-Civita and Sundman treat collisions of bodies so.) Where the law's exponent is neither
-1 nor 1.5, contacts begin at a depth of 1e-14 m. Rolling ends before the lift-off and stays with time.
+1 nor 1.5, contacts begin at a depth of 1e-11 of the clearance. Rolling ends before the lift-off and stays with time.
 
 Steps run on beyond the rows, which are read off the series; so the memory holds one. Where the inputs change, it is
 dropped at that instant. So neither calls nor the density of rows change a bit of the motion.
@@ -24,6 +24,7 @@ Smoothed friction is taken too, but a very small smoothing speed makes it stiff,
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -59,16 +60,52 @@ from rig.engines.taylor.place import (
 from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
 from rig.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT, ROLLING, held_speed, normal_force
+from rig.kernels.contact import FLIGHT, ROLLING, TOUCHING, held_speed, normal_force
 from rig.kernels.forces import drive_speed
 
 _SAFETY = 0.9
-_LONGEST_S, _SHORTEST_S = 2e-2, 1e-12
+_LONGEST_S, _SHORTEST_S = 6e-2, 1e-12
 """Longest step, and the shortest that is no sign of trouble [s], in the variable of the series."""
 _ROUNDING = 1e-16
 """Tolerance that no step can vouch for."""
 _SCALE_T, _SCALE_ROOT = 1e-4, 3e-3
 """What counts as 1 in a step's error: 0.1 ms, 9 µm."""
+
+
+class Room(NamedTuple):
+    """Arrays that the series are worked out in."""
+
+    Y: np.ndarray  # the series at hand, shape (ORDER + 1, WIDTH): in the memory, so that it outlives the call
+    A: np.ndarray  # factors of products, shape (ORDER + 1, LANES)
+    B: np.ndarray
+    D: np.ndarray  # rates, shape (ORDER + 1, WIDTH)
+    acc: np.ndarray  # sums over lanes, shape (LANES,)
+    x: np.ndarray  # state, integrals and the columns up to the root, shape (ROOT + 1,)
+    dy: np.ndarray  # shape (N_VECTOR,)
+    out: np.ndarray  # shape (N_OBSERVED,)
+
+
+@njit(cache=True, error_model="numpy")
+def _aligned(rows, columns):
+    """Zeros whose rows begin on cache lines: the sums over lanes take half as long again without."""
+    room = np.zeros(rows * columns + 8)
+    first = (-room.ctypes.data % 64) // 8
+    return room[first : first + rows * columns].reshape((rows, columns))
+
+
+@njit(cache=True, error_model="numpy")
+def room_in(memory):
+    """Room for a call."""
+    return Room(
+        memory[SERIES : SERIES + (ORDER + 1) * WIDTH].reshape((ORDER + 1, WIDTH)),
+        _aligned(ORDER + 1, LANES),
+        _aligned(ORDER + 1, LANES),
+        _aligned(ORDER + 1, WIDTH),
+        _aligned(1, LANES)[0],
+        np.zeros(ROOT + 1),
+        np.empty(S.N_VECTOR),
+        np.empty(S.N_OBSERVED),
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -84,12 +121,13 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
 
 
 @njit(cache=True, error_model="numpy")
-def _make_series(constants, inputs, memory, Y, A, B, D, acc):
+def _make_series(constants, inputs, memory, room):
     """All coefficients of a series from the state in its first row.
 
     Returns:
         Whether it is a series in slowed time.
     """
+    Y, A, B, D, acc = room.Y, room.A, room.B, room.D, room.acc
     now, phase = int(memory[TICK]), int(memory[PHASE])
     aim = drive_speed(inputs, now, memory[FRACTION])
     pulse = along = 0.0
@@ -112,16 +150,29 @@ def _make_series(constants, inputs, memory, Y, A, B, D, acc):
 def _length(memory, Y, slowed):
     """How far a series holds: its last two terms stay within the tolerance."""
     tolerance = memory[TOLERANCE]
-    last = before = 0.0
+    last = before = known = 0.0
     for i in range(S.N_STATE):
+        known += Y[ORDER, i]
         last = max(last, abs(Y[ORDER, i]) * PER_SCALE[i])
         before = max(before, abs(Y[ORDER - 1, i]) * PER_SCALE[i])
     if slowed:
         last = max(last, abs(Y[ORDER, TIME]) / _SCALE_T, abs(Y[ORDER, ROOT]) / _SCALE_ROOT)
         before = max(before, abs(Y[ORDER - 1, TIME]) / _SCALE_T, abs(Y[ORDER - 1, ROOT]) / _SCALE_ROOT)
+    if not math.isfinite(known):  # max leaves out what is none
+        return math.nan
     return _SAFETY * min(
         (tolerance / max(last, 1e-200)) ** (1.0 / ORDER), (tolerance / max(before, 1e-200)) ** (1.0 / (ORDER - 1.0))
     )
+
+
+@njit(cache=True, error_model="numpy")
+def _law_length(memory, Y):
+    """How far the normal law and its losses hold in a series."""
+    tolerance, law, loss = memory[TOLERANCE], EVENTS + 2, S.CONTACT_LOSS
+    most = tolerance * max(1.0, abs(Y[0, law]))
+    last = max(abs(Y[ORDER - 1, law]) / most, abs(Y[ORDER - 1, loss]) / tolerance)
+    before = max(abs(Y[ORDER - 2, law]) / most, abs(Y[ORDER - 2, loss]) / tolerance)
+    return _SAFETY * min(max(last, 1e-200) ** (-1.0 / (ORDER - 1.0)), max(before, 1e-200) ** (-1.0 / (ORDER - 2.0)))
 
 
 @njit(cache=True, error_model="numpy")
@@ -153,32 +204,32 @@ def _note_peak(constants, inputs, memory, Y, x):
             low, high = before, s
             for _ in range(30):
                 middle = 0.5 * (low + high)
-                value, slope_middle = column_at(Y, FORCE, 0, middle)
-                if slope_middle > 0.0:
+                if column_at(Y, FORCE, 0, middle)[1] > 0.0:
                     low = middle
                 else:
                     high = middle
-            if value > peak:
-                peak = max(peak, _force_at(constants, inputs, memory, Y, middle, x))
+            if column_at(Y, FORCE, 0, high)[0] > peak:
+                peak = max(peak, _force_at(constants, inputs, memory, Y, high, x))
         before, slope_before = s, slope
     memory[PEAK_FORCE] = peak
 
 
 @njit(cache=True, error_model="numpy")
-def _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
-    """From the end of one series to the next.
+def _next_series(constants, inputs, memory, room, y):
+    """From the end of one series to the next; y is room for a state.
 
     Returns:
         False where there is none: the numbers are no longer finite.
     """
+    Y, x = room.Y, room.x
     if memory[SPAN] >= 0.0:
         if memory[PHASE] != FLIGHT:
             _note_peak(constants, inputs, memory, Y, x)
         series_at(Y, memory[LENGTH], x)
         memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
-    change_phase(constants, inputs, memory, x, y, dy, out)
+    change_phase(constants, inputs, memory, x, y, room.dy, room.out)
     Y[0, : ROOT + 1] = x
-    slowed = _make_series(constants, inputs, memory, Y, A, B, D, acc)
+    slowed = _make_series(constants, inputs, memory, room)
     memory[STEPS] += 1.0
     memory[EVALUATIONS] += ORDER
     if memory[PHASE] != FLIGHT:
@@ -188,6 +239,9 @@ def _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
     h = _length(memory, Y, slowed)
     if not math.isfinite(h):
         return False
+    if slowed and not (constants.contact.exponent == 1.5 or constants.contact.exponent == 1.0):
+        # The law, by which events and losses go, has a radius that a motion it hardly moves yet does not show.
+        h = min(h, _law_length(memory, Y))
     # Never further than it holds: what a series says beyond its radius is no number to go on with.
     if h < _SHORTEST_S:
         memory[CEILING] += 1.0
@@ -231,30 +285,51 @@ def _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
 
 
 @njit(cache=True, error_model="numpy")
-def _reach(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out, tick):
-    """State at a tick, into y: series after series up to there, the last one read off.
+def holds(memory, tick, fraction):
+    """Whether the series at hand holds at an instant: a whole tick and the ticks beyond it."""
+    return memory[SPAN] >= 0.0 and (tick - memory[END_TICK]) + (fraction - memory[END_FRACTION]) <= 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def continue_series(constants, inputs, memory, room, y):
+    """Go over to the next series; y is room for a state, and nan where the numbers are no longer finite.
 
     Returns:
-        Whether the numbers are still finite.
+        Whether they are.
     """
-    while (tick - memory[END_TICK]) - memory[END_FRACTION] > 0.0 or memory[SPAN] < 0.0:
-        if memory[STALLED] > 1000.0 or not _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
-            memory[CEILING] += 1.0
-            y[:] = np.nan
-            return False
-    time = ((tick - memory[TICK]) - memory[FRACTION]) * inputs.tick_s
-    s = time
-    if time >= memory[SPAN]:
-        s = memory[LENGTH]
-    elif memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
-        s = refine(Y, TIME, 0, time, 0.0, memory[LENGTH])
-    series_at(Y, s, x)
-    y[:] = x[: S.N_VECTOR]
+    if memory[STALLED] > 1000.0 or not _next_series(constants, inputs, memory, room, y):
+        memory[CEILING] += 1.0
+        memory[STALLED] = 1e9
+        y[:] = np.nan
+        return False
     return True
 
 
 @njit(cache=True, error_model="numpy")
-def _same_inputs(inputs, memory):
+def read_off(memory, room, y, tick, fraction):
+    """State at an instant of the series at hand, into y."""
+    Y, x = room.Y, room.x
+    time = ((tick - memory[TICK]) + (fraction - memory[FRACTION])) * memory[INPUTS]
+    s = time
+    if time >= memory[SPAN]:
+        s = memory[LENGTH]
+    elif time > 0.0 and memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
+        s = refine(Y, TIME, 0, time, 0.0, memory[LENGTH])
+    series_at(Y, s, x)
+    y[:] = x[: S.N_VECTOR]
+
+
+@njit(cache=True, error_model="numpy")
+def _reach(constants, inputs, memory, room, y, tick):
+    """State at a tick, into y: series after series up to there, the last one read off."""
+    while not holds(memory, tick, 0.0):
+        if not continue_series(constants, inputs, memory, room, y):
+            return
+    read_off(memory, room, y, tick, 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def same_inputs(inputs, memory):
     """Whether the inputs are what they were; keeps them."""
     kept = memory[INPUTS : INPUTS + 11]
     same = (
@@ -279,11 +354,32 @@ def _same_inputs(inputs, memory):
 
 
 @njit(cache=True, error_model="numpy")
-def _aligned(rows, columns):
-    """Zeros whose rows begin on cache lines: the sums over lanes take half as long again without."""
-    room = np.zeros(rows * columns + 8)
-    first = (-room.ctypes.data % 64) // 8
-    return room[first : first + rows * columns].reshape((rows, columns))
+def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
+    """A new beginning from the state y, at a whole tick and the ticks beyond it.
+
+    `leaves` says that a contact ends there: its gap counts as closed, whatever rounding makes of it.
+    """
+    if memory[SPAN] >= 0.0 and memory[PHASE] != FLIGHT:
+        _note_peak(constants, inputs, memory, room.Y, room.x)
+    room.x[: S.N_VECTOR] = y
+    memory[SPAN] = -1.0
+    memory[EVENT] = NOTHING
+    if leaves:
+        memory[EVENT], memory[PHASE] = FIRST, TOUCHING
+    memory[TICK], memory[FRACTION] = float(tick), fraction
+    memory[END_TICK], memory[END_FRACTION] = float(tick), fraction
+    continue_series(constants, inputs, memory, room, y)
+
+
+@njit(cache=True, error_model="numpy")
+def write_row(constants, inputs, memory, room, y, tick, phase, rows, row):
+    """The row of an instant."""
+    out = room.out
+    rates(constants, inputs, tick, 0.0, memory[ONSET], phase, True, y, room.dy, out)
+    for i in range(S.N_VECTOR):
+        rows[row, i] = y[i]
+    for i in range(S.N_OBSERVED):
+        rows[row, S.N_VECTOR + i] = out[i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -301,31 +397,11 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         stride: Steps a row.
         rows: Out, shape (ceil(steps / stride), N_ROW).
     """
-    Y = memory[SERIES : SERIES + (ORDER + 1) * WIDTH].reshape((ORDER + 1, WIDTH))
-    A = _aligned(ORDER + 1, LANES)
-    B = _aligned(ORDER + 1, LANES)
-    D = _aligned(ORDER + 1, WIDTH)
-    acc = _aligned(1, LANES)[0]
-    x = np.zeros(ROOT + 1)
-    dy = np.empty(S.N_VECTOR)
-    out = np.empty(S.N_OBSERVED)
-    if not _same_inputs(inputs, memory) or memory[SPAN] < 0.0:
-        # A new beginning, from what is here now.
-        if memory[SPAN] >= 0.0 and memory[PHASE] != FLIGHT:
-            _note_peak(constants, inputs, memory, Y, x)
-        x[: S.N_VECTOR] = y
-        memory[SPAN] = -1.0
-        memory[EVENT] = NOTHING
-        memory[TICK], memory[FRACTION] = float(tick), 0.0
-        memory[END_TICK], memory[END_FRACTION] = float(tick), 0.0
-        if not _next_series(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out):
-            memory[STALLED] = 1e9
+    room = room_in(memory)
+    if not same_inputs(inputs, memory) or memory[SPAN] < 0.0:
+        begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
     for row in range((steps + stride - 1) // stride):
         now = tick + row * stride * step_ticks
-        _reach(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out, now)
-        rates(constants, inputs, now, 0.0, memory[ONSET], int(memory[PHASE]), True, y, dy, out)
-        for i in range(S.N_VECTOR):
-            rows[row, i] = y[i]
-        for i in range(S.N_OBSERVED):
-            rows[row, S.N_VECTOR + i] = out[i]
-    _reach(constants, inputs, memory, Y, A, B, D, acc, x, y, dy, out, tick + steps * step_ticks)
+        _reach(constants, inputs, memory, room, y, now)
+        write_row(constants, inputs, memory, room, y, now, int(memory[PHASE]), rows, row)
+    _reach(constants, inputs, memory, room, y, tick + steps * step_ticks)
