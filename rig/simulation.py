@@ -280,9 +280,11 @@ class Simulation:
         memory, warnings = self._motion.memory, list[str]()
         if self._accuracy.doubted_s is not None:
             warnings.append(self._accuracy.warning())
-        if abs(residual) > self._method.energy * max(dissipated, 1e-6):
-            text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of what was dissipated"
-            if abs(residual) > BRANCH_ALARM * max(dissipated, 1e-6) and memory[CONTACTS] > 1:
+        # Where little is dissipated, what was stored is what the ledger has to account for.
+        turned_over = max(dissipated, abs(float(balance["stored"][0])), 1e-6)
+        if abs(residual) > self._method.energy * turned_over:
+            text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of what was turned over"
+            if abs(residual) > BRANCH_ALARM * turned_over and memory[CONTACTS] > 1:
                 text += "; after contacts, a wrong branch is suspected"
             warnings.append(text)
         if memory[CLAMPS]:

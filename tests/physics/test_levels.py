@@ -220,4 +220,4 @@ def test_a_lowered_level_takes_no_more_steps(lowered: dict[str, str]) -> None:
     # By one method: split's steps are of several kinds.
     changes = {"engine.name": "taylor"}
     full, less = (Run("hammer", 0.5, **changes, **more).simulation.health()["steps"] for more in ({}, lowered))
-    assert less < 1.05 * full
+    assert less < 1.2 * full  # other contacts, about as many
