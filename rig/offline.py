@@ -14,9 +14,10 @@ import numpy as np
 from rig.channels import ChannelTable
 from rig.errors import InputError, UnknownNameError, Words, whole_file
 from rig.kernels.signals import COLUMN, N_ROW, ROW
+from rig.motion import DISSIPATED, STORED, SUPPLIED, energy_balance
 from rig.samples import Samples, place
 from rig.scenes import Scene, load_scene, parse_scene
-from rig.simulation import DISSIPATED, STORED, SUPPLIED, Frame, Simulation, energy_balance
+from rig.simulation import Frame, Simulation
 
 NAMES = tuple(COLUMN)
 _MUST = "one of the signals it keeps of the model (those of the sensors are in run.samples)"

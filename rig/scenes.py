@@ -81,7 +81,9 @@ class EngineChoice(Written):
     step_us: Annotated[int, Field(ge=1, le=1000)] = 0
     """Step [us], a whole number of ticks; left out: the engine's own."""
     tolerance: Annotated[FiniteFloat, Field(ge=0.0, le=0.1)] = 0.0
-    """Scaled error a step of an adaptive engine; left out: the engine's own."""
+    """Scaled error: of the whole run with split, of a step with another adaptive engine; left out: the engine's own."""
+    companion: bool = False
+    """A second run beside it, at a sixteenth of the tolerance, tells the error; left out: with split only."""
 
     @field_validator("name")
     @classmethod
@@ -96,7 +98,8 @@ class EngineChoice(Written):
         name = data.get("name", next(iter(ENGINES))) if isinstance(data, dict) else None
         if not isinstance(name, str) or (method := ENGINES.get(name)) is None:
             return data
-        return {"step_us": method.step_us, "tolerance": method.tolerance, **data}
+        own = {"step_us": method.step_us, "companion": method.companion, **data}
+        return {**own, "tolerance": data.get("tolerance") or method.tolerance}  # 0 is what recordings of 0.1 say
 
 
 @cache
@@ -194,6 +197,8 @@ class Scene(Written):
                 f"left out with engine {self.engine.name}, whose steps are fixed",
                 self.engine.tolerance,
             )
+        if self.engine.companion and not self.engine.tolerance:
+            raise InputError("engine.companion", "false without an engine.tolerance", True)
         return self
 
     @model_validator(mode="after")

@@ -21,13 +21,14 @@ import numpy as np
 from rig.channels import ChannelTable
 from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.engines import ENGINES, load_engine
-from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, MEMORY, PEAK_FORCE, STEPS
+from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, PEAK_FORCE, STEPS
 from rig.errors import InputError, SimulationError, Words
 from rig.kernels import signals as S
 from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
+from rig.motion import BRANCH_ALARM, FINER, Accuracy, Motion, energy_balance
 from rig.scenes import Scene, load_scene, rig_table, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
@@ -39,14 +40,6 @@ ROW_TICKS = 25
 
 The sensors' filters run at this rate. Ideal sensors have none: their rows are as far apart as samples and truth.
 """
-ENERGY_ALARM = 1e-3
-"""Energy residual over dissipated energy above which a run is in doubt, ..."""
-BRANCH_ALARM = 1e-2
-"""... and above which it may have missed a contact or made one up: in the charts, such runs are off by 1e-2 to 0.5."""
-
-STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy")
-SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
-DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +83,8 @@ class Snapshot:
 
 
 _CHANGING = (
-    "tick", "first_row", "_segments", "_engaged", "_pulse", "_pending", "_y", "_memory", "_last", "_conditioner",
-    "_keyphasor",
+    "tick", "first_row", "_segments", "_engaged", "_pulse", "_pending", "_motion", "_companion", "_accuracy", "_last",
+    "_conditioner", "_keyphasor",
 )  # fmt: skip
 
 
@@ -165,10 +158,15 @@ class Simulation:
         self._engaged = scene.initial.magnets
         self._pulse: tuple[HammerCommand, int, int] | None = None
         self._pending = sorted(
-            ((self._on_grid(timed.at_s), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
+            ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
         )
-        self._y = self._initial_state(self._segments[0].speed)
-        self._memory = np.zeros(MEMORY)
+        choice, initial = scene.engine, self._initial_state(self._segments[0].speed)
+        self._motion = Motion(initial, choice.step_us, self._stride, choice.tolerance)
+        self._companion: Motion | None = None
+        if choice.companion:
+            stride = self.block_ticks // choice.step_us
+            self._companion = Motion(initial.copy(), choice.step_us, stride, FINER * choice.tolerance)
+        self._accuracy = Accuracy(choice.tolerance)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None
 
@@ -179,13 +177,14 @@ class Simulation:
     def first_row(self) -> np.ndarray:
         """The observed row at time zero, shape (N_ROW,). The first use starts the engine, which compiles it."""
         row = np.empty((1, S.N_ROW))
-        constants, inputs = self.model.constants, self._inputs()
-        self._engine.start(
-            constants, inputs, self._y, self._memory, float(self._step_ticks), self.scene.engine.tolerance
-        )
-        y, memory = self._y.copy(), self._memory.copy()
-        self._engine.advance(constants, inputs, y, memory, self.tick, self._step_ticks, 1, 1, row)
+        engine, constants, inputs = self._engine, self.model.constants, self._inputs()
+        for motion in self._motions():
+            motion.begin(engine, constants, inputs)
+        copy.deepcopy(self._motion).run(engine, constants, inputs, row, self.tick, self.tick, self.tick + 1)
         return row[0]
+
+    def _motions(self) -> list[Motion]:
+        return [self._motion] if self._companion is None else [self._motion, self._companion]
 
     def advance(self, ticks: int) -> Frame:
         """Move on by `ticks`.
@@ -202,16 +201,21 @@ class Simulation:
         if len(self._rows) < n:
             self._rows = np.empty((n, S.N_ROW))
         rows = self._rows[:n]
+        companion = np.empty((ticks // self.block_ticks, S.N_ROW))
         events: list[dict[str, Any]] = []
         while self.tick < end:
             self._take_effect(events)
-            stop = min(end, self._next_change())
-            self._run(rows[(self.tick - start) // self.row_ticks : (stop - start) // self.row_ticks], stop - self.tick)
+            stop, inputs = min(end, self._next_change()), self._inputs()
+            for motion, out in zip(self._motions(), (rows, companion), strict=False):
+                motion.run(self._engine, self.model.constants, inputs, out, start, self.tick, stop)
+            self.tick = stop
         self._last = rows[-1].copy()
-        if not np.isfinite(self._y).all():
+        if not np.isfinite(self._motion.y).all():
             raise SimulationError(
-                f"the state is no longer finite at {self.tick / TICK_RATE_HZ:.6f} s; try a shorter engine.step_us"
+                f"the state is no longer finite at {self._lost_s(rows, start):.6f} s; {self._method.advice}"
             )
+        if self._companion is not None:
+            events = sorted(events + self._doubts(rows, companion, start), key=lambda event: event["tick"])
         return Frame(
             tick=start,
             ticks=ticks,
@@ -221,6 +225,19 @@ class Simulation:
             events=events,
             rows=rows,
         )
+
+    def _lost_s(self, rows: np.ndarray, start: int) -> float:
+        finite = np.isfinite(rows[:, : S.N_STATE]).all(axis=1)
+        row = len(rows) if finite.all() else int(np.argmin(finite))
+        return (start + row * self.row_ticks) / TICK_RATE_HZ
+
+    def _doubts(self, rows: np.ndarray, companion: np.ndarray, start: int) -> list[dict[str, Any]]:
+        every = self.block_ticks // self.row_ticks
+        times_s = (start + self.block_ticks * np.arange(len(companion))) / TICK_RATE_HZ
+        text, since_s = self._accuracy.compare(rows[::every], companion, times_s), self._accuracy.doubted_s
+        if text is None or since_s is None:
+            return []
+        return [{"event": "warning", "tick": round(since_s * TICK_RATE_HZ), "time_s": since_s, "text": text}]
 
     def submit(self, name: str, request: dict[str, Any]) -> int:
         """Check a command and schedule it for the present tick.
@@ -260,14 +277,18 @@ class Simulation:
         last = first if self._last is None else self._last
         balance = energy_balance(last[None, :], first)
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
-        warnings = []
-        if abs(residual) > ENERGY_ALARM * max(dissipated, 1e-6):
-            text = f"energy residual {residual:.2e} J is above {ENERGY_ALARM:g} of what was dissipated"
-            if abs(residual) > BRANCH_ALARM * max(dissipated, 1e-6) and self._memory[CONTACTS] > 1:
+        memory, warnings = self._motion.memory, list[str]()
+        if self._accuracy.doubted_s is not None:
+            warnings.append(self._accuracy.warning())
+        # Where little is dissipated, what was stored is what the ledger has to account for.
+        turned_over = max(dissipated, abs(float(balance["stored"][0])), 1e-6)
+        if abs(residual) > self._method.energy * turned_over:
+            text = f"energy residual {residual:.2e} J is above {self._method.energy:g} of what was turned over"
+            if abs(residual) > BRANCH_ALARM * turned_over and memory[CONTACTS] > 1:
                 text += "; after contacts, a wrong branch is suspected"
             warnings.append(text)
-        if self._memory[CLAMPS]:
-            warnings.append(f"the contact law would have pulled at {self._memory[CLAMPS]:.0f} steps and was held at 0")
+        if memory[CLAMPS]:
+            warnings.append(f"the contact law would have pulled at {memory[CLAMPS]:.0f} steps and was held at 0")
         late = sum(tick >= self.end_tick for tick, _ in self._pending)
         if late:
             warnings.append(f"{late} commands of the scene lie after its end and will not be given")
@@ -276,23 +297,25 @@ class Simulation:
             warnings.append(
                 f"engine.step_us is above {longest}: its energy residual may not show how wrong the engine is"
             )
-        if self._memory[CEILING]:
+        if memory[CEILING]:
             warnings.append(
-                f"{self._memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least size"
+                f"{memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least size"
             )
-        if self._memory[FLOORED]:
-            warnings.append(f"{self._memory[FLOORED]:.0f} contacts began slower than contact.speed_floor")
+        if memory[FLOORED]:
+            warnings.append(f"{memory[FLOORED]:.0f} contacts began slower than contact.speed_floor")
         return {
             "spin_hz": float(last[COLUMN["theta_rate"]]) / (2.0 * math.pi),
             "energy": {
                 "residual_j": residual,
                 "dissipated_j": dissipated,
                 "residual_share": residual / max(dissipated, 1e-6),
+                "alarm_share": self._method.energy,
             },
+            "accuracy": None if self._companion is None else self._accuracy.document(),
             "engine": {**self.scene.engine.model_dump(), "levels": self.scene.model.model_dump()},
-            "contacts": int(self._memory[CONTACTS]),
-            "peak_normal_force_n": float(self._memory[PEAK_FORCE]),
-            "steps": int(self._memory[STEPS]),
+            "contacts": int(memory[CONTACTS]),
+            "peak_normal_force_n": float(memory[PEAK_FORCE]),
+            "steps": int(memory[STEPS]),
             "warnings": warnings,
         }
 
@@ -360,13 +383,11 @@ class Simulation:
             )
         return self.model.state(ring_x=x, ring_y=y, spin=spin)
 
-    def _on_grid(self, time_s: float) -> int:
-        # The first row at or after the time asked for.
-        return math.ceil(round(time_s * TICK_RATE_HZ) / self.row_ticks) * self.row_ticks
-
     def _profile(self) -> list[_Segment]:
         drive = self.scene.drive
-        points = [(self._on_grid(time), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))]
+        points = [
+            (round(time * TICK_RATE_HZ), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))
+        ]
         segments = [
             _Segment(tick=t0, speed=w0, slope=(w1 - w0) / (t1 - t0) * TICK_RATE_HZ)
             for (t0, w0), (t1, w1) in pairwise(points)
@@ -389,8 +410,8 @@ class Simulation:
                         event | {"event": "warning", "text": "a hammer pulse of the scene found the hammer in a pulse"}
                     )
                     continue
-                length = max(1, round(command.duration_ms * 1e-3 * TICK_RATE_HZ / self.row_ticks)) * self.row_ticks
-                self._pulse = (command, self.tick, self.tick + length)
+                length = round(command.duration_ms * 1e-3 * TICK_RATE_HZ)
+                self._pulse = (command, self.tick, self.tick + max(1, length))
             elif isinstance(command, SpeedCommand):
                 self._ramp_to(2.0 * math.pi * command.speed_hz)
             else:
@@ -400,7 +421,7 @@ class Simulation:
     def _ramp_to(self, target: float) -> None:
         segment = self._segment()
         now = segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
-        length = self._on_grid(abs(target - now) / self.model.parameters["drive.ramp_rate"])
+        length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
         hold = _Segment(tick=self.tick + length, speed=target, slope=0.0)
         slope = (target - now) / length * TICK_RATE_HZ if length else 0.0
         self._segments = [_Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
@@ -411,17 +432,20 @@ class Simulation:
         if not self._engaged:
             return
         shaft, magnet = self.model.constants.shaft, self.model.constants.magnet
-        gamma, beta = self._y[0], self._y[1]
-        x, y = beta, -gamma
-        if self.model.constants.levels.euler:
-            x, y = math.sin(beta), -math.sin(gamma) * math.cos(beta)
-        _, _, stored = magnet_force(shaft.arm_magnet * x, shaft.arm_magnet * y, magnet)
-        self._y[S.RELEASE_WORK] -= stored
+        for motion in self._motions():
+            gamma, beta = motion.y[0], motion.y[1]
+            x, y = beta, -gamma
+            if self.model.constants.levels.euler:
+                x, y = math.sin(beta), -math.sin(gamma) * math.cos(beta)
+            _, _, stored = magnet_force(shaft.arm_magnet * x, shaft.arm_magnet * y, magnet)
+            motion.y[S.RELEASE_WORK] -= stored
         self._engaged = False
 
     def _next_change(self) -> int:
         ticks = [segment.tick for segment in self._segments if segment.tick > self.tick]
         ticks += [tick for tick, _ in self._pending]
+        if self._pulse is not None and self._pulse[2] > self.tick:
+            ticks.append(self._pulse[2])
         return min(ticks, default=2**62)
 
     def _inputs(self) -> Inputs:
@@ -443,13 +467,6 @@ class Simulation:
             ideal_drive=self.scene.drive.mode == "ideal",
             magnet_engaged=self._engaged,
         )
-
-    def _run(self, rows: np.ndarray, ticks: int) -> None:
-        self._engine.advance(
-            self.model.constants, self._inputs(), self._y, self._memory, self.tick, self._step_ticks,
-            ticks // self._step_ticks, self._stride, rows,
-        )  # fmt: skip
-        self.tick += ticks
 
     def _sample(self, rows: np.ndarray, start: int) -> dict[str, Block]:
         rate = self.scene.sensors.rate_hz
@@ -473,28 +490,3 @@ class Simulation:
 
     def _block(self, tick: int, index: int, rate_hz: int, values: np.ndarray) -> Block:
         return Block(tick=tick, index=index, rate_hz=float(rate_hz), tick_rate_hz=float(TICK_RATE_HZ), values=values)
-
-
-def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]:
-    """The energy ledger of a run.
-
-    Args:
-        rows: Observed rows, shape (n, N_ROW).
-        first: Row at the start of the run, shape (N_ROW,).
-
-    Returns:
-        stored (change since the start), supplied, dissipated, and residual = stored - supplied + dissipated [J], each
-        shape (n,).
-    """
-
-    def total(names: tuple[str, ...], table: np.ndarray) -> np.ndarray:
-        return np.sum([table[..., COLUMN[name]] for name in names], axis=0)
-
-    stored = total(STORED, rows) - total(STORED, first)
-    supplied, dissipated = total(SUPPLIED, rows), total(DISSIPATED, rows)
-    return {
-        "stored": stored,
-        "supplied": supplied,
-        "dissipated": dissipated,
-        "residual": stored - supplied + dissipated,
-    }

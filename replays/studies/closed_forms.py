@@ -141,12 +141,6 @@ RUNGE_KUTTA_4_LIMIT = 2.0 * math.sqrt(2.0)
 RUNGE_KUTTA_4_REAL_LIMIT = 2.7852935634
 """h lambda up to which R(-h lambda) = 1 - z + z^2/2 - z^3/6 + z^4/24 stays below 1: what damping must keep."""
 VERLET_LIMIT = 2.0
-SPLIT_CONTACT_LIMIT = 2.0 * math.sqrt(3.0)
-"""h w of a linear contact that the kick of `split` takes.
-
-Drift h/2, kick, drift h/2 with the processed force F (1 - z^2/12), z = h w (Takahashi and Imada), has the trace
-2 - z^2 (1 - z^2/12). Its largest fall is 3 < 4, at z^2 = 6, so it never turns over; it ceases to push at z^2 = 12.
-"""
 
 
 def runge_kutta_4_gain(z: float) -> float:

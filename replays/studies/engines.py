@@ -13,7 +13,6 @@ from replays.report.canvas import BLUE, GREEN, ORANGE, PINK, RED, SKY
 from replays.studies.closed_forms import (
     RUNGE_KUTTA_4_LIMIT,
     RUNGE_KUTTA_4_REAL_LIMIT,
-    SPLIT_CONTACT_LIMIT,
     VERLET_LIMIT,
 )
 from rig.engines import ENGINES
@@ -43,8 +42,6 @@ class Traits(NamedTuple):
     """Charted in a quick chart; empty: every second of the full ones."""
     oscillator_limit: float | None = None
     """Largest h w of an undamped oscillator that stays bounded [1]; infinite where there is none, None if unknown."""
-    contact_limit: float | None = None
-    """The same of a linear contact, where it differs."""
     damping_limit: float | None = None
     """Largest h lambda of a damping rate that its fixed step takes [1]; None if unknown."""
     damping_because: str = "explicit, and nothing shortens its steps"
@@ -56,28 +53,20 @@ class Traits(NamedTuple):
     """Whether it keeps an impact's energy at a step of 200 µs, and why."""
     flight_limit: float = 1e-4
     """Scaled error allowed in free flight, before the allowance."""
-    follows_gap: bool = False
-    """Whether its steps follow the gap's speed, so that they are as long as asked only next to rest."""
     warned_within_ticks: int = 60_000
     """How long a run with a step far too long goes on before it must have warned."""
 
-    def limit(self, oscillator: str) -> float:
-        """Largest h w of an oscillator by theory, "house" or "contact"; nan where there is none that is known."""
-        limit = self.oscillator_limit
-        if oscillator == "contact" and self.contact_limit is not None:
-            limit = self.contact_limit
-        return math.nan if limit is None or math.isinf(limit) else limit
+    def limit(self) -> float:
+        """Largest h w of an oscillator by theory; nan where there is none that is known."""
+        return math.nan if self.oscillator_limit is None or math.isinf(self.oscillator_limit) else self.oscillator_limit
 
 
 _SHORTENS = (True, "error control shortens the steps")
 _FEW_STEPS = "no error control, an impact of 0.32 ms in a few steps; measured: "
 _ROWS = {
     "split": Traits(
-        RED, "o", _fixed(100, *FIXED_STEPS, 1), _fixed(50, 40, 25, 20, 10, 5),
-        oscillator_limit=math.inf, contact_limit=SPLIT_CONTACT_LIMIT,
-        damping_limit=100.0, damping_because="its steps follow the damping down to 1/32",
-        coarse_bounce=(True, "its steps shrink through impacts"),
-        flight_limit=1e-7, follows_gap=True, warned_within_ticks=500_000,
+        RED, "o", _tolerances(25, 2, 3, 4, 5, 6), _tolerances(25, 3, 4, 5),
+        oscillator_limit=math.inf, coarse_bounce=(True, "series take the impact, and do not follow the grid"),
     ),
     "rk8": Traits(
         BLUE, "s", _tolerances(25, *range(4, 13)), _tolerances(25, 6, 8, 10, 12),

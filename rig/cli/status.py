@@ -105,9 +105,12 @@ def status_table(document: dict[str, Any]) -> Table:
     rows.append(("energy", f"residual {residual}, dissipated {dissipated}"))
     engine, share = document.get("engine") or {}, energy.get("residual_share")
     if engine and share is not None:
-        # Reference-free: what the method makes or loses of the energy that it should account for.
         rows.append(("engine", f"{engine['name']}, {engine['step_us']} us"))
-        rows.append(("error estimate", f"energy residual {share:.1e} of what was dissipated (alarm at 1e-3)"))
+        if accuracy := document.get("accuracy"):
+            rows.append(("error estimate", f"{accuracy['estimate']:.1e} (scaled), for {engine['tolerance']:g} asked"))
+        # Reference-free: what the method makes or loses of the energy that it should account for.
+        alarm = energy.get("alarm_share", 1e-3)
+        rows.append(("energy left open", f"{share:.1e} of what was dissipated (alarm at {alarm:g})"))
     rows.append(("samples published", str(document["samples_published"])))
     rows.append(("commands taken", str(document["commands"])))
     counts = document["congestion"]

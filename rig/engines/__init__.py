@@ -29,18 +29,29 @@ class Method(NamedTuple):
     contacts: tuple[str, ...] = ("compliant",)
     longest_us: int = 1000
     """Longest step at which its error estimate can be trusted [us]; above it a run says so."""
+    energy: float = 1e-3
+    """Share of what was dissipated up to which its ledger may be open."""
+    companion: bool = False
+    """Whether a run has, unless asked otherwise, a companion that tells its error."""
+
+    @property
+    def advice(self) -> str:
+        """What to try where it fails."""
+        return "try a finer engine.tolerance" if self.tolerance else "try a shorter engine.step_us"
 
 
 _BY_STATE = ("none", "smoothed", "switch")
 
 ENGINES = {
     "split": Method(
-        "exact linear flow and one contact kick a step, order 2",
+        "Taylor series through impacts, exact linear flow and kicks elsewhere",
         25,
-        0.0,
+        1e-4,
         ("none", "exact"),
         ("impact", "compliant"),
         100,
+        5e-3,
+        companion=True,
     ),
     "rk8": Method("Dormand-Prince 8(5,3), events located", 25, 1e-8, (*_BY_STATE, "exact")),
     "taylor": Method("Taylor series of order 16, events as roots", 25, 1e-9, ("none", "smoothed", "exact")),

@@ -20,4 +20,4 @@ BEFORE, BEFORE_SPAN, LAST = 13, 14, 15
 """Normal force before the last [N], time between both [ticks], last normal force [N]."""
 OWN = 16
 """From here on an engine's own."""
-MEMORY = 800
+MEMORY = 1280

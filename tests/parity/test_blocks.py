@@ -95,8 +95,14 @@ def whole() -> Whole:
 
 
 def test_there_is_something_to_compare(whole: Whole) -> None:
-    assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "release"]
-    assert [event["tick"] for event in whole.events] == [20_000, 150_000, 205_000, 400_000]
+    # A hard blow on a rolling shaft: its error estimate comes above ten times the tolerance, which is an event too.
+    assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "warning", "release"]
+    assert [event["tick"] for event in whole.events if event["event"] != "warning"] == [
+        20_000,
+        150_000,
+        205_000,
+        400_000,
+    ]
     assert whole.health["contacts"] > 10
     assert len(whole.edges) == 3
     assert len(whole.rows) == END // 25
@@ -196,6 +202,6 @@ def test_cuts_change_no_bit_with_any_engine(engine: str) -> None:
         )
         rows = [simulation.advance(length).rows.copy() for _ in range(120_000 // length)]
         assert simulation.health()["contacts"] > 0
-        return np.concatenate(rows).tobytes(), simulation._y.tobytes(), simulation._memory.tobytes()
+        return np.concatenate(rows).tobytes(), simulation._motion.y.tobytes(), simulation._motion.memory.tobytes()
 
     assert motion(1_000) == motion(120_000)

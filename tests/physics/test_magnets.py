@@ -50,7 +50,8 @@ from rig.magnets import (
     radial_field,
 )
 from rig.model import Model, build_model, describe
-from rig.simulation import Simulation, energy_balance
+from rig.motion import energy_balance
+from rig.simulation import Simulation
 
 S_MAGNET = S.COLUMN["magnet_energy"]
 TABLE_1 = MagnetGeometry(8, 16.9e-3, 6e-3, 8e-3, 25e-3, 705e3)

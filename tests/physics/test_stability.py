@@ -76,10 +76,10 @@ def test_impact_quadrature_against_an_integration(factor, speed):
     assert run.y[0].max() == pytest.approx(right.depth, rel=1e-3)
 
 
-@pytest.mark.parametrize("engine", [name for name in ENGINES if math.isfinite(traits(name).limit("house"))])
+@pytest.mark.parametrize("engine", [name for name in ENGINES if math.isfinite(traits(name).limit())])
 @pytest.mark.parametrize("oscillator", [house_ratio, contact_ratio])
 def test_linear_limits(engine, oscillator):
-    limit = traits(engine).limit("house")
+    limit = traits(engine).limit()
     mass = base_model(ModelLevels()).constants.house.inner_mass
     if oscillator is contact_ratio:
         mass = pivoted_mass(bare_shaft())
@@ -87,13 +87,6 @@ def test_linear_limits(engine, oscillator):
     step = limit / math.sqrt(stiffness / mass)
     assert oscillator(engine, 0.97 * step, stiffness) < GROWN
     assert oscillator(engine, 1.03 * step, stiffness) > GROWN
-
-
-def test_limit_of_the_contact_kick_of_split():
-    mass, stiffness = pivoted_mass(bare_shaft()), 1e8
-    step = traits("split").limit("contact") / math.sqrt(stiffness / mass)
-    # Only the near side: beyond it the kick ceases to push, and the shaft falls through without growing by powers.
-    assert contact_ratio("split", 0.97 * step, stiffness) < GROWN
 
 
 def test_split_has_no_limit_for_the_houses():

@@ -174,9 +174,9 @@ def test_first_impacts_agree_with_heyoka() -> None:
     assert peer.failure is None
     simulation = ready(tolerance=1e-12)
     assert scaled_error(states(simulation, 0.05), peer.states[:50]) < 1e-9
-    assert simulation._memory[CONTACTS] == len(peer.onsets) == 16
+    assert simulation._motion.memory[CONTACTS] == len(peer.onsets) == 16
     # Sixteen impacts, a hundred steps each by a series in time alone.
-    assert simulation._memory[CONTACT_STEPS] < 30 * 16
+    assert simulation._motion.memory[CONTACT_STEPS] < 30 * 16
 
 
 def scaled(motion: np.ndarray) -> np.ndarray:
@@ -207,13 +207,13 @@ def test_agrees_with_rk8(case: str) -> None:
     one, other = ready(scene, tolerance=1e-11, **changes), ready(scene, "rk8", 1e-11, engine__step_us=5, **changes)
     # Sixteen impacts make an error a thousand times larger: up to the fourth.
     first, second = scaled(states(one, 0.034)), scaled(states(other, 0.034))
-    assert one._memory[CONTACTS] == other._memory[CONTACTS] > 0
+    assert one._motion.memory[CONTACTS] == other._motion.memory[CONTACTS] > 0
     assert np.sqrt(np.mean((first - second) ** 2)) < 1e-8
     # The ledger's columns against the largest of their kind.
     ledger = slice(S.N_STATE, S.N_VECTOR)
-    np.testing.assert_allclose(one._y[ledger], other._y[ledger], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(one._motion.y[ledger], other._motion.y[ledger], rtol=1e-7, atol=1e-9)
     if "pull" in case:
-        assert one._memory[CLAMPS] > 0
+        assert one._motion.memory[CLAMPS] > 0
 
 
 def test_the_error_falls_with_the_tolerance_and_the_ledger_closes() -> None:
@@ -223,7 +223,7 @@ def test_the_error_falls_with_the_tolerance_and_the_ledger_closes() -> None:
         simulation = ready(tolerance=tolerance)
         errors.append(float(np.sqrt(np.mean((scaled(states(simulation, 0.05)) - exact) ** 2))))
         assert abs(simulation.health()["energy"]["residual_share"]) < 100.0 * tolerance
-        assert simulation._memory[CEILING] == 0.0
+        assert simulation._motion.memory[CEILING] == 0.0
     assert all(fine < 0.3 * coarse for coarse, fine in pairwise(errors)), errors
     assert errors[-1] < 1e-8
 
@@ -246,7 +246,7 @@ def test_rows_change_no_bit_and_a_new_input_ends_a_series() -> None:
 def test_a_long_flight_takes_few_steps() -> None:
     simulation = ready("stable-run")
     simulation.advance(500_000)
-    assert simulation._memory[STEPS] <= 150
+    assert simulation._motion.memory[STEPS] <= 150
     motion = move("taylor", simulation.model.constants, quiet_inputs(magnets=True), state(beta=1e-4), ticks=1000)
     assert motion.contacts == 0
 
@@ -274,9 +274,9 @@ def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
     one, other = (
         simulate("hammer", {**changes, "engine.name": name}, duration_s=0.05).simulation for name in ("taylor", "rk8")
     )
-    assert one._memory[CONTACTS] == other._memory[CONTACTS] > 1
-    assert np.abs(scaled(one._y[: S.N_STATE]) - scaled(other._y[: S.N_STATE])).max() < 1e-6
-    assert one._memory[STEPS] < 400
+    assert one._motion.memory[CONTACTS] == other._motion.memory[CONTACTS] > 1
+    assert np.abs(scaled(one._motion.y[: S.N_STATE]) - scaled(other._motion.y[: S.N_STATE])).max() < 1e-6
+    assert one._motion.memory[STEPS] < 400
     assert not one.health()["warnings"]
 
 

@@ -130,10 +130,10 @@ def test_clock_angle_speed_and_blow_come_out_of_a_log(damped_log: Recording) -> 
     assert fitted["drive.speed_hz"].value == pytest.approx(6.2, abs=2e-3)
     assert fitted["hammer.1.force_n"].value == pytest.approx(60.0, rel=1e-3)
     assert fitted["hammer.1.duration_ms"].value == pytest.approx(5.2, rel=1e-3)
-    # The blow as the log has it, on the model's clock, is at the row where the scene has it.
+    # The blow as the log has it, on the model's clock, is at the tick where the scene has it.
     began_s = (AT_S - 5.43219) * (1.0 + 40e-6) + experiment.first_s
     shift_s = fitted["clock.offset_s"].value
-    scene_s = math.ceil(round(value_of(found.experiment, "hammer.1.at_s") * 1e6) / 25) * 25e-6
+    scene_s = round(value_of(found.experiment, "hammer.1.at_s") * 1e6) * 1e-6
     assert began_s - shift_s == pytest.approx(scene_s, abs=5e-6)
     assert any(one.line.startswith("time: shifted by ") for one in found.fitted)
     # The angle at the first row of the log, which ran for 5.43219 s before.

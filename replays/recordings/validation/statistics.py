@@ -25,7 +25,7 @@ from replays.recordings.validation.phases import (
 from replays.recordings.validation.truth import TruthTables, energy_change
 from rig.kernels.signals import COLUMN
 from rig.model import build_model
-from rig.simulation import DISSIPATED
+from rig.motion import DISSIPATED
 
 _ENERGIES = {"dissipated": DISSIPATED, "drive_work": ("drive_work",)}
 """Columns of the truth that sum up to a quantity."""

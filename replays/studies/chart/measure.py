@@ -20,7 +20,7 @@ from rig.engines.memory import CONTACTS, EVALUATIONS, STEPS
 from rig.kernels.contact import normal_force
 from rig.kernels.geometry import gap
 from rig.kernels.signals import N_ROW, N_STATE
-from rig.simulation import energy_balance
+from rig.motion import energy_balance
 
 OFF = 0.5
 """Scaled error from which a run is on another branch: as far from the reference as the motion is large."""

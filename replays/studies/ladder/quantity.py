@@ -11,8 +11,8 @@ import numpy as np
 
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN
+from rig.motion import DISSIPATED
 from rig.orbit import phase, whirl_frequency
-from rig.simulation import DISSIPATED
 
 SETTLED = 0.25
 """The settled phase is this last part of a run."""

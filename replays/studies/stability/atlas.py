@@ -45,7 +45,7 @@ class Map(NamedTuple):
     @property
     def limit(self) -> float:
         """Largest h w by theory; nan where there is none."""
-        return traits(self.engine).limit(self.oscillator)
+        return traits(self.engine).limit()
 
 
 def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
@@ -60,20 +60,17 @@ def house_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = 
 def contact_ratio(engine: str, step_s: float, stiffness: float, *, periods: int = PERIODS) -> float:
     """Energy ratio of a small oscillation of the shaft on an undamped linear contact, pressed on by its weight.
 
-    Where steps follow the gap's speed the weight is the true one and the oscillation 1/1000 of the depth: only next to
-    rest are they as long as asked. For the others the weight is such that the depth is 20 µm, and the
-    oscillation 1/100 of that: with less, error control has nothing to control.
+    The weight is such that the depth is 20 µm, and the oscillation 1/100 of that: with less, error control has nothing
+    to control.
     """
     constants = bare_shaft(damping_factor=0.0, exponent=1.0, stiffness=stiffness, gravity=True)
     shaft = constants.shaft
-    depth, part = shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring / stiffness, 1e-3
-    if not traits(engine).follows_gap:
-        shaft = shaft._replace(gravity=shaft.gravity * _DEPTH / depth)
-        depth, part = _DEPTH, 1e-2
+    depth = shaft.mass * shaft.gravity * shaft.arm_centre / shaft.arm_ring / stiffness
+    shaft = shaft._replace(gravity=shaft.gravity * _DEPTH / depth)
     constants = constants._replace(shaft=shaft)
     # Gamma > 0 lowers the shaft.
-    rest = (constants.contact.clearance + depth) / shaft.arm_ring
-    y0 = state(Gamma=rest + part * depth / shaft.arm_ring)
+    rest = (constants.contact.clearance + _DEPTH) / shaft.arm_ring
+    y0 = state(Gamma=rest + 0.01 * _DEPTH / shaft.arm_ring)
     columns = ("Gamma", "Gamma_rate")
     return _ratio(engine, constants, y0, step_s, stiffness, pivoted_mass(constants), columns, shaft.arm_ring, periods,
                   rest=rest)  # fmt: skip
@@ -113,8 +110,6 @@ def _ratio(
     The first part is a quarter; for the contact a fortieth, before growth lifts the shaft off. In the contact
     `split` first settles, and its rest is where its mean is.
     """
-    settles = traits(engine).follows_gap
-    house = columns[0] == "x_ih"
     angular = math.sqrt(stiffness / mass)
     # Beyond every limit a few steps tell, and more would only follow numbers without meaning.
     longest = 40 if angular * step_s > 3.6 else 10**9
@@ -130,10 +125,8 @@ def _ratio(
         part = len(place) // 4
 
         def energy(window: slice) -> float:
-            if settles and not house:
-                return stiffness * float(np.var(place[window])) + mass * float(np.var(speed[window]))
             return stiffness * float(np.mean(place[window] ** 2)) + mass * float(np.mean(speed[window] ** 2))
 
-        early = part if settles or house else max(4, len(place) // 40)
+        early = part if columns[0] == "x_ih" else max(4, len(place) // 40)
         ratio = energy(slice(-part, None)) / energy(slice(None, early))
     return ratio if math.isfinite(ratio) else math.inf

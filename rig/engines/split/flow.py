@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from rig.engines.split.inner_motion import FAST, Axis, Houses, inlined
+from rig.kernels.constants import Constants
 from rig.kernels.magnet import magnet_force
 
 GRID = 5
@@ -26,62 +27,32 @@ HALF = 12
 uy and py; decay of the distance to the drive's speed, and its integral; the flow's time, half a step [s]."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _exponential(a, t):
-    """exp(a t) of a small matrix by scaled and squared Taylor series, to rounding."""
-    n = len(a)
-    size = 0.0
-    for i in range(n):
-        row = 0.0
-        for j in range(n):
-            row += abs(a[i, j] * t)
-        size = max(size, row)
-    halvings = 0
-    while size > 0.25:
-        size *= 0.5
-        halvings += 1
-    scaled = a * (t / 2.0**halvings)
-    total = np.eye(n)
-    term = np.eye(n)
+def _exponential(a: np.ndarray, t: float) -> np.ndarray:
+    """Exp of matrices a t, shape (..., n, n), by a Taylor series: to rounding where a t is below 1/4."""
+    total = np.broadcast_to(np.eye(a.shape[-1]), a.shape).copy()
+    term = total.copy()
     for k in range(1, 16):
-        new = np.zeros((n, n))
-        for i in range(n):
-            for j in range(n):
-                for m in range(n):
-                    new[i, j] += term[i, m] * scaled[m, j]
-        term = new / k
+        term = term @ a * (t / k)
         total += term
-    for _ in range(halvings):
-        new = np.zeros((n, n))
-        for i in range(n):
-            for j in range(n):
-                for m in range(n):
-                    new[i, j] += total[i, m] * total[m, j]
-        total = new
     return total
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _house_rates(constants):
+def _house_rates(constants: Constants) -> np.ndarray:
     """Matrices of the houses' linear motion: horizontal and vertical, each on (inner, rate, outer, rate)."""
     house, levels = constants.house, constants.levels
-    across = np.zeros((4, 4))
-    upright = np.zeros((4, 4))
+    rates = np.zeros((2, 4, 4))
+    across, upright = rates
     if levels.inner_house:
-        k, d = house.inner_beam_stiffness, house.inner_beam_damping
-        across[0, 1] = 1.0
+        k, d, kv = house.inner_beam_stiffness, house.inner_beam_damping, house.pair_stiffness_vertical
+        across[0, 1] = upright[0, 1] = 1.0
         across[1] = np.array([-k, -d, k, d]) / house.inner_mass
-        upright[0, 1] = 1.0
-        kv = house.pair_stiffness_vertical
         upright[1] = np.array([-kv, 0.0, kv, 0.0]) / house.inner_mass
         if levels.outer_house:
-            across[2, 3] = 1.0
-            across[3] = np.array([k, d, -k - house.pair_stiffness_horizontal, -d]) / house.outer_mass
-            upright[2, 3] = 1.0
-            upright[3] = (
-                np.array([kv, 0.0, -kv - house.outer_beam_stiffness, -house.outer_beam_damping]) / house.outer_mass
-            )
-    return across, upright
+            ground = house.pair_stiffness_horizontal, house.outer_beam_stiffness, house.outer_beam_damping
+            across[2, 3] = upright[2, 3] = 1.0
+            across[3] = np.array([k, d, -k - ground[0], -d]) / house.outer_mass
+            upright[3] = np.array([kv, 0.0, -kv - ground[1], -ground[2]]) / house.outer_mass
+    return rates
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -101,33 +72,33 @@ def _axis_flow(stiffness, damping, t):
     return decay * (c + half * s), decay * s, -decay * stiffness * s, decay * (c - half * s)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def magnet_springs(constants):
+def magnet_springs(constants: Constants) -> tuple[float, float, float]:
     """Where the shaft rests on its magnets, uy [1], and their torque per tilt u about it, x and y [N m]."""
     shaft, magnet = constants.shaft, constants.magnet
     lB, weight = shaft.arm_magnet, shaft.arm_centre * shaft.mass * shaft.gravity
+    force = getattr(magnet_force, "py_func", magnet_force)  # once a run: not worth a compilation
     rest, slope, eps = 0.0, 0.0, 1e-6
     for _ in range(50):
-        torque = lB * magnet_force(0.0, lB * rest, magnet)[1] - weight
-        slope = lB * (magnet_force(0.0, lB * (rest + eps), magnet)[1] - magnet_force(0.0, lB * (rest - eps), magnet)[1])
+        torque = lB * force(0.0, lB * rest, magnet)[1] - weight
+        slope = lB * (force(0.0, lB * (rest + eps), magnet)[1] - force(0.0, lB * (rest - eps), magnet)[1])
         rest -= torque / (slope / (2.0 * eps))
-    return rest, -lB * magnet_force(lB * eps, lB * rest, magnet)[0] / eps, -slope / (2.0 * eps)
+    return rest, -lB * force(lB * eps, lB * rest, magnet)[0] / eps, -slope / (2.0 * eps)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def house_flows(constants, grid_step, flows):
-    """Flows of the houses for half a step of every level.
+def house_flows(constants: Constants, grid_step: float) -> np.ndarray:
+    """Flows of the houses for half a step of every level, shape (LEVELS, HOUSE_FLOW); the grid's own step in s.
 
-    Args:
-        constants: Of the model.
-        grid_step: The grid's own step [s].
-        flows: Out, shape (LEVELS, HOUSE_FLOW).
+    The shortest, or one that the series takes, by its series; each of the others is the one before it, twice.
     """
-    across, upright = _house_rates(constants)
-    for level in range(LEVELS):
-        t = 0.5 * 2.0 ** (level - GRID) * grid_step
-        flows[level, :16] = _exponential(across, t).ravel()
-        flows[level, 16:] = _exponential(upright, t).ravel()
+    rates, t = _house_rates(constants), 0.5 * 2.0**-GRID * grid_step
+    halvings = max(0, math.ceil(math.log2(max(1e-30, 4.0 * t * float(np.abs(rates).sum(axis=-1).max())))))
+    flow = _exponential(rates, t * 2.0**-halvings)
+    for _ in range(halvings):
+        flow = flow @ flow
+    flows = [flow]
+    for _ in range(1, LEVELS):
+        flows.append(flows[-1] @ flows[-1])
+    return np.array(flows).reshape(LEVELS, HOUSE_FLOW)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)

@@ -1,4 +1,4 @@
-"""The contact's impulse over a kick of `rig.engines.split`: normal law, friction, and what the kicks' sum misses.
+"""The contact's impulse over a kick of `rig.engines.split`: normal law and friction.
 
 Impulses are along the normal n (from the ring's centre to the shaft's) and across it; jn > 0 pushes the shaft back,
 jt > 0 is what slows a positive sliding speed.
@@ -9,10 +9,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from numba import njit
-
-from rig.engines.split.inner_motion import FAST, inlined
-from rig.kernels.contact import damping_ratio, elastic_force
+from rig.engines.split.inner_motion import inlined
+from rig.kernels.contact import elastic_force
 
 
 class Law(NamedTuple):
@@ -57,43 +55,6 @@ class Impulse(NamedTuple):
     dcy: float
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def crossing(before, rate_before, now, rate_now, h):
-    """Where a gap crosses 0 between two kicks, on its cubic Hermite interpolant: part of h, and the rate there."""
-    s = before / (before - now)
-    for _ in range(3):
-        s2 = s * s
-        value = (
-            before * (1.0 + s2 * (2.0 * s - 3.0))
-            + h * rate_before * s * (1.0 - s) * (1.0 - s)
-            + now * s2 * (3.0 - 2.0 * s)
-            + h * rate_now * s2 * (s - 1.0)
-        )
-        slope = (
-            6.0 * s * (s - 1.0) * (before - now)
-            + h * rate_before * (1.0 - s) * (1.0 - 3.0 * s)
-            + h * rate_now * s * (3.0 * s - 2.0)
-        )
-        if slope * (now - before) <= 0.0:
-            break
-        s = min(max(s - value / slope, 0.0), 1.0)
-    rate = (
-        6.0 * s * (s - 1.0) * (before - now)
-        + h * rate_before * (1.0 - s) * (1.0 - 3.0 * s)
-        + h * rate_now * s * (3.0 * s - 2.0)
-    ) / h
-    return s, rate
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def end_error(power, q):
-    """Hurwitz' zeta(-power, q): error of the sum of (q + j)^power, j = 0, 1, ... against its integral from 0."""
-    far = q + 3.0
-    total = q**power + (q + 1.0) ** power + (q + 2.0) ** power
-    total -= far ** (power + 1.0) / (power + 1.0) - 0.5 * far**power + power / 12.0 * far ** (power - 1.0)
-    return total + power * (1.0 - power) * (2.0 - power) / 720.0 * far ** (power - 3.0)
-
-
 @inlined
 def law_at(contact, depth, factor_per_speed):
     """The compliant law at a depth [m]; the damping factor comes over the onset speed [s/m]."""
@@ -121,28 +82,6 @@ def mobility_of(plant, euler, axis, nx, ny):
 
 
 @inlined
-def onset_error(contact, rate, since, onset_speed, h):
-    """What a kick misses of a force that began `since` of a step h before, at a rate of the gap > 0 [N s]."""
-    exponent = contact.exponent
-    damped = damping_ratio(rate, onset_speed, contact)
-    elastic = -h * contact.stiffness * (h * rate) ** exponent * damped * end_error(exponent, since)
-    return elastic - h * contact.viscous_damping * rate * (0.5 - since)
-
-
-@inlined
-def end_impulse(contact, part, speed, onset_speed, ago, h):
-    """What the last kick missed of a force that ended a `part` of the time `ago` after it, normal [N s].
-
-    The gap opened at a speed < 0; h is the step of the kick that finds it open.
-    """
-    exponent = contact.exponent
-    size = damping_ratio(speed, onset_speed, contact)
-    if speed >= 0.0 or size <= 0.0:
-        return 0.0
-    return -h * contact.stiffness * (-h * speed) ** exponent * size * end_error(exponent, part * ago / h)
-
-
-@inlined
 def flow_acceleration(constants, plant, axis, houses, motion):
     """What the flow alone would add to the rate of the gap [m/s^2]."""
     house = constants.house
@@ -158,7 +97,7 @@ def flow_acceleration(constants, plant, axis, houses, motion):
 
 
 @inlined
-def compliant_push(law, w, rate, flow_rate, missed, h):
+def compliant_push(law, w, rate, flow_rate, h):
     """Normal impulse of a compliant contact over a step: damping in closed form, commutator and all.
 
     Args:
@@ -166,7 +105,6 @@ def compliant_push(law, w, rate, flow_rate, missed, h):
         w: Mobility.
         rate: Of the depth, before the impulse [m/s].
         flow_rate: What the flow alone adds to it [m/s^2].
-        missed: What the step misses of a force that has just begun [N s].
         h: Step [s].
     """
     damping = h * law.damping
@@ -174,7 +112,7 @@ def compliant_push(law, w, rate, flow_rate, missed, h):
     share = 1.0 / (1.0 + z * (0.5 + z * (1.0 / 12.0)))
     jn = (h * law.elastic + damping * rate) * share
     bend = jn * law.relative * h * w.nn * (1.0 / 12.0)
-    held = h * law.elastic + missed - jn * bend * (1.0 + 0.25 * z - (7.0 / 6.0) * bend)
+    held = h * law.elastic - jn * bend * (1.0 + 0.25 * z - (7.0 / 6.0) * bend)
     held += damping * damping * w.nn * h * flow_rate * (1.0 / 24.0)
     jn = (held + damping * rate) * share
     shift = h * jn * damping * w.nn * (1.0 / 24.0)
@@ -190,8 +128,8 @@ def friction_impulse(w, jn, limit, sliding, slid):
         jn: Normal impulse [N s].
         limit: Largest one that friction can give [N s].
         sliding: Sliding speed before it [m/s].
-        slid: Sliding speed after the last kick [m/s]; nan: there was none in this contact.
+        slid: Sliding speed after the last kick [m/s]; nan: there was none, in a contact that rolls so far.
     """
-    target = -0.5 * (sliding - slid) if slid == slid else 0.0
+    target = -0.5 * (sliding - slid) if slid == slid else -sliding
     wanted = (sliding - target - w.nt * jn) * w.per_tt
     return min(max(wanted, -limit), limit), wanted

@@ -1,33 +1,15 @@
-"""Splitting: the exact flow of everything linear, one kick a step for everything else; order 2, cheap, and bounded.
+"""The default engine: each phase of the motion by the cheapest method that keeps the tolerance asked for.
 
-A step is half a flow, a kick, half a flow. The flow solves shaft on linear magnets, drive and both houses exactly:
-the houses ring at up to 1.6 kHz and cost no accuracy. The kick holds the contact, the magnets' hardening, gravity,
-unbalance, the hammer and the turning of the axis.
+- Impacts, slip, the turn of friction and all that is not settled: the Taylor series of `rig.engines.taylor`, with their
+  events; some eleven series an impact. They could take everything, and do where nothing below holds.
+- Flight, as long as no bound lets the gap close: exact linear flow, and a kick a step for what is not linear.
+- Contact that rolls, or slides, without an event for a while and has no swing left: flow and kicks as well.
+- A rigid contact: impacts one by one where the gap closes (`rig.engines.split.rigid`); where it lasts, kicks.
 
-State inside: the direction of the axis, u = (sin b, -sin G cos b), and its rate p. In these, a point at arm l is l u,
-the kinematics have no sines, and with S the sum of arm times lateral force
+Which one runs is decided at a row, by rules on the state (`rig.engines.split.levels`), and given up in the middle of
+one at the start of the step that was not to be a kick's.
 
-    Ixx u'' = S - (S.u) u - Ixx |u'|^2 u + Izz w (u x u')
-
-Errors of second order of such a step are two commutators of flow A and kick B. [B,[A,B]] goes into the kick: with the
-contact's force f on the relative motion at the ring and the flow's acceleration a of it, that is
-2 (f.grad) f + (v.grad f_v) f - f_v (v.grad f + f_v a) on the speed and -f_v f on the position, h^3/24 of each. For an
-undamped contact it is Takahashi and Imada's F* = F (1 - h^2/12 F' w_n) (J. Phys. Soc. Jpn. 53 (1984) 3765); what comes
-next in h^2 F' w_n is chosen for a lasting contact to keep its true depth. [A,[A,B]] is a change of coordinates by
-h^2/24 [A,B] (the processing of Blanes, Casas and Murua, SIAM J. Sci. Comput. 27 (2006) 1817): it vanishes out of
-contact, so an impact returns the right speeds; at the end of a step, where the next one is of another length, and for
-the rows it is carried out. Where a contact begins and ends, its force goes as t^n between two kicks; what the sum
-misses there is Hurwitz' zeta(-n, q). Left out of both commutators: the houses' damping, and friction where it rolls.
-
-The normal impulse holds its damping in closed form. Coulomb's friction is a clamp on the tangential impulse: what
-would bring the sliding speed to its target, held within mu times the normal impulse. The target is minus half of what
-the flow changed since the last kick, so that the speed is 0 in the mean of a step and not at its end: with a target
-of 0 the order is 1. Rolling is not processed, so order 2 is all there is.
-
-Steps are powers of two of the grid's step, by rules on the state alone: long in flight as far as the gap cannot
-close, short through impacts (they make small errors a thousand times larger), the grid's own in settled contact.
-
-The houses' momentum ledger is the flow's own, so its residual is 0 by construction; the energy residual is not.
+How a step of flow and kick is made: `rig.engines.split.steps`.
 """
 
 from __future__ import annotations
@@ -37,457 +19,195 @@ import math
 import numpy as np
 from numba import njit
 
-from rig.engines.memory import EVALUATIONS, ONSET, PHASE, STEPS
-from rig.engines.split.flow import (
-    GRID,
-    HOUSE_FLOW,
-    LEVELS,
-    flow,
-    house_flows,
-    magnet_springs,
-    shaft_flows,
-)
-from rig.engines.split.impulse import Impulse
+from rig.engines.memory import PHASE
+from rig.engines.split.flow import GRID, house_flows, magnet_springs, shaft_flows
 from rig.engines.split.inner_motion import (
     FAST,
-    Axis,
-    Houses,
     eccentricity,
     from_coordinates,
-    geometry_of,
-    house_energy,
-    inlined,
-    into_coordinates,
     motion_of,
     plant_of,
 )
-from rig.engines.split.kick import Kick, along, continued, hammer_mean, processed, smooth_forces, turned, turning
-from rig.engines.split.levels import STRUCK, flight_level, span_of
+from rig.engines.split.kick import Kick
+from rig.engines.split.levels import ANY, flight_level
 from rig.engines.split.place import (
-    AGO,
-    ANGLE,
-    CONJUGATE,
-    COS,
-    DEPTH,
-    ENGAGED,
+    AGAIN,
+    BOUNCE,
     FLOWS,
     FLOWS_END,
-    KICK,
-    KICKED,
-    PX,
-    PY,
-    RATE,
+    GRID_TICKS,
+    LAST_STEP,
+    LIMIT,
+    MODE,
     REST,
-    SIN,
-    SLID,
-    SPIN,
+    ROLLS,
     SPRING_X,
     SPRING_Y,
-    THETA,
-    UX,
-    UY,
     WANTED,
-    X0,
-    Y0,
 )
-from rig.engines.split.state import Call, Coordinates, Direction, Smooth, Step, Touch, Work
-from rig.engines.split.touch import begin_contact, end_contact, house_kick, kick_contact
+from rig.engines.split.rigid import bounce, hold, part
+from rig.engines.split.state import Call, Coordinates, Direction, Touch
+from rig.engines.split.steps import keep, keep_state, kicks, struck
+from rig.engines.taylor import march as series
+from rig.engines.taylor.events import FIRST, NOTHING
+from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, SLACK, SPAN
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT, damping_per_speed, held_speed
-from rig.kernels.dynamics import evaluate
-from rig.kernels.forces import drive_speed
+from rig.kernels.contact import FLIGHT, ROLLING
+from rig.kernels.geometry import gap
 
 ORDER = 2
 
+_SERIES, _KICKS = 0.0, 1.0
+"""Modes: series, which take everything; flow and kicks, where they may."""
+_SHARE = 1e-3
+"""Part of the tolerance that one step of the series may err by: impacts make small errors a thousand times larger."""
+_FAR_S = 1e-2
+"""Where a series reaches this far [s], because no house rings, flow and kicks are no faster."""
+_SETTLED_S = 1e-3
+"""A contact is one for kicks after this time without an event [s]; and if they had to leave it, after this time."""
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+
 def start(constants, inputs, y, memory, step_ticks, tolerance):
-    """Prepare the memory for a state: the inner state, and the flows for this step."""
-    memory[:] = 0.0
-    memory[ONSET] = held_speed(0.0, constants.contact)
-    axis, w, theta, houses = from_coordinates(constants, y)
-    keep(memory, axis, w, theta, houses)
-    memory[ANGLE] = theta
-    memory[COS] = math.cos(theta + constants.shaft.unbalance_phase)
-    memory[SIN] = math.sin(theta + constants.shaft.unbalance_phase)
-    memory[SLID] = np.nan
-    memory[WANTED] = GRID
-    memory[KICKED] = -1.0
-    memory[ENGAGED] = 1.0 if inputs.magnet_engaged else 0.0
+    """Prepare the memory for a state: the series, and the flows for this step."""
+    series.start(constants, inputs, y, memory, step_ticks, _SHARE * tolerance if tolerance > 0.0 else 1e-9)
+    memory[LIMIT] = tolerance
     # The shaft's flow is linear about its rest on the magnets.
     memory[REST], memory[SPRING_X], memory[SPRING_Y] = magnet_springs(constants)
-    house_flows(constants, step_ticks * inputs.tick_s, memory[FLOWS:FLOWS_END].reshape(LEVELS, HOUSE_FLOW))
+    _prepare_flows(constants, inputs, memory, step_ticks)
 
 
-@inlined
-def keep(memory, axis, w, theta, houses):
-    """Put the motion into the memory."""
-    memory[UX], memory[UY], memory[PX], memory[PY] = axis
-    memory[SPIN], memory[THETA] = w, theta
-    memory[X0], memory[X0 + 1], memory[X0 + 2], memory[X0 + 3] = houses.x0, houses.x1, houses.x2, houses.x3
-    memory[Y0], memory[Y0 + 1], memory[Y0 + 2], memory[Y0 + 3] = houses.y0, houses.y1, houses.y2, houses.y3
+def _prepare_flows(constants, inputs, memory, step_ticks):
+    """Flows of the houses for steps of another grid."""
+    memory[GRID_TICKS] = step_ticks
+    memory[FLOWS:FLOWS_END] = house_flows(constants, step_ticks * inputs.tick_s).ravel()
 
 
-@inlined
-def kept(memory):
-    """Axis, spin, spin angle and houses from the memory."""
-    x, y = memory[X0 : X0 + 4], memory[Y0 : Y0 + 4]
-    axis = Axis(memory[UX], memory[UY], memory[PX], memory[PY])
-    return axis, memory[SPIN], memory[THETA], Houses(x[0], x[1], x[2], x[3], y[0], y[1], y[2], y[3])
-
-
-@inlined
-def _kept_state(constants, memory):
-    """Contact, coordinates and the unbalance's direction from the memory."""
-    k = memory[KICK : KICK + 8]
-    touch = Touch(
-        int(memory[PHASE]),
-        memory[SLID],
-        memory[DEPTH],
-        memory[RATE],
-        memory[AGO],
-        int(memory[WANTED]),
-        damping_per_speed(memory[ONSET], constants.contact),
-    )
-    kick = Kick(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7])
-    return (
-        touch,
-        Coordinates(int(memory[KICKED]), memory[CONJUGATE], kick),
-        Direction(memory[COS], memory[SIN], memory[ANGLE]),
-    )
-
-
-@inlined
-def _keep_state(memory, touch, coordinates, direction):
-    """Put them into the memory."""
-    memory[PHASE], memory[SLID], memory[WANTED] = float(touch.phase), touch.slid, float(touch.wanted)
-    memory[DEPTH], memory[RATE], memory[AGO] = touch.depth, touch.rate, touch.ago
-    memory[KICKED], memory[CONJUGATE] = float(coordinates.kicked), coordinates.conjugate
-    k = memory[KICK : KICK + 8]
-    k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7] = coordinates.kick
-    memory[COS], memory[SIN], memory[ANGLE] = direction.cosine, direction.sine, direction.angle
-
-
-@inlined
-def _touch_with(touch, ago, wanted):
-    """The contact with another time since the last kick [s] and another level asked for."""
-    return Touch(touch.phase, touch.slid, touch.depth, touch.rate, ago, wanted, touch.factor)
-
-
-@inlined
-def _step_of(constants, inputs, call, touch, kicked, axis, houses, owed, now, n, last):
-    """The next step: as long as the state allows; it starts at a multiple of its length, and ends at the row.
-
-    Args:
-        constants: Of the model.
-        inputs: Of this call.
-        call: What stays through the call.
-        touch: The contact.
-        kicked: Level of the last kick, -1 before the first.
-        axis: Of the shaft.
-        houses: Of the stator.
-        owed: Level of the half flow that the last kick still owes, -1 for none.
-        now: Tick of the row.
-        n: Start, in shortest steps from the row on.
-        last: The next row.
-    """
-    begin = now + n * call.part_ticks
-    struck = inputs.hammer_start <= begin < inputs.hammer_end
-    level = touch.wanted
-    if touch.phase == FLIGHT:
-        owed_s = span_of(call, owed) if owed >= 0 else 0.0
-        level = flight_level(constants, call, axis, houses, owed_s, struck)
-    if kicked < 0:
-        level = 0  # what the conjugate coordinates need is known after a kick
-    while n & ((1 << level) - 1) != 0 or n + (1 << level) > last:
-        level -= 1
-    count = 1 << level
-    return Step(
-        level, count, 2.0 * span_of(call, level), call.per_s / float(1 << level), begin, n + count, owed, struck
-    )
-
-
-@inlined
-def _flow_to_middle(
-    constants, inputs, call, shaft_table, house_table, step, aim, axis, w, theta, houses, touch, coordinates
-):
-    """The half flow that is still owed, the change of coordinates for a step of another length, and half a flow."""
-    plant, level, owed = call.plant, step.level, step.owed
-    inner = constants.levels.inner_house
-    merged = owed == level
-    conjugate, kicked = coordinates.conjugate, coordinates.kicked
-    depth, rate, ago = touch.depth, touch.rate, touch.ago
-    if owed >= 0 and not merged:
-        axis, w, theta, houses = flow(shaft_table, house_table, owed, inner, axis, w, theta, aim, houses)
-        ago = 0.0
-    if level != kicked:
-        # Each length of step has its own conjugate coordinates, at the ends of the steps.
-        since = span_of(call, kicked) if kicked >= 0 else 0.0
-        carried = continued(constants, plant, inputs.magnet_engaged, coordinates.kick, axis, w, since)
-        axis, houses = processed(conjugate - step.h * step.h * (1.0 / 24.0), plant, carried, axis, houses)
-        conjugate = step.h * step.h * (1.0 / 24.0)
-        kicked = level
-    if touch.phase == FLIGHT and level <= GRID and not merged:
-        # Where an onset in the half step ahead is measured from.
-        ex, ey = eccentricity(constants, axis, houses)
-        motion = motion_of(constants, axis.px, axis.py, houses, ex, ey)
-        depth, rate, ago = motion.depth, motion.rate, 0.0
-    at = level + 1 if merged else level
-    axis, w, theta, houses = flow(shaft_table, house_table, at, inner, axis, w, theta, aim, houses)
-    ago += span_of(call, at)
-    touch = Touch(touch.phase, touch.slid, depth, rate, ago, touch.wanted, touch.factor)
-    return axis, w, theta, houses, touch, Coordinates(kicked, conjugate, coordinates.kick)
-
-
-@inlined
-def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
-    """Everything smooth, in the middle of the step: sum of arm times force, without the flow's linear magnets."""
-    shaft, lI = constants.shaft, constants.shaft.arm_disk
-    rotation = w - geometry.share  # theta'
-    pull = lI * shaft.unbalance * rotation * rotation
-    pull_x, pull_y = pull * direction.cosine, pull * direction.sine
-    force = lI * hammer_mean(inputs, step.begin, step.parts * call.part_ticks) if step.struck else 0.0
-    hammer_x, hammer_y = force * inputs.hammer_x, force * inputs.hammer_y
-    Sx, Sy, ax, ay = smooth_forces(
-        constants, call.plant, inputs.magnet_engaged, axis, pull_x + hammer_x, pull_y + hammer_y
-    )
-    # What depends on the rates: they are taken again in the middle of the kick, for order 2.
-    turning_x, turning_y = turning(
-        constants.levels.euler, call.plant, axis, geometry.uz, axis.px, axis.py, geometry.pz, w
-    )
-    return Smooth(Sx, Sy, ax, ay, turning_x, turning_y, pull_x, pull_y, hammer_x, hammer_y, rotation)
-
-
-@inlined
-def _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch):
-    """The contact's impulse: at an onset, in contact, at a lift-off, or none; and the contact after it."""
-    h, r0 = step.h, constants.contact.clearance
-    qx = axis.px + 0.5 * h * (smooth.ax + smooth.turning_x)
-    qy = axis.py + 0.5 * h * (smooth.ay + smooth.turning_y)
-    impulse = Impulse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _enter_kicks(constants, memory, y, phase, wanted):
+    """From the series over to kicks, at the state y."""
+    axis, w, theta, houses = from_coordinates(constants, y)
+    keep(memory, axis, w, theta, houses)
+    angle = theta + constants.shaft.unbalance_phase
+    none = Kick(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    direction = Direction(math.cos(angle), math.sin(angle), theta)
     ex, ey = eccentricity(constants, axis, houses)
-    if ex * ex + ey * ey > r0 * r0:
-        motion = motion_of(constants, qx, qy, houses, ex, ey)
-        missed = 0.0
-        if touch.phase == FLIGHT:
-            missed = begin_contact(constants, memory, touch, motion, h)
-            factor = damping_per_speed(memory[ONSET], constants.contact)
-            touch = Touch(FLIGHT, np.nan, touch.depth, touch.rate, touch.ago, min(step.level, GRID), factor)
-        return kick_contact(constants, call, memory, ledger, axis, houses, motion, w, touch, missed, step)
-    depth, rate = touch.depth, touch.rate
-    if touch.phase != FLIGHT:
-        motion = motion_of(constants, qx, qy, houses, ex, ey)
-        impulse = end_contact(constants, call.plant, ledger, touch, motion, memory[ONSET], h)
-        depth, rate = motion.depth, motion.rate
-    elif step.level <= GRID:
-        motion = motion_of(constants, qx, qy, houses, ex, ey)
-        depth, rate = motion.depth, motion.rate
-    return impulse, Touch(FLIGHT, touch.slid, depth, rate, 0.0, touch.wanted, touch.factor)
+    rate = motion_of(constants, axis.px, axis.py, houses, ex, ey).rate
+    keep_state(memory, Touch(phase, np.nan, rate, wanted, 0.0), Coordinates(-1, 0.0, none), direction)
+    memory[BOUNCE], memory[LAST_STEP] = rate, 0.0
+    memory[MODE] = _KICKS
 
 
-@inlined
-def _kick_shaft(
-    constants, inputs, call, step, axis, geometry, w, theta, gained, moved, direction, smooth, impulse, work
-):
-    """The kick of shaft and drive, with its powers and torques; all forces in the middle of it.
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _try_kicks(constants, inputs, call, memory, y, now, end):
+    """Go over to kicks where the next steps, up to the tick `end`, are likely to be theirs."""
+    phase = int(memory[PHASE])
+    if memory[SPAN] < 0.0 or now < memory[AGAIN] or struck(inputs, now, end):
+        return
+    if phase == FLIGHT:
+        if memory[SPAN] > _FAR_S and memory[LIMIT] > 0.0:
+            return
+        axis, w, _, houses = from_coordinates(constants, y)
+        level = flight_level(constants, inputs, call, axis, w, houses, 0.0)
+        if level >= GRID + 1 or (level == GRID and memory[LIMIT] == 0.0):
+            _enter_kicks(constants, memory, y, phase, GRID)
+        return
+    lasts = (now - memory[ROLLS]) * inputs.tick_s > _SETTLED_S and memory[SLACK] == 0.0
+    if lasts and constants.levels.compliant and constants.contact.gap_counts_outer == 0.0:
+        _enter_kicks(constants, memory, y, phase, ANY)
 
-    Args:
-        constants: Of the model.
-        inputs: Of this call.
-        call: What stays through the call.
-        step: At hand.
-        axis: Of the shaft.
-        geometry: Of the axis.
-        w: Spin [rad/s].
-        theta: Spin angle [rad].
-        gained: Energy that the flow gave to the spin [J].
-        moved: Angular momentum that it gave to it [N m s].
-        direction: Of the unbalance.
-        smooth: Smooth forces.
-        impulse: Of the contact.
-        work: Booked so far.
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _series_to(constants, inputs, plant, memory, room, y, tick):
+    """The series up to a tick, and the state there into y.
 
     Returns:
-        Axis, spin, spin angle, the kick, and the work.
+        Whether a rigid contact has begun to last on the way, at the end of the series at hand; y is the state there.
     """
-    shaft, plant, h = constants.shaft, call.plant, step.h
-    euler, ideal, arm = constants.levels.euler, inputs.ideal_drive, call.plant.arm
-    R, lA, lI, per_Ixx = shaft.radius, shaft.arm_ring, shaft.arm_disk, call.plant.per_Ixx
-    Sx, Sy, ax, ay, turning_x, turning_y, pull_x, pull_y, hammer_x, hammer_y, rotation = smooth
-    share = geometry.share
-    ux, uy, px, py = axis
-    uz = geometry.uz
-    jx, jy, jt = impulse.jx, impulse.jy, impulse.jt
-    lost = along(euler, axis, arm * jx, arm * jy)
-    dx, dyy = arm * jx - lost * ux, arm * jy - lost * uy
-    w_mid = w
-    if jt != 0.0 and not ideal:
-        # The spin that counts is the one in the middle of the kick, for the unbalance too.
-        w_mid = w - 0.5 * R * jt * plant.per_Izz
-        more = lI * shaft.unbalance * ((w_mid - share) ** 2 - rotation * rotation)
-        more_x, more_y = more * direction.cosine, more * direction.sine
-        lost = along(euler, axis, more_x, more_y)
-        pull_x, pull_y = pull_x + more_x, pull_y + more_y
-        Sx, Sy = Sx + more_x, Sy + more_y
-        ax, ay = ax + (more_x - lost * ux) * per_Ixx, ay + (more_y - lost * uy) * per_Ixx
-    mx, my = px + 0.5 * (h * (ax + turning_x) + dx), py + 0.5 * (h * (ay + turning_y) + dyy)
-    mz = -(ux * mx + uy * my) * geometry.per_uz
-    turning_x, turning_y = turning(euler, plant, axis, uz, mx, my, mz, w_mid)
-    share = geometry.share_per * (uy * mz - uz * my)
-    ux, uy = ux - arm * impulse.shift_x, uy - arm * impulse.shift_y
-    axis = Axis(ux, uy, px + h * (ax + turning_x) + dx, py + h * (ay + turning_y) + dyy)
-    torque = R * jt
-    if not ideal:
-        theta -= h * share
-        torque = h * (constants.torque_gain * share)
-        w += (torque - R * jt) * plant.per_Izz
-    net = moved + torque - R * jt
-    # What the next change of step and the rows need. Of what is smooth, only the unbalance changes fast.
-    kick = Kick(
-        ax + turning_x + hammer_x * per_Ixx,
-        ay + turning_y + hammer_y * per_Ixx,
-        -rotation * pull_y * per_Ixx,
-        rotation * pull_x * per_Ixx,
-        impulse.cx,
-        impulse.cy,
-        impulse.dcx,
-        impulse.dcy,
-    )
-    damped_x, damped_y = plant.damper_x * mx, plant.damper_y * my
-    Lx, Ly = h * (Sx - damped_x) + lA * jx, h * (Sy - damped_y) + lA * jy
-    work = Work(
-        work.drive + gained + torque * w_mid,
-        work.hammer + h * (hammer_x * mx + hammer_y * my),
-        work.unbalance + h * (pull_x * mx + pull_y * my),
-        work.bearing + h * (damped_x * mx + damped_y * my),
-        work.turn_x + (net * ux - uz * Ly),
-        work.turn_y + (net * uy + uz * Lx),
-        work.turn_z + (net * uz + ux * Ly - uy * Lx),
-    )
-    return axis, w, theta, kick, work
+    rigid = not constants.levels.compliant
+    while not series.holds(memory, tick, 0.0):
+        if memory[EVENT] != NOTHING:
+            memory[ROLLS] = memory[END_TICK]
+        if rigid and memory[EVENT] == FIRST:
+            series.read_off(memory, room, y, memory[END_TICK], memory[END_FRACTION])
+            if bounce(constants, inputs, plant, memory, room, y):
+                return True
+            end = int(memory[END_TICK])
+            series.begin_series(constants, inputs, memory, room, y, end, memory[END_FRACTION], True)
+            if not np.isfinite(y[0]):
+                return False
+        elif not series.continue_series(constants, inputs, memory, room, y):
+            return False
+    series.read_off(memory, room, y, tick, 0.0)
+    return False
 
 
-@inlined
-def _write_row(constants, inputs, now, memory, phase, plant, coordinates, axis, w, theta, houses, y, dy, rows, row):
-    """The row of an instant, in the motion's own coordinates."""
-    own_axis, own_houses = processed(coordinates.conjugate, plant, coordinates.kick, axis, houses)
-    into_coordinates(constants, own_axis, w, theta, own_houses, y)
-    # Rigid impacts have no force over time.
-    seen = phase if constants.levels.compliant else FLIGHT
-    evaluate(constants, inputs, now, 0.0, memory[ONSET], seen, True, y, dy, rows[row, S.N_VECTOR :])
-    for i in range(S.N_VECTOR):
-        rows[row, i] = y[i]
+@njit(cache=True, error_model="numpy")
+def _leave_kicks(constants, inputs, plant, memory, y):
+    """What the series need to know of the state that kicks have left.
+
+    Returns:
+        Whether a rigid contact ends there.
+    """
+    memory[MODE] = _SERIES
+    memory[SLACK] = 0.0
+    if not constants.levels.compliant:
+        touched = memory[PHASE] != FLIGHT
+        memory[PHASE] = FLIGHT
+        return touched and part(constants, inputs, plant, y)
+    if memory[PHASE] != FLIGHT and gap(constants, y)[0] <= 0.0:
+        memory[PHASE] = FLIGHT
+    if memory[PHASE] == ROLLING:
+        hold(constants, inputs, plant, y)
+    return False
 
 
-@inlined
-def _book(constants, y, ledger, work, axis, houses, moved, gained):
-    """The integrals since the last row into y; `moved` [N m s] and `gained` [J] by the last flow of the spin."""
-    house = constants.house
-    ledger[S.DRIVE_WORK] = work.drive + gained
-    ledger[S.HAMMER_WORK] = work.hammer
-    ledger[S.UNBALANCE_WORK] = work.unbalance
-    ledger[S.BEARING_LOSS] = work.bearing
-    ledger[S.HOUSE_LOSS] -= house_energy(constants, houses)
-    ledger[S.ANGULAR_IMPULSE_X] = work.turn_x + moved * axis.ux
-    ledger[S.ANGULAR_IMPULSE_Y] = work.turn_y + moved * axis.uy
-    ledger[S.ANGULAR_IMPULSE_Z] = work.turn_z + moved
-    for i in range(S.N_STATE, S.N_VECTOR):
-        y[i] += ledger[i]
-    y[S.HOUSE_IMPULSE_X] = house.inner_mass * houses.x1 + house.outer_mass * houses.x3
-    y[S.HOUSE_IMPULSE_Y] = house.inner_mass * houses.y1 + house.outer_mass * houses.y3
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST, nogil=True)
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """See `rig.engines`."""
-    # params:
-    euler, inner, ideal = constants.levels.euler, constants.levels.inner_house, inputs.ideal_drive
-    Izz = constants.shaft.polar_inertia
+    regridded = step_ticks != memory[GRID_TICKS]
+    if regridded:
+        _prepare_flows(constants, inputs, memory, step_ticks)
+    _advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows, regridded)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows, regridded):
+    """The same, on flows for this grid; `regridded` says that they are new."""
     plant = plant_of(constants, inputs, memory[REST], memory[SPRING_X], memory[SPRING_Y])
     shaft_table = shaft_flows(plant, inputs.magnet_engaged, step_ticks * inputs.tick_s)
-    house_table = memory[FLOWS:FLOWS_END].reshape(LEVELS, HOUSE_FLOW)
     half_s = 0.5 * 2.0**-GRID * (step_ticks * inputs.tick_s)
-    call = Call(plant, step_ticks / 2.0**GRID, half_s, 0.5 / half_s)
-    # state in:
-    axis, w, theta, houses = kept(memory)
-    touch, coordinates, direction = _kept_state(constants, memory)
-    if inputs.magnet_engaged != (memory[ENGAGED] == 1.0):
-        # Another division into flow and kick has other conjugate coordinates.
-        axis, houses = processed(coordinates.conjugate, plant, coordinates.kick, axis, houses)
-        coordinates = Coordinates(-1, 0.0, Kick(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        memory[ENGAGED] = 1.0 if inputs.magnet_engaged else 0.0
+    call = Call(plant, step_ticks / 2.0**GRID, half_s, 0.5 / half_s, memory[LIMIT])
+    room = series.room_in(memory)
     ledger = np.zeros(S.N_VECTOR)
-    dy = np.empty(S.N_VECTOR)
-    kicks = 0.0
+    changed = not series.same_inputs(inputs, memory)
+    if memory[SPAN] < 0.0 or (changed and memory[MODE] == _SERIES):
+        series.begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
+    elif memory[MODE] == _KICKS and (changed or regridded):
+        # Another division into flow and kick, or another grid, has other conjugate coordinates.
+        _enter_kicks(constants, memory, y, int(memory[PHASE]), int(memory[WANTED]))
     row = first = 0
     while first < steps:
-        now = tick + first * step_ticks
-        _write_row(
-            constants, inputs, now, memory, touch.phase, plant, coordinates, axis, w, theta, houses, y, dy, rows, row
-        )
+        now, ahead = tick + first * step_ticks, min(stride, steps - first)
+        end = now + ahead * step_ticks
+        if memory[MODE] == _SERIES:
+            _try_kicks(constants, inputs, call, memory, y, now, end)
+        # Rigid impacts have no force over time.
+        seen = int(memory[PHASE]) if constants.levels.compliant else FLIGHT
+        series.write_row(constants, inputs, memory, room, y, now, seen, rows, row)
         row += 1
-
-        # The steps up to the next row. Integrals of this row start at 0.
-        ledger[:] = 0.0
-        ledger[S.HOUSE_LOSS] = house_energy(constants, houses)
-        work = Work(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        # The unbalance's direction is turned step by step; its length is kept here.
-        q = 1.5 - 0.5 * (direction.cosine * direction.cosine + direction.sine * direction.sine)
-        direction = Direction(direction.cosine * q, direction.sine * q, direction.angle)
-        last = min(stride, steps - first) * 2**GRID
-        n = 0
-        owed = -1
+        n, last = 0, ahead * 2**GRID
         while n < last:
-            step = _step_of(constants, inputs, call, touch, coordinates.kicked, axis, houses, owed, now, n, last)
-
-            # Flow to the middle of the step. The drive's speed is that in the middle of the flow up to there.
-            middle = (n + 0.5 * step.parts) * call.part_ticks
-            back = 0.25 * step.parts if owed < 0 else 0.25 * (step.parts + (1 << owed))
-            aim = drive_speed(inputs, now, middle - back * call.part_ticks)
-            spin = w
-            if ideal:
-                w = aim
-            axis, w, theta, houses, touch, coordinates = _flow_to_middle(
-                constants, inputs, call, shaft_table, house_table, step, aim, axis, w, theta, houses, touch, coordinates
-            )
-            geometry = geometry_of(euler, axis)
-            if ideal:
-                w = drive_speed(inputs, now, middle) + geometry.share
-            gained, moved = 0.5 * Izz * (w * w - spin * spin), Izz * (w - spin)
-            cosine, sine = turned(direction.cosine, direction.sine, theta - direction.angle)
-            direction = Direction(cosine, sine, theta)
-
-            # The kick.
-            smooth = _smooth(constants, inputs, call, step, axis, geometry, w, direction)
-            impulse, touch = _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch)
-            axis, w, theta, kick, work = _kick_shaft(
-                constants, inputs, call, step, axis, geometry, w, theta, gained, moved, direction, smooth, impulse, work
-            )
-            coordinates = Coordinates(coordinates.kicked, coordinates.conjugate, kick)
-            if inner:
-                houses, near = house_kick(constants, plant, ledger, houses, impulse, step.h)
-                if near:
-                    touch = _touch_with(touch, touch.ago, min(touch.wanted, STRUCK))
-            kicks += 1.0
-            owed = step.level
-            n = step.end
-
-        # The half flow that is owed up to the row.
-        spin = w
-        aim = drive_speed(inputs, now, (last - 0.25 * (1 << owed)) * call.part_ticks)
-        if ideal:
-            w = aim
-        axis, w, theta, houses = flow(shaft_table, house_table, owed, inner, axis, w, theta, aim, houses)
-        touch = _touch_with(touch, touch.ago + span_of(call, owed), touch.wanted)
-        if ideal:
-            w = drive_speed(inputs, now, last * call.part_ticks) + geometry_of(euler, axis).share
-        _book(constants, y, ledger, work, axis, houses, Izz * (w - spin), 0.5 * Izz * (w * w - spin * spin))
-        first += last // 2**GRID
-
-    # out:
-    own_axis, own_houses = processed(coordinates.conjugate, plant, coordinates.kick, axis, houses)
-    into_coordinates(constants, own_axis, w, theta, own_houses, y)
-    keep(memory, axis, w, theta, houses)
-    _keep_state(memory, touch, coordinates, direction)
-    memory[STEPS] += kicks
-    memory[EVALUATIONS] += kicks
+            if memory[MODE] == _KICKS:
+                n = kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last)
+                if n < last:
+                    at = now + n * call.part_ticks
+                    memory[AGAIN] = memory[ROLLS] = at + _SETTLED_S / inputs.tick_s
+                    ends = _leave_kicks(constants, inputs, plant, memory, y)
+                    whole = math.floor(at)
+                    series.begin_series(constants, inputs, memory, room, y, whole, at - whole, ends)
+            elif _series_to(constants, inputs, plant, memory, room, y, end):
+                since = (memory[END_TICK] - now) + memory[END_FRACTION]
+                n = math.ceil(since / call.part_ticks)
+                _enter_kicks(constants, memory, y, ROLLING, GRID)
+            else:
+                n = last
+        first += ahead

@@ -1,31 +1,36 @@
-"""What the splitting engine keeps between calls, by position in the memory."""
+"""What the splitting engine keeps between calls beside what the series keep, by position in the memory."""
 
 from __future__ import annotations
 
 from itertools import count
 
-from rig.engines.memory import OWN
 from rig.engines.split.flow import HOUSE_FLOW, LEVELS
+from rig.engines.taylor.place import SERIES_END
 
-_next = count(OWN)
-UX, UY, PX, PY, SPIN, THETA = (next(_next) for _ in range(6))
+_next = count(SERIES_END)
+MODE = next(_next)
+"""Which method moves on: the series, or kicks."""
+LIMIT = next(_next)
+"""The tolerance of the whole."""
+ROLLS, AGAIN = (next(_next) for _ in range(2))
+"""Tick since which the contact's phase is what it is; tick from which kicks may be tried again."""
+UX, UY, PX, PY, SPIN, ANGLE = (next(_next) for _ in range(6))
 X0, X1, X2, X3, Y0, Y1, Y2, Y3 = (next(_next) for _ in range(8))
 """Houses: inner displacement and rate, outer displacement and rate, horizontal and vertical."""
-SLID, DEPTH, RATE, AGO = (next(_next) for _ in range(4))
-"""Sliding speed after the last kick, nan before the first of a contact; penetration, its rate and the time since the
-last kick in flight."""
-LAST_STEP = next(_next)
-"""Length of the last kick's step [s]; spans between forces are in seconds too."""
-WANTED, SETTLED, BOUNCE = (next(_next) for _ in range(3))
-"""Level asked for in contact, calm kicks in a row, mean rate of the gap in the last kick."""
-REST, SPRING_X, SPRING_Y, ENGAGED = (next(_next) for _ in range(4))
-"""Rest of the shaft on its magnets and the springs of its flow about it; whether the flow has the magnets."""
+SLID, RATE = (next(_next) for _ in range(2))
+"""Sliding speed after the last kick, nan before the first of a contact; rate of the penetration then."""
+WANTED, BOUNCE, LAST_STEP = (next(_next) for _ in range(3))
+"""Level asked for in contact; mean rate of the gap in the last kick, and that kick's step [s]."""
+REST, SPRING_X, SPRING_Y = (next(_next) for _ in range(3))
+"""Rest of the shaft on its magnets and the springs of its flow about it."""
 KICKED, CONJUGATE = (next(_next) for _ in range(2))
 """Level of the last kick, -1 before the first; h^2/24 of the coordinates in use."""
 KICK = next(_next)
 """The last kick (`rig.engines.split.kick.Kick`): eight numbers."""
-COS, SIN, ANGLE = (KICK + 8 + i for i in range(3))
+COS, SIN, TURNED = (KICK + 8 + i for i in range(3))
 """Direction of the unbalance, and the spin angle that it is for."""
-FLOWS = ANGLE + 1
+GRID_TICKS = TURNED + 1
+"""The grid's own step, for which ..."""
+FLOWS = GRID_TICKS + 1
 FLOWS_END = FLOWS + HOUSE_FLOW * LEVELS
-"""Flows of the houses."""
+"""... these are the flows of the houses."""

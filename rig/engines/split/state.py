@@ -15,6 +15,7 @@ class Call(NamedTuple):
     part_ticks: float  # shortest step [ticks]
     half_s: float  # half of it [s]
     per_s: float  # one over it [1/s]
+    tolerance: float  # error that is asked for; 0: steps of one length
 
 
 class Step(NamedTuple):
@@ -27,7 +28,6 @@ class Step(NamedTuple):
     begin: float  # tick at its start
     end: int  # its end, in shortest steps from the row on
     owed: int  # level of the half flow that the last kick still owes, -1 for none
-    struck: bool  # by the hammer
 
 
 class Touch(NamedTuple):
@@ -35,10 +35,8 @@ class Touch(NamedTuple):
 
     phase: int
     slid: float  # sliding speed after it, nan before the first of a contact [m/s]
-    depth: float  # penetration [m]
-    rate: float  # of it [m/s]
-    ago: float  # time since [s]
-    wanted: int  # level asked for in contact
+    rate: float  # of the penetration, after it [m/s]
+    wanted: int  # level asked for in contact; NONE: it is no longer one for kicks
     factor: float  # damping factor over the onset speed [s/m]
 
 

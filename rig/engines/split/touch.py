@@ -1,29 +1,24 @@
-"""The contact in a step of `rig.engines.split`: its beginning, its impulse in a kick, and its end."""
+"""A contact that lasts, in a step of `rig.engines.split`: its impulse in a kick, and what that does to the houses."""
 
 from __future__ import annotations
 
-from rig.engines.events import latch_onset
-from rig.engines.memory import BEFORE, BEFORE_SPAN, CLAMPS, CONTACT_STEPS, LAST, ONSET, PEAK_FORCE
-from rig.engines.peak import peak
+from rig.engines.memory import CONTACT_STEPS, PEAK_FORCE
 from rig.engines.split.impulse import (
     Impulse,
     Law,
     Push,
     compliant_push,
-    crossing,
-    end_impulse,
     flow_acceleration,
     friction_impulse,
     law_at,
     mobility_of,
-    onset_error,
 )
 from rig.engines.split.inner_motion import Houses, inlined
-from rig.engines.split.levels import contact_level, roughness
-from rig.engines.split.place import BOUNCE, LAST_STEP, SETTLED
+from rig.engines.split.levels import NONE, contact_level
+from rig.engines.split.place import BOUNCE, LAST_STEP
 from rig.engines.split.state import Touch
 from rig.kernels import signals as S
-from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, ROLLING
+from rig.kernels.contact import BACKWARD, FORWARD, ROLLING
 
 _SLOP = 200.0
 """Depth that a rigid ring keeps in lasting contact, over the step squared [m/s^2]: a chord of the arc stays inside."""
@@ -32,52 +27,20 @@ _RETURN = 0.1
 
 
 @inlined
-def begin_contact(constants, memory, touch, motion, h):
-    """Latch the onset speed of a contact that has begun since the last kick; what this kick misses of it [N s].
-
-    Args:
-        constants: Of the model.
-        memory: Of the engine.
-        touch: As the last kick left it.
-        motion: Now.
-        h: Step [s].
-    """
-    contact = constants.contact
-    speed, since = motion.rate, 0.5
-    if touch.depth < 0.0 and touch.ago > 0.0:
-        part, speed = crossing(touch.depth, touch.rate, motion.depth, motion.rate, touch.ago)
-        since = (1.0 - part) * touch.ago / h
-    latch_onset(memory, speed, contact)
-    memory[BEFORE] = memory[LAST] = memory[BEFORE_SPAN] = 0.0
-    memory[SETTLED], memory[BOUNCE] = 0.0, motion.rate
-    if not constants.levels.compliant or motion.rate <= 0.0:
-        return 0.0
-    return onset_error(contact, motion.rate, since, memory[ONSET], h)
+def no_impulse():
+    """Of a step without contact."""
+    return Impulse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @inlined
-def record_force(memory, force, h):
-    """Follow the largest normal force [N]: this is the one in the middle of the kick of a step h [s]."""
-    span = 0.5 * (memory[LAST_STEP] + h)
-    largest = peak(memory[BEFORE], memory[BEFORE_SPAN], memory[LAST], span, force)
-    memory[PEAK_FORCE] = max(memory[PEAK_FORCE], largest)
-    memory[BEFORE], memory[LAST], memory[BEFORE_SPAN], memory[LAST_STEP] = memory[LAST], force, span, h
-
-
-@inlined
-def rigid_push(contact, motion, w, begins, rate_before, h):
-    """Normal impulse of a rigid contact: Newton's law at an onset, Moreau's in lasting contact.
-
-    The latter leaves no speed in the mean of a step.
-    """
+def rigid_push(motion, w, rate_before, h):
+    """Normal impulse of a rigid contact that lasts, Moreau's: it leaves no speed in the mean of a step."""
     goal = -0.5 * (motion.rate - rate_before) - _RETURN * (motion.depth - _SLOP * h * h) / h
-    if begins:
-        goal = -contact.restitution * motion.rate if motion.rate > contact.speed_floor else 0.0
     return Push(max(0.0, (motion.rate - goal) / w.nn), 0.0, 0.0, w.nt / w.nn, 0.0)
 
 
 @inlined
-def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, touch, missed, step):
+def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, touch, step):
     """The contact's impulse over a kick, booked in memory and ledger.
 
     Args:
@@ -89,12 +52,12 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
         houses: Of the stator.
         motion: Of the shaft against the ring, halfway through what is smooth.
         spin: w [rad/s].
-        touch: As the last kick left it; in FLIGHT at an onset.
-        missed: What the kick misses of an onset [N s].
+        touch: As the last kick left it.
         step: At hand.
 
     Returns:
-        Impulse, and the contact after it.
+        Impulse, and the contact after it. Where no level is wanted any more nothing is booked: the step is not one for
+        kicks.
     """
     plant, h = call.plant, step.h
     contact, house = constants.contact, constants.house
@@ -105,10 +68,10 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     if compliant:
         law = law_at(contact, depth, touch.factor)
         flow_rate = flow_acceleration(constants, plant, axis, houses, motion)
-        push = compliant_push(law, w, rate, flow_rate, missed, h)
+        push = compliant_push(law, w, rate, flow_rate, h)
     else:
         law = Law(0.0, 0.0, 0.0, 0.0)
-        push = rigid_push(contact, motion, w, touch.phase == FLIGHT, touch.rate, h)
+        push = rigid_push(motion, w, touch.rate, h)
     jn, shift = push.jn, push.shift
 
     # Rolling holds along the arc, not at the corners of the polygon that the kicks make of it.
@@ -116,16 +79,30 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     jt, wanted_jt = friction_impulse(w, jn, plant.friction * jn, sliding, touch.slid)
     if jn > 0.0:
         jn = max(0.0, jn - push.back * jt)
-    elif compliant:
-        memory[CLAMPS] += 1.0
     phase = ROLLING
     if jt != wanted_jt:
         phase = FORWARD if wanted_jt > 0.0 else BACKWARD
     if plant.friction == 0.0:
-        phase = FORWARD if sliding > 0.0 else BACKWARD
+        phase = touch.phase
     slid = sliding - w.tt * jt - w.nt * jn
     rate_after = rate - w.nn * jn - w.nt * jt
     rate_mean = rate - 0.5 * (w.nn * jn + w.nt * jt)
+    wanted = touch.wanted
+    if compliant:
+        change = (rate_mean - memory[BOUNCE]) * step.per_h
+        wanted = contact_level(
+            call,
+            constants.shaft.arm_ring,
+            wanted,
+            h,
+            memory[LAST_STEP],
+            rate_mean,
+            change,
+            law.slope * w.nn,
+            push.taken,
+        )
+    if compliant and (jn <= 0.0 or phase != touch.phase or wanted == NONE):
+        return no_impulse(), Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
     jx, jy = -jn * nx + jt * ny, -jn * ny - jt * nx
     force_x, force_y = jx, jy
     loss = (jn - push.held) * rate_mean
@@ -148,47 +125,17 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     ledger[S.CONTACT_IMPULSE] += jn
     memory[CONTACT_STEPS] += 1.0
 
-    # A rigid contact is always calm, and its force no function of time.
-    rough, calm = False, True
+    # The force of a rigid contact is no function of time.
     cx = cy = dcx = dcy = 0.0
     if compliant:
-        record_force(memory, max(0.0, law.elastic + law.damping * rate_mean), h)
-        change = (rate_mean - memory[BOUNCE]) * step.per_h
-        memory[BOUNCE] = rate_mean
-        rough, calm = roughness(touch.wanted, rate_mean, change, law.slope * w.nn, push.taken)
+        memory[BOUNCE], memory[LAST_STEP] = rate_mean, h
+        memory[PEAK_FORCE] = max(memory[PEAK_FORCE], law.elastic + law.damping * rate_mean)
         cx, cy = force_x * step.per_h, force_y * step.per_h
         growth, turn = law.relative * rate_mean, lateral * per_distance
         flow_rate *= law.damping
         dcx, dcy = growth * cx - turn * cy - flow_rate * nx, growth * cy + turn * cx - flow_rate * ny
-    wanted = contact_level(memory, touch.wanted, rough, calm, step.end)
-    after = Touch(phase, slid, motion.depth, rate_after, 0.0, wanted, touch.factor)
+    after = Touch(phase, slid, rate_after, wanted, touch.factor)
     return Impulse(jx, jy, jt, shift * nx, shift * ny, cx, cy, dcx, dcy), after
-
-
-@inlined
-def end_contact(constants, plant, ledger, touch, motion, onset_speed, h):
-    """Impulse that makes up for what the last kick missed of a contact that has ended since.
-
-    Args:
-        constants: Of the model.
-        plant: Of this call.
-        ledger: Integrals since the last row, shape (N_VECTOR,).
-        touch: As the last kick left it.
-        motion: Now.
-        onset_speed: Of the contact [m/s].
-        h: Step [s].
-    """
-    jn = jt = 0.0
-    if constants.levels.compliant and touch.depth > 0.0:
-        part, speed = crossing(touch.depth, touch.rate, motion.depth, motion.rate, touch.ago)
-        jn = end_impulse(constants.contact, part, speed, onset_speed, touch.ago, h)
-        if touch.phase == FORWARD:
-            jt = plant.friction * jn
-        elif touch.phase == BACKWARD:
-            jt = -plant.friction * jn
-        ledger[S.CONTACT_IMPULSE] += jn
-    jx, jy = -jn * motion.nx + jt * motion.ny, -jn * motion.ny - jt * motion.nx
-    return Impulse(jx, jy, jt, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @inlined

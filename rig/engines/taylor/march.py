@@ -60,7 +60,7 @@ from rig.engines.taylor.place import (
 from rig.engines.taylor.polynomial import column_at, first_zero, refine, series_at
 from rig.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT, ROLLING, held_speed, normal_force
+from rig.kernels.contact import FLIGHT, ROLLING, TOUCHING, held_speed, normal_force
 from rig.kernels.forces import drive_speed
 
 _SAFETY = 0.9
@@ -354,15 +354,20 @@ def same_inputs(inputs, memory):
 
 
 @njit(cache=True, error_model="numpy")
-def _begin_series(constants, inputs, memory, room, y, tick):
-    """A new beginning from the state y, at a tick."""
+def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
+    """A new beginning from the state y, at a whole tick and the ticks beyond it.
+
+    `leaves` says that a contact ends there: its gap counts as closed, whatever rounding makes of it.
+    """
     if memory[SPAN] >= 0.0 and memory[PHASE] != FLIGHT:
         _note_peak(constants, inputs, memory, room.Y, room.x)
     room.x[: S.N_VECTOR] = y
     memory[SPAN] = -1.0
     memory[EVENT] = NOTHING
-    memory[TICK], memory[FRACTION] = float(tick), 0.0
-    memory[END_TICK], memory[END_FRACTION] = float(tick), 0.0
+    if leaves:
+        memory[EVENT], memory[PHASE] = FIRST, TOUCHING
+    memory[TICK], memory[FRACTION] = float(tick), fraction
+    memory[END_TICK], memory[END_FRACTION] = float(tick), fraction
     continue_series(constants, inputs, memory, room, y)
 
 
@@ -394,7 +399,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     """
     room = room_in(memory)
     if not same_inputs(inputs, memory) or memory[SPAN] < 0.0:
-        _begin_series(constants, inputs, memory, room, y, tick)
+        begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
     for row in range((steps + stride - 1) // stride):
         now = tick + row * stride * step_ticks
         _reach(constants, inputs, memory, room, y, now)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rig.engines.memory import OWN
+from rig.engines.tape.columns import WIDTH
 
 TICK, FRACTION, END_TICK, END_FRACTION = range(OWN + 1, OWN + 5)
 """Start and end of the series: whole tick and ticks beyond."""
@@ -20,3 +21,5 @@ SERIES = OWN + 32
 ORDER = 16
 """Of every series. From 12 to 18 the speed at equal error is the same within a tenth, through impacts and whirl; an
 order that follows the tolerance makes the error a rough function of it."""
+SERIES_END = SERIES + (ORDER + 1) * WIDTH
+"""Behind the series."""

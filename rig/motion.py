@@ -1,0 +1,158 @@
+"""The motion that an engine moves on, and how far it can be trusted: by its energy ledger, and by a companion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rig.engines import Engine
+from rig.engines.memory import MEMORY
+from rig.kernels import signals as S
+from rig.kernels.constants import Constants, Inputs
+from rig.kernels.signals import COLUMN
+
+STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy")
+SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
+DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
+BRANCH_ALARM = 1e-2
+"""Energy residual over dissipated energy above which a run may have missed a contact or made one up."""
+FINER = 1.0 / 16.0
+"""Part of the tolerance that a companion is asked for: enough for half the step in settled contact."""
+DOUBT = 10.0
+"""How many times engine.tolerance the estimate may come to before the run is in doubt."""
+_FIRST, _LOST = 1e-9, 0.1
+"""Growth is measured from the first distance above rounding, and up to where two runs no longer have to do with each
+other."""
+
+
+@dataclass
+class Motion:
+    """State and integrals, what the engine keeps, and the grid that rows are observed on.
+
+    Attributes:
+        y: Shape (N_VECTOR,).
+        step_ticks: The engine's own step [ticks].
+        stride: Steps a row.
+        tolerance: That the engine is asked for.
+        memory: Shape (MEMORY,).
+    """
+
+    y: np.ndarray
+    step_ticks: int
+    stride: int
+    tolerance: float
+    memory: np.ndarray = field(default_factory=lambda: np.zeros(MEMORY))
+
+    def begin(self, engine: Engine, constants: Constants, inputs: Inputs) -> None:
+        """Start the engine on this state."""
+        engine.start(constants, inputs, self.y, self.memory, float(self.step_ticks), self.tolerance)
+
+    def run(
+        self, engine: Engine, constants: Constants, inputs: Inputs, rows: np.ndarray, start: int, tick: int, stop: int
+    ) -> None:
+        """Move on from one tick to another under the same inputs.
+
+        Commands live on ticks, rows only observe: off the rows' grid the steps are what fits, and no row is kept.
+
+        Args:
+            engine: The engine.
+            constants: Of the model.
+            inputs: Hammer, drive, magnets.
+            rows: Out, one every `stride` steps from the tick `start` on, shape (n, N_ROW).
+            start: Tick of the first row.
+            tick: From here.
+            stop: To here.
+        """
+        row_ticks = self.stride * self.step_ticks
+        while tick < stop:
+            row, beyond = divmod(tick - start, row_ticks)
+            whole = 0 if beyond else (stop - tick) // row_ticks
+            if whole:
+                out, step, steps, stride = rows[row : row + whole], self.step_ticks, whole * self.stride, self.stride
+            else:
+                ticks = min(stop - tick, row_ticks - beyond)
+                step = math.gcd(ticks, self.step_ticks)
+                stride = steps = ticks // step
+                out = np.empty((1, S.N_ROW)) if beyond else rows[row : row + 1]
+            engine.advance(constants, inputs, self.y, self.memory, tick, step, steps, stride, out)
+            tick += steps * step
+
+
+@dataclass
+class Accuracy:
+    """What is known of a run's error, by its distance from a companion.
+
+    Attributes:
+        estimate: Largest error estimate so far: RMS of the scaled states (`STATE_SCALE`) [1].
+        grown_per_s: Rate at which a small distance has grown since the first contact, on the whole [1/s].
+        doubted_s: When the estimate came above `DOUBT` times the tolerance; None: never.
+    """
+
+    tolerance: float
+    estimate: float = 0.0
+    grown_per_s: float = 0.0
+    doubted_s: float | None = None
+    _first: tuple[float, float] | None = None
+
+    def compare(self, rows: np.ndarray, companion: np.ndarray, times_s: np.ndarray) -> str | None:
+        """Take note of both runs at the same instants, one after the other.
+
+        Args:
+            rows: Observed rows, shape (n, N_ROW).
+            companion: The companion's, alike.
+            times_s: Instants [s], shape (n,).
+
+        Returns:
+            What to say, if the run has come into doubt in these.
+        """
+        away = (rows[:, : S.N_STATE] - companion[:, : S.N_STATE]) / S.STATE_SCALE
+        said = None
+        for time, distance in zip(times_s.tolist(), np.sqrt(np.mean(away**2, axis=1)).tolist(), strict=True):
+            self.estimate = max(self.estimate, distance)
+            if self._first is None and distance > _FIRST:
+                self._first = time, distance
+            elif self._first is not None and self._first[1] < distance < _LOST:
+                self.grown_per_s = math.log(distance / self._first[1]) / (time - self._first[0])
+            if self.doubted_s is None and self.estimate > DOUBT * self.tolerance:
+                self.doubted_s = time
+                said = self.warning()
+        return said
+
+    def document(self) -> dict[str, float | None]:
+        """As JSON."""
+        return {"estimate": self.estimate, "growth_per_s": self.grown_per_s, "doubted_s": self.doubted_s}
+
+    def warning(self) -> str:
+        """What to say of a run that is in doubt."""
+        return (
+            f"accuracy: off by about {self.estimate:.1e} (scaled), above {DOUBT:g} times engine.tolerance "
+            f"({self.tolerance:g}), since {self.doubted_s or 0.0:.4f} s; small differences grow by "
+            f"{self.grown_per_s:.3g} 1/s: trust its statistics, or ask for a finer engine.tolerance"
+        )
+
+
+def energy_balance(rows: np.ndarray, first: np.ndarray) -> dict[str, np.ndarray]:
+    """The energy ledger of a run.
+
+    Args:
+        rows: Observed rows, shape (n, N_ROW).
+        first: Row at the start of the run, shape (N_ROW,).
+
+    Returns:
+        stored (change since the start), supplied, dissipated, and residual = stored - supplied + dissipated [J], each
+        shape (n,).
+    """
+
+    def total(names: tuple[str, ...], table: np.ndarray) -> np.ndarray:
+        return np.sum([table[..., COLUMN[name]] for name in names], axis=0)
+
+    stored = total(STORED, rows) - total(STORED, first)
+    supplied, dissipated = total(SUPPLIED, rows), total(DISSIPATED, rows)
+    return {
+        "stored": stored,
+        "supplied": supplied,
+        "dissipated": dissipated,
+        "residual": stored - supplied + dissipated,
+    }
