@@ -13,7 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from rig.kernels.constants import Constants, Inputs
 
 
 class Method(NamedTuple):
@@ -46,7 +48,7 @@ ENGINES = {
     "split": Method(
         "Taylor series through impacts, exact linear flow and kicks elsewhere",
         25,
-        1e-4,
+        3e-4,
         ("none", "exact"),
         ("impact", "compliant"),
         100,
@@ -75,8 +77,16 @@ class Engine(NamedTuple):
 def load_engine(name: str) -> Engine:
     """The engine of one of those names (imported only now): a module of its own, or a one-step method for the march."""
     module = import_module(f"rig.engines.{name.replace('-', '_')}")
+    from rig.kernels.records import packed
+
+    start, advance = getattr(module, "start", None), getattr(module, "advance", None)
     if hasattr(module, "METHOD"):
         from rig.engines import march
 
-        return Engine(march.start, partial(march.advance, module.METHOD), module.ORDER)
-    return Engine(module.start, module.advance, module.ORDER)
+        start = march.start
+        advance = partial(march.advance, module.METHOD)
+
+    def on_records(kernel: Callable[..., None], constants: Constants, inputs: Inputs, *others: Any) -> None:
+        kernel(packed(constants), packed(inputs), *others)
+
+    return Engine(partial(on_records, start), partial(on_records, advance), module.ORDER)

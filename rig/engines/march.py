@@ -43,7 +43,7 @@ from rig.engines.memory import (
     STEPS,
     TOLERANCE,
 )
-from rig.engines.method import Step, method_error, method_prepare, method_step, rates
+from rig.engines.method import Step, fill, method_error, method_prepare, method_step, rates
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT, TOUCHING, held_speed
 from rig.kernels.geometry import gap
@@ -119,10 +119,10 @@ def _to_event(event, events, method, constants, inputs, step, before, memory, y,
         memory[CEILING] += 1.0
     if events >= _MOST_EVENTS:
         # They pile up (a chatter, or bounces without end): from here on the phase changes at ends of parts.
-        y[:] = end
+        fill(y, end)
     elif first * after < 0.0:
         size *= locate(event, first, after, method, constants, inputs, step, memory, y, k, z, end, out)
-        y[:] = end
+        fill(y, end)
     else:
         # It was there at the start already, by rounding: change the phase, stay.
         size = 0.0
@@ -161,14 +161,14 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
         if method.order > 0.0:
             error = method_error(method, size * inputs.tick_s, k, scratch)
             if np.isnan(error):
-                y[:] = end
+                fill(y, end)
                 return
             if not _accepted(method, memory, ticks, size, error):
                 continue
         stale = True
         event = event_at_end(phase, before, contact, out)
         if event == NONE:
-            y[:] = end
+            fill(y, end)
             k[0] = k[method.rows - 1]
         else:
             events += 1
@@ -188,6 +188,7 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
 @njit(cache=True, error_model="numpy")
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
+    constants, inputs = constants[0], inputs[0]
     memory[:] = 0.0
     memory[ONSET] = held_speed(0.0, constants.contact)
     memory[SIZE] = step_ticks
@@ -215,6 +216,7 @@ def advance(method, constants, inputs, y, memory, tick, step_ticks, steps, strid
         stride: Steps a row.
         rows: Out, shape (ceil(steps / stride), N_ROW).
     """
+    constants, inputs = constants[0], inputs[0]
     k = np.zeros((method.rows, S.N_VECTOR))
     scratch = np.empty((2, S.N_STATE))
     z = np.empty(S.N_VECTOR)
@@ -226,7 +228,7 @@ def advance(method, constants, inputs, y, memory, tick, step_ticks, steps, strid
         now = tick + n * step_ticks
         if n % stride == 0:
             rates(constants, inputs, now, 0.0, memory[ONSET], int(memory[PHASE]), True, y, k[0], out)
-            rows[row, : S.N_VECTOR] = y
-            rows[row, S.N_VECTOR :] = out
+            fill(rows[row, : S.N_VECTOR], y)
+            fill(rows[row, S.N_VECTOR :], out)
             row += 1
         _grid_step(method, constants, inputs, now, ticks, memory, y, k, z, end, scratch, out)

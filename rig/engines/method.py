@@ -102,6 +102,13 @@ def rates(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy,
 
 
 @njit(cache=True, error_model="numpy")
+def fill(target, source):
+    """Copy as many numbers as `target` has. numpy's own assignment compiles texts of errors as well, for seconds."""
+    for i in range(len(target)):
+        target[i] = source[i]
+
+
+@njit(cache=True, error_model="numpy")
 def nothing_to_prepare(method, constants, inputs, step, y, k, z, out):
     """`method_prepare` of a method that has nothing to prepare."""
     return 0

@@ -95,14 +95,8 @@ def whole() -> Whole:
 
 
 def test_there_is_something_to_compare(whole: Whole) -> None:
-    # A hard blow on a rolling shaft: its error estimate comes above ten times the tolerance, which is an event too.
-    assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "warning", "release"]
-    assert [event["tick"] for event in whole.events if event["event"] != "warning"] == [
-        20_000,
-        150_000,
-        205_000,
-        400_000,
-    ]
+    assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "release"]
+    assert [event["tick"] for event in whole.events] == [20_000, 150_000, 205_000, 400_000]
     assert whole.health["contacts"] > 10
     assert len(whole.edges) == 3
     assert len(whole.rows) == END // 25
@@ -136,6 +130,13 @@ def test_no_mix_of_cuts_changes_a_bit(whole: Whole, cuts: list[int]) -> None:
 )
 def test_cuts_change_no_bit_of_other_scenes(overrides: dict[str, Any]) -> None:
     assert_same(run(END, overrides=overrides), run(15_000, 5_000, overrides=overrides))
+
+
+def test_cuts_change_no_bit_of_a_doubt() -> None:
+    # Without friction the shaft bounces on, and errors grow until the estimate is in doubt, which is an event.
+    whole = run(END, overrides={"model.friction": "none"})
+    assert [event["event"] for event in whole.events] == ["hammer", "speed", "hammer", "warning", "release"]
+    assert_same(whole, run(15_000, 5_000, overrides={"model.friction": "none"}))
 
 
 def test_commands_of_one_tick_take_effect_in_order() -> None:

@@ -29,7 +29,7 @@ def test_error_is_as_large_as_against_another_method() -> None:
     assert found.contacts[0] == found.contacts[1] > 10
     assert found.parted_s is None
     assert not found.wrong_branch
-    assert "split at tolerance 1e-05" in found.line()
+    assert "split at tolerance 3e-05" in found.line()
 
 
 def test_wrong_branch_is_suspected() -> None:

@@ -35,7 +35,7 @@ from replays.studies.stability.flight import house_oscillator
 from replays.studies.stability.impacts import first_impact
 from replays.studies.stability.motion import move, quiet_inputs, state
 from rig import load_scene, simulate
-from rig.engines import taylor
+from rig.engines import load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, MEMORY, ONSET, PHASE, STEPS
 from rig.engines.tape.columns import EVENTS, ROOT, WIDTH
 from rig.engines.tape.taylor import SERIES as CODE
@@ -74,8 +74,9 @@ def test_series_of_a_cosine_ends_with_its_own_remainder() -> None:
     memory, rows = np.zeros(MEMORY), np.empty((1, S.N_ROW))
     inputs = quiet_inputs(tick_s=1e-6)
     # Far more than is wanted, for a long series.
-    taylor.start(constants, inputs, y, memory, 1.0, 1e-1)
-    taylor.advance(constants, inputs, y, memory, 0, 1, 1, 1, rows)
+    engine = load_engine("taylor")
+    engine.start(constants, inputs, y, memory, 1.0, 1e-1)
+    engine.advance(constants, inputs, y, memory, 0, 1, 1, 1, rows)
     series = series_in(memory)
     times = np.array([2.0, 2.5, 3.0, 3.5]) / angular
     errors = []
@@ -104,10 +105,11 @@ def test_first_coefficients_are_the_equations(phase: int, mode: str) -> None:
         vx_oh=-1e-3, vy_oh=1e-3,
     )  # fmt: skip
     memory = np.zeros(MEMORY)
-    taylor.start(constants, inputs, y, memory, 1.0, 1e-9)
+    engine = load_engine("taylor")
+    engine.start(constants, inputs, y, memory, 1.0, 1e-9)
     memory[PHASE], memory[ONSET] = phase, 0.1
     before = y.copy()
-    taylor.advance(constants, inputs, y, memory, simulation.tick, 1, 0, 1, np.empty((0, S.N_ROW)))
+    engine.advance(constants, inputs, y, memory, simulation.tick, 1, 0, 1, np.empty((0, S.N_ROW)))
     series = series_in(memory)
 
     def rates(at: np.ndarray, fraction: float) -> np.ndarray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import functools
 import time
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -23,24 +23,17 @@ from rig.kernels.constants import Constants, Inputs
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
 from rig.kernels.dynamics import evaluate
 from rig.kernels.geometry import gap
+from rig.kernels.records import layout, plain
 
 N_STATE, N_VECTOR, N_OBSERVED = S.N_STATE, S.N_VECTOR, S.N_OBSERVED
 N_SWITCH = 2
 """Switching functions: the gap, and the friction's (v_t while sliding, what is left of mu F_n while rolling)."""
 
 
-def _layout(kind: type) -> np.dtype:
-    fields = []
-    for name, hint in get_type_hints(kind).items():
-        scalar = {float: np.float64, int: np.int64, bool: np.bool_}.get(hint)
-        fields.append((name, scalar or _layout(hint)))
-    return np.dtype(fields, align=True)
-
-
 PARAMETERS = np.dtype(
     [
-        ("constants", _layout(Constants)),
-        ("inputs", _layout(Inputs)),
+        ("constants", layout(Constants)),
+        ("inputs", layout(Inputs)),
         ("start_tick", np.int64),
         ("phase", np.int64),
         ("onset_speed", np.float64),
@@ -53,16 +46,12 @@ PARAMETERS = np.dtype(
 """The struct: the problem's numbers and, at the end, what changes during a solve."""
 
 
-def _plain(value: Any) -> Any:
-    return tuple(_plain(part) for part in value) if isinstance(value, tuple) else value
-
-
 def pack(problem: Problem) -> np.ndarray:
     """The struct of a problem, shape (1,), of its own for each solve: the phase changes in place."""
     parameters = np.zeros(1, PARAMETERS)
     parameters[0] = (
-        _plain(problem.constants),
-        _plain(problem.inputs),
+        plain(problem.constants),
+        plain(problem.inputs),
         problem.start_tick,
         problem.phase,
         problem.onset_speed,

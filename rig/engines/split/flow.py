@@ -16,7 +16,7 @@ from rig.kernels.magnet import magnet_force
 
 GRID = 5
 """Level of the grid's own step."""
-LEVELS = GRID + 8
+LEVELS = GRID + 4
 """Number of levels."""
 HOUSE_FLOW = 32
 """Numbers of a flow of the houses: its horizontal and vertical block on (inner, rate, outer, rate), (4, 4) each."""

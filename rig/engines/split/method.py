@@ -1,15 +1,13 @@
 """The default engine: each phase of the motion by the cheapest method that keeps the tolerance asked for.
 
-- Impacts, slip, the turn of friction and all that is not settled: the Taylor series of `rig.engines.taylor`, with their
-  events; some eleven series an impact. They could take everything, and do where nothing below holds.
-- Flight, as long as no bound lets the gap close: exact linear flow, and a kick a step for what is not linear.
-- Contact that rolls, or slides, without an event for a while and has no swing left: flow and kicks as well.
+- Flight, impacts, slip, the turn of friction and all that is not settled: the Taylor series of `rig.engines.taylor`,
+  with their events; some eleven series an impact. They could take everything, and do where nothing below holds.
+- Contact without an event for a while: exact linear flow and kicks (`rig.engines.split.steps`), three times as fast.
+  Their error is measured: a trial of both, from the same state, before they begin, and again every now and then.
 - A rigid contact: impacts one by one where the gap closes (`rig.engines.split.rigid`); where it lasts, kicks.
 
-Which one runs is decided at a row, by rules on the state (`rig.engines.split.levels`), and given up in the middle of
-one at the start of the step that was not to be a kick's.
-
-How a step of flow and kick is made: `rig.engines.split.steps`.
+Which one runs is decided at a row, and given up in the middle of one at the start of the step that was not to be a
+kick's.
 """
 
 from __future__ import annotations
@@ -19,7 +17,8 @@ import math
 import numpy as np
 from numba import njit
 
-from rig.engines.memory import PHASE
+from rig.engines.memory import PHASE, STEPS
+from rig.engines.method import PER_SCALE
 from rig.engines.split.flow import GRID, house_flows, magnet_springs, shaft_flows
 from rig.engines.split.inner_motion import (
     FAST,
@@ -29,14 +28,12 @@ from rig.engines.split.inner_motion import (
     plant_of,
 )
 from rig.engines.split.kick import Kick
-from rig.engines.split.levels import ANY, flight_level
+from rig.engines.split.levels import LONGEST, SHORTEST
 from rig.engines.split.place import (
     AGAIN,
-    BOUNCE,
     FLOWS,
     FLOWS_END,
     GRID_TICKS,
-    LAST_STEP,
     LIMIT,
     MODE,
     REST,
@@ -57,14 +54,20 @@ from rig.kernels.geometry import gap
 
 ORDER = 2
 
-_SERIES, _KICKS = 0.0, 1.0
-"""Modes: series, which take everything; flow and kicks, where they may."""
-_SHARE = 1e-3
+_SERIES, _KICKS, _TO_SERIES, _TO_KICKS = 0.0, 1.0, 2.0, 3.0
+"""Modes: series, which take everything; flow and kicks, where they may; and what is to take over from here on: another
+division into flow and kick, and another length or grid, has other conjugate coordinates."""
+_SHARE = 1e-4
 """Part of the tolerance that one step of the series may err by: impacts make small errors a thousand times larger."""
-_FAR_S = 1e-2
-"""Where a series reaches this far [s], because no house rings, flow and kicks are no faster."""
-_SETTLED_S = 1e-3
-"""A contact is one for kicks after this time without an event [s]; and if they had to leave it, after this time."""
+_SETTLED_S = 2e-2
+"""A contact is one for kicks after this time without an event [s]: what they err by grows in impacts that follow."""
+_TRIAL, _LONGEST_TRIAL_S = 0.1, 4e-3
+"""A trial lasts for this part of the time that the contact has lasted, at most this [s]; the next is due when it has
+lasted twice as long."""
+_ASTRAY = 0.2
+"""Part of the tolerance that kicks may err by in a trial."""
+_WORTH = 20.0
+"""Kicks for each series that they save, at most: as many take two thirds of its time."""
 
 
 def start(constants, inputs, y, memory, step_ticks, tolerance):
@@ -72,14 +75,14 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
     series.start(constants, inputs, y, memory, step_ticks, _SHARE * tolerance if tolerance > 0.0 else 1e-9)
     memory[LIMIT] = tolerance
     # The shaft's flow is linear about its rest on the magnets.
-    memory[REST], memory[SPRING_X], memory[SPRING_Y] = magnet_springs(constants)
+    memory[REST], memory[SPRING_X], memory[SPRING_Y] = magnet_springs(constants[0])
     _prepare_flows(constants, inputs, memory, step_ticks)
 
 
 def _prepare_flows(constants, inputs, memory, step_ticks):
     """Flows of the houses for steps of another grid."""
     memory[GRID_TICKS] = step_ticks
-    memory[FLOWS:FLOWS_END] = house_flows(constants, step_ticks * inputs.tick_s).ravel()
+    memory[FLOWS:FLOWS_END] = house_flows(constants[0], step_ticks * inputs[0].tick_s).ravel()
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -93,27 +96,7 @@ def _enter_kicks(constants, memory, y, phase, wanted):
     ex, ey = eccentricity(constants, axis, houses)
     rate = motion_of(constants, axis.px, axis.py, houses, ex, ey).rate
     keep_state(memory, Touch(phase, np.nan, rate, wanted, 0.0), Coordinates(-1, 0.0, none), direction)
-    memory[BOUNCE], memory[LAST_STEP] = rate, 0.0
     memory[MODE] = _KICKS
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _try_kicks(constants, inputs, call, memory, y, now, end):
-    """Go over to kicks where the next steps, up to the tick `end`, are likely to be theirs."""
-    phase = int(memory[PHASE])
-    if memory[SPAN] < 0.0 or now < memory[AGAIN] or struck(inputs, now, end):
-        return
-    if phase == FLIGHT:
-        if memory[SPAN] > _FAR_S and memory[LIMIT] > 0.0:
-            return
-        axis, w, _, houses = from_coordinates(constants, y)
-        level = flight_level(constants, inputs, call, axis, w, houses, 0.0)
-        if level >= GRID + 1 or (level == GRID and memory[LIMIT] == 0.0):
-            _enter_kicks(constants, memory, y, phase, GRID)
-        return
-    lasts = (now - memory[ROLLS]) * inputs.tick_s > _SETTLED_S and memory[SLACK] == 0.0
-    if lasts and constants.levels.compliant and constants.contact.gap_counts_outer == 0.0:
-        _enter_kicks(constants, memory, y, phase, ANY)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -125,16 +108,15 @@ def _series_to(constants, inputs, plant, memory, room, y, tick):
     """
     rigid = not constants.levels.compliant
     while not series.holds(memory, tick, 0.0):
-        if memory[EVENT] != NOTHING:
+        event = memory[EVENT] if memory[SPAN] >= 0.0 else NOTHING
+        if event != NOTHING:
             memory[ROLLS] = memory[END_TICK]
-        if rigid and memory[EVENT] == FIRST:
+        if rigid and event == FIRST:
             series.read_off(memory, room, y, memory[END_TICK], memory[END_FRACTION])
             if bounce(constants, inputs, plant, memory, room, y):
                 return True
             end = int(memory[END_TICK])
             series.begin_series(constants, inputs, memory, room, y, end, memory[END_FRACTION], True)
-            if not np.isfinite(y[0]):
-                return False
         elif not series.continue_series(constants, inputs, memory, room, y):
             return False
     series.read_off(memory, room, y, tick, 0.0)
@@ -161,46 +143,96 @@ def _leave_kicks(constants, inputs, plant, memory, y):
     return False
 
 
+def _trial(constants, inputs, y, memory, mode, level, tick, step_ticks, steps):
+    """State and memory after some steps in a mode."""
+    y, memory = y.copy(), memory.copy()
+    memory[AGAIN], memory[MODE], memory[WANTED] = np.inf, mode, level
+    _advance(constants, inputs, y, memory, tick, step_ticks, 0, steps, steps, np.empty((1, S.N_ROW)))
+    return y, memory
+
+
+def _choose(constants, inputs, y, memory, tick, step_ticks):
+    """Go over to kicks, to kicks of another length, or to the series, whichever a trial of all says."""
+    tick_s = float(inputs["tick_s"][0])
+    lasts = (tick - memory[ROLLS]) * tick_s
+    steps = math.ceil(min(_TRIAL * lasts, _LONGEST_TRIAL_S) / (step_ticks * tick_s))
+    memory[AGAIN] = tick + lasts / tick_s
+    kicked, wanted = memory[MODE] == _KICKS, memory[WANTED]
+    series_mode = _TO_SERIES if kicked else _SERIES
+    truth, after = _trial(constants, inputs, y, memory, series_mode, wanted, tick, step_ticks, steps)
+    if after[ROLLS] == memory[ROLLS]:
+        for level in range(LONGEST, SHORTEST - 1, -1):
+            if steps * 2.0 ** (GRID - level) > _WORTH * (after[STEPS] - memory[STEPS]):
+                break
+            mode = _KICKS if kicked and level == wanted else _TO_KICKS
+            end, left = _trial(constants, inputs, y, memory, mode, level, tick, step_ticks, steps)
+            away = (end - truth)[: S.N_STATE] * PER_SCALE
+            if left[MODE] == _KICKS and math.sqrt(float(away @ away) / S.N_STATE) < _ASTRAY * memory[LIMIT]:
+                memory[MODE], memory[WANTED] = mode, level
+                return
+    memory[MODE] = series_mode
+
+
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """See `rig.engines`."""
-    regridded = step_ticks != memory[GRID_TICKS]
-    if regridded:
+    if step_ticks != memory[GRID_TICKS]:
         _prepare_flows(constants, inputs, memory, step_ticks)
-    _advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows, regridded)
+        if memory[MODE] == _KICKS:
+            memory[MODE] = _TO_KICKS
+    done = _advance(constants, inputs, y, memory, tick, step_ticks, 0, steps, stride, rows)
+    while done < steps:
+        _choose(constants, inputs, y, memory, tick + done * step_ticks, step_ticks)
+        done = _advance(constants, inputs, y, memory, tick, step_ticks, done, steps, stride, rows)
+
+
+@njit(cache=True, error_model="numpy")
+def _due(constants, inputs, memory, now, end):
+    """Whether it is time for a trial of kicks and series at a row, before the next one at the tick `end`."""
+    if now < memory[AGAIN] or (now - memory[ROLLS]) * inputs.tick_s < _SETTLED_S or memory[SPAN] < 0.0:
+        return False
+    # On a fixed ring what the commutators leave of rolling friction drifts, and series are long.
+    if not constants.levels.inner_house or constants.contact.gap_counts_outer != 0.0 or not constants.levels.compliant:
+        return False
+    return memory[PHASE] != FLIGHT and memory[SLACK] == 0.0 and not struck(inputs, now, end)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows, regridded):
-    """The same, on flows for this grid; `regridded` says that they are new."""
+def _advance(constants, inputs, y, memory, tick, step_ticks, first, steps, stride, rows):
+    """The same from the step `first` on, up to the end or to a row at which a trial is due.
+
+    Returns:
+        Steps done by then.
+    """
+    constants, inputs = constants[0], inputs[0]
     plant = plant_of(constants, inputs, memory[REST], memory[SPRING_X], memory[SPRING_Y])
     shaft_table = shaft_flows(plant, inputs.magnet_engaged, step_ticks * inputs.tick_s)
     half_s = 0.5 * 2.0**-GRID * (step_ticks * inputs.tick_s)
-    call = Call(plant, step_ticks / 2.0**GRID, half_s, 0.5 / half_s, memory[LIMIT])
+    call = Call(plant, step_ticks / 2.0**GRID, half_s, 0.5 / half_s)
     room = series.room_in(memory)
     ledger = np.zeros(S.N_VECTOR)
     changed = not series.same_inputs(inputs, memory)
-    if memory[SPAN] < 0.0 or (changed and memory[MODE] == _SERIES):
-        series.begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
-    elif memory[MODE] == _KICKS and (changed or regridded):
-        # Another division into flow and kick, or another grid, has other conjugate coordinates.
+    if memory[MODE] == _TO_SERIES:
+        _leave_kicks(constants, inputs, plant, memory, y)
+        memory[SPAN] = -1.0
+    if memory[MODE] == _TO_KICKS or (memory[MODE] == _KICKS and changed):
         _enter_kicks(constants, memory, y, int(memory[PHASE]), int(memory[WANTED]))
-    row = first = 0
+    elif memory[MODE] == _SERIES and (changed or memory[SPAN] < 0.0):
+        series.begin_series(constants, inputs, memory, room, y, tick + first * step_ticks, 0.0, False)
     while first < steps:
         now, ahead = tick + first * step_ticks, min(stride, steps - first)
         end = now + ahead * step_ticks
-        if memory[MODE] == _SERIES:
-            _try_kicks(constants, inputs, call, memory, y, now, end)
+        if _due(constants, inputs, memory, now, end):
+            return first
         # Rigid impacts have no force over time.
         seen = int(memory[PHASE]) if constants.levels.compliant else FLIGHT
-        series.write_row(constants, inputs, memory, room, y, now, seen, rows, row)
-        row += 1
+        series.write_row(constants, inputs, memory, room, y, now, seen, rows, first // stride)
         n, last = 0, ahead * 2**GRID
         while n < last:
             if memory[MODE] == _KICKS:
                 n = kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last)
                 if n < last:
                     at = now + n * call.part_ticks
-                    memory[AGAIN] = memory[ROLLS] = at + _SETTLED_S / inputs.tick_s
+                    memory[ROLLS] = at
                     ends = _leave_kicks(constants, inputs, plant, memory, y)
                     whole = math.floor(at)
                     series.begin_series(constants, inputs, memory, room, y, whole, at - whole, ends)
@@ -211,3 +243,4 @@ def _advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows
             else:
                 n = last
         first += ahead
+    return first

@@ -13,14 +13,14 @@ MODE = next(_next)
 LIMIT = next(_next)
 """The tolerance of the whole."""
 ROLLS, AGAIN = (next(_next) for _ in range(2))
-"""Tick since which the contact's phase is what it is; tick from which kicks may be tried again."""
+"""Tick since which the contact's phase is what it is; tick from which kicks are held against a series again."""
 UX, UY, PX, PY, SPIN, ANGLE = (next(_next) for _ in range(6))
 X0, X1, X2, X3, Y0, Y1, Y2, Y3 = (next(_next) for _ in range(8))
 """Houses: inner displacement and rate, outer displacement and rate, horizontal and vertical."""
 SLID, RATE = (next(_next) for _ in range(2))
 """Sliding speed after the last kick, nan before the first of a contact; rate of the penetration then."""
-WANTED, BOUNCE, LAST_STEP = (next(_next) for _ in range(3))
-"""Level asked for in contact; mean rate of the gap in the last kick, and that kick's step [s]."""
+WANTED = next(_next)
+"""Level asked for."""
 REST, SPRING_X, SPRING_Y = (next(_next) for _ in range(3))
 """Rest of the shaft on its magnets and the springs of its flow about it."""
 KICKED, CONJUGATE = (next(_next) for _ in range(2))

@@ -15,7 +15,6 @@ class Call(NamedTuple):
     part_ticks: float  # shortest step [ticks]
     half_s: float  # half of it [s]
     per_s: float  # one over it [1/s]
-    tolerance: float  # error that is asked for; 0: steps of one length
 
 
 class Step(NamedTuple):

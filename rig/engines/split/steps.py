@@ -1,4 +1,4 @@
-"""Steps of exact flow and one kick, in free flight and in contact that has settled.
+"""Steps of exact flow and one kick, in contact that has settled.
 
 A step of flow and kick is half a flow, a kick, half a flow. The flow solves shaft on linear magnets, drive and both
 houses exactly: the houses ring at up to 1.6 kHz and cost no accuracy. The kick holds the contact, the magnets'
@@ -44,7 +44,7 @@ from rig.engines.split.inner_motion import (
     motion_of,
 )
 from rig.engines.split.kick import Kick, along, continued, hammer_mean, processed, smooth_forces, turned, turning
-from rig.engines.split.levels import ANY, NONE, flight_level, span_of
+from rig.engines.split.levels import NONE, span_of
 from rig.engines.split.place import (
     ANGLE,
     CONJUGATE,
@@ -69,7 +69,7 @@ from rig.engines.split.place import (
 from rig.engines.split.state import Coordinates, Direction, Smooth, Step, Touch, Work
 from rig.engines.split.touch import house_kick, kick_contact, no_impulse
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT, damping_per_speed
+from rig.kernels.contact import damping_per_speed
 from rig.kernels.forces import drive_speed
 
 _OPEN = 1e-9
@@ -125,8 +125,8 @@ def struck(inputs, begin, end):
 
 
 @inlined
-def _step_of(constants, inputs, call, touch, kicked, axis, w, houses, owed, now, n, last):
-    """The next step: as long as the state allows; it starts at a multiple of its length, and ends at the row.
+def _step_of(constants, inputs, call, touch, kicked, owed, now, n, last):
+    """The next step: as long as is wanted; it starts at a multiple of its length, and ends at the row.
 
     Args:
         constants: Of the model.
@@ -134,9 +134,6 @@ def _step_of(constants, inputs, call, touch, kicked, axis, w, houses, owed, now,
         call: What stays through the call.
         touch: The contact.
         kicked: Level of the last kick, -1 before the first.
-        axis: Of the shaft.
-        w: Spin [rad/s].
-        houses: Of the stator.
         owed: Level of the half flow that the last kick still owes, -1 for none.
         now: Tick of the row.
         n: Start, in shortest steps from the row on.
@@ -147,12 +144,9 @@ def _step_of(constants, inputs, call, touch, kicked, axis, w, houses, owed, now,
     """
     begin = now + n * call.part_ticks
     level = touch.wanted
-    if touch.phase == FLIGHT:
-        owed_s = span_of(call, owed) if owed >= 0 else 0.0
-        level = flight_level(constants, inputs, call, axis, w, houses, owed_s)
     if level != NONE:
-        if kicked < 0 or level == ANY:
-            level = 0  # what the conjugate coordinates need, and the contact's stiffness, is known after a kick
+        if kicked < 0:
+            level = 0  # what the conjugate coordinates need is known after a kick
         while n & ((1 << level) - 1) != 0 or n + (1 << level) > last:
             level -= 1
         if constants.levels.compliant and struck(inputs, begin, begin + float(1 << level) * call.part_ticks):
@@ -203,14 +197,12 @@ def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
 
 @inlined
 def _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch):
-    """The contact's impulse, or none in flight; and the contact after it."""
+    """The contact's impulse, and the contact after it."""
     h, r0 = step.h, constants.contact.clearance
     # A rigid contact may begin where rounding, or a chord of the arc, leaves a gap.
     least = r0 if constants.levels.compliant else r0 - _OPEN
     qx = axis.px + 0.5 * h * (smooth.ax + smooth.turning_x)
     qy = axis.py + 0.5 * h * (smooth.ay + smooth.turning_y)
-    if touch.phase == FLIGHT:
-        return no_impulse(), touch
     ex, ey = eccentricity(constants, axis, houses)
     if ex * ex + ey * ey <= least * least:
         return no_impulse(), Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
@@ -352,7 +344,7 @@ def kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last)
     taken = 0.0
     owed = -1
     while n < last:
-        step = _step_of(constants, inputs, call, touch, coordinates.kicked, axis, w, houses, owed, now, n, last)
+        step = _step_of(constants, inputs, call, touch, coordinates.kicked, owed, now, n, last)
         if step.level == NONE:
             break
         before = (axis, w, theta, houses, coordinates, direction)

@@ -14,8 +14,7 @@ from rig.engines.split.impulse import (
     mobility_of,
 )
 from rig.engines.split.inner_motion import Houses, inlined
-from rig.engines.split.levels import NONE, contact_level
-from rig.engines.split.place import BOUNCE, LAST_STEP
+from rig.engines.split.levels import NONE, bears
 from rig.engines.split.state import Touch
 from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, FORWARD, ROLLING
@@ -88,20 +87,7 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     rate_after = rate - w.nn * jn - w.nt * jt
     rate_mean = rate - 0.5 * (w.nn * jn + w.nt * jt)
     wanted = touch.wanted
-    if compliant:
-        change = (rate_mean - memory[BOUNCE]) * step.per_h
-        wanted = contact_level(
-            call,
-            constants.shaft.arm_ring,
-            wanted,
-            h,
-            memory[LAST_STEP],
-            rate_mean,
-            change,
-            law.slope * w.nn,
-            push.taken,
-        )
-    if compliant and (jn <= 0.0 or phase != touch.phase or wanted == NONE):
+    if compliant and (jn <= 0.0 or phase != touch.phase or not bears(call, wanted, h, law.slope * w.nn, push.taken)):
         return no_impulse(), Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
     jx, jy = -jn * nx + jt * ny, -jn * ny - jt * nx
     force_x, force_y = jx, jy
@@ -128,7 +114,6 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     # The force of a rigid contact is no function of time.
     cx = cy = dcx = dcy = 0.0
     if compliant:
-        memory[BOUNCE], memory[LAST_STEP] = rate_mean, h
         memory[PEAK_FORCE] = max(memory[PEAK_FORCE], law.elastic + law.damping * rate_mean)
         cx, cy = force_x * step.per_h, force_y * step.per_h
         growth, turn = law.relative * rate_mean, lateral * per_distance

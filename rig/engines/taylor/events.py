@@ -8,7 +8,7 @@ from numba import njit
 
 from rig.engines.events import latch_onset, sliding_phase
 from rig.engines.memory import CLAMPS, EVALUATIONS, ONSET, PHASE
-from rig.engines.method import rates
+from rig.engines.method import fill, rates
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT
 from rig.engines.taylor.place import EAST, EVENT, FRACTION, KNOWN, NORTH, ORDER, SLACK, SPAN, TICK
 from rig.engines.taylor.polynomial import first_zero
@@ -119,7 +119,7 @@ def enter_events(constants, memory, Y):
 @njit(cache=True, error_model="numpy")
 def _settle(constants, inputs, memory, x, y, dy, out):
     """Phase of a contact whose sliding speed is 0: rolling if that is possible, else the way it is pushed."""
-    y[:] = x[: S.N_VECTOR]
+    fill(y, x)
     # Written so that it is the very call of `advance`: each kind of arguments would be compiled anew.
     memory[PHASE] = ROLLING
     tick, phase = int(memory[TICK]), int(memory[PHASE])

@@ -40,7 +40,7 @@ from rig.engines.memory import (
     STEPS,
     TOLERANCE,
 )
-from rig.engines.method import PER_SCALE, rates
+from rig.engines.method import PER_SCALE, fill, rates
 from rig.engines.tape.columns import EVENTS, FORCE, ROOT, TIME, WIDTH
 from rig.engines.taylor.events import FIRST, NOTHING, change_phase, enter_events, preload_end, ring_at
 from rig.engines.taylor.place import (
@@ -111,6 +111,7 @@ def room_in(memory):
 @njit(cache=True, error_model="numpy")
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
+    constants, inputs = constants[0], inputs[0]
     memory[:] = 0.0
     memory[ONSET] = held_speed(0.0, constants.contact)
     memory[TOLERANCE] = tolerance
@@ -228,7 +229,7 @@ def _next_series(constants, inputs, memory, room, y):
         series_at(Y, memory[LENGTH], x)
         memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
     change_phase(constants, inputs, memory, x, y, room.dy, room.out)
-    Y[0, : ROOT + 1] = x
+    fill(Y[0, : ROOT + 1], x)
     slowed = _make_series(constants, inputs, memory, room)
     memory[STEPS] += 1.0
     memory[EVALUATIONS] += ORDER
@@ -316,7 +317,7 @@ def read_off(memory, room, y, tick, fraction):
     elif time > 0.0 and memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
         s = refine(Y, TIME, 0, time, 0.0, memory[LENGTH])
     series_at(Y, s, x)
-    y[:] = x[: S.N_VECTOR]
+    fill(y, x)
 
 
 @njit(cache=True, error_model="numpy")
@@ -355,20 +356,19 @@ def same_inputs(inputs, memory):
 
 @njit(cache=True, error_model="numpy")
 def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
-    """A new beginning from the state y, at a whole tick and the ticks beyond it.
+    """A new beginning from the state y, at a whole tick and the ticks beyond it, for the next series to continue from.
 
     `leaves` says that a contact ends there: its gap counts as closed, whatever rounding makes of it.
     """
     if memory[SPAN] >= 0.0 and memory[PHASE] != FLIGHT:
         _note_peak(constants, inputs, memory, room.Y, room.x)
-    room.x[: S.N_VECTOR] = y
+    fill(room.x[: S.N_VECTOR], y)
     memory[SPAN] = -1.0
     memory[EVENT] = NOTHING
     if leaves:
         memory[EVENT], memory[PHASE] = FIRST, TOUCHING
     memory[TICK], memory[FRACTION] = float(tick), fraction
     memory[END_TICK], memory[END_FRACTION] = float(tick), fraction
-    continue_series(constants, inputs, memory, room, y)
 
 
 @njit(cache=True, error_model="numpy")
@@ -397,6 +397,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         stride: Steps a row.
         rows: Out, shape (ceil(steps / stride), N_ROW).
     """
+    constants, inputs = constants[0], inputs[0]
     room = room_in(memory)
     if not same_inputs(inputs, memory) or memory[SPAN] < 0.0:
         begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
