@@ -5,7 +5,8 @@ An engine is a module with `METHOD`, a one-step method that `rig.engines.march` 
 `advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)`: it moves state `y` and `memory` (shape
 (MEMORY,), counters first, see `rig.engines.memory`) on in place by `steps` steps of `step_ticks` and writes one row of
 `rig.kernels.signals.ROW` every `stride` steps, the first at the start. It knows no clock, no I/O and no threads, and
-its result does not depend on how a run is cut into calls.
+its result does not depend on how a run is cut into calls. Constants and inputs come to it as records
+(`rig.kernels.records`); who calls an `Engine` hands it the tuples.
 """
 
 from __future__ import annotations
@@ -76,15 +77,14 @@ class Engine(NamedTuple):
 
 def load_engine(name: str) -> Engine:
     """The engine of one of those names (imported only now): a module of its own, or a one-step method for the march."""
-    module = import_module(f"rig.engines.{name.replace('-', '_')}")
     from rig.kernels.records import packed
 
-    start, advance = getattr(module, "start", None), getattr(module, "advance", None)
+    module: Any = import_module(f"rig.engines.{name.replace('-', '_')}")
     if hasattr(module, "METHOD"):
-        from rig.engines import march
-
-        start = march.start
-        advance = partial(march.advance, module.METHOD)
+        march: Any = import_module("rig.engines.march")
+        start, advance = march.start, partial(march.advance, module.METHOD)
+    else:
+        start, advance = module.start, module.advance
 
     def on_records(kernel: Callable[..., None], constants: Constants, inputs: Inputs, *others: Any) -> None:
         kernel(packed(constants), packed(inputs), *others)

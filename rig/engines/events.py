@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from numba import njit
-
 from rig.engines.memory import BEFORE, BEFORE_SPAN, CONTACTS, EVALUATIONS, FLOORED, LAST, ONSET, PEAK_FORCE, PHASE
 from rig.engines.method import Step, method_step, rates
 from rig.engines.peak import peak
 from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, ROLLING, TOUCHING, held_speed
+from rig.kernels.stage import kernel
 
 NONE, ONSET_EVENT, LIFT_OFF, TURN, BREAK = range(5)
 """Events: none; onset; lift-off; the sliding speed comes to 0; rolling needs more than mu F_n."""
@@ -30,14 +29,14 @@ class Before(NamedTuple):
     margin: float  # what rolling needs beyond mu F_n [N]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def seen(contact, out):
     """What events are judged by, of what is observed."""
     margin = surplus(BREAK, contact, out)
     return Before(out[S.PENETRATION], out[S.PENETRATION_RATE], out[S.SLIDING_SPEED], margin)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def surplus(event, contact, out):
     """What is below 0 before an event and above 0 after it."""
     if event == ONSET_EVENT:
@@ -49,7 +48,7 @@ def surplus(event, contact, out):
     return out[S.SLIDING_SPEED]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def event_at_end(phase, before, contact, out):
     """The event that has happened by the end of a step, the gravest first."""
     if phase == FLIGHT:
@@ -68,7 +67,7 @@ def event_at_end(phase, before, contact, out):
     return NONE
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def surplus_before(event, before):
     """The event's surplus at the start of the step."""
     if event == LIFT_OFF:
@@ -80,14 +79,14 @@ def surplus_before(event, before):
     return before.depth
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rates_at_end(method, constants, inputs, step, end, k, out):
     """Rates at the end of a step into the last row of k, what is observed there into `out`."""
     fraction = step.fraction + step.ticks
     rates(constants, inputs, step.tick, fraction, step.onset_speed, step.phase, False, end, k[method.rows - 1], out)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def locate(event, before, after, method, constants, inputs, step, memory, y, k, z, end, out):
     """Part of a step after which the event happens, by bracketing secants on steps of the method itself.
 
@@ -122,7 +121,7 @@ def locate(event, before, after, method, constants, inputs, step, memory, y, k, 
     return cut
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sliding_phase(constants, speed):
     """Phase of a contact that slides at a speed."""
     if constants.levels.friction != EXACT:
@@ -130,7 +129,7 @@ def sliding_phase(constants, speed):
     return FORWARD if speed > 0.0 else BACKWARD
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def latch_onset(memory, speed, contact):
     """Count a contact that begins at a speed [m/s], and keep the impact speed that it holds."""
     memory[CONTACTS] += 1.0
@@ -139,7 +138,7 @@ def latch_onset(memory, speed, contact):
     memory[ONSET] = held_speed(speed, contact)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def change_phase(event, constants, inputs, tick, fraction, memory, y, dy, out):
     """Go over to the phase behind an event, at the state where it happens."""
     phase = int(memory[PHASE])
@@ -158,7 +157,7 @@ def change_phase(event, constants, inputs, tick, fraction, memory, y, dy, out):
         memory[PHASE] = ROLLING if held else (BACKWARD if phase == FORWARD else FORWARD)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def note_force(memory, force, ticks):
     """Follow the largest normal force."""
     memory[PEAK_FORCE] = max(memory[PEAK_FORCE], peak(memory[BEFORE], memory[BEFORE_SPAN], memory[LAST], ticks, force))

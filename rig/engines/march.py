@@ -47,6 +47,7 @@ from rig.engines.method import Step, fill, method_error, method_prepare, method_
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT, TOUCHING, held_speed
 from rig.kernels.geometry import gap
+from rig.kernels.stage import kernel
 
 _LEAST = 1.0 / 64.0
 """Shortest part next to a crossing, in steps of the grid; ..."""
@@ -61,7 +62,7 @@ _MOST_EVENTS = 200
 _SAFETY = 0.9
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _length(method, tick_s, memory, ticks, left, before, events):
     """Length of the next part [ticks]: as the error estimate, the contact's beginning or end, and the grid allow.
 
@@ -87,7 +88,7 @@ def _length(method, tick_s, memory, ticks, left, before, events):
     return left if size > 0.999 * left else size  # no slivers
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _accepted(method, memory, ticks, size, error):
     """Whether a part of `size` with this scaled error will do; proposes the next one's length."""
     tolerance = memory[TOLERANCE]
@@ -106,7 +107,7 @@ def _accepted(method, memory, ticks, size, error):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _to_event(event, events, method, constants, inputs, step, before, memory, y, k, z, end, out):
     """Go to the instant of an event and over to the phase behind it; y and k[0] are there then.
 
@@ -136,7 +137,7 @@ def _to_event(event, events, method, constants, inputs, step, before, memory, y,
     return size
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scratch, out):
     """One step of the grid in as many parts as events, crossings and error estimates ask for.
 
@@ -185,7 +186,7 @@ def _grid_step(method, constants, inputs, tick, ticks, memory, y, k, z, end, scr
     memory[CEILING] += 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
     constants, inputs = constants[0], inputs[0]
@@ -200,7 +201,7 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
         memory[PHASE] = sliding_phase(constants, out[S.SLIDING_SPEED])
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
 def advance(method, constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """Take `steps` steps in place and write every `stride`-th instant's row (see `rig.engines`).
 

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from numba import njit
 from numba.extending import overload
 
 from rig.kernels import signals as S
 from rig.kernels.dynamics import evaluate
+from rig.kernels.stage import kernel
 
 PER_SCALE = 1.0 / S.STATE_SCALE
 
@@ -95,26 +95,26 @@ def _compiled_prepare(method, constants, inputs, step, y, k, z, out):
     return FUNCTIONS[method.instance_class].prepare.py_func
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rates(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy, out):
     """`evaluate` as a function of its own, so that only the stages' loop holds another copy of it."""
     evaluate(constants, inputs, tick, fraction, onset_speed, phase, observe, y, dy, out)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def fill(target, source):
     """Copy as many numbers as `target` has. numpy's own assignment compiles texts of errors as well, for seconds."""
     for i in range(len(target)):
         target[i] = source[i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def nothing_to_prepare(method, constants, inputs, step, y, k, z, out):
     """`method_prepare` of a method that has nothing to prepare."""
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def no_estimate(method, h, k, scratch):
     """`method_error` of a method that has no estimate."""
     return 0.0

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from numba import njit
+from rig.kernels.stage import kernel
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@kernel
 def peak(before, back, last, ahead, force):
     """Largest of the latest value and of the parabola through the latest three, where the middle one is the largest.
 

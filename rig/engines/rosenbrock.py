@@ -17,10 +17,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rig.engines.method import FUNCTIONS, PER_SCALE, Functions, rates
 from rig.kernels import signals as S
+from rig.kernels.stage import kernel
 
 ORDER = 4
 _N = S.N_STATE // 2
@@ -68,7 +68,7 @@ class Rosenbrock(NamedTuple):
 METHOD = Rosenbrock()
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _prepare(method, constants, inputs, step, y, k, z, out):
     """Jacobian of all rates by the state and by time, as forward differences."""
     for j in range(S.N_STATE):
@@ -89,7 +89,7 @@ def _prepare(method, constants, inputs, step, y, k, z, out):
     return S.N_STATE + 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _factor(k, g):
     """Factors of 1/g - J_v - g J_x for speeds v and positions x, rows exchanged as the pivots ask."""
     for i in range(_N):
@@ -114,7 +114,7 @@ def _factor(k, g):
                     k[_LU + i, j] -= factor * k[_LU + p, j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _solve(k, g, u):
     """Solve (1/g - J) u = right for the whole vector."""
     right = k[_RIGHT]
@@ -143,7 +143,7 @@ def _solve(k, g, u):
         u[i] *= g
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step(method, constants, inputs, step, y, k, z, end, out):
     h = step.ticks * inputs.tick_s
     _factor(k, _GAMMA * h)
@@ -173,7 +173,7 @@ def _step(method, constants, inputs, step, y, k, z, end, out):
     return _STAGES - 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _error(method, h, k, scratch):
     total = 0.0
     for i in range(S.N_STATE):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from rig.engines.method import FUNCTIONS, PER_SCALE, Functions, nothing_to_prepare
 from rig.kernels import signals as S
 from rig.kernels.dynamics import evaluate
+from rig.kernels.stage import kernel
 
 
 class Tableau(NamedTuple):
@@ -25,7 +25,7 @@ class Tableau(NamedTuple):
     graded: bool = True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step(method, constants, inputs, step, y, k, z, end, out):
     """One step; k holds the stages' rates, then those at the end."""
     a, b, c = method.a, method.b, method.c
@@ -54,7 +54,7 @@ def _step(method, constants, inputs, step, y, k, z, end, out):
     return len(b) - 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _error(method, h, k, scratch):
     """Scaled error estimate of a step (Hairer's form where there are two estimates)."""
     low, high = scratch[0], scratch[1]

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from numba import njit
-
 from rig.engines.method import FUNCTIONS, Functions, no_estimate, nothing_to_prepare
 from rig.kernels import signals as S
+from rig.kernels.stage import kernel
 
 ORDER = 1
 _N = S.N_STATE // 2
@@ -27,7 +26,7 @@ class SemiImplicitEuler(NamedTuple):
 METHOD = SemiImplicitEuler()
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step(method, constants, inputs, step, y, k, z, end, out):
     h = step.ticks * inputs.tick_s
     for i in range(_N):

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from numba import njit
-
 from rig.engines.method import FUNCTIONS, Functions, no_estimate, nothing_to_prepare, rates
 from rig.kernels import signals as S
+from rig.kernels.stage import kernel
 
 ORDER = 2
 _N = S.N_STATE // 2
@@ -29,7 +28,7 @@ class Verlet(NamedTuple):
 METHOD = Verlet()
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step(method, constants, inputs, step, y, k, z, end, out):
     h = step.ticks * inputs.tick_s
     half = 0.5 * h

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from rig.kernels.stage import kernel
 
 SERIES_REACH = 0.06
 """Up to this angle [rad] the series below are exact to rounding; the shaft's tilts stay below 0.02 rad."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@kernel
 def sin_cos(angle):
     """Sine and cosine of an angle [rad].
 
@@ -31,7 +31,7 @@ def sin_cos(angle):
     return sine, cosine
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@kernel
 def arc_sine(value):
     """Angle [rad] of a sine, by its series where that is exact to rounding."""
     if abs(value) > SERIES_REACH:

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from rig.kernels.angles import arc_sine, sin_cos
+from rig.kernels.stage import kernel
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@kernel
 def axis_of(euler, gamma, beta, gamma_rate, beta_rate):
     """Lateral direction ux, uy [1] and rate px, py [1/s] of the axis, by its angles and their rates."""
     if not euler:
@@ -22,7 +21,7 @@ def axis_of(euler, gamma, beta, gamma_rate, beta_rate):
     return sb, -sG * cb, cb * beta_rate, -(cG * cb * gamma_rate - sG * sb * beta_rate)
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@kernel
 def angles_of(euler, ux, uy, px, py):
     """Gamma, beta [rad] and their rates [rad/s], by lateral direction and rate of the axis."""
     if not euler:

@@ -9,10 +9,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from numba import njit
-
 from rig.kernels.angles import sin_cos
-from rig.kernels.stage import stage
+from rig.kernels.stage import kernel, stage
 
 
 class State(NamedTuple):
@@ -99,7 +97,7 @@ def eccentricity_of(constants, state, pose):
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=False)
+@kernel
 def gap(constants, y):
     """Penetration of the shaft into the ring [m] (negative: gap) and its rate [m/s], by y, shape (N_VECTOR,)."""
     state = State(y[0], y[1], y[2], y[3], y[4], y[5], y[6], y[7], y[8], y[9], y[10], y[11], y[12], y[13])

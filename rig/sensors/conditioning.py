@@ -10,6 +10,7 @@ from numba import njit
 
 from rig.channels import Channel, Group, check_signals
 from rig.kernels.signals import COLUMN
+from rig.kernels.stage import kernel
 from rig.sensors.noise import draw, noise_streams
 
 _SECTIONS = 3
@@ -29,7 +30,7 @@ _TABLE = _SECTION + 7 * _SECTIONS
 _A, _B, _D = (_LANES * at for at in _SECTION_AT)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _filter(table, volts):
     """From signals to volts behind the filters, in place, for `_LANES` channels.
 
@@ -63,7 +64,7 @@ def _filter(table, volts):
             row[c] = u
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _convert(table, volts, every, noise):
     """From volts to counts, still as floats, in place.
 
@@ -83,7 +84,7 @@ def _convert(table, volts, every, noise):
             row[c] = min(max(count, -limit - 1.0), limit)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
 def _condition(rows, first, every, columns, places, tables, streams, counts):
     """Filter every row, convert every `every`-th from row `first` on.
 

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from rig.kernels.signals import COLUMN
+from rig.kernels.stage import kernel
 
 TURN = 2.0 * math.pi
 FRACTIONS = 2**20
@@ -40,7 +41,7 @@ class Keyphasor:
         return found[:count]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
 def _edges(rows, row_ticks, last, found):
     """How many edges there are, at most one a row; `last` in and out, shape (2,), `found` out, shape (n,)."""
     count = 0
@@ -60,7 +61,7 @@ def _edges(rows, row_ticks, last, found):
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _crossing(y0, y1, m0, m1):
     """Part of an interval at which the interpolant of values y and slopes m is 0, by Newton's method.
 

@@ -12,7 +12,8 @@ import zlib
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
+
+from rig.kernels.stage import kernel
 
 _LAYERS = 256
 EDGE = 3.6541528853610088
@@ -55,7 +56,7 @@ def noise_streams(names: Sequence[str], seed: int) -> np.ndarray:
     return streams
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _uniform(stream):
     """A number in [0, 1); sums of unsigned integers wrap."""
     a, b, c, count = stream[0], stream[1], stream[2], stream[3]
@@ -65,7 +66,7 @@ def _uniform(stream):
     return float(bits >> _ELEVEN) * 2.0**-53
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _near_edge(stream, layer, whole, x):
     """Whether a point that may lie beyond the edge of its layer counts, and its place: 1 of 80 comes here."""
     if layer == 0:
@@ -78,7 +79,7 @@ def _near_edge(stream, layer, whole, x):
     return rise * _uniform(stream) + _DENSITY[layer] < math.exp(-0.5 * x * x), x
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def draw(streams, out):
     """The next numbers of every stream: normal, mean 0, variance 1.
 

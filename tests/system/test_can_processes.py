@@ -34,8 +34,9 @@ def hub_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
     arguments = ("can", "hub", "can0", "can1", "--speed", "1M/8M", "--listen", endpoint)
     with process("-m", "rig", *arguments) as child:
         assert child.stdout is not None
-        # The first start after a change compiles.
-        assert "Ctrl-C ends it" in child.stdout.readline()
+        # The first start after a change compiles, and says so.
+        said = next(line for line in child.stdout if not line.startswith("compiling"))
+        assert "Ctrl-C ends it" in said
         yield child, endpoint
 
 

@@ -51,6 +51,7 @@ from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, SLACK, SPAN
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT, ROLLING
 from rig.kernels.geometry import gap
+from rig.kernels.stage import kernel
 
 ORDER = 2
 
@@ -123,7 +124,7 @@ def _series_to(constants, inputs, plant, memory, room, y, tick):
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _leave_kicks(constants, inputs, plant, memory, y):
     """What the series need to know of the state that kicks have left.
 
@@ -185,7 +186,7 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         done = _advance(constants, inputs, y, memory, tick, step_ticks, done, steps, stride, rows)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _due(constants, inputs, memory, now, end):
     """Whether it is time for a trial of kicks and series at a row, before the next one at the tick `end`."""
     if now < memory[AGAIN] or (now - memory[ROLLS]) * inputs.tick_s < _SETTLED_S or memory[SPAN] < 0.0:
@@ -196,7 +197,7 @@ def _due(constants, inputs, memory, now, end):
     return memory[PHASE] != FLIGHT and memory[SLACK] == 0.0 and not struck(inputs, now, end)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
 def _advance(constants, inputs, y, memory, tick, step_ticks, first, steps, stride, rows):
     """The same from the step `first` on, up to the end or to a row at which a trial is due.
 

@@ -21,6 +21,7 @@ from rig.engines.split.inner_motion import (
 from rig.engines.taylor.place import END_FRACTION, END_TICK
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT
+from rig.kernels.stage import kernel
 
 _PRESSED = 0.1
 """Acceleration towards the ring from which on a contact can last [m/s^2]: less is a rounding error of the weight's."""
@@ -77,7 +78,7 @@ def _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt):
         y[S.HOUSE_IMPULSE_Y] -= jy
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _pressed(constants, inputs, memory, room, y):
     """Acceleration of the closing gap in flight, at the end of the series at hand and the state y [m/s^2]."""
     tick, fraction = int(memory[END_TICK]), memory[END_FRACTION]

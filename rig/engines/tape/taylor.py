@@ -39,22 +39,21 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from rig.engines.memory import ONSET, PHASE
 from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
 from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
+from rig.kernels.stage import kernel, stage
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@stage
 def product(below, left_0, right_0, later, left, right):
     """The k-th coefficient of a product; `later` is 0 for k = 0, else 1. No array goes in: that counts references."""
     return below + left_0 * right + left * (later * right_0)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@stage
 def quotient(below, first, divisor, dividend, inverse):
     """The k-th coefficient of a quotient that begins with `first` (for k = 0: 0), by the inverse of the divisor's."""
     return (dividend - below - divisor * first) * inverse
@@ -97,7 +96,7 @@ class _Code:
         lanes, wide = _whole(self.widest), _whole(self.rarest + WAVE_LANES)
         body = [line.replace("WAVE", str(self.rarest)) for line in body]
         lines = [
-            "", "", '@njit(cache=True, error_model="numpy")',
+            "", "", "@kernel",
             f"def {tape.phase}(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc):",
             f'    """{tape.phase.capitalize()}: {self.widest} lanes."""',
             "    levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet",

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from rig.engines.events import latch_onset, sliding_phase
 from rig.engines.memory import CLAMPS, EVALUATIONS, ONSET, PHASE
 from rig.engines.method import fill, rates
@@ -26,6 +24,7 @@ from rig.kernels.contact import (
 )
 from rig.kernels.dynamics import unit_response
 from rig.kernels.geometry import State, eccentricity_of, pose_of
+from rig.kernels.stage import kernel
 
 NOTHING, FIRST, _SECOND, _THIRD, _HOUSE_NS, _HOUSE_EW = range(6)
 """What ends a series: a length or a corner of the hammer's; a zero of one of the events' functions; a transducer."""
@@ -44,7 +43,7 @@ _TOLD_DEPTH = 1e-10
 """Depth over the clearance from which on a difference of distances tells it."""
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _loses(displacement, rate, stiffness, preload):
     """Which transducer of a pair has lost its preload, or is about to: 0, or the sign of the displacement."""
     change = 0.5 * stiffness * displacement
@@ -54,7 +53,7 @@ def _loses(displacement, rate, stiffness, preload):
     return sign if over > edge or (over > -edge and sign * rate > 0.0) else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def ring_at(constants, inputs, x):
     """Force of the ring without friction (penetration, its rate, sliding speed), and the response to friction, at x."""
     state = State(x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8], x[9], x[10], x[11], x[12], x[13])
@@ -65,13 +64,13 @@ def ring_at(constants, inputs, x):
     return ring, unit_response(constants, inputs, pose, ring.nx, ring.ny)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _holds_at_rest(constants):
     """Whether friction may keep the sliding speed at 0."""
     return constants.levels.friction == EXACT and constants.contact.friction > 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def enter_events(constants, memory, Y):
     """Functions that fall through 0 where an event happens, of what the series has in their columns."""
     contact, phase = constants.contact, int(memory[PHASE])
@@ -116,7 +115,7 @@ def enter_events(constants, memory, Y):
         second[0] += math.sqrt(_FRICTIONLESS_S * 2.0 * Y[1, ROOT])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _settle(constants, inputs, memory, x, y, dy, out):
     """Phase of a contact whose sliding speed is 0: rolling if that is possible, else the way it is pushed."""
     fill(y, x)
@@ -131,7 +130,7 @@ def _settle(constants, inputs, memory, x, y, dy, out):
         memory[KNOWN + 1] = 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def change_phase(constants, inputs, memory, x, y, dy, out):
     """Go over to what is behind the event that has ended a series, at the state x where it happens."""
     event, phase = int(memory[EVENT]), int(memory[PHASE])
@@ -192,7 +191,7 @@ def change_phase(constants, inputs, memory, x, y, dy, out):
         memory[EAST] = _loses(x[S.X_OH], x[S.VX_OH], house.pair_stiffness_horizontal, house.preload)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def preload_end(constants, memory, Y, h):
     """Where within h a transducer loses or finds its preload; and which pair's."""
     house = constants.house

@@ -62,6 +62,7 @@ from rig.engines.taylor.series import LANES, flight, rolling, sliding
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT, ROLLING, TOUCHING, held_speed, normal_force
 from rig.kernels.forces import drive_speed
+from rig.kernels.stage import kernel
 
 _SAFETY = 0.9
 _LONGEST_S, _SHORTEST_S = 6e-2, 1e-12
@@ -85,7 +86,7 @@ class Room(NamedTuple):
     out: np.ndarray  # shape (N_OBSERVED,)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _aligned(rows, columns):
     """Zeros whose rows begin on cache lines: the sums over lanes take half as long again without."""
     room = np.zeros(rows * columns + 8)
@@ -93,7 +94,7 @@ def _aligned(rows, columns):
     return room[first : first + rows * columns].reshape((rows, columns))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def room_in(memory):
     """Room for a call."""
     return Room(
@@ -108,7 +109,7 @@ def room_in(memory):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: a state that begins in contact holds the floored impact speed."""
     constants, inputs = constants[0], inputs[0]
@@ -121,7 +122,7 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
         memory[PHASE] = sliding_phase(constants, ring.sliding)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _make_series(constants, inputs, memory, room):
     """All coefficients of a series from the state in its first row.
 
@@ -147,7 +148,7 @@ def _make_series(constants, inputs, memory, room):
     return phase != FLIGHT and phase != ROLLING
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _length(memory, Y, slowed):
     """How far a series holds: its last two terms stay within the tolerance."""
     tolerance = memory[TOLERANCE]
@@ -166,7 +167,7 @@ def _length(memory, Y, slowed):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _law_length(memory, Y):
     """How far the normal law and its losses hold in a series."""
     tolerance, law, loss = memory[TOLERANCE], EVENTS + 2, S.CONTACT_LOSS
@@ -176,7 +177,7 @@ def _law_length(memory, Y):
     return _SAFETY * min(max(last, 1e-200) ** (-1.0 / (ORDER - 1.0)), max(before, 1e-200) ** (-1.0 / (ORDER - 2.0)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _force_at(constants, inputs, memory, Y, s, x):
     """Normal force by the law, at s of a series [N]. Its own column says less: no length of step vouches for it."""
     series_at(Y, s, x)
@@ -184,7 +185,7 @@ def _force_at(constants, inputs, memory, Y, s, x):
     return normal_force(ring.delta, ring.rate, memory[ONSET], constants.contact)[0]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _note_peak(constants, inputs, memory, Y, x):
     """The largest normal force within a series; x is room for a state."""
     h = memory[LENGTH]
@@ -215,7 +216,7 @@ def _note_peak(constants, inputs, memory, Y, x):
     memory[PEAK_FORCE] = peak
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _next_series(constants, inputs, memory, room, y):
     """From the end of one series to the next; y is room for a state.
 
@@ -285,13 +286,13 @@ def _next_series(constants, inputs, memory, room, y):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def holds(memory, tick, fraction):
     """Whether the series at hand holds at an instant: a whole tick and the ticks beyond it."""
     return memory[SPAN] >= 0.0 and (tick - memory[END_TICK]) + (fraction - memory[END_FRACTION]) <= 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def continue_series(constants, inputs, memory, room, y):
     """Go over to the next series; y is room for a state, and nan where the numbers are no longer finite.
 
@@ -306,7 +307,7 @@ def continue_series(constants, inputs, memory, room, y):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def read_off(memory, room, y, tick, fraction):
     """State at an instant of the series at hand, into y."""
     Y, x = room.Y, room.x
@@ -320,7 +321,7 @@ def read_off(memory, room, y, tick, fraction):
     fill(y, x)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _reach(constants, inputs, memory, room, y, tick):
     """State at a tick, into y: series after series up to there, the last one read off."""
     while not holds(memory, tick, 0.0):
@@ -329,7 +330,7 @@ def _reach(constants, inputs, memory, room, y, tick):
     read_off(memory, room, y, tick, 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def same_inputs(inputs, memory):
     """Whether the inputs are what they were; keeps them."""
     kept = memory[INPUTS : INPUTS + 11]
@@ -354,7 +355,7 @@ def same_inputs(inputs, memory):
     return same
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
     """A new beginning from the state y, at a whole tick and the ticks beyond it, for the next series to continue from.
 
@@ -371,7 +372,7 @@ def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
     memory[END_TICK], memory[END_FRACTION] = float(tick), fraction
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def write_row(constants, inputs, memory, room, y, tick, phase, rows, row):
     """The row of an instant."""
     out = room.out
@@ -382,7 +383,7 @@ def write_row(constants, inputs, memory, room, y, tick, phase, rows, row):
         rows[row, S.N_VECTOR + i] = out[i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
 def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows):
     """Take `steps` steps in place and write every `stride`-th instant's row (see `rig.engines`).
 

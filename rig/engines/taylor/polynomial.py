@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from rig.engines.taylor.place import ORDER
+from rig.kernels.stage import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def series_at(Y, s, x):
     """State and integrals at s, and the root of the penetration, into x, shape (ROOT + 1,)."""
     for i in range(len(x)):
@@ -19,7 +18,7 @@ def series_at(Y, s, x):
             x[i] = x[i] * s + Y[k, i]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def column_at(Y, column, shift, s):
     """One column at s without its first `shift` coefficients, over s**shift, and its slope."""
     value = slope = 0.0
@@ -29,7 +28,7 @@ def column_at(Y, column, shift, s):
     return value, slope
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def refine(Y, column, shift, goal, low, high):
     """Where a column passes a value between low and high, by guarded Newton steps."""
     below = column_at(Y, column, shift, low)[0] < goal
@@ -52,7 +51,7 @@ def refine(Y, column, shift, goal, low, high):
     return s
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def first_zero(Y, column, shift, h):
     """The first zero of a column (without what is known to be 0) up to h, if it falls through 0; else infinity.
 

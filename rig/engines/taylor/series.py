@@ -9,22 +9,21 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from rig.engines.memory import ONSET, PHASE
 from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
 from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
+from rig.kernels.stage import kernel, stage
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@stage
 def product(below, left_0, right_0, later, left, right):
     """The k-th coefficient of a product; `later` is 0 for k = 0, else 1. No array goes in: that counts references."""
     return below + left_0 * right + left * (later * right_0)
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@stage
 def quotient(below, first, divisor, dividend, inverse):
     """The k-th coefficient of a quotient that begins with `first` (for k = 0: 0), by the inverse of the divisor's."""
     return (dividend - below - divisor * first) * inverse
@@ -33,7 +32,7 @@ def quotient(below, first, divisor, dividend, inverse):
 LANES = 128
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc):
     """Flight: 48 lanes."""
     levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet
@@ -479,7 +478,7 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
         Y[ORDER, i] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc):
     """Sliding: 64 lanes."""
     levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet
@@ -1050,7 +1049,7 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         Y[ORDER, i] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, D, acc):
     """Rolling: 76 lanes."""
     levels, shaft, magnet = constants.levels, constants.shaft, constants.magnet
