@@ -92,6 +92,13 @@ class EngineChoice(Written):
             raise ValueError(f"one of {', '.join(ENGINES)}")
         return name
 
+    @field_validator("tolerance")
+    @classmethod
+    def _above_rounding(cls, tolerance: float) -> float:
+        if 0.0 < tolerance < 1e-30:
+            raise ValueError("at least 1e-30, far below rounding; 0 is the engine's own")
+        return tolerance
+
     @model_validator(mode="before")
     @classmethod
     def _own_step(cls, data: Any) -> Any:

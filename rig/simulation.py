@@ -28,7 +28,7 @@ from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
-from rig.motion import BRANCH_ALARM, FINER, Accuracy, Motion, energy_balance
+from rig.motion import BRANCH_ALARM, FINER, FINEST, Accuracy, Motion, energy_balance
 from rig.scenes import Scene, load_scene, rig_table, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
@@ -165,7 +165,8 @@ class Simulation:
         self._companion: Motion | None = None
         if choice.companion:
             stride = self.block_ticks // choice.step_us
-            self._companion = Motion(initial.copy(), choice.step_us, stride, FINER * choice.tolerance)
+            finer = min(FINEST, FINER * choice.tolerance)
+            self._companion = Motion(initial.copy(), choice.step_us, stride, finer)
         self._accuracy = Accuracy(choice.tolerance)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None

@@ -58,7 +58,7 @@ ENGINES = {
     ),
     "rk8": Method("Dormand-Prince 8(5,3), events located", 25, 1e-8, (*_BY_STATE, "exact")),
     "taylor": Method("Taylor series of order 16, events as roots", 25, 1e-9, ("none", "smoothed", "exact")),
-    "tsit5": Method("Tsitouras 5(4), adaptive, events located", 500, 1e-6, (*_BY_STATE, "exact")),
+    "tsit5": Method("Tsitouras 5(4), adaptive, events located", 50, 1e-6, (*_BY_STATE, "exact")),
     "rk4": Method("classical Runge-Kutta, events located", 5, 0.0, (*_BY_STATE, "exact")),
     "verlet": Method("velocity Verlet, order 2, events located", 5, 0.0, (*_BY_STATE, "exact")),
     "semi-implicit-euler": Method("symplectic Euler, order 1, events located", 5, 0.0, _BY_STATE),

@@ -115,7 +115,8 @@ def test_drop_on_a_rigid_ring_rebounds_by_the_closed_form() -> None:
     rest = speed / fall + 2.0 * e * speed / fall / (1.0 - e)
     assert rest < 0.5
     weight = mass * fall
-    assert (impulse[-1] - impulse[-11]) / 0.01 == pytest.approx(weight, rel=1e-3)
+    # There the compliant law holds it, and it still rings a little.
+    assert (impulse[-1] - impulse[-11]) / 0.01 == pytest.approx(weight, rel=5e-3)
     assert run["ring_y"][-1] == pytest.approx(-clearance, abs=1e-6)
     assert run.simulation.health()["contacts"] < 60
     dissipated = float(energy_balance(run.rows, run.rows[0])["dissipated"][-1])
@@ -157,17 +158,20 @@ def whirl(run: Run) -> float:
 
 def test_rigid_impacts_whirl_as_the_kinematics_say() -> None:
     run = Run("hammer", 1.0, **IMPACT)
+    # Where contact lasts, the compliant law lets the shaft in as far as the force asks for.
     shaft, clearance = run.constants.shaft, run.constants.contact.clearance
+    radius = np.hypot(run["ring_x"], run["ring_y"])[-200:]
+    depth = float(np.mean(run["penetration"][-200:]))
+    assert 1e-6 < depth < 2e-5
+    assert radius.mean() == pytest.approx(clearance + depth, abs=1e-7)
     spin = (run["theta"][-1] - run["theta"][-200]) / (run.times[-1] - run.times[-200]) / (2.0 * math.pi)
     frequency = whirl(run)
-    assert frequency == pytest.approx(-spin * shaft.radius / clearance, rel=1e-3)
+    assert frequency == pytest.approx(-spin * shaft.radius / radius.mean(), rel=1e-3)
     impulse = run["contact_impulse"]
     force = (impulse[-1] - impulse[-200]) / (run.times[-1] - run.times[-200])
     mass = shaft.transverse_inertia / shaft.arm_ring**2
-    centrifugal = mass * clearance * (2.0 * math.pi * frequency) ** 2
+    centrifugal = mass * radius.mean() * (2.0 * math.pi * frequency) ** 2
     assert force == pytest.approx(centrifugal, rel=0.02)  # magnets and gyroscopic moment left out
-    radius = np.hypot(run["ring_x"], run["ring_y"])[-200:]
-    assert np.abs(radius - clearance).max() < 1e-6
     assert abs(run.residual_share) < 1e-3
     # Rolling: nothing slides once it whirls.
     assert np.abs(run["sliding_speed"][-200:]).max() < 0.02 * shaft.radius * spin * 2.0 * math.pi
@@ -180,8 +184,9 @@ def test_rigid_ring_hits_harder_and_whirls_faster() -> None:
     assert peaks[1] / peaks[0] == pytest.approx(1.57, abs=0.06)
     f = [whirl(run) for run in (houses, rigid, impacts)]
     assert 1.001 < f[1] / f[0] < 1.006
-    assert 1.004 < f[2] / f[0] < 1.012  # no compliance at all: the figure of +0.5 % lies between
-    assert impacts.simulation.health()["peak_normal_force_n"] == 0.0
+    assert f[2] == pytest.approx(f[1], rel=2e-4)  # the same law once it rolls
+    # An impact has no force; the contact that lasts has.
+    assert 400.0 < impacts.simulation.health()["peak_normal_force_n"] < peaks[1]
 
 
 @pytest.mark.parametrize("stator", ["rigid", "inner-house"])

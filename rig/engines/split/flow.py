@@ -21,7 +21,7 @@ LEVELS = GRID + 4
 HOUSE_FLOW = 32
 """Numbers of a flow of the houses: its horizontal and vertical block on (inner, rate, outer, rate), (4, 4) each."""
 
-_FALL_X, _FALL_Y, _PUSH, _RUSH, _DECAY, _LAG = 0, 4, 8, 9, 10, 11
+_FALL_Y, _PUSH, _RUSH, _DECAY, _LAG = 4, 8, 9, 10, 11
 HALF = 12
 """Columns of the flows of shaft and drive: a block (2, 2) of each lateral direction; what gravity or the rest adds to
 uy and py; decay of the distance to the drive's speed, and its integral; the flow's time, half a step [s]."""
@@ -108,8 +108,8 @@ def shaft_flows(plant, engaged, grid_step):
     for level in range(LEVELS):
         f = flows[level]
         t = 0.5 * 2.0 ** (level - GRID) * grid_step
-        f[_FALL_X : _FALL_X + 4] = _axis_flow(plant.spring_x * plant.per_Ixx, plant.damper_x * plant.per_Ixx, t)
-        f[_FALL_Y : _FALL_Y + 4] = _axis_flow(plant.spring_y * plant.per_Ixx, plant.damper_y * plant.per_Ixx, t)
+        f[0], f[1], f[2], f[3] = _axis_flow(plant.spring_x * plant.per_Ixx, plant.damper_x * plant.per_Ixx, t)
+        f[4], f[5], f[6], f[7] = _axis_flow(plant.spring_y * plant.per_Ixx, plant.damper_y * plant.per_Ixx, t)
         if engaged:
             f[_PUSH] = (1.0 - f[_FALL_Y]) * plant.rest
             f[_RUSH] = -f[_FALL_Y + 2] * plant.rest

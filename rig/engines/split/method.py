@@ -4,7 +4,8 @@
   with their events; some eleven series an impact. They could take everything, and do where nothing below holds.
 - Contact without an event for a while: exact linear flow and kicks (`rig.engines.split.steps`), three times as fast.
   Their error is measured: a trial of both, from the same state, before they begin, and again every now and then.
-- A rigid contact: impacts one by one where the gap closes (`rig.engines.split.rigid`); where it lasts, kicks.
+- A rigid contact: impacts one by one where the gap closes (`rig.engines.split.rigid`); where it lasts, it is the
+  compliant one.
 
 Which one runs is decided at a row, and given up in the middle of one at the start of the step that was not to be a
 kick's.
@@ -22,9 +23,7 @@ from rig.engines.method import PER_SCALE
 from rig.engines.split.flow import GRID, house_flows, magnet_springs, shaft_flows
 from rig.engines.split.inner_motion import (
     FAST,
-    eccentricity,
     from_coordinates,
-    motion_of,
     plant_of,
 )
 from rig.engines.split.kick import Kick
@@ -36,13 +35,14 @@ from rig.engines.split.place import (
     GRID_TICKS,
     LIMIT,
     MODE,
+    OWN_TICKS,
     REST,
     ROLLS,
     SPRING_X,
     SPRING_Y,
     WANTED,
 )
-from rig.engines.split.rigid import bounce, hold, part
+from rig.engines.split.rigid import bounce, hold
 from rig.engines.split.state import Call, Coordinates, Direction, Touch
 from rig.engines.split.steps import keep, keep_state, kicks, struck
 from rig.engines.taylor import march as series
@@ -62,19 +62,22 @@ _SHARE = 1e-4
 """Part of the tolerance that one step of the series may err by: impacts make small errors a thousand times larger."""
 _SETTLED_S = 2e-2
 """A contact is one for kicks after this time without an event [s]: what they err by grows in impacts that follow."""
-_TRIAL, _LONGEST_TRIAL_S = 0.1, 4e-3
+_TRIAL, _LONGEST_TRIAL_S = 0.05, 2e-2
 """A trial lasts for this part of the time that the contact has lasted, at most this [s]; the next is due when it has
 lasted twice as long."""
-_ASTRAY = 0.2
-"""Part of the tolerance that kicks may err by in a trial."""
+_ASTRAY, _LOST = 0.2, 5e-3
+"""Part of the tolerance that kicks may err by in a trial, and of the losses in it."""
+_FINEST = 1e-4
+"""Below this tolerance kicks that keep it are no faster than series."""
 _WORTH = 20.0
 """Kicks for each series that they save, at most: as many take two thirds of its time."""
+_LOSSES = [S.BEARING_LOSS, S.HOUSE_LOSS, S.CONTACT_LOSS, S.FRICTION_LOSS]
 
 
 def start(constants, inputs, y, memory, step_ticks, tolerance):
     """Prepare the memory for a state: the series, and the flows for this step."""
     series.start(constants, inputs, y, memory, step_ticks, _SHARE * tolerance if tolerance > 0.0 else 1e-9)
-    memory[LIMIT] = tolerance
+    memory[LIMIT], memory[OWN_TICKS] = tolerance, step_ticks
     # The shaft's flow is linear about its rest on the magnets.
     memory[REST], memory[SPRING_X], memory[SPRING_Y] = magnet_springs(constants[0])
     _prepare_flows(constants, inputs, memory, step_ticks)
@@ -94,54 +97,37 @@ def _enter_kicks(constants, memory, y, phase, wanted):
     angle = theta + constants.shaft.unbalance_phase
     none = Kick(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     direction = Direction(math.cos(angle), math.sin(angle), theta)
-    ex, ey = eccentricity(constants, axis, houses)
-    rate = motion_of(constants, axis.px, axis.py, houses, ex, ey).rate
-    keep_state(memory, Touch(phase, np.nan, rate, wanted, 0.0), Coordinates(-1, 0.0, none), direction)
+    keep_state(memory, Touch(phase, np.nan, wanted, 0.0), Coordinates(-1, 0.0, none), direction)
     memory[MODE] = _KICKS
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@kernel
 def _series_to(constants, inputs, plant, memory, room, y, tick):
-    """The series up to a tick, and the state there into y.
-
-    Returns:
-        Whether a rigid contact has begun to last on the way, at the end of the series at hand; y is the state there.
-    """
-    rigid = not constants.levels.compliant
+    """The series up to a tick, and the state there into y."""
     while not series.holds(memory, tick, 0.0):
-        event = memory[EVENT] if memory[SPAN] >= 0.0 else NOTHING
-        if event != NOTHING:
+        bounced = False
+        if memory[SPAN] >= 0.0 and memory[EVENT] != NOTHING:
             memory[ROLLS] = memory[END_TICK]
-        if rigid and event == FIRST:
-            series.read_off(memory, room, y, memory[END_TICK], memory[END_FRACTION])
-            if bounce(constants, inputs, plant, memory, room, y):
-                return True
+            if memory[EVENT] == FIRST and memory[PHASE] == FLIGHT and not constants.levels.compliant:
+                series.read_off(memory, room, y, memory[END_TICK], memory[END_FRACTION])
+                bounced = bounce(constants, inputs, plant, memory, room, y)
+        if bounced:
             end = int(memory[END_TICK])
             series.begin_series(constants, inputs, memory, room, y, end, memory[END_FRACTION], True)
         elif not series.continue_series(constants, inputs, memory, room, y):
-            return False
+            return
     series.read_off(memory, room, y, tick, 0.0)
-    return False
 
 
 @kernel
 def _leave_kicks(constants, inputs, plant, memory, y):
-    """What the series need to know of the state that kicks have left.
-
-    Returns:
-        Whether a rigid contact ends there.
-    """
+    """What the series need to know of the state that kicks have left."""
     memory[MODE] = _SERIES
     memory[SLACK] = 0.0
-    if not constants.levels.compliant:
-        touched = memory[PHASE] != FLIGHT
-        memory[PHASE] = FLIGHT
-        return touched and part(constants, inputs, plant, y)
     if memory[PHASE] != FLIGHT and gap(constants, y)[0] <= 0.0:
         memory[PHASE] = FLIGHT
     if memory[PHASE] == ROLLING:
         hold(constants, inputs, plant, y)
-    return False
 
 
 def _trial(constants, inputs, y, memory, mode, level, tick, step_ticks, steps):
@@ -168,7 +154,9 @@ def _choose(constants, inputs, y, memory, tick, step_ticks):
             mode = _KICKS if kicked and level == wanted else _TO_KICKS
             end, left = _trial(constants, inputs, y, memory, mode, level, tick, step_ticks, steps)
             away = (end - truth)[: S.N_STATE] * PER_SCALE
-            if left[MODE] == _KICKS and math.sqrt(float(away @ away) / S.N_STATE) < _ASTRAY * memory[LIMIT]:
+            lost, right = (float(np.sum((run - y)[_LOSSES])) for run in (end, truth))
+            near = math.sqrt(float(away @ away) / S.N_STATE) < _ASTRAY * memory[LIMIT]
+            if left[MODE] == _KICKS and near and abs(lost - right) < _LOST * right:
                 memory[MODE], memory[WANTED] = mode, level
                 return
     memory[MODE] = series_mode
@@ -191,8 +179,10 @@ def _due(constants, inputs, memory, now, end):
     """Whether it is time for a trial of kicks and series at a row, before the next one at the tick `end`."""
     if now < memory[AGAIN] or (now - memory[ROLLS]) * inputs.tick_s < _SETTLED_S or memory[SPAN] < 0.0:
         return False
+    if memory[LIMIT] < _FINEST or memory[GRID_TICKS] != memory[OWN_TICKS]:
+        return False
     # On a fixed ring what the commutators leave of rolling friction drifts, and series are long.
-    if not constants.levels.inner_house or constants.contact.gap_counts_outer != 0.0 or not constants.levels.compliant:
+    if not constants.levels.inner_house or constants.contact.gap_counts_outer != 0.0:
         return False
     return memory[PHASE] != FLIGHT and memory[SLACK] == 0.0 and not struck(inputs, now, end)
 
@@ -224,9 +214,7 @@ def _advance(constants, inputs, y, memory, tick, step_ticks, first, steps, strid
         end = now + ahead * step_ticks
         if _due(constants, inputs, memory, now, end):
             return first
-        # Rigid impacts have no force over time.
-        seen = int(memory[PHASE]) if constants.levels.compliant else FLIGHT
-        series.write_row(constants, inputs, memory, room, y, now, seen, rows, first // stride)
+        series.write_row(constants, inputs, memory, room, y, now, int(memory[PHASE]), rows, first // stride)
         n, last = 0, ahead * 2**GRID
         while n < last:
             if memory[MODE] == _KICKS:
@@ -234,14 +222,11 @@ def _advance(constants, inputs, y, memory, tick, step_ticks, first, steps, strid
                 if n < last:
                     at = now + n * call.part_ticks
                     memory[ROLLS] = at
-                    ends = _leave_kicks(constants, inputs, plant, memory, y)
+                    _leave_kicks(constants, inputs, plant, memory, y)
                     whole = math.floor(at)
-                    series.begin_series(constants, inputs, memory, room, y, whole, at - whole, ends)
-            elif _series_to(constants, inputs, plant, memory, room, y, end):
-                since = (memory[END_TICK] - now) + memory[END_FRACTION]
-                n = math.ceil(since / call.part_ticks)
-                _enter_kicks(constants, memory, y, ROLLING, GRID)
+                    series.begin_series(constants, inputs, memory, room, y, whole, at - whole, False)
             else:
+                _series_to(constants, inputs, plant, memory, room, y, end)
                 n = last
         first += ahead
     return first

@@ -17,8 +17,8 @@ ROLLS, AGAIN = (next(_next) for _ in range(2))
 UX, UY, PX, PY, SPIN, ANGLE = (next(_next) for _ in range(6))
 X0, X1, X2, X3, Y0, Y1, Y2, Y3 = (next(_next) for _ in range(8))
 """Houses: inner displacement and rate, outer displacement and rate, horizontal and vertical."""
-SLID, RATE = (next(_next) for _ in range(2))
-"""Sliding speed after the last kick, nan before the first of a contact; rate of the penetration then."""
+SLID = next(_next)
+"""Sliding speed after the last kick, nan before the first of a contact."""
 WANTED = next(_next)
 """Level asked for."""
 REST, SPRING_X, SPRING_Y = (next(_next) for _ in range(3))
@@ -31,6 +31,7 @@ COS, SIN, TURNED = (KICK + 8 + i for i in range(3))
 """Direction of the unbalance, and the spin angle that it is for."""
 GRID_TICKS = TURNED + 1
 """The grid's own step, for which ..."""
-FLOWS = GRID_TICKS + 1
+OWN_TICKS = GRID_TICKS + 1
+FLOWS = OWN_TICKS + 1
 FLOWS_END = FLOWS + HOUSE_FLOW * LEVELS
-"""... these are the flows of the houses."""
+"""... these are the flows of the houses; and the step of rows, where trials are held."""

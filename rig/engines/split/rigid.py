@@ -95,13 +95,15 @@ def bounce(constants, inputs, plant, memory, room, y):
     The impulse across is what would end the sliding, within mu times the normal one.
 
     Returns:
-        Whether the contact lasts: the shaft comes in no faster than the speed floor, and is pressed on.
+        False where the contact lasts: the shaft comes in no faster than the speed floor, and is pressed on. Then the
+        compliant law takes it.
     """
     contact, mu = constants.contact, plant.friction
     motion, m, sliding = _seen(constants, plant, y)
+    if motion.rate <= contact.speed_floor and _pressed(constants, inputs, memory, room, y) > _PRESSED:
+        return False
     latch_onset(memory, motion.rate, contact)
-    lasts = motion.rate <= contact.speed_floor and _pressed(constants, inputs, memory, room, y) > _PRESSED
-    change = motion.rate if lasts else (1.0 + contact.restitution) * max(motion.rate, 0.0) + _APART
+    change = (1.0 + contact.restitution) * max(motion.rate, 0.0) + _APART
     # Both conditions at once where it sticks; else the limit holds, and the normal condition with it.
     determinant = m.nn * m.tt - m.nt * m.nt
     jn = (change * m.tt - sliding * m.nt) / determinant
@@ -111,7 +113,7 @@ def bounce(constants, inputs, plant, memory, room, y):
         jn = change / (m.nn + way * m.nt)
         jt = way * jn
     _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt)
-    return lasts
+    return True
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -119,16 +121,3 @@ def hold(constants, inputs, plant, y):
     """End the sliding at the state y of a contact that rolls: kicks leave it none in the mean of a step only."""
     motion, m, sliding = _seen(constants, plant, y)
     _strike(constants, inputs, plant, y, motion, m, sliding, 0.0, sliding / m.tt)
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def part(constants, inputs, plant, y):
-    """See to it that a rigid contact that is over opens at the state y.
-
-    Returns:
-        Whether the gap is still closed by as much as a contact keeps it.
-    """
-    motion, m, sliding = _seen(constants, plant, y)
-    if motion.rate > -_APART:
-        _strike(constants, inputs, plant, y, motion, m, sliding, (motion.rate + _APART) / m.nn, 0.0)
-    return motion.depth > -_APART

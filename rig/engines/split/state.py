@@ -34,7 +34,6 @@ class Touch(NamedTuple):
 
     phase: int
     slid: float  # sliding speed after it, nan before the first of a contact [m/s]
-    rate: float  # of the penetration, after it [m/s]
     wanted: int  # level asked for in contact; NONE: it is no longer one for kicks
     factor: float  # damping factor over the onset speed [s/m]
 

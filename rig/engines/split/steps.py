@@ -55,7 +55,6 @@ from rig.engines.split.place import (
     KICKED,
     PX,
     PY,
-    RATE,
     SIN,
     SLID,
     SPIN,
@@ -71,9 +70,6 @@ from rig.engines.split.touch import house_kick, kick_contact, no_impulse
 from rig.kernels import signals as S
 from rig.kernels.contact import damping_per_speed
 from rig.kernels.forces import drive_speed
-
-_OPEN = 1e-9
-"""Gap that ends a rigid contact [m]."""
 
 
 @inlined
@@ -98,7 +94,7 @@ def _kept_state(constants, memory):
     """Contact, coordinates and the unbalance's direction from the memory."""
     k = memory[KICK : KICK + 8]
     factor = damping_per_speed(memory[ONSET], constants.contact)
-    touch = Touch(int(memory[PHASE]), memory[SLID], memory[RATE], int(memory[WANTED]), factor)
+    touch = Touch(int(memory[PHASE]), memory[SLID], int(memory[WANTED]), factor)
     kick = Kick(k[0], k[1], k[2], k[3], k[4], k[5], k[6], k[7])
     return (
         touch,
@@ -110,7 +106,7 @@ def _kept_state(constants, memory):
 @inlined
 def keep_state(memory, touch, coordinates, direction):
     """Put them into the memory."""
-    memory[PHASE], memory[SLID], memory[RATE] = float(touch.phase), touch.slid, touch.rate
+    memory[PHASE], memory[SLID] = float(touch.phase), touch.slid
     memory[WANTED] = float(touch.wanted)
     memory[KICKED], memory[CONJUGATE] = float(coordinates.kicked), coordinates.conjugate
     k = memory[KICK : KICK + 8]
@@ -149,7 +145,7 @@ def _step_of(constants, inputs, call, touch, kicked, owed, now, n, last):
             level = 0  # what the conjugate coordinates need is known after a kick
         while n & ((1 << level) - 1) != 0 or n + (1 << level) > last:
             level -= 1
-        if constants.levels.compliant and struck(inputs, begin, begin + float(1 << level) * call.part_ticks):
+        if struck(inputs, begin, begin + float(1 << level) * call.part_ticks):
             level = NONE
     count = 1 << max(level, 0)
     return Step(level, count, 2.0 * call.half_s * count, call.per_s / count, begin, n + count, owed)
@@ -199,13 +195,11 @@ def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
 def _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch):
     """The contact's impulse, and the contact after it."""
     h, r0 = step.h, constants.contact.clearance
-    # A rigid contact may begin where rounding, or a chord of the arc, leaves a gap.
-    least = r0 if constants.levels.compliant else r0 - _OPEN
     qx = axis.px + 0.5 * h * (smooth.ax + smooth.turning_x)
     qy = axis.py + 0.5 * h * (smooth.ay + smooth.turning_y)
     ex, ey = eccentricity(constants, axis, houses)
-    if ex * ex + ey * ey <= least * least:
-        return no_impulse(), Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
+    if ex * ex + ey * ey <= r0 * r0:
+        return no_impulse(), Touch(touch.phase, touch.slid, NONE, touch.factor)
     motion = motion_of(constants, qx, qy, houses, ex, ey)
     return kick_contact(constants, call, memory, ledger, axis, houses, motion, w, touch, step)
 
@@ -378,8 +372,8 @@ def kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last)
         coordinates = Coordinates(coordinates.kicked, coordinates.conjugate, kick)
         if inner:
             houses, near = house_kick(constants, plant, ledger, houses, impulse, step.h)
-            if near and constants.levels.compliant:
-                touch = Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
+            if near:
+                touch = Touch(touch.phase, touch.slid, NONE, touch.factor)
         taken += 1.0
         owed = step.level
         n = step.end

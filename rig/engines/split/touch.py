@@ -5,8 +5,6 @@ from __future__ import annotations
 from rig.engines.memory import CONTACT_STEPS, PEAK_FORCE
 from rig.engines.split.impulse import (
     Impulse,
-    Law,
-    Push,
     compliant_push,
     flow_acceleration,
     friction_impulse,
@@ -19,23 +17,11 @@ from rig.engines.split.state import Touch
 from rig.kernels import signals as S
 from rig.kernels.contact import BACKWARD, FORWARD, ROLLING
 
-_SLOP = 200.0
-"""Depth that a rigid ring keeps in lasting contact, over the step squared [m/s^2]: a chord of the arc stays inside."""
-_RETURN = 0.1
-"""Part of a depth beyond it that is taken back in a step."""
-
 
 @inlined
 def no_impulse():
     """Of a step without contact."""
     return Impulse(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-@inlined
-def rigid_push(motion, w, rate_before, h):
-    """Normal impulse of a rigid contact that lasts, Moreau's: it leaves no speed in the mean of a step."""
-    goal = -0.5 * (motion.rate - rate_before) - _RETURN * (motion.depth - _SLOP * h * h) / h
-    return Push(max(0.0, (motion.rate - goal) / w.nn), 0.0, 0.0, w.nt / w.nn, 0.0)
 
 
 @inlined
@@ -60,17 +46,12 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     """
     plant, h = call.plant, step.h
     contact, house = constants.contact, constants.house
-    compliant, inner = constants.levels.compliant, constants.levels.inner_house
+    inner = constants.levels.inner_house
     nx, ny, per_distance, depth, rate, lateral = motion
     w = mobility_of(plant, constants.levels.euler, axis, nx, ny)
-    flow_rate = 0.0
-    if compliant:
-        law = law_at(contact, depth, touch.factor)
-        flow_rate = flow_acceleration(constants, plant, axis, houses, motion)
-        push = compliant_push(law, w, rate, flow_rate, h)
-    else:
-        law = Law(0.0, 0.0, 0.0, 0.0)
-        push = rigid_push(motion, w, touch.rate, h)
+    law = law_at(contact, depth, touch.factor)
+    flow_rate = flow_acceleration(constants, plant, axis, houses, motion)
+    push = compliant_push(law, w, rate, flow_rate, h)
     jn, shift = push.jn, push.shift
 
     # Rolling holds along the arc, not at the corners of the polygon that the kicks make of it.
@@ -84,11 +65,9 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     if plant.friction == 0.0:
         phase = touch.phase
     slid = sliding - w.tt * jt - w.nt * jn
-    rate_after = rate - w.nn * jn - w.nt * jt
     rate_mean = rate - 0.5 * (w.nn * jn + w.nt * jt)
-    wanted = touch.wanted
-    if compliant and (jn <= 0.0 or phase != touch.phase or not bears(call, wanted, h, law.slope * w.nn, push.taken)):
-        return no_impulse(), Touch(touch.phase, touch.slid, touch.rate, NONE, touch.factor)
+    if jn <= 0.0 or phase != touch.phase or not bears(call, touch.wanted, h, law.slope * w.nn, push.taken):
+        return no_impulse(), Touch(touch.phase, touch.slid, NONE, touch.factor)
     jx, jy = -jn * nx + jt * ny, -jn * ny - jt * nx
     force_x, force_y = jx, jy
     loss = (jn - push.held) * rate_mean
@@ -111,15 +90,12 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
     ledger[S.CONTACT_IMPULSE] += jn
     memory[CONTACT_STEPS] += 1.0
 
-    # The force of a rigid contact is no function of time.
-    cx = cy = dcx = dcy = 0.0
-    if compliant:
-        memory[PEAK_FORCE] = max(memory[PEAK_FORCE], law.elastic + law.damping * rate_mean)
-        cx, cy = force_x * step.per_h, force_y * step.per_h
-        growth, turn = law.relative * rate_mean, lateral * per_distance
-        flow_rate *= law.damping
-        dcx, dcy = growth * cx - turn * cy - flow_rate * nx, growth * cy + turn * cx - flow_rate * ny
-    after = Touch(phase, slid, rate_after, wanted, touch.factor)
+    memory[PEAK_FORCE] = max(memory[PEAK_FORCE], law.elastic + law.damping * rate_mean)
+    cx, cy = force_x * step.per_h, force_y * step.per_h
+    growth, turn = law.relative * rate_mean, lateral * per_distance
+    flow_rate *= law.damping
+    dcx, dcy = growth * cx - turn * cy - flow_rate * nx, growth * cy + turn * cx - flow_rate * ny
+    after = Touch(phase, slid, touch.wanted, touch.factor)
     return Impulse(jx, jy, jt, shift * nx, shift * ny, cx, cy, dcx, dcy), after
 
 

@@ -67,6 +67,8 @@ from rig.kernels.stage import kernel
 _SAFETY = 0.9
 _LONGEST_S, _SHORTEST_S = 6e-2, 1e-12
 """Longest step, and the shortest that is no sign of trouble [s], in the variable of the series."""
+_NOTHING = 1e-60
+"""What counts as 0 in a state."""
 _ROUNDING = 1e-16
 """Tolerance that no step can vouch for."""
 _SCALE_T, _SCALE_ROOT = 1e-4, 3e-3
@@ -231,6 +233,10 @@ def _next_series(constants, inputs, memory, room, y):
         memory[TICK], memory[FRACTION] = memory[END_TICK], memory[END_FRACTION]
     change_phase(constants, inputs, memory, x, y, room.dy, room.out)
     fill(Y[0, : ROOT + 1], x)
+    for i in range(S.N_STATE):
+        # At rest, rates decay to where a processor takes a hundred times as long for a product.
+        if abs(Y[0, i]) < _NOTHING:
+            Y[0, i] = 0.0
     slowed = _make_series(constants, inputs, memory, room)
     memory[STEPS] += 1.0
     memory[EVALUATIONS] += ORDER
