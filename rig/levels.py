@@ -24,7 +24,7 @@ class ModelLevels(BaseModel):
     stator: Literal["rigid", "inner-house", "two-houses"] = "two-houses"
     """Bodies that move; those that do not pass forces on."""
     contact: Literal["impact", "compliant"] = "compliant"
-    """A rigid impact law (restitution, no force over time), or a compliant normal law; contact that lasts is compliant."""
+    """Impacts of a rigid ring (restitution, no force over time), compliant where contact lasts; or compliant always."""
     friction: Literal["none", "smoothed", "switch", "exact"] = "exact"
     """None; tanh of the sliding speed; clamped linear; Coulomb's set-valued law."""
 

@@ -8,7 +8,9 @@ from typing import Any
 
 from numba.core.event import Listener
 
-_ENGINE_S = 30
+from rig.cli.ahead import SERIES, start_beside
+
+_ENGINE_S = 45
 """Processor time that an engine takes, with the kernels that it calls, on a usual machine [s]."""
 
 
@@ -27,7 +29,7 @@ class Compiling(Listener):
         self._begun, self._going_on = begun, going_on
         self._under_way: list[str] = []
         """Modules of the functions, each on the way of the one before."""
-        self._told = False
+        self._told = self._beside = False
         self._spent_s, self._since_s = 0.0, 0.0
 
     def on_start(self, event: Any) -> None:
@@ -39,6 +41,9 @@ class Compiling(Listener):
         ours = [module for module in self._under_way if module.startswith(("rig.", "drivers."))]
         if not ours:
             return
+        if ours[0].startswith(SERIES) and not self._beside:
+            self._beside = True
+            start_beside()
         name, spent_s = ".".join(ours[-1].split(".")[-2:]), self._spent_s + now_s - self._since_s
         text = f"compiling {name} ({spent_s:.0f} s of CPU; some {_ENGINE_S} s an engine)"
         if self._told:

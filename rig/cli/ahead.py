@@ -1,0 +1,59 @@
+"""Half of a first start's compiling, in a process of its own beside it: `python -m rig.cli.ahead`.
+
+The kernels of an engine are compiled in the order in which they call each other, and the longest, the series, come
+last. On a second core they are ready by then, and found in the cache.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from threading import Thread
+
+SERIES = ("rig.engines.split", "rig.engines.taylor")
+"""Engines that are made of series."""
+
+
+def start_beside() -> None:
+    """Start it where there is a core for it. It ends by itself, and with this process."""
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    if len(cores) > 1:
+        quiet = subprocess.DEVNULL
+        subprocess.Popen([sys.executable, "-m", __name__], stdin=quiet, stdout=quiet, stderr=quiet)
+
+
+def compile_last() -> None:
+    """Compile the series, then the sensors, by calling them as a run does."""
+    import numpy as np
+
+    from rig.engines.memory import MEMORY
+    from rig.engines.taylor.march import room_in
+    from rig.engines.taylor.series import flight, rolling, sliding
+    from rig.kernels.constants import Inputs
+    from rig.kernels.records import packed
+    from rig.kernels.signals import N_ROW
+    from rig.sensors.conditioning import Conditioner
+    from rig.simulation import Simulation
+
+    simulation = Simulation("hammer")
+    quiet = Inputs(1e-6, 0.0, 1.0, 0.0, 0, 0, 0.0, 0.0, 0, ideal_drive=False, magnet_engaged=True)
+    constants, inputs = packed(simulation.model.constants)[0], packed(quiet)[0]
+    memory = np.zeros(MEMORY)
+    room = room_in(memory)
+    for series in (flight, rolling, sliding):
+        series(constants, inputs, memory, 0.0, 0.0, 0.0, 0.0, room.Y, room.A, room.B, room.D, room.acc)
+    groups, rows = tuple(simulation.table.groups.values()), np.zeros((1000, N_ROW))
+    Conditioner(groups, row_rate_hz=40_000, seed=1, noise=True, ideal=False).counts(rows)
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.2)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    compile_last()
