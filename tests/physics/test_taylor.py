@@ -31,9 +31,11 @@ import pytest
 
 from replays.studies.peers import PEERS, Setting, scaled_error
 from replays.studies.peers.window import cut_window
+from replays.studies.random_scene import draw_scene
 from replays.studies.stability.flight import house_oscillator
 from replays.studies.stability.impacts import first_impact
 from replays.studies.stability.motion import move, quiet_inputs, state
+from replays.studies.stability.worker import Task, run_task
 from rig import load_scene, simulate
 from rig.engines import load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACT_STEPS, CONTACTS, MEMORY, ONSET, PHASE, STEPS
@@ -280,6 +282,13 @@ def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
     assert np.abs(scaled(one._motion.y[: S.N_STATE]) - scaled(other._motion.y[: S.N_STATE])).max() < 1e-6
     assert one._motion.memory[STEPS] < 400
     assert not one.health()["warnings"]
+
+
+def test_a_contact_that_begins_with_hardly_any_speed_goes_on() -> None:
+    # It begins deeper than it may go without friction: rolling began behind the ring's surface, where there is no force.
+    run = {name: run_task(Task(draw_scene(21, 385), name, 1e-9)) for name in ("taylor", "rk8")}
+    assert [done.failure for done in run.values()] == ["", ""]
+    assert scaled_error(run["taylor"].states, run["rk8"].states) < 1e-5
 
 
 def test_a_stiff_linear_contact_rolls() -> None:

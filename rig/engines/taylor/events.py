@@ -112,7 +112,8 @@ def enter_events(constants, memory, Y):
         # Frictionless up to the depth of that time, on the way in: s' = delta'/2.
         for k in range(ORDER + 1):
             second[k] = -Y[k, ROOT]
-        second[0] += math.sqrt(_FRICTIONLESS_S * 2.0 * Y[1, ROOT])
+        least = 2.0 * math.sqrt(_LEAST_DEPTH * contact.clearance)  # so slow a contact begins at half of it
+        second[0] += max(least, math.sqrt(_FRICTIONLESS_S * 2.0 * Y[1, ROOT]))
 
 
 @kernel
