@@ -285,7 +285,7 @@ def test_a_motion_along_a_line_goes_on(friction: float, force: float) -> None:
 
 
 def test_a_contact_that_begins_with_hardly_any_speed_goes_on() -> None:
-    # It begins deeper than it may go without friction: rolling began behind the ring's surface, where there is no force.
+    # It begins deeper than it may go without friction: rolling began before the ring, where there is no force.
     run = {name: run_task(Task(draw_scene(21, 385), name, 1e-9)) for name in ("taylor", "rk8")}
     assert [done.failure for done in run.values()] == ["", ""]
     assert scaled_error(run["taylor"].states, run["rk8"].states) < 1e-5

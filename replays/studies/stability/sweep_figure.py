@@ -14,7 +14,9 @@ from replays.studies.stability.truth import WRONG
 from rig.engines import ENGINES
 
 _LEAST, _MOST = 1e-10, 10.0
-"""Errors drawn [1]; what is beyond stands at the edge."""
+"""Errors drawn [1]; what is beyond stands at the edge, ..."""
+_SLOWEST = 1e-3
+"""... as do speeds below this."""
 
 
 @house_style()
@@ -49,7 +51,7 @@ def draw_sweep(folder: Path, rows: list[dict[str, Any]], engines: list[str]) -> 
         main_one = engine == main
         style = {"color": traits(engine).colour, "lw": 3.0 if main_one else 1.6, "zorder": 8 if main_one else 5}
         _shares(errors, wrong, label=f"{engine}: {silent} of {len(wrong)}", **style)
-        _shares(speeds, [one["speed"] or 0.0 for _, one in ran], **style)
+        _shares(speeds, [max(one["speed"] or 0.0, _SLOWEST) for _, one in ran], **style)
     distance = [row["distance"] for row in rows if row["status"] == "decided"]
     _shares(errors, distance, color="0.6", lw=5.0, alpha=0.5, zorder=1, label="the two accurate ones, from each other")
     errors.set(
