@@ -6,6 +6,7 @@ last. On a second core they are ready by then, and found in the cache.
 
 from __future__ import annotations
 
+import atexit
 import os
 import subprocess
 import sys
@@ -17,11 +18,17 @@ SERIES = ("rig.engines.split", "rig.engines.taylor")
 
 
 def start_beside() -> None:
-    """Start it where there is a core for it. It ends by itself, and with this process."""
+    """Start it where there is a core for it. It ends by itself, or with this process."""
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
     if len(cores) > 1:
         quiet = subprocess.DEVNULL
-        subprocess.Popen([sys.executable, "-m", __name__], stdin=quiet, stdout=quiet, stderr=quiet)
+        child = subprocess.Popen([sys.executable, "-m", __name__], stdin=quiet, stdout=quiet, stderr=quiet)
+        atexit.register(_end, child)
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    child.kill()
+    child.wait()
 
 
 def compile_last() -> None:

@@ -221,11 +221,14 @@ def test_a_command_and_its_effect_are_told_once_and_what_had_none_is_told_too() 
     ]  # fmt: skip
 
 
-def test_compiling_is_told_as_long_as_it_lasts() -> None:
+def test_compiling_is_told_as_long_as_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
     from types import SimpleNamespace
 
+    from rig.cli import compiling
     from rig.cli.compiling import Compiling
 
+    beside: list[str] = []
+    monkeypatch.setattr(compiling, "start_beside", lambda: beside.append("started"))
     begun: list[str] = []
     told: list[str] = []
     listener = Compiling(begun.append, told.append)
@@ -242,6 +245,7 @@ def test_compiling_is_told_as_long_as_it_lasts() -> None:
     (first,) = begun
     assert first.startswith("compiling split.method (0 s of CPU; ")
     assert first.endswith("), once on this machine")
+    assert beside == ["started"]
 
 
 def test_every_command_with_tables_has_the_same_options(capsys: pytest.CaptureFixture[str]) -> None:
