@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numba import njit
 
-from rig.engines.memory import PHASE, STEPS
+from rig.engines.memory import ONSET, PHASE, STEPS
 from rig.engines.method import PER_SCALE
 from rig.engines.split.flow import GRID, house_flows, magnet_springs, shaft_flows
 from rig.engines.split.inner_motion import (
@@ -33,6 +33,7 @@ from rig.engines.split.place import (
     FLOWS,
     FLOWS_END,
     GRID_TICKS,
+    HARDEST,
     LIMIT,
     MODE,
     OWN_TICKS,
@@ -47,7 +48,7 @@ from rig.engines.split.state import Call, Coordinates, Direction, Touch
 from rig.engines.split.steps import keep, keep_state, kicks, struck
 from rig.engines.taylor import march as series
 from rig.engines.taylor.events import FIRST, NOTHING
-from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, SLACK, SPAN
+from rig.engines.taylor.place import END_FRACTION, END_TICK, EVENT, FRACTION, SLACK, SPAN, TICK
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT, ROLLING
 from rig.kernels.geometry import gap
@@ -105,17 +106,23 @@ def _enter_kicks(constants, memory, y, phase, wanted):
 def _series_to(constants, inputs, plant, memory, room, y, tick):
     """The series up to a tick, and the state there into y."""
     while not series.holds(memory, tick, 0.0):
-        bounced = False
+        bounced = lasts = False
         if memory[SPAN] >= 0.0 and memory[EVENT] != NOTHING:
             memory[ROLLS] = memory[END_TICK]
             if memory[EVENT] == FIRST and memory[PHASE] == FLIGHT and not constants.levels.compliant:
                 series.read_off(memory, room, y, memory[END_TICK], memory[END_FRACTION])
                 bounced = bounce(constants, inputs, plant, memory, room, y)
+                lasts = not bounced
         if bounced:
             end = int(memory[END_TICK])
             series.begin_series(constants, inputs, memory, room, y, end, memory[END_FRACTION], True)
         elif not series.continue_series(constants, inputs, memory, room, y):
             return
+        if lasts and memory[HARDEST] > memory[ONSET]:
+            # It has come of that impact: after so slow an onset the law's damping is stiff, and no other matters here.
+            series.read_off(memory, room, y, memory[TICK], memory[FRACTION])
+            memory[ONSET] = memory[HARDEST]
+            series.begin_series(constants, inputs, memory, room, y, int(memory[TICK]), memory[FRACTION], False)
     series.read_off(memory, room, y, tick, 0.0)
 
 

@@ -12,6 +12,8 @@ MODE = next(_next)
 """Which method moves on: the series, or kicks."""
 LIMIT = next(_next)
 """The tolerance of the whole."""
+HARDEST = next(_next)
+"""Speed of the hardest rigid impact so far [m/s]."""
 ROLLS, AGAIN = (next(_next) for _ in range(2))
 """Tick since which the contact's phase is what it is; tick from which kicks are held against a series again."""
 UX, UY, PX, PY, SPIN, ANGLE = (next(_next) for _ in range(6))

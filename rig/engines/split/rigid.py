@@ -18,6 +18,7 @@ from rig.engines.split.inner_motion import (
     into_coordinates,
     motion_of,
 )
+from rig.engines.split.place import HARDEST
 from rig.engines.taylor.place import END_FRACTION, END_TICK
 from rig.kernels import signals as S
 from rig.kernels.contact import FLIGHT
@@ -103,6 +104,7 @@ def bounce(constants, inputs, plant, memory, room, y):
     if motion.rate <= contact.speed_floor and _pressed(constants, inputs, memory, room, y) > _PRESSED:
         return False
     latch_onset(memory, motion.rate, contact)
+    memory[HARDEST] = max(memory[HARDEST], memory[ONSET])
     change = (1.0 + contact.restitution) * max(motion.rate, 0.0) + _APART
     # Both conditions at once where it sticks; else the limit holds, and the normal condition with it.
     determinant = m.nn * m.tt - m.nt * m.nt
