@@ -106,7 +106,7 @@ def test_a_signal_ends_the_stream_in_good_order() -> None:
 def test_a_killed_rig_is_noticed_long_before_the_lease_ends() -> None:
     with rig("real-time") as (child, endpoint), ZenohClient(endpoint, wait_s=10.0) as client:
         listener = Listener(client)
-        until(lambda: bool(listener.follow.received) and listener.alive == [True])
+        until(lambda: bool(listener.follow.received and listener.events) and listener.alive == [True])
         child.kill()
         until(lambda: listener.alive == [True, False])
     assert listener.gaps == []
