@@ -382,11 +382,12 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
     client = ScriptedClient()
     session = RecordingSession(client, path, inbox_bytes=20_000)
     gate = threading.Event()
-    real = RecordingWriter.take
+    real, done = RecordingWriter.take, []
 
     def slow(self, payload: Payload) -> None:
         gate.wait(10.0)
         real(self, payload)
+        done.append(payload)
 
     monkeypatch.setattr(RecordingWriter, "take", slow)
     blocks = [(PROBES, encode_block(block_of(PROBES, number))) for number in range(50)]
@@ -396,8 +397,11 @@ def test_a_full_inbox_refuses_blocks_counts_them_and_leaves_a_gap(path, monkeypa
             client.publish(*block)
         gate.set()
         deadline = time.monotonic() + 10.0
-        while session._inbox.used and time.monotonic() < deadline:  # what is being written takes room, too
+        quiet = 0
+        while quiet < 100 and time.monotonic() < deadline:  # what is being written takes room, too
+            before = len(done)
             time.sleep(0.002)
+            quiet = quiet + 1 if len(done) == before and not session.waiting else 0
         client.publish(*blocks[-1])
         client.publish(EVENTS, encode_document({"event": "end", "tick": 0, "time_s": 0.0, "reason": "completed"}))
 
