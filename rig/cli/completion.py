@@ -82,15 +82,8 @@ _ENDING = re.compile(r"(?<![\w.])\.[a-z][a-z0-9]+\b")
 SCENE_KEYS = (
     *("duration_s", "seed", "parameters", "fidelity"),
     *("initial.position", "initial.x_mm", "initial.y_mm", "initial.magnets"),
-    *(
-        "drive.mode",
-        "drive.speed_hz",
-        "drive.profile",
-        "engine.name",
-        "engine.step_us",
-        "engine.tolerance",
-        "engine.companion",
-    ),
+    *("drive.mode", "drive.speed_hz", "drive.profile"),
+    *("engine.name", "engine.step_us", "engine.tolerance", "engine.companion"),
     *("model.magnet", "model.shaft", "model.stator", "model.contact", "model.friction"),
     *("sensors.groups", "sensors.rate_hz", "sensors.truth_rate_hz", "sensors.noise", "sensors.chain"),
 )

@@ -47,7 +47,7 @@ _BY_STATE = ("none", "smoothed", "switch")
 
 ENGINES = {
     "split": Method(
-        "Taylor series through impacts, exact linear flow and kicks elsewhere",
+        "Taylor series, exact linear flow and kicks in lasting contact",
         25,
         3e-4,
         ("none", "exact"),

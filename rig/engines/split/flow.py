@@ -8,9 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from rig.engines.split.inner_motion import FAST, Axis, Houses, inlined
+from rig.engines.split.inner_motion import Axis, Houses, fast, inlined
 from rig.kernels.constants import Constants
 from rig.kernels.magnet import magnet_force
 
@@ -55,7 +54,7 @@ def _house_rates(constants: Constants) -> np.ndarray:
     return rates
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def _axis_flow(stiffness, damping, t):
     """Exp of [[0, 1], [-stiffness, -damping]] t, row by row."""
     decay = math.exp(-0.5 * damping * t)
@@ -101,7 +100,7 @@ def house_flows(constants: Constants, grid_step: float) -> np.ndarray:
     return np.array(flows).reshape(LEVELS, HOUSE_FLOW)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def shaft_flows(plant, engaged, grid_step):
     """Flows of shaft and drive for half a step of every level, shape (LEVELS, 13); `grid_step` in s."""
     flows = np.empty((LEVELS, 13))

@@ -22,6 +22,7 @@ FAST = {"contract", "reassoc", "arcp", "nsz"}
 """What the compiler may do beyond the rules of IEEE 754: fuse, reorder, take reciprocals. One build makes the same bits
 every time all the same, in 5/6 of the time. Nothing that assumes that there is no nan."""
 
+fast = njit(cache=True, error_model="numpy", fastmath=FAST)
 inlined = njit(cache=True, error_model="numpy", fastmath=FAST, forceinline=True, no_cpython_wrapper=True)  # pyright: ignore[reportCallIssue]
 """Put in place by the compiler wherever it is called, and only from compiled code: no wrapper for Python to compile."""
 
@@ -94,7 +95,7 @@ class Plant(NamedTuple):
     tightest: float  # root of twice the houses' energy at which one of them can come loose [J^0.5]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def plant_of(constants, inputs, rest, spring_x, spring_y):
     """What a call makes of the constants and the inputs.
 
@@ -142,7 +143,7 @@ def plant_of(constants, inputs, rest, spring_x, spring_y):
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def from_coordinates(constants, y):
     """Generalised coordinates y as axis, spin about it [rad/s], spin angle [rad], houses."""
     euler = constants.levels.euler
@@ -153,7 +154,7 @@ def from_coordinates(constants, y):
     return axis, w, y[S.THETA], houses
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def into_coordinates(constants, axis, w, theta, houses, y):
     """The same the other way, into y."""
     euler = constants.levels.euler

@@ -81,17 +81,6 @@ def turned(cos_a, sin_a, by):
 
 
 @inlined
-def hammer_mean(inputs, start_tick, ticks):
-    """Mean force of the hammer over a step [N]: the pulse's own integral, of that part which lies in the step."""
-    begin, end = max(start_tick, float(inputs.hammer_start)), min(start_tick + ticks, float(inputs.hammer_end))
-    if end <= begin:
-        return 0.0
-    width = math.pi / (inputs.hammer_end - inputs.hammer_start)
-    before, after = width * (begin - inputs.hammer_start), width * (end - inputs.hammer_start)
-    return inputs.hammer_force * (math.cos(before) - math.cos(after)) / (width * ticks)
-
-
-@inlined
 def along(euler, axis, x, y):
     """Part along the axis of something lateral, by which the direction does not change; none with small angles."""
     return x * axis.ux + y * axis.uy if euler else 0.0

@@ -2,7 +2,7 @@
 
 - Flight, impacts, slip, the turn of friction and all that is not settled: the Taylor series of `rig.engines.taylor`,
   with their events; some eleven series an impact. They could take everything, and do where nothing below holds.
-- Contact without an event for a while: exact linear flow and kicks (`rig.engines.split.steps`), three times as fast.
+- Contact without an event for a while: exact linear flow and kicks (`rig.engines.split.steps`), up to twice as fast.
   Their error is measured: a trial of both, from the same state, before they begin, and again every now and then.
 - A rigid contact: impacts one by one where the gap closes (`rig.engines.split.rigid`); where it lasts, it is the
   compliant one.
@@ -22,7 +22,7 @@ from rig.engines.memory import ONSET, PHASE, STEPS
 from rig.engines.method import PER_SCALE
 from rig.engines.split.flow import GRID, house_flows, magnet_springs, shaft_flows
 from rig.engines.split.inner_motion import (
-    FAST,
+    fast,
     from_coordinates,
     plant_of,
 )
@@ -90,7 +90,7 @@ def _prepare_flows(constants, inputs, memory, step_ticks):
     memory[FLOWS:FLOWS_END] = house_flows(constants[0], step_ticks * inputs[0].tick_s).ravel()
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def _enter_kicks(constants, memory, y, phase, wanted):
     """From the series over to kicks, at the state y."""
     axis, w, theta, houses = from_coordinates(constants, y)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from rig.engines.events import latch_onset
 from rig.engines.memory import ONSET
 from rig.engines.method import rates
 from rig.engines.split.impulse import mobility_of
 from rig.engines.split.inner_motion import (
-    FAST,
     Axis,
     Houses,
     eccentricity,
+    fast,
     from_coordinates,
     geometry_of,
     into_coordinates,
@@ -31,7 +29,7 @@ _APART = 1e-9
 """Least speed at which what leaves leaves [m/s]: 0 has rounding's sign."""
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def _seen(constants, plant, y):
     """Motion at the ring, mobility there and sliding speed [m/s] at the state y."""
     axis, w, _, houses = from_coordinates(constants, y)
@@ -41,7 +39,7 @@ def _seen(constants, plant, y):
     return motion, m, motion.lateral + constants.shaft.radius * w
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt):
     """Impulses jn, normal, and jt, across [N s], on the state y and in its integrals."""
     shaft, euler, per_inner = constants.shaft, constants.levels.euler, plant.per_inner
@@ -89,7 +87,7 @@ def _pressed(constants, inputs, memory, room, y):
     return (room.out[S.PENETRATION_RATE] - before) / _MOMENT_S
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def bounce(constants, inputs, plant, memory, room, y):
     """An impact at the state y, whose gap is closed: Newton's restitution, and Coulomb's friction.
 
@@ -118,7 +116,7 @@ def bounce(constants, inputs, plant, memory, room, y):
     return True
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@fast
 def hold(constants, inputs, plant, y):
     """End the sliding at the state y of a contact that rolls: kicks leave it none in the mean of a step only."""
     motion, m, sliding = _seen(constants, plant, y)

@@ -65,8 +65,6 @@ class Smooth(NamedTuple):
     turning_y: float
     pull_x: float  # unbalance
     pull_y: float
-    hammer_x: float
-    hammer_y: float
     rotation: float  # theta' [rad/s]
 
 
@@ -74,7 +72,6 @@ class Work(NamedTuple):
     """Integrals since the last row that are booked kick by kick."""
 
     drive: float  # [J]
-    hammer: float
     unbalance: float
     bearing: float
     turn_x: float  # torques [N m s]

@@ -2,7 +2,7 @@
 
 A step of flow and kick is half a flow, a kick, half a flow. The flow solves shaft on linear magnets, drive and both
 houses exactly: the houses ring at up to 1.6 kHz and cost no accuracy. The kick holds the contact, the magnets'
-hardening, gravity, unbalance, the hammer and the turning of the axis.
+hardening, gravity, unbalance and the turning of the axis; the hammer's blows are for the series.
 
 State inside: the direction of the axis, u = (sin b, -sin G cos b), and its rate p. In these, a point at arm l is l u,
 the kinematics have no sines, and with S the sum of arm times lateral force
@@ -43,7 +43,7 @@ from rig.engines.split.inner_motion import (
     into_coordinates,
     motion_of,
 )
-from rig.engines.split.kick import Kick, along, continued, hammer_mean, processed, smooth_forces, turned, turning
+from rig.engines.split.kick import Kick, along, continued, processed, smooth_forces, turned, turning
 from rig.engines.split.levels import NONE, span_of
 from rig.engines.split.place import (
     ANGLE,
@@ -121,11 +121,10 @@ def struck(inputs, begin, end):
 
 
 @inlined
-def _step_of(constants, inputs, call, touch, kicked, owed, now, n, last):
+def _step_of(inputs, call, touch, kicked, owed, now, n, last):
     """The next step: as long as is wanted; it starts at a multiple of its length, and ends at the row.
 
     Args:
-        constants: Of the model.
         inputs: Of this call.
         call: What stays through the call.
         touch: The contact.
@@ -173,22 +172,18 @@ def _flow_to_middle(constants, inputs, call, shaft_table, house_table, step, aim
 
 
 @inlined
-def _smooth(constants, inputs, call, step, axis, geometry, w, direction):
+def _smooth(constants, inputs, call, axis, geometry, w, direction):
     """Everything smooth, in the middle of the step: sum of arm times force, without the flow's linear magnets."""
     shaft, lI = constants.shaft, constants.shaft.arm_disk
     rotation = w - geometry.share  # theta'
     pull = lI * shaft.unbalance * rotation * rotation
     pull_x, pull_y = pull * direction.cosine, pull * direction.sine
-    force = lI * hammer_mean(inputs, step.begin, step.parts * call.part_ticks)
-    hammer_x, hammer_y = force * inputs.hammer_x, force * inputs.hammer_y
-    Sx, Sy, ax, ay = smooth_forces(
-        constants, call.plant, inputs.magnet_engaged, axis, pull_x + hammer_x, pull_y + hammer_y
-    )
+    Sx, Sy, ax, ay = smooth_forces(constants, call.plant, inputs.magnet_engaged, axis, pull_x, pull_y)
     # What depends on the rates: they are taken again in the middle of the kick, for order 2.
     turning_x, turning_y = turning(
         constants.levels.euler, call.plant, axis, geometry.uz, axis.px, axis.py, geometry.pz, w
     )
-    return Smooth(Sx, Sy, ax, ay, turning_x, turning_y, pull_x, pull_y, hammer_x, hammer_y, rotation)
+    return Smooth(Sx, Sy, ax, ay, turning_x, turning_y, pull_x, pull_y, rotation)
 
 
 @inlined
@@ -232,7 +227,7 @@ def _kick_shaft(
     shaft, plant, h = constants.shaft, call.plant, step.h
     euler, ideal, arm = constants.levels.euler, inputs.ideal_drive, call.plant.arm
     R, lA, lI, per_Ixx = shaft.radius, shaft.arm_ring, shaft.arm_disk, call.plant.per_Ixx
-    Sx, Sy, ax, ay, turning_x, turning_y, pull_x, pull_y, hammer_x, hammer_y, rotation = smooth
+    Sx, Sy, ax, ay, turning_x, turning_y, pull_x, pull_y, rotation = smooth
     share = geometry.share
     ux, uy, px, py = axis
     uz = geometry.uz
@@ -263,8 +258,8 @@ def _kick_shaft(
     net = moved + torque - R * jt
     # What the next change of step and the rows need. Of what is smooth, only the unbalance changes fast.
     kick = Kick(
-        ax + turning_x + hammer_x * per_Ixx,
-        ay + turning_y + hammer_y * per_Ixx,
+        ax + turning_x,
+        ay + turning_y,
         -rotation * pull_y * per_Ixx,
         rotation * pull_x * per_Ixx,
         impulse.cx,
@@ -276,7 +271,6 @@ def _kick_shaft(
     Lx, Ly = h * (Sx - damped_x) + lA * jx, h * (Sy - damped_y) + lA * jy
     work = Work(
         work.drive + gained + torque * w_mid,
-        work.hammer + h * (hammer_x * mx + hammer_y * my),
         work.unbalance + h * (pull_x * mx + pull_y * my),
         work.bearing + h * (damped_x * mx + damped_y * my),
         work.turn_x + (net * ux - uz * Ly),
@@ -291,7 +285,6 @@ def _book(constants, y, ledger, work, axis, houses, moved, gained):
     """The integrals since the last row into y; `moved` [N m s] and `gained` [J] by the last flow of the spin."""
     house = constants.house
     ledger[S.DRIVE_WORK] = work.drive + gained
-    ledger[S.HAMMER_WORK] = work.hammer
     ledger[S.UNBALANCE_WORK] = work.unbalance
     ledger[S.BEARING_LOSS] = work.bearing
     ledger[S.HOUSE_LOSS] -= house_energy(constants, houses)
@@ -331,14 +324,14 @@ def kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last)
     # Integrals of this piece start at 0.
     ledger[:] = 0.0
     ledger[S.HOUSE_LOSS] = house_energy(constants, houses)
-    work = Work(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    work = Work(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     # The unbalance's direction is turned step by step; its length is kept here.
     q = 1.5 - 0.5 * (direction.cosine * direction.cosine + direction.sine * direction.sine)
     direction = Direction(direction.cosine * q, direction.sine * q, direction.angle)
     taken = 0.0
     owed = -1
     while n < last:
-        step = _step_of(constants, inputs, call, touch, coordinates.kicked, owed, now, n, last)
+        step = _step_of(inputs, call, touch, coordinates.kicked, owed, now, n, last)
         if step.level == NONE:
             break
         before = (axis, w, theta, houses, coordinates, direction)
@@ -361,7 +354,7 @@ def kicks(constants, inputs, call, memory, shaft_table, ledger, y, now, n, last)
         direction = Direction(cosine, sine, theta)
 
         # The kick.
-        smooth = _smooth(constants, inputs, call, step, axis, geometry, w, direction)
+        smooth = _smooth(constants, inputs, call, axis, geometry, w, direction)
         impulse, touch = _contact(constants, call, memory, ledger, step, axis, w, houses, smooth, touch)
         if touch.wanted == NONE:
             axis, w, theta, houses, coordinates, direction = before

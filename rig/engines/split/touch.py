@@ -86,7 +86,6 @@ def kick_contact(constants, call, memory, ledger, axis, houses, motion, spin, to
         loss += law.elastic * w.nn * shift - lateral_jump * lateral - springs
     ledger[S.CONTACT_LOSS] += loss
     ledger[S.FRICTION_LOSS] += jt * 0.5 * (sliding + slid)
-    ledger[S.GAP_WORK] += contact.gap_counts_outer * (jx * houses.x3 + jy * houses.y3)
     ledger[S.CONTACT_IMPULSE] += jn
     memory[CONTACT_STEPS] += 1.0
 

@@ -383,10 +383,8 @@ def write_row(constants, inputs, memory, room, y, tick, phase, rows, row):
     """The row of an instant."""
     out = room.out
     rates(constants, inputs, tick, 0.0, memory[ONSET], phase, True, y, room.dy, out)
-    for i in range(S.N_VECTOR):
-        rows[row, i] = y[i]
-    for i in range(S.N_OBSERVED):
-        rows[row, S.N_VECTOR + i] = out[i]
+    fill(rows[row, : S.N_VECTOR], y)
+    fill(rows[row, S.N_VECTOR :], out)
 
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
