@@ -56,13 +56,21 @@ class Publisher:
         for key, document in documents().items():
             self.server.answer(key, lambda _, document=document: encode_document(document))
         self.beats: list[dict] = []
-        self.server.hear(f"{CLIENTS}/*", lambda _, payload: self.beats.append(decode_document(payload)))
+        self.reached: set[str] = set()
+        """Keys of the clients that have had a row."""
+        self.server.hear(f"{CLIENTS}/*", self._heard)
         self.server.announce()
         self.sent: dict[str, list[bytes]] = {}
         self.rows: dict[str, int] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
+
+    def _heard(self, key: str, payload: bytes) -> None:
+        beat = decode_document(payload)
+        self.beats.append(beat)
+        if beat["received_index"]:
+            self.reached.add(key)
 
     def _run(self) -> None:
         start_s = time.monotonic()
@@ -338,7 +346,7 @@ def test_a_second_recorder_to_the_same_file_is_refused_and_the_first_one_goes_on
             _, errors = second.communicate(timeout=PATIENCE_S)
             assert second.returncode == 1
             assert "no other recording is writing to" in errors
-            until(lambda: (tmp_path / "other.mcap.part").exists())
+            until(lambda: len(rig.reached) == 2)
             rig.end()
             for process in (first, third):
                 output, errors = process.communicate(timeout=PATIENCE_S)
