@@ -207,10 +207,12 @@ class NodeBus(can.BusABC):
         """Keep frames until they are read; the lock is held."""
         self._batches.append((frames, filters))
         self.waiting += len(frames)
-        while self.waiting > self._queue_size and len(self._batches) > 1:
-            surplus = len(self._batches.popleft()[0])
-            self.waiting -= surplus
-            self.dropped += surplus
+        while (surplus := self.waiting - self._queue_size) > 0:
+            oldest, by = self._batches.popleft()
+            if surplus < len(oldest):
+                self._batches.appendleft((oldest[surplus:], by))
+            self.waiting -= min(surplus, len(oldest))
+            self.dropped += min(surplus, len(oldest))
             self._overflowed = True
         self._arrived.notify()
 
