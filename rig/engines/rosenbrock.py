@@ -1,4 +1,4 @@
-"""RODAS, an L-stable Rosenbrock method of order 4(3) in six stages: linearly implicit, for the stiff smoothed friction.
+"""RODAS, an L-stable Rosenbrock method of order 4(3) in six stages: linearly implicit, for what is stiff.
 
 E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.7 and its code RODAS (method 1).
 A stage solves one linear system in the Jacobian J, in the form without products of matrices:
@@ -8,8 +8,8 @@ A stage solves one linear system in the Jacobian J, in the form without products
 J comes by differences, once a step. Positions have their speeds for rates, so the system of 14 folds into one of 7;
 the integrals of the ledger feed back into nothing and follow by substitution.
 
-A part costs 21 evaluations where rk8 takes 12, and rk8 needs no smoothing at all: this engine pays where the smoothed
-law is wanted at a small smoothing speed, which makes every explicit method's step as short.
+A part costs 21 evaluations where rk8 takes 12: this engine pays where the contact is over-damped, or friction smoothed
+over a small speed, which makes every explicit method's step as short.
 """
 
 from __future__ import annotations

@@ -214,6 +214,7 @@ CLASS = {
     "verlet": ({"engine__step_us": 1}, 1e-2),
     "rk8": ({"engine__step_us": 20}, 1e-6),
     "taylor": ({}, 1e-7),
+    "rosenbrock": ({"engine__tolerance": 1e-7}, 1e-4),
 }
 
 
