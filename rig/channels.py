@@ -10,13 +10,13 @@ import tomllib
 from collections.abc import Collection, Iterable
 from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
 from rig.errors import InputError, UnknownNameError, Words
-from rig.outside import check, input_error, parse_toml
+from rig.outside import check, parse_toml
 
 TABLE = Path(__file__).with_name("channels.toml")
 
@@ -42,6 +42,8 @@ class Channel(BaseModel):
     """Output limits of the conditioner [V]."""
     bandwidth_hz: PositiveFloat
     """-3 dB corner of the anti-alias low-pass [Hz]."""
+    filter_order: Annotated[int, Field(ge=1, le=8)] = 4
+    """Order of that Butterworth low-pass."""
     highpass_hz: Annotated[float, Field(ge=0)]
     """AC coupling [Hz]; 0 is DC-coupled."""
     noise_v: Annotated[float, Field(ge=0)]
@@ -116,6 +118,8 @@ class ChannelTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     groups: dict[str, Group]
+    curves: dict[str, tuple[tuple[FiniteFloat, FiniteFloat], ...]] = {}
+    """What formulas may use of an angle: points (degrees, value), periodic in a turn."""
 
     def __repr__(self) -> str:
         groups = [f"{name}: {', '.join(group.names)}" for name, group in self.groups.items()]
@@ -152,7 +156,7 @@ class ChannelTable(BaseModel):
                 )
                 group = group.model_copy(update={"rate_hz": rate_hz, "channels": rows})
             kept[name] = group
-        return ChannelTable(groups=kept)
+        return ChannelTable(groups=kept, curves=self.curves)
 
 
 def parse_table(text: str) -> ChannelTable:
@@ -162,23 +166,39 @@ def parse_table(text: str) -> ChannelTable:
         InputError: It is no TOML, or the first thing that is missing or wrong in it.
     """
     try:
-        groups = {}
-        for name, body in parse_toml(text, field="channel table")["groups"].items():
-            shared = {**body.get("defaults", {}), "group": name, "rate_hz": body["rate_hz"], "kind": body["kind"]}
-            rows = [
-                check(Channel, {**shared, **row}, field=f"channel {row.get('name', number)}").model_dump()
-                for number, row in enumerate(body["channels"], 1)
-            ]
-            groups[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": rows}
-        return ChannelTable.model_validate({"groups": groups})
-    except ValidationError as error:
-        raise input_error(error, "channel table", ChannelTable) from None
+        return table_of(raw_groups(text))
     except KeyError as error:
         raise InputError(f"channel table: {error.args[0]}", "given", None) from None
     except (TypeError, AttributeError):
         raise InputError("channel table", "[groups.NAME] with title, rate_hz, kind and channels", text[:80]) from None
     except tomllib.TOMLDecodeError as error:
         raise InputError("channel table", "a TOML file", Words(error)) from None
+
+
+def raw_groups(text: str) -> dict[str, Any]:
+    """The groups of a TOML text as they stand there, with the group's own kind and defaults merged into each row."""
+    groups = parse_toml(text, field="channel table")["groups"]
+    for body in groups.values():
+        shared = {**body.pop("defaults", {}), "kind": body["kind"]}
+        body["channels"] = [{**shared, **row} for row in body["channels"]]
+    return groups
+
+
+def table_of(groups: dict[str, Any], curves: dict[str, Any] | None = None) -> ChannelTable:
+    """The table of groups with whole rows, and of curves.
+
+    Raises:
+        InputError: The first thing that is missing or wrong.
+    """
+    made = {}
+    for name, body in groups.items():
+        own = {"group": name, "rate_hz": body["rate_hz"]}
+        rows = [
+            check(Channel, {**row, **own}, field=f"channel {row.get('name', number)}")
+            for number, row in enumerate(body["channels"], 1)
+        ]
+        made[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": tuple(rows)}
+    return check(ChannelTable, {"groups": made, "curves": curves or {}}, field="channel table")
 
 
 def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:

@@ -61,7 +61,8 @@ class Motion:
             engine: The engine.
             constants: Of the model.
             inputs: Hammer, drive, magnets.
-            rows: Out, one every `stride` steps from the tick `start` on, shape (n, N_ROW).
+            rows: Out, one every `stride` steps from the tick `start` on, shape (n, N_ROW); also that at `stop`, before
+                anything changes there, where there is room for it.
             start: Tick of the first row.
             tick: From here.
             stop: To here.
@@ -71,13 +72,18 @@ class Motion:
             row, beyond = divmod(tick - start, row_ticks)
             whole = 0 if beyond else (stop - tick) // row_ticks
             if whole:
-                out, step, steps, stride = rows[row : row + whole], self.step_ticks, whole * self.stride, self.stride
+                step, steps, stride = self.step_ticks, whole * self.stride, self.stride
+                out = rows[row : row + whole + 1]
             else:
                 ticks = min(stop - tick, row_ticks - beyond)
                 step = math.gcd(ticks, self.step_ticks)
                 stride = steps = ticks // step
-                out = np.empty((1, S.N_ROW)) if beyond else rows[row : row + 1]
+                out = np.empty((2, S.N_ROW))
             engine.advance(constants, inputs, self.y, self.memory, tick, step, steps, stride, out)
+            if not whole and not beyond:
+                rows[row] = out[0]
+            elif not whole and beyond + ticks == row_ticks and row + 1 < len(rows):
+                rows[row + 1] = out[1]
             tick += steps * step
 
 

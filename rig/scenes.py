@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from functools import cache
 from itertools import pairwise
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
+from rig.channel_file import read_channels
 from rig.channels import ChannelTable, check_signals, default_table
 from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand
 from rig.engines import ENGINES
@@ -20,8 +22,14 @@ from rig.levels import ModelLevels
 from rig.outside import Written, check, parse_toml, read_toml, table_in
 from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
 from rig.pick import Pick, digest, equations_digest
+from rig.sensors.formula import Formulas
+from rig.sensors.places import fits, unfit
 
 SCENES = Path(__file__).with_name("scenes")
+ROW_TICKS = (25, 20, 10, 5, 4, 2, 1)
+"""How far apart rows may be [ticks], ..."""
+ROWS_A_WAVE = 8
+"""... and how many there are at least in a period of the highest bandwidth."""
 _APART_S = 0.01
 """Least time between two points of a speed profile [s]: well above any step."""
 
@@ -124,9 +132,10 @@ def rig_table() -> ChannelTable:
 class SensorChoice(Written):
     """What is measured, and how often."""
 
-    groups: tuple[str, ...] = tuple(rig_table().groups)
-    rate_hz: Annotated[int, Field(ge=100, le=1_000_000)] = 20_000
-    """Sample rate of every channel [Hz]."""
+    groups: tuple[str, ...] = ()
+    """Groups of channels that are on; none named: all."""
+    rate_hz: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """Sample rate of every channel [Hz]; 0: that of each group in the channel table."""
     truth_rate_hz: Annotated[int, Field(ge=10, le=1_000_000)] = 2_000
     """Rate of the truth that is published beside the sensors [Hz]."""
     noise: bool = True
@@ -134,13 +143,19 @@ class SensorChoice(Written):
     chain: Literal["ideal", "full"] = "full"
     """The full chain of filter, noise, offset and converter, or what the sensor measures and nothing else."""
 
-    @field_validator("groups")
+    @field_validator("rate_hz")
     @classmethod
-    def _known(cls, groups: tuple[str, ...]) -> tuple[str, ...]:
-        known = rig_table().groups
-        if not groups or any(group not in known for group in groups) or len(set(groups)) < len(groups):
-            raise ValueError(f"a list of different names out of {', '.join(known)}")
-        return groups
+    def _a_rate(cls, rate_hz: int) -> int:
+        if 0 < rate_hz < 100:
+            raise ValueError("at least 100, or 0 for the channel table's own")
+        return rate_hz
+
+    @field_validator("truth_rate_hz")
+    @classmethod
+    def _whole_period(cls, rate_hz: int) -> int:
+        if 1_000_000 % rate_hz:
+            raise ValueError("a rate whose period is a whole number of microseconds, such as 1000, 2000 or 10000")
+        return rate_hz
 
 
 class Scene(Written):
@@ -154,7 +169,7 @@ class Scene(Written):
         >>> scene = rig.load_scene("hammer", {"duration_s": 0.5})
         >>> scene
         Scene(hammer: 0.5 s at 6.2 Hz, 1 command; parameters corrected, engine split 25 us, seed 1)
-        >>> scene.commands[0].at_s, scene.commands[0].request.force_n, scene.sensors.rate_hz
+        >>> scene.commands[0].at_s, scene.commands[0].request.force_n, scene.table.groups["probes"].rate_hz
         (0.02, 100.0, 20000)
     """
 
@@ -172,6 +187,8 @@ class Scene(Written):
     model: ModelLevels = ModelLevels()
     engine: EngineChoice = EngineChoice()
     sensors: SensorChoice = SensorChoice()
+    channels: ChannelTable | None = None
+    """The user's own channel table, read from the file that a scene names (`rig.channel_file`); none: the rig's."""
     fidelity: Literal["given", "auto"] = "given"
     """Model and engine as given here, or as `rig ladder` has picked and stored them."""
     pick: Pick | None = None
@@ -208,17 +225,27 @@ class Scene(Written):
             raise InputError("engine.companion", "false without an engine.tolerance", True)
         return self
 
+    @field_validator("channels", mode="before")
+    @classmethod
+    def _read_table(cls, channels: Any) -> Any:
+        if isinstance(channels, str | Path):
+            return read_channels(Path(channels))
+        return channels
+
     @model_validator(mode="after")
-    def _whole_rates(self) -> Scene:
-        for field in ("rate_hz", "truth_rate_hz"):
-            rate = getattr(self.sensors, field)
-            # A sample is taken at the end of a step, never between two.
-            if 1_000_000 % rate or (1_000_000 // rate) % self.engine.step_us:
-                usual = (100_000, 50_000, 25_000, 20_000, 10_000, 5_000, 2_000, 1_000, 500, 200, 100)
-                rates = [f"{other}" for other in usual if (1_000_000 // other) % self.engine.step_us == 0]
-                must = f"a rate whose period is a whole number of steps of {self.engine.step_us} us, engine.step_us"
-                hint = f" (such as {', '.join(rates[:6])} Hz)" if rates else ""
-                raise InputError(f"sensors.{field}", must + hint, rate)
+    def _possible_sensors(self) -> Scene:
+        known = (self.channels or rig_table()).groups
+        for name in self.sensors.groups:
+            if name not in known or self.sensors.groups.count(name) > 1:
+                raise InputError("sensors.groups", f"a list of different names out of {', '.join(known)}", name)
+        formulas = self.formulas()
+        for channel in self.table.channels.values():
+            formulas.column(channel.name, channel.signal)
+        row_rate_hz = 1_000_000 // self.row_ticks
+        for group in self.table.groups.values():
+            if not fits(group.rate_hz, row_rate_hz):
+                field = "sensors.rate_hz" if self.sensors.rate_hz else f"groups.{group.name}.rate_hz"
+                raise unfit(field, group.rate_hz, row_rate_hz)
         return self
 
     @model_validator(mode="after")
@@ -279,6 +306,30 @@ class Scene(Written):
             f"fidelity auto: {levels}; drive {pick.drive}, sensors {pick.sensors}; {pick.engine} "
             f"{pick.step_us} us{finest}; picked {pick.date} for {asked}"
         )
+
+    @property
+    def table(self) -> ChannelTable:
+        """Channel table of the sensors that are on, at their rates."""
+        whole = self.channels or rig_table()
+        return whole.only(self.sensors.groups or tuple(whole.groups), self.sensors.rate_hz or None)
+
+    @property
+    def row_ticks(self) -> int:
+        """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step."""
+        table, truth = self.table, 1_000_000 // self.sensors.truth_rate_hz
+        rates = [group.rate_hz for group in table.groups.values()]
+        if self.sensors.chain == "ideal" and all(1_000_000 % rate == 0 for rate in rates):
+            return math.gcd(truth, *(1_000_000 // rate for rate in rates))
+        fastest = max(channel.bandwidth_hz for channel in table.channels.values())
+        return math.gcd(truth, next(ticks for ticks in ROW_TICKS if ticks * fastest <= 1e6 / ROWS_A_WAVE or ticks == 1))
+
+    def formulas(self) -> Formulas:
+        """What the channels' formulas may use."""
+        parameters = self.load_parameters()
+        numbers = {
+            name: parameters[name] for name, entry in parameters.entries.items() if not isinstance(entry.value, str)
+        }
+        return Formulas(numbers, self.table.curves, numbers["shaft.arm_disk"])
 
     def load_parameters(self) -> ParameterSet:
         """The scene's parameters with its own changes applied."""

@@ -29,17 +29,12 @@ from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
 from rig.motion import BRANCH_ALARM, FINER, FINEST, Accuracy, Motion, energy_balance
-from rig.scenes import Scene, load_scene, rig_table, scene_document
+from rig.scenes import Scene, load_scene, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
 from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key
 
 TICK_RATE_HZ = 1_000_000
-ROW_TICKS = 25
-"""Rows are observed every 25 us, more often where rates ask for it, or every step where that is longer.
-
-The sensors' filters run at this rate. Ideal sensors have none: their rows are as far apart as samples and truth.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +62,8 @@ class Frame:
     def blocks(self) -> Iterator[tuple[str, Block]]:
         """Keys and blocks, in the order in which they are published."""
         for group, block in self.samples.items():
-            yield sensor_key(group), block
+            if len(block.values):
+                yield sensor_key(group), block
         if self.edges is not None:
             yield EDGES, self.edges
         for table, block in self.truth.items():
@@ -84,7 +80,7 @@ class Snapshot:
 
 _CHANGING = (
     "tick", "first_row", "_segments", "_engaged", "_pulse", "_pending", "_motion", "_companion", "_accuracy", "_last",
-    "_conditioner", "_keyphasor",
+    "_conditioners", "_keyphasor",
 )  # fmt: skip
 
 
@@ -125,27 +121,31 @@ class Simulation:
         self.model = build_model(scene.load_parameters(), scene.model)
         self._engine = load_engine(scene.engine.name)
         self._method = ENGINES[scene.engine.name]
-        self._step_ticks = scene.engine.step_us
-        sensors = scene.sensors
-        periods = [TICK_RATE_HZ // rate for rate in (sensors.rate_hz, sensors.truth_rate_hz)]
-        # The coarsest grid that steps, samples and truth all fall on; filters need ROW_TICKS.
-        grid = math.gcd(*periods)
-        longest = ROW_TICKS if sensors.chain == "full" else grid
-        self._stride = max(
-            n for n in range(1, max(1, longest // self._step_ticks) + 1) if grid % (n * self._step_ticks) == 0
+        sensors, self.row_ticks = scene.sensors, scene.row_ticks
+        # Steps are as long as may be of those that end on the rows.
+        self._step_ticks = next(
+            ticks for ticks in range(min(scene.engine.step_us, self.row_ticks), 0, -1) if self.row_ticks % ticks == 0
         )
-        self.row_ticks = self._stride * self._step_ticks
-        self.block_ticks = math.lcm(*periods)
+        self._stride = self.row_ticks // self._step_ticks
+        self.table: ChannelTable = scene.table
+        groups = self.table.groups.values()
+        whole = [TICK_RATE_HZ // group.rate_hz for group in groups if TICK_RATE_HZ % group.rate_hz == 0]
+        self.block_ticks = math.lcm(self.row_ticks, TICK_RATE_HZ // sensors.truth_rate_hz, *whole)
         self.end_tick = math.ceil(max(1, round(scene.duration_s * TICK_RATE_HZ)) / self.block_ticks) * self.block_ticks
-        self.table: ChannelTable = rig_table().only(sensors.groups, sensors.rate_hz)
-        self._conditioner = Conditioner(
-            tuple(self.table.groups.values()),
-            row_rate_hz=TICK_RATE_HZ // self.row_ticks,
-            seed=scene.seed,
-            noise=sensors.noise,
-            ideal=sensors.chain == "ideal",
-        )
-        self._keyphasor = Keyphasor() if "drive" in sensors.groups else None
+        formulas = scene.formulas()
+        self._conditioners = [
+            Conditioner(
+                [group for group in groups if group.rate_hz == rate],
+                row_rate_hz=TICK_RATE_HZ // self.row_ticks,
+                seed=scene.seed,
+                noise=sensors.noise,
+                ideal=sensors.chain == "ideal",
+                formulas=copy.copy(formulas),
+            )
+            for rate in dict.fromkeys(group.rate_hz for group in groups)
+        ]
+        marked = any(channel.signal == "keyphasor" for channel in self.table.channels.values())
+        self._keyphasor = Keyphasor() if marked else None
         self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
         self._truth_columns = np.array([COLUMN[column] for columns in S.TRUTH.values() for column in columns])
         ends = accumulate(len(columns) for columns in S.TRUTH.values())
@@ -161,12 +161,12 @@ class Simulation:
             ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
         )
         choice, initial = scene.engine, self._initial_state(self._segments[0].speed)
-        self._motion = Motion(initial, choice.step_us, self._stride, choice.tolerance)
+        self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance)
         self._companion: Motion | None = None
         if choice.companion:
-            stride = self.block_ticks // choice.step_us
             finer = min(FINEST, FINER * choice.tolerance)
-            self._companion = Motion(initial.copy(), choice.step_us, stride, finer)
+            stride = self.block_ticks // self._step_ticks
+            self._companion = Motion(initial.copy(), self._step_ticks, stride, finer)
         self._accuracy = Accuracy(choice.tolerance)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None
@@ -199,17 +199,24 @@ class Simulation:
         _ = self.first_row  # starts the engine
         start, end = self.tick, self.tick + ticks
         n = ticks // self.row_ticks
-        if len(self._rows) < n:
-            self._rows = np.empty((n, S.N_ROW))
-        rows = self._rows[:n]
+        if len(self._rows) <= n:
+            self._rows = np.empty((n + 1, S.N_ROW))
+        rows, seen = self._rows[: n + 1], 0
         companion = np.empty((ticks // self.block_ticks, S.N_ROW))
         events: list[dict[str, Any]] = []
+        counts: list[dict[str, np.ndarray]] = []
         while self.tick < end:
             self._take_effect(events)
             stop, inputs = min(end, self._next_change()), self._inputs()
             for motion, out in zip(self._motions(), (rows, companion), strict=False):
                 motion.run(self._engine, self.model.constants, inputs, out, start, self.tick, stop)
             self.tick = stop
+            # What changes on a row changes behind it: sensors see the row before the change, then that after it.
+            row, beyond = divmod(stop - start, self.row_ticks)
+            if not beyond:
+                counts.append(self._condition(rows[seen : row + 1]))
+                seen = row
+        rows = rows[:n]
         self._last = rows[-1].copy()
         if not np.isfinite(self._motion.y).all():
             raise SimulationError(
@@ -220,7 +227,7 @@ class Simulation:
         return Frame(
             tick=start,
             ticks=ticks,
-            samples=self._sample(rows, start),
+            samples=self._sample(counts, start),
             edges=self._edges(rows, start),
             truth=self._truth(rows, start),
             events=events,
@@ -469,12 +476,20 @@ class Simulation:
             magnet_engaged=self._engaged,
         )
 
-    def _sample(self, rows: np.ndarray, start: int) -> dict[str, Block]:
-        rate = self.scene.sensors.rate_hz
-        index = start * rate // TICK_RATE_HZ
-        return {
-            name: self._block(start, index, rate, counts) for name, counts in self._conditioner.counts(rows).items()
-        }
+    def _condition(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        return {name: counts for each in self._conditioners for name, counts in each.counts(rows).items()}
+
+    def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
+        found = {}
+        for name, group in self.table.groups.items():
+            parts = [part[name] for part in counts]
+            # The first sample at or behind the start, to the nearest tick.
+            index = -(-start * group.rate_hz // TICK_RATE_HZ)
+            tick = round(index * TICK_RATE_HZ / group.rate_hz)
+            found[name] = self._block(
+                tick, index, group.rate_hz, parts[0] if len(parts) == 1 else np.concatenate(parts)
+            )
+        return found
 
     def _edges(self, rows: np.ndarray, start: int) -> Block | None:
         if self._keyphasor is None:

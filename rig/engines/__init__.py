@@ -4,7 +4,8 @@ An engine is a module with `METHOD`, a one-step method that `rig.engines.march` 
 `rig.engines.method`), or with its own `start(constants, inputs, y, memory, step_ticks, tolerance)` and
 `advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)`: it moves state `y` and `memory` (shape
 (MEMORY,), counters first, see `rig.engines.memory`) on in place by `steps` steps of `step_ticks` and writes one row of
-`rig.kernels.signals.ROW` every `stride` steps, the first at the start. It knows no clock, no I/O and no threads, and
+`rig.kernels.signals.ROW` every `stride` steps, the first at the start, and that at the end where `rows` has room for
+it. It knows no clock, no I/O and no threads, and
 its result does not depend on how a run is cut into calls. Constants and inputs come to it as records
 (`rig.kernels.records`); who calls an `Engine` hands it the tuples.
 """

@@ -215,7 +215,7 @@ def advance(method, constants, inputs, y, memory, tick, step_ticks, steps, strid
         step_ticks: Ticks a step.
         steps: Number of steps.
         stride: Steps a row.
-        rows: Out, shape (ceil(steps / stride), N_ROW).
+        rows: Out, shape (ceil(steps / stride), N_ROW), or one longer: the last is that at the end.
     """
     constants, inputs = constants[0], inputs[0]
     k = np.zeros((method.rows, S.N_VECTOR))
@@ -225,11 +225,12 @@ def advance(method, constants, inputs, y, memory, tick, step_ticks, steps, strid
     out = np.empty(S.N_OBSERVED)
     ticks = float(step_ticks)
     row = 0
-    for n in range(steps):
+    for n in range(steps + 1):
         now = tick + n * step_ticks
-        if n % stride == 0:
+        if n % stride == 0 and row < len(rows):
             rates(constants, inputs, now, 0.0, memory[ONSET], int(memory[PHASE]), True, y, k[0], out)
             fill(rows[row, : S.N_VECTOR], y)
             fill(rows[row, S.N_VECTOR :], out)
             row += 1
-        _grid_step(method, constants, inputs, now, ticks, memory, y, k, z, end, scratch, out)
+        if n < steps:
+            _grid_step(method, constants, inputs, now, ticks, memory, y, k, z, end, scratch, out)

@@ -236,4 +236,7 @@ def _advance(constants, inputs, y, memory, tick, step_ticks, first, steps, strid
                 _series_to(constants, inputs, plant, memory, room, y, end)
                 n = last
         first += ahead
+    count = (steps + stride - 1) // stride
+    if len(rows) > count:
+        series.write_row(constants, inputs, memory, room, y, tick + steps * step_ticks, int(memory[PHASE]), rows, count)
     return first

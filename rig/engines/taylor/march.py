@@ -400,14 +400,18 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
         step_ticks: Ticks a step of the grid that rows and calls lie on.
         steps: Number of steps.
         stride: Steps a row.
-        rows: Out, shape (ceil(steps / stride), N_ROW).
+        rows: Out, shape (ceil(steps / stride), N_ROW), or one longer: the last is that at the end.
     """
     constants, inputs = constants[0], inputs[0]
     room = room_in(memory)
     if not same_inputs(inputs, memory) or memory[SPAN] < 0.0:
         begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
-    for row in range((steps + stride - 1) // stride):
+    count = (steps + stride - 1) // stride
+    for row in range(count):
         now = tick + row * stride * step_ticks
         _reach(constants, inputs, memory, room, y, now)
         write_row(constants, inputs, memory, room, y, now, int(memory[PHASE]), rows, row)
-    _reach(constants, inputs, memory, room, y, tick + steps * step_ticks)
+    end = tick + steps * step_ticks
+    _reach(constants, inputs, memory, room, y, end)
+    if len(rows) > count:
+        write_row(constants, inputs, memory, room, y, end, int(memory[PHASE]), rows, count)

@@ -1,0 +1,149 @@
+"""Signals that a user makes of the model's: `signal = "along(shaft_x(0.3), shaft_y(0.3), 45) + runout(theta)"`.
+
+A formula is an expression in the names of the model's signals, its parameters in SI (`shaft.arm_disk`), numbers, and
+the functions below. It is read, never run as code: only what is listed here has a meaning.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rig.errors import InputError, UnknownNameError
+from rig.kernels.signals import COLUMN, N_ROW
+
+_LONGEST = 500
+_DEEPEST = 30
+
+FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+    "abs": (1, np.abs),
+    "atan2": (2, np.arctan2),
+    "cos": (1, np.cos),
+    "exp": (1, np.exp),
+    "hypot": (2, np.hypot),
+    "max": (2, np.maximum),
+    "min": (2, np.minimum),
+    "sign": (1, np.sign),
+    "sin": (1, np.sin),
+    "sqrt": (1, np.sqrt),
+    "along": (3, lambda x, y, degrees: x * np.cos(np.radians(degrees)) + y * np.sin(np.radians(degrees))),
+}
+"""Functions of a formula: how many arguments they take, and what they do. `along` is what a sensor at an angle feels of
+a horizontal and a vertical signal."""
+PLACES = {"shaft_x": "disk_x", "shaft_y": "disk_y"}
+"""The shaft at a distance from the pivot [m]: it is rigid, so `shaft_x(arm)` is the disk's by the ratio of the arms."""
+_OPERATORS: dict[type, Callable[..., Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Pow: np.power,
+    ast.USub: np.negative,
+    ast.UAdd: np.positive,
+}
+
+Curve = Sequence[tuple[float, float]]
+
+
+class Formulas:
+    """The formulas of some channels.
+
+    Args:
+        parameters: Values by name, SI.
+        curves: Functions of an angle [rad], periodic in a turn: points (degrees, value).
+        arm_disk: Distance of the disk from the pivot [m].
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, float] | None = None,
+        curves: Mapping[str, Curve] | None = None,
+        arm_disk: float = 1.0,
+    ) -> None:
+        self._parameters, self._arm_disk = parameters or {}, arm_disk
+        self._curves = {name: np.array(points, float).T for name, points in (curves or {}).items()}
+        self._made: list[Callable[[np.ndarray], Any]] = []
+
+    def column(self, channel: str, signal: str) -> int:
+        """Column of a signal: the model's, or that of a formula behind those.
+
+        Raises:
+            InputError: It is neither a signal of the model nor a formula.
+        """
+        if signal in COLUMN:
+            return COLUMN[signal]
+        field = f"channel {channel}.signal"
+        if signal.isidentifier():
+            raise UnknownNameError(field, "one of the model's, or a formula of them", signal, COLUMN)
+        try:
+            if len(signal) > _LONGEST:
+                raise InputError(field, f"at most {_LONGEST} characters", len(signal))
+            tree = ast.parse(signal.strip(), mode="eval").body
+        except (SyntaxError, ValueError, MemoryError, RecursionError):
+            raise InputError(field, "one of the model's signals, or a formula of them", signal) from None
+        self._made.append(self._read(tree, field, 0))
+        return N_ROW + len(self._made) - 1
+
+    def values(self, rows: np.ndarray) -> np.ndarray:
+        """All formulas at observed rows, shape (n, formulas); where one is no finite number, it is 0."""
+        found = np.empty((len(rows), len(self._made)))
+        if self._made:
+            with np.errstate(all="ignore"):
+                for n, make in enumerate(self._made):
+                    found[:, n] = make(rows)
+            found[~np.isfinite(found)] = 0.0
+        return found
+
+    def _read(self, node: ast.AST, field: str, depth: int) -> Callable[[np.ndarray], Any]:
+        def inner(each: ast.AST) -> Callable[[np.ndarray], Any]:
+            return self._read(each, field, depth + 1)
+
+        if depth > _DEEPEST:
+            raise InputError(field, f"nested at most {_DEEPEST} deep", ast.unparse(node))
+        match node:
+            case ast.Constant(value=bool()):
+                pass
+            case ast.Constant(value=int() | float() as value) if abs(value) < 1e300:
+                number = np.float64(value)
+                return lambda rows: number
+            case ast.Name(id=name) if name in COLUMN:
+                column = COLUMN[name]
+                return lambda rows: rows[:, column]
+            case ast.Name(id="pi"):
+                return lambda rows: math.pi
+            case ast.Name(id=name):
+                raise UnknownNameError(field, "made of the model's signals", name, [*COLUMN, *FUNCTIONS, *PLACES])
+            case ast.Attribute():
+                name = ast.unparse(node)
+                if name not in self._parameters:
+                    raise UnknownNameError(field, "made of the parameters that are numbers", name, self._parameters)
+                value = np.float64(self._parameters[name])
+                return lambda rows: value
+            case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
+                of, act = inner(operand), _OPERATORS[type(op)]
+                return lambda rows: act(of(rows))
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+                one, other, act = inner(left), inner(right), _OPERATORS[type(op)]
+                return lambda rows: act(one(rows), other(rows))
+            case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
+                return self._call(name, [inner(each) for each in args], field)
+        raise InputError(field, "made of numbers, signals, parameters, + - * / ** and functions", ast.unparse(node))
+
+    def _call(self, name: str, of: list[Callable[[np.ndarray], Any]], field: str) -> Callable[[np.ndarray], Any]:
+        known = {**{key: count for key, (count, _) in FUNCTIONS.items()}, **dict.fromkeys([*PLACES, *self._curves], 1)}
+        if name not in known:
+            raise UnknownNameError(field, "made of the functions", name, known)
+        if len(of) != known[name]:
+            raise InputError(field, f"{name} of {known[name]} argument{'s' * (known[name] > 1)}", len(of))
+        if name in FUNCTIONS:
+            act = FUNCTIONS[name][1]
+            return lambda rows: act(*(each(rows) for each in of))
+        if name in PLACES:
+            column, arm = COLUMN[PLACES[name]], self._arm_disk
+            return lambda rows: of[0](rows) / arm * rows[:, column]
+        degrees, values = self._curves[name]
+        return lambda rows: np.interp(np.degrees(of[0](rows)), degrees, values, period=360.0)
