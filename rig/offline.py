@@ -15,7 +15,7 @@ from rig.channels import ChannelTable
 from rig.errors import InputError, UnknownNameError, Words, whole_file
 from rig.kernels.signals import COLUMN, N_ROW, ROW
 from rig.motion import DISSIPATED, STORED, SUPPLIED, energy_balance
-from rig.samples import Samples, place
+from rig.samples import Samples, joined, place
 from rig.scenes import Scene, load_scene, parse_scene
 from rig.simulation import Frame, Simulation
 
@@ -39,11 +39,11 @@ class Run:
 
     Attributes:
         simulation: The simulation at its end (model, scene, engine memory).
-        times_s: Instants of the signals [s], shape (n,).
+        times_s: Instants of the signals [s], shape (n,); those of the samples, where rows fall on them.
         signals: States, forces and energies of the model, SI, shape (n, columns); `run["normal_force"]` is one column.
         names: Names of the model's signals that were kept, all by default; the sensors' are `run.samples.names`.
-        samples: What each sensor showed, at the same instants, in its own unit; `run.samples.to_si()` has SI.
-        counts: The same as the converter gave it, int32.
+        sampled: What each sensor showed, in its own unit: a table for every rate.
+        counted: The same as the converter gave it, int32.
         edges_s: Keyphasor edges [s], shape (turns,).
         events: What took effect, each with event, tick and time_s.
 
@@ -67,8 +67,8 @@ class Run:
     times_s: np.ndarray
     signals: np.ndarray
     names: tuple[str, ...]
-    samples: Samples
-    counts: Samples
+    sampled: tuple[Samples, ...]
+    counted: tuple[Samples, ...]
     edges_s: np.ndarray
     events: list[dict[str, Any]]
 
@@ -88,12 +88,39 @@ class Run:
         return ROW[COLUMN[self.names[place(name, self.names, must=_MUST)]]].unit
 
     def __repr__(self) -> str:
-        scene = self.simulation.scene
+        scene, rate = self.simulation.scene, _kept_rate(self.simulation)
         return (
-            f"Run({scene.name}: {len(self.times_s) / scene.sensors.rate_hz:g} s, {len(self.times_s)} rows at "
-            f"{scene.sensors.rate_hz} Hz of {len(self.names)} signals and {len(self.samples.names)} channels; "
+            f"Run({scene.name}: {len(self.times_s) / rate:g} s, {len(self.times_s)} rows at "
+            f"{rate:g} Hz of {len(self.names)} signals and {len(self.table.channels)} channels; "
             f"{scene.engine.name} {scene.engine.step_us} us, seed {scene.seed})"
         )
+
+    @property
+    def samples(self) -> Samples:
+        """What each sensor showed, in its own unit; `run.samples.to_si()` has SI.
+
+        Raises:
+            InputError: Groups have rates of their own: `run.groups` has each.
+        """
+        return joined(self.sampled)
+
+    @property
+    def counts(self) -> Samples:
+        """The same as the converter gave it, int32."""
+        return joined(self.counted)
+
+    @property
+    def groups(self) -> dict[str, Samples]:
+        """What each sensor showed, group by group."""
+        found = {}
+        for name, group in self.table.groups.items():
+            table = next(table for table in self.sampled if group.names[0] in table.names)
+            first = table.names.index(group.names[0])
+            part = slice(first, first + len(group.names))
+            found[name] = replace(
+                table, name=name, values=table.values[:, part], names=group.names, units=table.units[part]
+            )
+        return found
 
     @property
     def table(self) -> ChannelTable:
@@ -119,7 +146,8 @@ class Run:
             parts.append(energy_balance(rows, first))
         names = tuple(parts[0])
         values = np.column_stack([np.concatenate([part[name] for part in parts]) for name in names])
-        return replace(self.samples, name="energy", values=values, names=names, units=("J",) * len(names))
+        index, rate = np.arange(len(values)), _kept_rate(self.simulation)
+        return Samples("energy", self.times_s, index, values, names, ("J",) * len(names), rate)
 
 
 def frames(simulation: Simulation, *, chunk_s: float = 0.1, commands: Iterable[SentCommand] = ()) -> Iterator[Frame]:
@@ -158,13 +186,13 @@ def simulate(
         changes: Other values by dotted key, of the scene or of its parameters, as for `rig.load_scene`.
         duration_s: Another duration than the scene's [s].
         signals: Names of the model's signals to keep; all of them unless given.
-        folder: Where signals.npy, samples.npy and counts.npy are written (a new one is made), to be read from there row
-            by row as they are used; in memory unless given.
+        folder: Where signals.npy, samples.npy and counts.npy are written (a new one is made; with groups of several
+            rates, a file for each), to be read from there row by row as they are used; in memory unless given.
         commands: What is sent on the way, as for `frames`.
         progress: Called with the part done, 0 to 1.
 
     Returns:
-        The run; signals are kept at the sensors' rate.
+        The run; signals are kept at the sensors' rate, or at every row where samples fall between rows.
 
     Raises:
         InputError: There is no such scene, signal or folder, or a value is none that it can have.
@@ -188,47 +216,56 @@ def simulate(
     if duration_s is not None:
         scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})
     simulation = Simulation(scene)
-    every = simulation.tick_rate_hz // scene.sensors.rate_hz // simulation.row_ticks
-    n = simulation.end_tick // (every * simulation.row_ticks)
-    table = simulation.table
-    channels = [channel for group in table.groups.values() for channel in group.channels]
+    every, end = simulation.kept_every, simulation.end_tick
+    n, table = end // (every * simulation.row_ticks), simulation.table
     columns = slice(None) if names == NAMES else [COLUMN[name] for name in names]
     edges, events = [], []
+    rates = dict.fromkeys(group.rate_hz for group in table.groups.values())
+    alike = {rate: [group for group in table.groups.values() if group.rate_hz == rate] for rate in rates}
+    shown, counts = dict[int, _Rows](), dict[int, _Rows]()
     with ExitStack() as stack:
         kept = _Rows(stack, folder, "signals", (n, len(names)), np.float64)
-        shown = _Rows(stack, folder, "samples", (n, len(channels)), np.float64)
-        counts = _Rows(stack, folder, "counts", (n, len(channels)), np.int32)
+        for rate, groups in alike.items():
+            shape = (-(-end * rate // simulation.tick_rate_hz), sum(len(group.channels) for group in groups))
+            of = f"-{rate}-hz" if len(alike) > 1 else ""
+            shown[rate] = _Rows(stack, folder, f"samples{of}", shape, np.float64)
+            counts[rate] = _Rows(stack, folder, f"counts{of}", shape, np.int32)
         for frame in frames(simulation, commands=commands):
             kept.add(frame.rows[::every, columns])
-            blocks = {name: frame.samples[name].values for name in table.groups}
-            counts.add(np.hstack(list(blocks.values())))
-            shown.add(np.hstack([table.groups[name].engineering(block) for name, block in blocks.items()]))
+            for rate, groups in alike.items():
+                blocks = [frame.samples[group.name].values for group in groups]
+                counts[rate].add(np.hstack(blocks))
+                shown[rate].add(
+                    np.hstack([group.engineering(block) for group, block in zip(groups, blocks, strict=True)])
+                )
             if frame.edges is not None:
                 edges.append((frame.edges.tick + frame.edges.values[:, 0]) / simulation.tick_rate_hz)
             events += frame.events
             if progress is not None:
                 progress(simulation.tick / simulation.end_tick)
-    index = np.arange(n)
-    times_s = index / scene.sensors.rate_hz
-    samples = Samples(
-        name="sensors",
-        times_s=times_s,
-        index=index,
-        values=shown.array(),
-        names=tuple(channel.name for channel in channels),
-        units=tuple(channel.unit for channel in channels),
-        rate_hz=float(scene.sensors.rate_hz),
-    )
+    sampled, counted = [], []
+    for rate, groups in alike.items():
+        values, channels = shown[rate].array(), [channel for group in groups for channel in group.channels]
+        index = np.arange(len(values))
+        called = "sensors" if len(alike) == 1 else ", ".join(group.name for group in groups)
+        labels, units = tuple(channel.name for channel in channels), tuple(channel.unit for channel in channels)
+        sampled.append(Samples(called, index / rate, index, values, labels, units, float(rate)))
+        counted.append(replace(sampled[-1], values=counts[rate].array(), units=("count",) * len(units)))
     return Run(
         simulation=simulation,
-        times_s=times_s,
+        times_s=np.arange(n) / _kept_rate(simulation),
         signals=kept.array(),
         names=names,
-        samples=samples,
-        counts=replace(samples, values=counts.array(), units=("count",) * len(channels)),
+        sampled=tuple(sampled),
+        counted=tuple(counted),
         edges_s=np.concatenate(edges) if edges else np.empty(0),
         events=events,
     )
+
+
+def _kept_rate(simulation: Simulation) -> float:
+    """Rate of the signals that a run keeps [Hz]."""
+    return simulation.tick_rate_hz / (simulation.kept_every * simulation.row_ticks)
 
 
 def _names(signals: Iterable[str]) -> tuple[str, ...]:

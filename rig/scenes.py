@@ -316,12 +316,15 @@ class Scene(Written):
     @property
     def row_ticks(self) -> int:
         """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step."""
-        table, truth = self.table, 1_000_000 // self.sensors.truth_rate_hz
+        table = self.table
         rates = [group.rate_hz for group in table.groups.values()]
-        if self.sensors.chain == "ideal" and all(1_000_000 % rate == 0 for rate in rates):
-            return math.gcd(truth, *(1_000_000 // rate for rate in rates))
-        fastest = max(channel.bandwidth_hz for channel in table.channels.values())
-        return math.gcd(truth, next(ticks for ticks in ROW_TICKS if ticks * fastest <= 1e6 / ROWS_A_WAVE or ticks == 1))
+        # Samples and truth fall on rows where their periods are whole ticks.
+        periods = [1_000_000 // rate for rate in (self.sensors.truth_rate_hz, *rates) if 1_000_000 % rate == 0]
+        if self.sensors.chain == "ideal" and len(periods) > len(rates):
+            return math.gcd(*periods)
+        longest = 1e6 / ROWS_A_WAVE / max(channel.bandwidth_hz for channel in table.channels.values())
+        fit = [ticks for ticks in ROW_TICKS if ticks <= longest and all(period % ticks == 0 for period in periods)]
+        return fit[0] if fit else 1
 
     def formulas(self) -> Formulas:
         """What the channels' formulas may use."""

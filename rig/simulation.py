@@ -105,6 +105,7 @@ class Simulation:
         block_ticks: An advance must be a whole multiple of this.
         end_tick: Where the scene ends.
         row_ticks: Ticks between observed rows.
+        kept_every: Rows from one that samples fall on to the next; 1 where some fall between rows.
 
     Example:
         >>> import rig
@@ -130,6 +131,7 @@ class Simulation:
         self.table: ChannelTable = scene.table
         groups = self.table.groups.values()
         whole = [TICK_RATE_HZ // group.rate_hz for group in groups if TICK_RATE_HZ % group.rate_hz == 0]
+        self.kept_every = math.gcd(*whole) // self.row_ticks if len(whole) == len(groups) else 1
         self.block_ticks = math.lcm(self.row_ticks, TICK_RATE_HZ // sensors.truth_rate_hz, *whole)
         self.end_tick = math.ceil(max(1, round(scene.duration_s * TICK_RATE_HZ)) / self.block_ticks) * self.block_ticks
         formulas = scene.formulas()

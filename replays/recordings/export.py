@@ -20,7 +20,7 @@ from replays.recordings.background import Background
 from replays.recordings.formats import columnar, delimited
 from replays.recordings.formats.export import check_output
 from rig import wire
-from rig.errors import whole_file
+from rig.errors import InputError, Words, whole_file
 from rig.kernels.signals import ROW
 from rig.offline import frames
 from rig.simulation import Frame, Simulation
@@ -91,24 +91,36 @@ def write_run(
 
 
 def table_columns(simulation: Simulation) -> list[str]:
-    """Column headings of a table of a run."""
+    """Column headings of a table of a run.
+
+    Raises:
+        InputError: Groups have rates of their own.
+    """
+    rates = {name: group.rate_hz for name, group in simulation.table.groups.items()}
+    if len(set(rates.values())) > 1:
+        told = ", ".join(f"{name} {rate} Hz" for name, rate in rates.items())
+        raise InputError("output", "an .mcap file where groups have rates of their own", Words(told))
     channels = simulation.table.channels.values()
     return [
         "time [s]",
-        *(f"truth.{signal.name} [{signal.unit}]" for signal in ROW),
+        *(f"truth.{signal.name} [{signal.unit}]" for signal in (ROW if _on_rows(simulation) else ())),
         *(f"{channel.name} [{channel.unit}]" for channel in channels),
     ]
 
 
+def _on_rows(simulation: Simulation) -> bool:
+    """Whether samples fall on rows, so that there is truth beside them."""
+    return all(simulation.tick_rate_hz % group.rate_hz == 0 for group in simulation.table.groups.values())
+
+
 def table_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
     """The rows of one frame, shape (samples, columns)."""
-    rate = simulation.scene.sensors.rate_hz
-    every = simulation.tick_rate_hz // rate // simulation.row_ticks
-    truth = frame.rows[::every]
-    first = frame.tick * rate // simulation.tick_rate_hz
-    times = (first + np.arange(len(truth)))[:, None] / rate
-    sensors = [simulation.table.groups[group].engineering(block.values) for group, block in frame.samples.items()]
-    return np.hstack([times, truth, *sensors])
+    blocks = frame.samples
+    first = next(iter(blocks.values()))
+    times = (first.index + np.arange(len(first.values)))[:, None] / first.rate_hz
+    truth = [frame.rows[:: simulation.kept_every]] if _on_rows(simulation) else []
+    sensors = [simulation.table.groups[group].engineering(block.values) for group, block in blocks.items()]
+    return np.hstack([times, *truth, *sensors])
 
 
 class _TableRun:

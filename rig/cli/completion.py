@@ -80,7 +80,7 @@ _SCRIPTS = {"bash": _BASH, "zsh": _ZSH, "fish": _FISH}
 _RIG = Path(__file__).parents[1]
 _ENDING = re.compile(r"(?<![\w.])\.[a-z][a-z0-9]+\b")
 SCENE_KEYS = (
-    *("duration_s", "seed", "parameters", "fidelity"),
+    *("duration_s", "seed", "parameters", "channels", "fidelity"),
     *("initial.position", "initial.x_mm", "initial.y_mm", "initial.magnets"),
     *("drive.mode", "drive.speed_hz", "drive.profile"),
     *("engine.name", "engine.step_us", "engine.tolerance", "engine.companion"),

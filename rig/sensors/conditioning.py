@@ -211,16 +211,25 @@ def channel_poles(channel: Channel, row_rate_hz: float = math.inf) -> tuple[np.n
     return np.array(found, complex), np.array(residues, complex), 0.0 if low else 1.0
 
 
-def _held(poles: np.ndarray, length: float) -> np.ndarray:
-    """Integral of exp(p (length - t)) times the four rows' weights, shape (poles, 4); poles per row, length in rows."""
+def _held(poles: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Integrals of exp(p (length - t)) times the four rows' weights, from 0 to the length.
+
+    Args:
+        poles: Per row, shape (p,).
+        lengths: In rows, shape (n,).
+
+    Returns:
+        Shape (p, n, 4).
+    """
     places, weights = np.polynomial.legendre.leggauss(24)
-    t = 0.5 * length * (places + 1.0)
-    return np.exp(poles[:, None] * (length - t)) @ (0.5 * length * weights[:, None] * _cubics(t))
+    t = 0.5 * lengths[:, None] * (places + 1.0)
+    falling = np.exp(poles[:, None, None] * (lengths[:, None] - t)) * (0.5 * lengths[:, None] * weights)
+    return np.einsum("pnt,ntr->pnr", falling, _cubics(t))
 
 
 def _cubics(t: np.ndarray) -> np.ndarray:
-    """Weights of the four rows at places in the interval, shape (places, 4)."""
-    return np.array([math.prod((t - b) / (a - b) for b in _NODES if b != a) for a in _NODES]).T
+    """Weights of the four rows at places in the interval, shape (..., 4)."""
+    return np.stack([math.prod((t - b) / (a - b) for b in _NODES if b != a) for a in _NODES], axis=-1)
 
 
 def _coefficients(
@@ -237,13 +246,14 @@ def _coefficients(
     Returns:
         Shapes (p, _POLE), (p, 2), (parts, 4 + 2 p).
     """
-    factor, held, settled = np.exp(poles), residues[:, None] * _held(poles, 1.0), -residues / poles
+    factor, settled = np.exp(poles), -residues / poles
+    held = residues[:, None] * _held(poles, np.ones(1))[:, 0]
     step = np.hstack([factor.real[:, None], factor.imag[:, None], held.real, held.imag])
     places = np.arange(parts) / parts
     turned = np.exp(poles * places[:, None])
-    rows = np.array([(residues[:, None] * _held(poles, place)).real.sum(axis=0) for place in places])
+    rows = direct * _cubics(places) + (residues[:, None, None] * _held(poles, places)).real.sum(axis=0)
     waves = np.stack([turned.real, turned.imag], axis=2).reshape(parts, -1)
-    return step, np.stack([settled.real, settled.imag], axis=1), np.hstack([direct * _cubics(places) + rows, waves])
+    return step, np.stack([settled.real, settled.imag], axis=1), np.hstack([rows, waves])
 
 
 class Conditioner:

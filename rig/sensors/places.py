@@ -6,7 +6,7 @@ import math
 
 from rig.errors import InputError
 
-_MOST = 1024
+_MOST = 4096
 """Most places between rows that the samples of one rate may have: what each is made of is worked out beforehand."""
 
 

@@ -139,17 +139,20 @@ def build_experiment(
     elif wanted.commands != "scene":
         data["commands"] = list(wanted.commands)
     data |= {"duration_s": duration_s, "fidelity": "given"}
-    groups = tuple(name for name in table.groups if name in default_table().groups)
-    data["sensors"] = {**data["sensors"], "groups": groups or data["sensors"]["groups"]}
+    own = default_table().groups
+    groups = tuple(name for name in table.groups if name in own)
+    if groups:
+        data["sensors"] = {**data["sensors"], "groups": () if set(groups) == set(own) else groups}
     rates = {table.groups[name].rate_hz for name in groups}
     try:
         rate = rates.pop() if len(rates) == 1 else data["sensors"]["rate_hz"]
+        rate = 0 if all(rate == group.rate_hz for group in own.values()) else rate
         scene = parse_scene({**data, "sensors": {**data["sensors"], "rate_hz": rate}})
     except InputError as error:
         if not error.field.startswith("sensors"):
             raise
         scene = parse_scene(data)
-        remarks.append(f"the scene samples at {scene.sensors.rate_hz} Hz, as the rig cannot at the log's rate")
+        remarks.append("the scene samples at the rig's own rates, as it cannot at the log's")
     remarks.append(f"scene {scene.name}: what was done as the mapping tells it, on assumed parameters until identified")
     simulation = Simulation(scene)
     commands = [{"at_s": timed.at_s, **timed.request.model_dump()} for timed in scene.commands]
