@@ -36,6 +36,8 @@ from pydantic import AfterValidator, Field
 from rig.channels import TABLE, ChannelTable, raw_groups, table_of
 from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import Written, check, read_toml
+from rig.parameters import load_parameters
+from rig.sensors.formula import Formulas
 
 KIND = "user"
 """Provenance of what stands in such a file."""
@@ -43,13 +45,15 @@ _PLAIN: dict[str, Any] = {
     "bias_v": 0.0, "range_v": [-10.0, 10.0], "highpass_hz": 0.0, "noise_v": 0.0, "adc_v": 10.0, "adc_bits": 24,
 }  # fmt: skip
 _RATE_HZ = 20_000
+MOST_HZ = 130_000.0
+"""Largest bandwidth: what rows of 1 us can show [Hz]."""
 _MOST = 512
 """Most channels of a table."""
 
 
 def _identifier(name: str) -> str:
-    if not (name.isascii() and name.isidentifier() and len(name) <= 32):
-        raise ValueError("a name of letters, digits and _, 32 at most, as buses and files have them")
+    if not (name.isascii() and name.isidentifier() and len(name) <= 28):
+        raise ValueError("a name of letters, digits and _, 28 at most, as buses and files have them")
     return name
 
 
@@ -90,7 +94,13 @@ def read_channels(path: Path) -> ChannelTable:
     try:
         file = check(_File, read_toml(path), field="")
         curves = {name: _curve(name, given, path.parent) for name, given in file.curves.items()}
-        return table_of(_merged(file), curves)
+        table = table_of(_merged(file), curves)
+        formulas = Formulas(load_parameters().numbers(), table.curves)
+        for channel in table.channels.values():
+            formulas.column(channel.name, channel.signal)
+            if channel.bandwidth_hz > MOST_HZ:
+                raise InputError(f"channel {channel.name}.bandwidth_hz", f"at most {MOST_HZ:g}", channel.bandwidth_hz)
+        return table
     except InputError as error:
         field = error.field if error.field.startswith(str(path)) else f"{path.name}: {error.field}"
         raise InputError(field, error.must, error.received) from None
@@ -101,6 +111,11 @@ def _merged(file: _File) -> dict[str, Any]:
     groups = raw_groups(TABLE.read_text()) if file.base == "rig" else {}
     given: dict[str, set[str]] = {}
     """What the file says of each channel."""
+    said = [(f"groups.{name}.defaults", group.defaults) for name, group in file.groups.items()]
+    said += [(f"channel {row.name}", row.model_dump()) for group in file.groups.values() for row in group.channels]
+    for where, fields in [*said, *((f"channels.{name}", changes) for name, changes in file.channels.items())]:
+        for name in {"rate_hz", "group", "kind"} & set(fields):
+            raise InputError(f"{where}.{name}", "left out: it is the group's", fields[name])
     for name, group in file.groups.items():
         if name not in groups and not group.channels:
             raise InputError(f"groups.{name}.channels", "given, as there is no such group yet", None)

@@ -59,12 +59,13 @@ class Channel(BaseModel):
     @model_validator(mode="after")
     def _whole_scale(self) -> Channel:
         if self.sensitivity_v == 0.0:
-            raise ValueError(f"channel {self.name}: sensitivity_v must be non-zero")
+            raise InputError(f"channel {self.name}.sensitivity_v", "non-zero", self.sensitivity_v)
         low, high = self.range_v
         if not -self.adc_v <= low < high <= self.adc_v:
-            raise ValueError(f"channel {self.name}: range_v must lie inside +-adc_v and be ascending")
+            must = f"two ascending values inside +-adc_v ({self.adc_v:g} V)"
+            raise InputError(f"channel {self.name}.range_v", must, self.range_v)
         if not (math.isfinite(self.scale) and self.scale and math.isfinite(self.offset)):
-            raise ValueError(f"channel {self.name}: sensitivity_v must give a scale that is finite")
+            raise InputError(f"channel {self.name}.sensitivity_v", "one that gives a finite scale", self.sensitivity_v)
         return self
 
     @property
@@ -131,7 +132,8 @@ class ChannelTable(BaseModel):
     def _names_once(self) -> ChannelTable:
         names = [channel.name for group in self.groups.values() for channel in group.channels]
         if len(set(names)) < len(names):
-            raise ValueError(f"channel {next(n for n in names if names.count(n) > 1)} stands twice")
+            name = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"channel {name}", "in the table once", names.count(name))
         if any(name != group.name or not name for name, group in self.groups.items()):
             raise ValueError("each group must stand under its own name")
         return self

@@ -101,6 +101,10 @@ class ParameterSet:
             raise TypeError(f"{key} is the rule {entry.value!r}; its number comes from the model")
         return entry.value * SI[entry.unit]
 
+    def numbers(self) -> dict[str, float]:
+        """The values that are numbers, in SI."""
+        return {key: self[key] for key, entry in self.entries.items() if not isinstance(entry.value, str)}
+
     def rule(self, key: str) -> str | None:
         """The name of the rule that gives the value, or None where it is a number."""
         value = self._entry(key).value

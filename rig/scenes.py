@@ -26,9 +26,11 @@ from rig.sensors.formula import Formulas
 from rig.sensors.places import fits, unfit
 
 SCENES = Path(__file__).with_name("scenes")
-ROW_TICKS = (25, 20, 10, 5, 4, 2, 1)
-"""How far apart rows may be [ticks], ..."""
-ROWS_A_WAVE = 8
+ROW_TICKS = 25
+"""How far apart rows are [ticks], ..."""
+ROWS_ELSE = (25, 20, 10, 5, 4, 2)
+"""... or where that does not divide the periods of samples and truth, ..."""
+ROWS_A_WAVE = 7.5
 """... and how many there are at least in a period of the highest bandwidth."""
 _APART_S = 0.01
 """Least time between two points of a speed profile [s]: well above any step."""
@@ -323,15 +325,12 @@ class Scene(Written):
         if self.sensors.chain == "ideal" and len(periods) > len(rates):
             return math.gcd(*periods)
         longest = 1e6 / ROWS_A_WAVE / max(channel.bandwidth_hz for channel in table.channels.values())
-        fit = [ticks for ticks in ROW_TICKS if ticks <= longest and all(period % ticks == 0 for period in periods)]
+        fit = [ticks for ticks in ROWS_ELSE if ticks <= longest and all(period % ticks == 0 for period in periods)]
         return fit[0] if fit else 1
 
     def formulas(self) -> Formulas:
         """What the channels' formulas may use."""
-        parameters = self.load_parameters()
-        numbers = {
-            name: parameters[name] for name, entry in parameters.entries.items() if not isinstance(entry.value, str)
-        }
+        numbers = self.load_parameters().numbers()
         return Formulas(numbers, self.table.curves, numbers["shaft.arm_disk"])
 
     def load_parameters(self) -> ParameterSet:
@@ -388,6 +387,8 @@ def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = Non
         return scene if overrides is None else change_scene(scene, overrides)
     path = scene_path(scene)
     data = {"name": path.stem, **read_toml(path)}
+    if isinstance(data.get("channels"), str):
+        data["channels"] = path.parent / data["channels"]  # as whoever wrote the scene means it
     for key, value in _keyed(overrides or {}):
         _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -210,6 +211,20 @@ class MessageTable:
     def fd(self) -> tuple[Message, ...]:
         """Messages of the FD sample layout."""
         return tuple(row for row in self.messages if row.samples is not None and row.fd)
+
+    @property
+    def layout(self) -> int:
+        """A number for how samples lie in the messages, 1 to 255, by which two sides can tell that theirs differ."""
+        said = [
+            (
+                row.name,
+                row.identifier,
+                row.length,
+                [(each.name, each.start, each.scale, each.offset) for each in row.signals],
+            )
+            for row in (*self.fd, *self.classic)
+        ]
+        return zlib.crc32(repr(said).encode()) % 255 + 1
 
     @property
     def others(self) -> tuple[Message, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from drivers.can import analysis
 from drivers.can.bus.timing import Speed
@@ -23,14 +23,16 @@ class Schedule:
     Attributes:
         classic_hz: Rate of the classic layout [Hz]; None: not sent.
         fd_hz: Rate of the FD layout [Hz]; None: not sent.
+        table: Messages; those of the rig's own channel table unless given.
     """
 
     classic_hz: int | None = CLASSIC_HZ
     fd_hz: int | None = None
+    table: MessageTable = field(default_factory=default_messages, compare=False)
 
-    def messages(self, table: MessageTable | None = None) -> dict[Message, float]:
+    def messages(self) -> dict[Message, float]:
         """Every message and its period [s]."""
-        return (table or default_messages()).schedule(classic_hz=self.classic_hz, fd_hz=self.fd_hz)
+        return self.table.schedule(classic_hz=self.classic_hz, fd_hz=self.fd_hz)
 
     def response_times(self, speed: Speed) -> list[tuple[Message, analysis.Response]]:
         """Worst case of every message on a bus of that speed, the highest priority first.
@@ -68,7 +70,7 @@ class Schedule:
         if self.classic_hz is None or self.fd_hz is not None or share <= CLASSIC_SHARE:
             return []
         must = f"at most {100 * CLASSIC_SHARE:g} % of {speed} with classic frames, so that others find room beside them"
-        received = Words(f"{100 * share:.1f} % with {len(default_messages().classic)} frames an instant")
+        received = Words(f"{100 * share:.1f} % with {len(self.table.classic)} frames an instant")
         return [f"{InputError('CAN load', must, received)} (a lower --can-rate or --can-fd helps)"]
 
     def _check_fd(self, speed: Speed) -> None:
@@ -91,13 +93,14 @@ class Schedule:
         ]
 
 
-def schedule_from(*, classic: bool, fd: bool, rate_hz: int | None) -> Schedule:
+def schedule_from(*, classic: bool, fd: bool, rate_hz: int | None, table: MessageTable | None = None) -> Schedule:
     """The schedule of the options of `rig run` and `rig can load`.
 
     Args:
         classic: Send the classic layout; also where neither is asked for.
         fd: Send the FD layout.
         rate_hz: Rate of the samples [Hz], for classic frames at most their usual one; None: the usual ones.
+        table: Messages; those of the rig's own channel table unless given.
 
     Raises:
         InputError: A rate that is none.
@@ -110,4 +113,5 @@ def schedule_from(*, classic: bool, fd: bool, rate_hz: int | None) -> Schedule:
     return Schedule(
         classic_hz=min(rate_hz or CLASSIC_HZ, CLASSIC_HZ) if classic else None,
         fd_hz=(rate_hz or FD_HZ) if fd else None,
+        table=table or default_messages(),
     )

@@ -33,6 +33,8 @@ FD_HZ = 10_000
 CLASSIC_SHARE = 0.7
 """Most that the classic layout is to take of its bus, with everything that goes with it; beyond, a start warns."""
 
+_FD_CHANNELS = 20
+"""As many of 24 bits fit into a frame with their number."""
 KEY = 0x9D
 """What every command carries."""
 AHEAD = 15
@@ -211,6 +213,7 @@ def _other_messages() -> list[Message]:
                 Signal("beat", 8, 8, label="Running number, modulo 256"),
                 Signal("counter", 16, 8, label="Of the last command that reached the rig; the next has one more"),
                 Signal("time", 24, 32, unit="us", label=f"End of the last block. {_TIME}"),
+                Signal("layout", 56, 8, label="Which sample messages these are; another number: another DBC"),
             ),
         ),
         Message(
@@ -248,24 +251,34 @@ def _sample_signals(samples: Samples, index_label: str) -> tuple[Signal, ...]:
 
 
 def _fd_messages(table: ChannelTable) -> list[Message]:
-    found = []
-    for position, group in enumerate(table.groups.values()):
-        if any(channel.adc_bits > 24 for channel in group.channels):
-            raise ValueError(f"channels of {group.name} must have at most 24 bits for CAN FD frames")
-        rows = 60 // (3 * len(group.channels))
-        if not rows:
-            raise ValueError(f"group {group.name} must have at most 20 channels for CAN FD frames")
-        samples = Samples(group.channels, rows, 3, 4)
+    found, taken = [], {row.name for row in _other_messages()}
+    parts = [
+        (group, group.channels[first : first + _FD_CHANNELS])
+        for group in table.groups.values()
+        for first in range(0, len(group.channels), _FD_CHANNELS)
+    ]
+    spacing = 0x10 if len(parts) <= 0x10 else 1
+    if len(parts) > 0x100:
+        raise InputError("channels", "few enough for 256 CAN FD messages", len(table.channels))
+    for position, (group, channels) in enumerate(parts):
+        for channel in channels:
+            if channel.adc_bits > 24:
+                raise InputError(f"channel {channel.name}.adc_bits", "at most 24 on a CAN bus", channel.adc_bits)
+        rows = 60 // (3 * len(channels))
+        samples = Samples(channels, rows, 3, 4)
+        name = group.name.capitalize()
+        if len(channels) < len(group.channels) or name in taken:
+            name = f"{name}_{position}"
         label = (
             f"{group.title}: {rows} instants of counts as recorded. Every n-th sample of the {group.rate_hz} Hz stream "
             f"(n = {group.rate_hz // FD_HZ} at {FD_HZ} Hz; Rates.fd_step), not filtered again: "
             "what lies above half the slower rate folds back"
         )
         index = "Number of the first instant in the recording, modulo 2^32; the others follow by Rates.fd_step"
-        length = next(size for size in FD_LENGTHS[8:] if size >= 4 + 3 * rows * len(group.channels))
+        length = next(size for size in FD_LENGTHS[8:] if size >= 4 + 3 * rows * len(channels))
         found.append(
             Message(
-                group.name.capitalize(), 0x100 + 0x10 * position, length, True, rows / FD_HZ, True, RIG, label,
+                name, 0x100 + spacing * position, length, True, rows / FD_HZ, True, RIG, label,
                 _sample_signals(samples, index), samples,
             )
         )  # fmt: skip
@@ -297,6 +310,19 @@ def make_table(channels: ChannelTable) -> MessageTable:
     """All messages for a channel table."""
     rows = [*_other_messages(), *_fd_messages(channels), *_classic_messages(channels)]
     return MessageTable(tuple(sorted(rows, key=lambda row: row.identifier)))
+
+
+def messages_for(channels: ChannelTable) -> MessageTable:
+    """The rig's own messages where these channels are among them as they are, else messages of their own.
+
+    Raises:
+        InputError: They do not fit into messages.
+    """
+    known = default_table().channels
+    for name, channel in channels.channels.items():
+        if name not in known or (known[name].scale, known[name].offset) != (channel.scale, channel.offset):
+            return make_table(channels)
+    return default_messages()
 
 
 @cache

@@ -10,14 +10,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from drivers.can.message import Message, MessageTable
-from drivers.can.signals import State, default_messages
+from drivers.can.signals import State, default_messages, messages_for
 from drivers.samples import Samples
 from drivers.stream import RIG_GONE, whole_step
+from rig.channel_file import read_channels
 from rig.errors import InputError
 
 if TYPE_CHECKING:
@@ -104,7 +106,7 @@ class CanSource:
 
     Args:
         spec: INTERFACE:CHANNEL?NAME=VALUE&... of python-can's bus; `layout=fd` or `layout=classic` chooses one where
-            both are sent.
+            both are sent, and `channels=FILE.toml` says which channel table the rig runs with.
         wait_s: How long to wait for a rig to be there [s]; it tells of itself once a second.
         table: Messages; by default those of the rig's own channel table.
 
@@ -119,7 +121,10 @@ class CanSource:
         self._wish = settings.pop("layout", None)
         if self._wish not in (None, "fd", "classic"):
             raise InputError("layout", "fd or classic", self._wish)
+        if (channels := settings.pop("channels", None)) is not None:
+            table = messages_for(read_channels(Path(channels)))
         self._table = table or default_messages()
+        self._other_layout = 0
         self._wait_s = wait_s
         self._bus = open_bus(spec, interface, channel, **settings)
         self._lock = threading.RLock()
@@ -150,6 +155,9 @@ class CanSource:
         if not self._known.wait(self._wait_s) or self.rates is None:
             must = f"a bus with a rig on it (no Rates and Sync in {self._wait_s:g} s)"
             raise InputError("can", must, self._bus.channel_info)
+        if self._other_layout:
+            must = f"a rig with the sample messages {self._table.layout} (?channels=FILE.toml tells of others)"
+            raise InputError("can", must, self._other_layout)
         layout = self._wish or ("fd" if self.rates["fd_step"] else "classic")
         if not self.rates[f"{layout}_step"]:
             raise InputError("layout", "one that the rig sends", layout)
@@ -236,7 +244,9 @@ class CanSource:
         elif row.name == "Rates":
             self.rates = row.decode(data)
         elif row.name == "Heartbeat":
-            return row.decode(data)["state"]
+            beat = row.decode(data)
+            self._other_layout = beat["layout"] if beat["layout"] not in (0, self._table.layout) else 0
+            return beat["state"]
         if self._sync is not None and self.rates is not None and self.rates["rate"]:
             self._known.set()
         return None

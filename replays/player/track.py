@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from recorder.reader import join
 from recorder.records import Chunk
 from rig import wire
+from rig.channels import ChannelTable
 from rig.errors import InputError
 
 
@@ -57,6 +58,11 @@ class Track:
     def complete(self) -> bool:
         """Whether all files were finished."""
         return self._recording.complete
+
+    @property
+    def table(self) -> ChannelTable:
+        """What the rig measured."""
+        return self._recording.table
 
     @property
     def documents(self) -> dict[str, dict[str, Any]]:

@@ -16,10 +16,11 @@ from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
 from rig.channels import Channel, Group
 from rig.errors import InputError
-from rig.kernels.signals import COLUMN
 from rig.offline import frames
-from rig.scenes import SensorChoice
+from rig.scenes import Scene
 from rig.sensors.conditioning import Conditioner
+from rig.sensors.formula import Formulas
+from rig.sensors.places import between, fits
 from rig.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
 
 _FINE_BITS = 32
@@ -100,22 +101,22 @@ class Measured:
         return tuple(channel.model_copy(update={"adc_bits": _FINE_BITS}) for channel in self.channels)
 
 
-def measured(recording: Recording, sensors: SensorChoice, *, longest_s: float = math.inf) -> dict[str, Measured]:
+def measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf) -> dict[str, Measured]:
     """The groups of a recording that the model knows, by name.
 
     Args:
         recording: The recording.
-        sensors: The scene's choice: whether there were filters and noise.
+        scene: What it is a recording of: what its channels feel, and whether there were filters and noise.
         longest_s: How much of it, from the first sample on [s].
 
     Raises:
         InputError: It holds no two samples of a channel that the model knows.
     """
-    found = {}
+    found, formulas, sensors = {}, scene.formulas(), scene.sensors
     ideal = sensors.chain == "ideal"
     noise = sensors.noise and not ideal
     for name, group in recording.table.groups.items():
-        columns = [c for c, channel in enumerate(group.channels) if channel.signal in COLUMN]
+        columns = [c for c, channel in enumerate(group.channels) if formulas.knows(channel.name, channel.signal)]
         samples = recording.samples(name)
         if not columns or len(samples.times_s) < 2:
             continue
@@ -161,24 +162,32 @@ class Prediction:
 class _Channels:
     """Turns rows of the model into what channels of one rate show without noise, on the recorded rows."""
 
-    def __init__(self, parts: Sequence[Measured], *, rate_hz: int, row_rate_hz: int) -> None:
+    def __init__(self, parts: Sequence[Measured], *, rate_hz: int, row_rate_hz: int, formulas: Formulas) -> None:
         self._parts, self._rate_hz = parts, rate_hz
-        self.every = row_rate_hz // rate_hz
+        self.apart, self._in_a_row = between(rate_hz, row_rate_hz)
         groups = [Group(name=part.group, title=part.group, rate_hz=rate_hz, channels=part.fine) for part in parts]
         self._groups = {group.name: group for group in groups}
-        self._conditioner = Conditioner(groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal)
+        self._conditioner = Conditioner(
+            groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal, formulas=formulas
+        )
+        self._last: np.ndarray | None = None
         self._counts: dict[str, list[np.ndarray]] = {part.group: [] for part in parts}
         self._first = 0
 
     def begin(self, row: int) -> None:
-        """Leave out what is before a row, a whole number of samples on."""
-        self._first = row // self.every
+        """Leave out what is before a row that a sample falls on."""
+        self._first = row * self._in_a_row // self.apart
 
     def take(self, rows: np.ndarray) -> None:
+        if self._last is not None:
+            rows = np.concatenate([self._last, rows])
+        self._last = rows[-1:]
         for name, counts in self._conditioner.counts(rows).items():
             self._counts[name].append(counts)
 
     def values(self) -> dict[str, np.ndarray]:
+        assert self._last is not None
+        self.take(self._last)  # for the sample on the last row
         found = {}
         for part in self._parts:
             values = self._groups[part.group].engineering(np.concatenate(self._counts[part.group]))
@@ -217,16 +226,19 @@ def lagrange(places: np.ndarray, nodes: Sequence[int] | np.ndarray) -> np.ndarra
     )
 
 
-def _channels(parts: dict[str, Measured], *, row_rate_hz: int) -> list[_Channels]:
+def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> list[_Channels]:
     """The channels, those of one rate together."""
     rates: dict[tuple[int, bool], list[Measured]] = {}
     for part in parts.values():
         rate = part.channels[0].rate_hz
         places = part.times_s * rate
-        exact = row_rate_hz % rate == 0 and bool(np.abs(places - np.rint(places)).max() < 1e-6)
+        exact = fits(rate, row_rate_hz) and bool(np.abs(places - np.rint(places)).max() < 1e-6)
         # A clock that does not divide ours is read off every row of the model.
         rates.setdefault((rate if exact else row_rate_hz, part.ideal), []).append(part)
-    return [_Channels(alike, rate_hz=rate, row_rate_hz=row_rate_hz) for (rate, _), alike in rates.items()]
+    return [
+        _Channels(alike, rate_hz=rate, row_rate_hz=row_rate_hz, formulas=scene.formulas())
+        for (rate, _), alike in rates.items()
+    ]
 
 
 class LeadIns:
@@ -295,7 +307,7 @@ def predict(
     last_s = max((float(part.times_s[-1]) for part in parts.values()), default=0.0)
     simulation = experiment.simulation()
     row_rate_hz = TICK_RATE_HZ // simulation.row_ticks
-    taking = _channels(parts, row_rate_hz=row_rate_hz)
+    taking = _channels(parts, experiment.scene, row_rate_hz=row_rate_hz)
     chunk_s = min(_CHUNK_S, last_s + 2e-3)  # the row of the last sample must be in it, and some behind it
     begin_tick = _begin_tick(parts, taking, chunk_s=chunk_s, row_rate_hz=row_rate_hz)
     for channels in taking:
@@ -329,7 +341,7 @@ def predict(
 def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chunk_s: float, row_rate_hz: int) -> int:
     """From when on the channels are worked out: early enough for their filters to have settled at the first sample."""
     chunk = round(chunk_s * row_rate_hz)
-    if chunk_s < _CHUNK_S or any(chunk % channels.every for channels in taking):
+    if chunk_s < _CHUNK_S or any(chunk % channels.apart for channels in taking):
         return 0
     corners = [c.highpass_hz for part in parts.values() for c in part.channels if c.highpass_hz]
     settled_s = _SETTLED_S + _DECAYS / (2.0 * math.pi * min(corners, default=math.inf))
@@ -341,6 +353,7 @@ def bare(experiment: Experiment) -> Experiment:
     """The same motion with one cheap sensor: rows stay as far apart as they were."""
     return experiment.changed(
         {
+            "channels": None,
             "sensors.groups": ["hammer"],
             "sensors.chain": "ideal",
             "sensors.rate_hz": TICK_RATE_HZ // experiment.simulation().row_ticks,

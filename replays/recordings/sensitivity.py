@@ -23,8 +23,8 @@ from rig.commands import check_command
 from rig.errors import InputError, SimulationError
 from rig.model import build_model
 from rig.parameters import load_parameters
-from rig.scenes import Scene, TimedCommand, change_scene, parse_scene
-from rig.simulation import ROW_TICKS, TICK_RATE_HZ
+from rig.scenes import ROW_TICKS, Scene, TimedCommand, change_scene, parse_scene
+from rig.simulation import TICK_RATE_HZ
 
 CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
 """How late the recording's clock is where its samples begin, and how much faster it goes: unit, change of size 1."""

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rig.cli.can_output import CanMessages
+from rig.cli.options import ChannelFile
 from rig.cli.tables import Form, echo, echo_document, echo_json, new_table
 from rig.errors import check_new_file, whole_file
 
 if TYPE_CHECKING:
     from drivers.can.bus.timing import Speed
     from drivers.can.schedule import Schedule
+    from rig.channels import ChannelTable
 
 
 def dbc(
@@ -21,29 +23,33 @@ def dbc(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE.dbc", help="Write it to this file.")
     ] = None,
+    channels: ChannelFile = None,
 ) -> None:
     """Show the DBC of the rig's messages, made from the channel table, or write it to a file."""
     from drivers.can.dbc import text
-    from rig.scenes import rig_table
 
     if output is not None:
         check_new_file(output, field="--output", suffixes=(".dbc",), force=True)
-    rig_table()
-    _warn(*CanMessages(can_classic=True).plan())
+    schedule, speed = CanMessages(can_classic=True).plan(_table(channels))
+    _warn(schedule, speed)
     if output is None:
-        echo_document(text())
+        echo_document(text(schedule.table))
         return
     with whole_file(output) as draft:
-        draft.write_text(text(), encoding="utf-8")
+        draft.write_text(text(schedule.table), encoding="utf-8")
     echo(f"{output} written")
 
 
-def load(*, messages: CanMessages, form: Form) -> None:
-    """Show every message of the rig with its period, share of the bus and longest response time."""
+def _table(channels: Path | None) -> ChannelTable:
+    from rig.channel_file import read_channels
     from rig.scenes import rig_table
 
-    rig_table()
-    schedule, speed = messages.plan()
+    return rig_table() if channels is None else read_channels(channels)
+
+
+def load(*, messages: CanMessages, channels: ChannelFile = None, form: Form) -> None:
+    """Show every message of the rig with its period, share of the bus and longest response time."""
+    schedule, speed = messages.plan(_table(channels))
     messages_found = [
         {
             "id": message.identifier,

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from drivers.can.bus.timing import Speed
     from drivers.can.gateway import Gateway
     from drivers.can.schedule import Schedule
+    from rig.channels import ChannelTable
     from rig.cli.can_outlets import CanOutlets
     from rig.transport import Server
 
@@ -38,15 +39,17 @@ class CanMessages:
         _can("Bit rate, and that of the data phase of CAN FD; 1M and 1M/8M by default.", metavar="RATE[/RATE]"),
     ] = None
 
-    def plan(self) -> tuple[Schedule, Speed]:
-        """What is sent at which bit rates.
+    def plan(self, channels: ChannelTable | None = None) -> tuple[Schedule, Speed]:
+        """What is sent of these channels, by default the rig's own, at which bit rates.
 
         Raises:
-            InputError: There is no such rate.
+            InputError: There is no such rate, or no message for a channel.
         """
         from drivers.can.schedule import schedule_from
+        from drivers.can.signals import messages_for
 
-        schedule = schedule_from(classic=self.can_classic, fd=self.can_fd, rate_hz=self.can_rate)
+        table = None if channels is None else messages_for(channels)
+        schedule = schedule_from(classic=self.can_classic, fd=self.can_fd, rate_hz=self.can_rate, table=table)
         usual = "1M" if schedule.fd_hz is None else "1M/8M"
         return schedule, bit_rates(self.can_bitrate or usual, field="--can-bitrate")
 
@@ -77,14 +80,14 @@ class CanOptions:
     ] = None
     can_slcan: Annotated[bool, _can("Play an SLCAN adapter of the bus on a port of its own.", "--can-slcan")] = False
 
-    def output(self) -> CanOutput | None:
-        """The bus that is asked for, if any; as for `CanOutput`.
+    def output(self, channels: ChannelTable | None) -> CanOutput | None:
+        """The bus that is asked for, if any, for these channels; as for `CanOutput`.
 
         Raises:
             InputError: There is none such, or it is only said how it should be.
         """
         if self.can is not None:
-            return CanOutput(self.can, self)
+            return CanOutput(self.can, self, channels)
         if self != CanOptions():
             raise InputError("--can", "given with the other --can options", None)
         return None
@@ -100,12 +103,13 @@ class CanOutput:
     Args:
         spec: INTERFACE:CHANNEL, with ?NAME=VALUE&... for more of python-can's settings.
         options: What the rig does there.
+        channels: What it measures; by default the rig's own.
 
     Raises:
         InputError: What was asked for does not make a bus, or not one that can carry the messages.
     """
 
-    def __init__(self, spec: str, options: CanOptions | None = None) -> None:
+    def __init__(self, spec: str, options: CanOptions | None = None, channels: ChannelTable | None = None) -> None:
         options = options or CanOptions()
         socketcand, slcan = options.can_socketcand, options.can_slcan
         from rig.transport.endpoint import parse_loopback
@@ -117,7 +121,7 @@ class CanOutput:
             parse_loopback(socketcand, field="--can-socketcand")
         if self.interface == "zenoh" and "endpoint" in self._settings:
             parse_loopback(str(self._settings["endpoint"]), field="--can")
-        self.schedule, self.speed = options.messages.plan()
+        self.schedule, self.speed = options.messages.plan(channels)
         if options.can_overload:
             self.load = self.schedule.load(self.speed)
         else:

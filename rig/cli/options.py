@@ -33,6 +33,9 @@ OptionalRecordingFiles = Annotated[list[Path] | None, _RECORDING_FILES]
 FromS = Annotated[float | None, typer.Option("--from", metavar="S", help="Where to begin, in s of simulated time.")]
 ToS = Annotated[float | None, typer.Option("--to", metavar="S", help="Where to end, in s of simulated time.")]
 Channels = Annotated[str | None, typer.Option("--channels", metavar="NAME,...", help="Only these channels.")]
+ChannelFile = Annotated[
+    Path | None, typer.Option("--channels", metavar="FILE.toml", help="The sensors, from a channel table of your own.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace what is there already.")]
 ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="FILE", help="Write a report with pictures, .html or .pdf.")
@@ -44,6 +47,7 @@ class SceneChanges:
     """What a run has in another way than its scene."""
 
     parameters: Parameters = None
+    channels: ChannelFile = None
     changes: Changes = None
     engine: Engine = None
     duration_s: Annotated[float | None, typer.Option(help="Length of the run, in s.")] = None
@@ -58,6 +62,7 @@ class SceneChanges:
         overrides = pairs("--set", self.changes, "KEY=VALUE, such as drive.speed_hz=5.2")
         named = {
             "parameters": self.parameters,
+            "channels": self.channels,
             "engine.name": self.engine,
             "duration_s": self.duration_s,
             "seed": self.seed,

@@ -139,7 +139,7 @@ def replay(
             raise InputError("--wait-for", "left out with --pause", played.wait_for)
         track = Track(files)
         edit = changed.edit(track)
-        bus = can.output()
+        bus = can.output(track.table)
 
     def make(server: Server) -> Player:
         player = Player(

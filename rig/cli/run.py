@@ -55,7 +55,7 @@ def run(
         from rig.transport.endpoint import check_free, parse_endpoint, parse_loopback
 
         loaded = load_scene(scene, overrides)
-        bus = can.output()
+        bus = can.output(loaded.table)
         simulation = Simulation(loaded)
         block_ticks = _block_ticks(block_ms, simulation)
         # Last: a wrong line is told as such also where another rig runs.

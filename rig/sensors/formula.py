@@ -79,14 +79,22 @@ class Formulas:
         field = f"channel {channel}.signal"
         if signal.isidentifier():
             raise UnknownNameError(field, "one of the model's, or a formula of them", signal, COLUMN)
+        if len(signal) > _LONGEST:
+            raise InputError(field, f"a formula of at most {_LONGEST} characters", len(signal))
         try:
-            if len(signal) > _LONGEST:
-                raise InputError(field, f"at most {_LONGEST} characters", len(signal))
             tree = ast.parse(signal.strip(), mode="eval").body
         except (SyntaxError, ValueError, MemoryError, RecursionError):
             raise InputError(field, "one of the model's signals, or a formula of them", signal) from None
         self._made.append(self._read(tree, field, 0))
         return N_ROW + len(self._made) - 1
+
+    def knows(self, channel: str, signal: str) -> bool:
+        """Whether there is such a signal, or it is a formula."""
+        try:
+            self.column(channel, signal)
+        except InputError:
+            return False
+        return True
 
     def values(self, rows: np.ndarray) -> np.ndarray:
         """All formulas at observed rows, shape (n, formulas); where one is no finite number, it is 0."""

@@ -126,7 +126,7 @@ def test_any_rate_whose_samples_fall_on_few_places_between_rows_will_do(rate: in
     assert 1_000_000 % scene.row_ticks == 0
     assert (1_000_000 // truth) % scene.row_ticks == 0
     assert rate // math.gcd(rate, rows) <= 4096
-    assert rows >= 8 * max(channel.bandwidth_hz for channel in scene.table.channels.values())
+    assert rows >= 7.5 * max(channel.bandwidth_hz for channel in scene.table.channels.values())
 
 
 def test_rates_that_laboratories_have_will_do_with_any_step() -> None:

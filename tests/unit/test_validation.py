@@ -247,7 +247,7 @@ def explained(recording: Recording, parts: dict[str, Measured], nominal: Predict
 @pytest.fixture(scope="module")
 def heard(hammer: Recording) -> tuple[dict[str, Measured], Prediction]:
     experiment = Experiment.of(hammer)
-    parts = measured(hammer, experiment.scene.sensors, longest_s=1.0)
+    parts = measured(hammer, experiment.scene, longest_s=1.0)
     return parts, predict(bare(experiment), parts)
 
 

@@ -22,7 +22,7 @@ from drivers.can.gateway.commands import IDENTIFIERS, Commands
 from drivers.can.gateway.outbox import Outbox
 from drivers.can.gateway.samples import sample_frames, steps
 from drivers.can.schedule import SLOT_S, Schedule
-from drivers.can.signals import EventKind, State, default_messages
+from drivers.can.signals import EventKind, State
 from drivers.health import Guard, Rising
 from rig import wire
 from rig.channels import ChannelTable
@@ -93,9 +93,9 @@ class Gateway:
         except pydantic.ValidationError as error:
             raise input_error(error, "catalogue.table", ChannelTable) from None
         self._tick_rate_hz = catalogue.tick_rate_hz
-        self._messages = default_messages().by_name
+        self._messages, self._layout = schedule.table.by_name, schedule.table.layout
         self._rate_hz, self._steps = steps(table, schedule)
-        self._samples = sample_frames(table, self._steps)
+        self._samples = sample_frames(table, schedule, self._steps)
         self._groups = tuple(table.groups)
         self._queue: deque[tuple[str, bytes]] = deque()
         self._queue_seconds = queue_seconds
@@ -333,6 +333,7 @@ class Gateway:
                 beat=self._beat,
                 counter=self.commands.counter,
                 time=self._time_us & _WORD_32,
+                layout=self._layout,
             )
             self.outbox.answer(
                 self._messages["Rates"],

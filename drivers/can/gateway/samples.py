@@ -7,7 +7,6 @@ import numpy as np
 from drivers.can.bus.frame import BRS, FD, FD_WIDTH, RECORDS, octets
 from drivers.can.message import ABSENT, Message
 from drivers.can.schedule import Schedule
-from drivers.can.signals import default_messages
 from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
@@ -94,10 +93,12 @@ def steps(table: ChannelTable, schedule: Schedule) -> tuple[int, dict[bool, int]
     if len(rates) != 1:
         raise InputError("sample rates", "the same for all sensor groups to go on a CAN bus", sorted(rates))
     rate = rates.pop()
-    known = {channel.name: channel for row in default_messages().fd if row.samples for channel in row.samples.channels}
+    known = {channel.name: channel for row in schedule.table.fd if row.samples for channel in row.samples.channels}
     for name, channel in table.channels.items():
         if name not in known or (known[name].scale, known[name].offset) != (channel.scale, channel.offset):
-            raise InputError(f"channel {name}", "calibrated as in the channel table, which the DBC is made from", name)
+            raise InputError(
+                f"channel {name}", "calibrated as in the channel table that the messages are made of", name
+            )
     found = {}
     for fd, wanted in ((True, schedule.fd_hz), (False, schedule.classic_hz)):
         if wanted is not None:
@@ -107,10 +108,10 @@ def steps(table: ChannelTable, schedule: Schedule) -> tuple[int, dict[bool, int]
     return rate, found
 
 
-def sample_frames(table: ChannelTable, picked: dict[bool, int]) -> list[SampleFrames]:
+def sample_frames(table: ChannelTable, schedule: Schedule, picked: dict[bool, int]) -> list[SampleFrames]:
     """Makers of all sample messages that are sent, for what the rig has of their channels."""
     found = []
-    for message in (*default_messages().fd, *default_messages().classic):
+    for message in (*schedule.table.fd, *schedule.table.classic):
         if message.samples is None or message.fd not in picked:
             continue
         columns = {

@@ -16,7 +16,6 @@ from replays.recordings.sensitivity import ANGLE, CLOCK, scale_of, value_of, wit
 from rig.channels import Channel
 from rig.commands import COMMANDS, HammerCommand
 from rig.errors import InputError
-from rig.kernels.signals import COLUMN
 from rig.parameters import load_parameters
 from rig.scenes import Scene
 from rig.simulation import TICK_RATE_HZ
@@ -216,18 +215,19 @@ def observe(
     Raises:
         InputError: It has none of these channels, or no samples in the window.
     """
+    formulas = experiment.scene.formulas()
     groups = {
         channel.name: group.name
         for group in recording.table.groups.values()
         for channel in group.channels
-        if channel.signal in COLUMN and recording.messages.get(sensor_key(group.name))
+        if formulas.knows(channel.name, channel.signal) and recording.messages.get(sensor_key(group.name))
     }
     usable = [name for name in groups if name not in NOT_FITTED]
     wanted = list(channels) if channels else usable
     missing = [name for name in wanted if name not in usable]
     if missing or not wanted:
         raise InputError("channels", f"some that the recording has: {', '.join(usable)}", ", ".join(missing))
-    whole = measured(recording, experiment.scene.sensors)
+    whole = measured(recording, experiment.scene)
     whole = {name: whole[name].only(wanted) for name in dict.fromkeys(groups[name] for name in wanted)}
     first_s = max(float(part.times_s[0]) for part in whole.values())
     last_s = min(float(part.times_s[-1]) for part in whole.values())

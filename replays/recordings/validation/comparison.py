@@ -57,7 +57,8 @@ def validate(
         bits=again.bits, bit_exact=bool(again.bits) and all(one.equal for one in again.bits.values()),
         declared=declared, window_s=(begin, end), window_reason=reason, residuals=tuple(trajectory),
         truth=tuple(truth), phases=tuple(phases), statistics=tuple(judged),
-        calibration=tuple(calibration(recording)), skipped=sum(stream.lost for stream in recording.streams.values()),
+        calibration=tuple(calibration(recording, experiment)),
+        skipped=sum(stream.lost for stream in recording.streams.values()),
         explained=None, fitted=tuple(one.line for one in again.tuned.fitted) if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
         doubts=recording.doubts,
@@ -96,7 +97,7 @@ def _done_again(
     recording: Recording, experiment: Experiment, criteria: Criteria, step: Callable[[str], None]
 ) -> _DoneAgain:
     rules = criteria.window
-    parts = measured(recording, experiment.scene.sensors, longest_s=rules.longest_s)
+    parts = measured(recording, experiment.scene, longest_s=rules.longest_s)
     how_far = "perturbed, to see how far it can be predicted"
     if is_imported(recording):
         tuned = tune(recording, experiment, criteria.imported.nuisances, progress=lambda text: step(f"log: {text}"))
@@ -139,21 +140,21 @@ def _explained(again: _DoneAgain, *, from_s: float, step: Callable[[str], None])
     return explained
 
 
-def calibration(recording: Recording) -> list[str]:
-    """How the recording's channels differ from the rig's own table."""
-    own = default_table().channels
-    found = []
+def calibration(recording: Recording, experiment: Experiment) -> list[str]:
+    """How the recording's channels differ from the table of its scene, the rig's own where that has none."""
+    table = experiment.scene.channels or default_table()
+    own, found = table.channels, list[str]()
     if is_imported(recording):
         mapped = recording.scene["import"]["mapping"]["channels"]
         lacking = [name for name, entry in mapped.items() if "bandwidth_hz" not in entry]
         return [f"no bandwidth told of {', '.join(lacking)}: taken for half of the rate"] if lacking else []
     for name, channel in recording.table.channels.items():
         if name not in own:
-            found.append(f"{name}: not in the rig's own channel table")
+            found.append(f"{name}: not in the channel table of its scene")
             continue
-        like = default_table().only((own[name].group,), channel.rate_hz).channels[name]
-        fields = ("signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "highpass_hz", "noise_v",
-                  "adc_v", "adc_bits")  # fmt: skip
+        like = table.only((own[name].group,), channel.rate_hz).channels[name]
+        fields = ("signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "filter_order", "highpass_hz",
+                  "noise_v", "adc_v", "adc_bits")  # fmt: skip
         off = [f"{key} {getattr(channel, key)} instead of {getattr(like, key)}" for key in fields
                if getattr(channel, key) != getattr(like, key)]  # fmt: skip
         if off:

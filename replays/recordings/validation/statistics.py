@@ -95,7 +95,7 @@ def _viewer(experiment: Experiment, parts: dict[str, Measured]) -> Callable[[dic
     row = experiment.simulation().first_row
     channels = {channel.name: channel for part in parts.values() for channel in part.channels}
     base = {name: float(row[COLUMN[channel.signal]] / channel.si)
-            for name, channel in channels.items() if name.startswith("P_")}  # fmt: skip
+            for name, channel in channels.items() if name.startswith("P_") and channel.signal in COLUMN}  # fmt: skip
     touches = math.nan
     if "ring_x" in channels:
         touches = model.constants.contact.clearance * 1e3 + 6.0 * _floor(parts, ("ring_x",))

@@ -1,0 +1,235 @@
+"""A user's own channels: what the file makes, what formulas say, and one line for every wrong table."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rig
+from drivers.can.dbc import database
+from drivers.can.signals import default_messages, messages_for
+from rig.channel_file import read_channels
+from rig.channels import default_table
+from rig.errors import InputError
+from rig.kernels.signals import COLUMN, N_ROW
+from rig.scenes import load_scene
+from rig.sensors.formula import Formulas
+from rig.simulation import Simulation
+
+MINE = """
+drop = ["accelerations", "hammer"]
+
+[channels.disk_x]
+sensitivity_v = 7.87
+
+[groups.probes]
+rate_hz = 51200
+
+[groups.bearing]
+title = "Probes at the bearing"
+rate_hz = 51200
+defaults = { unit = "mm", si = 1e-3, sensitivity_v = 3.94, bias_v = -10.0, range_v = [-18.0, -2.0], adc_v = 20.0 }
+channels = [
+    { name = "bearing_u", signal = "along(shaft_x(0.35), shaft_y(0.35), 45) + runout(theta)" },
+    { name = "bearing_v", signal = "along(shaft_x(0.35), shaft_y(0.35), 135)", noise_v = 1e-3 },
+]
+
+[groups.forces]
+channels = [{ name = "beam", signal = "house.inner_beam_stiffness * (x_ih - x_oh)", range_v = [-5, 5] }]
+
+[groups.slow]
+rate_hz = 1000
+channels = [
+    { name = "strain", unit = "um/m", si = 1e-6, sensitivity_v = 0.01, signal = "6 * 0.004 / 0.25 ** 2 * x_ih" },
+]
+
+[curves]
+runout = "runout.csv"
+"""
+
+
+def written(folder: Path, text: str = MINE) -> Path:
+    angles = np.arange(0.0, 360.0, 5.0)
+    np.savetxt(folder / "runout.csv", np.c_[angles, 5e-6 * np.cos(np.radians(angles))], delimiter=",")
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_file_says_what_is_different(tmp_path: Path) -> None:
+    table, own = read_channels(written(tmp_path)), default_table().channels
+    assert {name: group.names for name, group in table.groups.items()} == {
+        "probes": ("disk_x", "disk_y", "ring_x", "ring_y"),
+        "forces": ("P_N", "P_S", "P_E", "P_W", "beam"),
+        "drive": ("speed", "keyphasor"),
+        "bearing": ("bearing_u", "bearing_v"),
+        "slow": ("strain",),
+    }
+    assert [group.rate_hz for group in table.groups.values()] == [51_200, 20_000, 20_000, 51_200, 1_000]
+    found = table.channels
+    assert found["disk_x"] == own["disk_x"].model_copy(
+        update={"sensitivity_v": 7.87, "rate_hz": 51_200, "kind": "user"}
+    )
+    assert found["P_N"] == own["P_N"]
+    # What a new channel does not say is its group's where all there agree, and plain otherwise.
+    assert (found["beam"].unit, found["beam"].sensitivity_v, found["beam"].range_v) == ("N", 1e-3, (-5.0, 5.0))
+    assert (found["strain"].bandwidth_hz, found["strain"].adc_bits, found["strain"].noise_v) == (250.0, 24, 0.0)
+    assert (found["bearing_u"].kind, found["bearing_u"].label) == ("user", "bearing_u")
+
+
+def test_a_slower_group_lowers_the_corner_that_nobody_gave(tmp_path: Path) -> None:
+    slow = "[groups.probes]\nrate_hz = 1000\n[channels.disk_y]\nbandwidth_hz = 900.0"
+    table = read_channels(written(tmp_path, slow))
+    assert (table.channels["disk_x"].bandwidth_hz, table.channels["disk_y"].bandwidth_hz) == (250.0, 900.0)
+
+
+def test_a_table_can_be_made_of_nothing(tmp_path: Path) -> None:
+    table = read_channels(written(tmp_path, 'base = "none"\n' + channel('signal = "pivot_x"')))
+    assert list(table.channels) == ["a"]
+    frame = Simulation(load_scene("stable-run", {"channels": str(tmp_path / "mine.toml")})).advance(10_000)
+    assert (frame.samples["g"].values.shape, frame.edges) == ((200, 1), None)
+
+
+def test_channels_show_what_their_formulas_say(tmp_path: Path) -> None:
+    changes = {"channels": str(written(tmp_path)), "sensors.chain": "ideal", "sensors.rate_hz": 20_000}
+    run = rig.simulate("hammer", changes, duration_s=0.1)
+    model = run.simulation.model.constants
+    x, y = 0.35 / model.shaft.arm_disk * run["disk_x"], 0.35 / model.shaft.arm_disk * run["disk_y"]
+    runout = np.interp(
+        np.degrees(run["theta"]) % 360, np.arange(0.0, 365.0, 5.0), 5e-6 * np.cos(np.radians(np.arange(0, 365, 5)))
+    )
+    expected = {
+        "bearing_u": ((x + y) * math.sqrt(0.5) + runout) * 1e3,
+        "bearing_v": (y - x) * math.sqrt(0.5) * 1e3,
+        "beam": model.house.inner_beam_stiffness * (run["x_ih"] - run["x_oh"]),
+        "strain": 6 * 0.004 / 0.25**2 * run["x_ih"] * 1e6,
+    }
+    channels = run.table.channels
+    for name, values in expected.items():
+        np.testing.assert_allclose(
+            run.samples[name], values, rtol=0, atol=0.51 * abs(channels[name].scale), err_msg=name
+        )
+
+
+def test_formulas_are_what_they_read() -> None:
+    rows = np.random.default_rng(1).normal(size=(50, N_ROW))
+    x, y, angle = (rows[:, COLUMN[name]] for name in ("disk_x", "disk_y", "theta"))
+    formulas = Formulas({"ring.clearance": 0.5}, {"cam": ((0.0, 0.0), (90.0, 1.0), (270.0, -1.0))}, 0.314)
+    cases = {
+        "-disk_x + 2 * disk_y ** 2": -x + 2 * y**2,
+        "max(min(disk_x, 0.2), -ring.clearance)": np.clip(x, -0.5, 0.2),
+        "abs(disk_x) / hypot(disk_x, disk_y)": np.abs(x) / np.hypot(x, y),
+        "atan2(disk_y, disk_x) + sign(disk_y) * pi": np.arctan2(y, x) + np.sign(y) * math.pi,
+        "exp(-disk_x) * cos(theta) - sin(theta)": np.exp(-x) * np.cos(angle) - np.sin(angle),
+        "cam(theta)": np.interp(np.degrees(angle) % 360, [-90, 0, 90, 270, 360], [-1, 0, 1, -1, 0]),
+        "sqrt(disk_x)": np.where(x >= 0, np.sqrt(np.abs(x)), 0.0),
+        "1 / 0": np.zeros(50),
+    }
+    columns = [formulas.column("c", text) for text in cases]
+    assert columns == list(range(N_ROW, N_ROW + len(cases)))
+    for made, expected in zip(formulas.values(rows).T, cases.values(), strict=True):
+        np.testing.assert_allclose(made, expected, rtol=1e-12, atol=1e-15)
+
+
+def test_messages_follow_the_table(tmp_path: Path) -> None:
+    assert messages_for(default_table()) is default_messages()
+    assert messages_for(default_table().only(("forces",), 5_000)) is default_messages()
+    table = messages_for(read_channels(written(tmp_path)))
+    assert table.layout != default_messages().layout
+    sampled = [channel.name for row in table.fd if row.samples for channel in row.samples.channels]
+    assert sampled == list(read_channels(tmp_path / "mine.toml").channels)
+    names = {signal.name for message in database(table).messages for signal in message.signals}
+    assert {"bearing_u", "strain", "beam_0"} <= names
+    many = ", ".join(f'{{ name = "c{n}", signal = "P_N" }}' for n in range(60))
+    wide = messages_for(read_channels(written(tmp_path, f"[groups.forces]\nchannels = [{many}]")))
+    assert sum(len(row.samples.channels) for row in wide.fd if row.samples) == 75
+    database(wide)
+
+
+def test_a_scene_names_the_file_beside_it_and_holds_what_it_said(tmp_path: Path) -> None:
+    written(tmp_path)
+    (tmp_path / "scene.toml").write_text('channels = "mine.toml"\n')
+    scene = load_scene(tmp_path / "scene.toml")
+    assert scene.channels == read_channels(tmp_path / "mine.toml")
+    document = Simulation(scene).scene_document()["scene"]
+    (tmp_path / "mine.toml").unlink()
+    assert rig.Scene.model_validate(document) == scene
+
+
+def channel(row: str) -> str:
+    good = {"name": '"a"', "signal": '"P_N"', "unit": '"N"', "si": "1.0", "sensitivity_v": "1e-3"}
+    for part in row.split("; "):
+        name, _, value = part.partition(" = ")
+        good[name] = value
+    inside = ", ".join(f"{name} = {value}" for name, value in good.items() if value)
+    return f"[groups.g]\nchannels = [{{ {inside} }}]"
+
+
+WRONG = {
+    "no sensitivity": (channel("sensitivity_v = "), "channel a.sensitivity_v must be given"),
+    "no unit": (channel("unit = "), "channel a.unit must be given"),
+    "no scale": (channel("si = "), "channel a.si must be given"),
+    "no name": (channel("name = "), "groups.g.channels.0.name must be given"),
+    "no signal": (channel("signal = "), "channel a.signal must be given"),
+    "sensitivity of nothing": (channel("sensitivity_v = 0"), "channel a.sensitivity_v must be non-zero"),
+    "negative unit": (channel("si = -1"), "channel a.si must be greater than 0"),
+    "unknown signal": (channel('signal = "disk_z"'), "channel a.signal must be one of the model's"),
+    "unknown in a formula": (channel('signal = "2 * disk_z"'), "such as disk_y"),
+    "unknown parameter": (channel('signal = "shaft.arm * P_N"'), "such as shaft.arm_ring, shaft.arm_disk"),
+    "law as a number": (channel('signal = "contact.exponent * P_N"'), "made of the parameters that are numbers"),
+    "unknown function": (channel('signal = "sine(theta)"'), "made of the functions, such as sin"),
+    "too many arguments": (channel('signal = "sin(theta, 1)"'), "sin of 1 argument; instead received 2"),
+    "no formula": (channel('signal = "P_N +"'), "or a formula of them; instead received 'P_N +'"),
+    "code": (channel('''signal = "__import__('os').system('true')"'''), "channel a.signal must be"),
+    "an attribute of a number": (channel('signal = "(1).real"'), "channel a.signal must be"),
+    "a comprehension": (channel('signal = "[x for x in P_N]"'), "made of numbers, signals, parameters"),
+    "a comparison": (channel('signal = "P_N > 3"'), "made of numbers, signals, parameters"),
+    "text in a formula": (channel('signal = "P_N + True"'), "made of numbers, signals, parameters"),
+    "a deep formula": (channel(f'signal = "{"-" * 40}P_N"'), "nested at most 30 deep"),
+    "a long formula": (channel(f'signal = "{"P_N + " * 100}P_N"'), "a formula of at most 500 characters"),
+    "range that falls": (channel("range_v = [5, -5]"), "channel a.range_v must be two ascending values inside"),
+    "range beyond the converter": (
+        channel("range_v = [-20, 20]"),
+        "channel a.range_v must be two ascending values inside",
+    ),
+    "no bits": (channel("adc_bits = 4"), "channel a.adc_bits must be greater than or equal to 8"),
+    "many poles": (channel("filter_order = 12"), "channel a.filter_order must be less than or equal to 8"),
+    "noise below zero": (channel("noise_v = -1"), "channel a.noise_v must be greater than or equal to 0"),
+    "bandwidth beyond any row": (channel("bandwidth_hz = 1e6"), "channel a.bandwidth_hz must be at most 130000"),
+    "unknown field": (channel("sensitivty_v = 1"), "channel a.sensitivty_v must be a field that there is"),
+    "name with a blank": (channel('name = "a b"'), "a name of letters, digits and _"),
+    "name twice": (channel('name = "P_N"'), "channel P_N must be in the table once"),
+    "rate of zero": ("[groups.probes]\nrate_hz = 0", "groups.probes.rate_hz must be greater than or equal to 1"),
+    "rate of too many places": ("[groups.probes]\nrate_hz = 19997", "groups.probes.rate_hz must be one whose samples"),
+    "a rate a channel": (channel("rate_hz = 100"), "channel a.rate_hz must be left out"),
+    "unknown channel": ("[channels.disk_z]\nnoise_v = 0", "channels.disk_z must be the name of a channel"),
+    "another name": ('[channels.disk_x]\nname = "x"', "channels.disk_x.name must be left out"),
+    "drop of nothing": ('drop = ["disk_z"]', "drop must be names of groups or channels, such as disk_y"),
+    "nothing left": ('drop = ["probes", "forces", "accelerations", "drive", "hammer"]', "such that a channel is left"),
+    "a group of nothing": ("[groups.g]\nrate_hz = 1000", "groups.g.channels must be given"),
+    "unknown table": ("[group.g]\nrate_hz = 1000", "group must be a field that there is, such as groups"),
+    "unknown base": ('base = "mine"', "base must be"),
+    "no curve": ('[curves]\nc = "none.csv"', "curves.c must be a file that can be read"),
+    "a curve back and forth": (
+        "[curves]\nc = [[0, 1], [0, 2]]",
+        "curves.c must be 2 to 10000 points of ascending angle",
+    ),
+    "a curve of more than a turn": ("[curves]\nc = [[0, 1], [400, 2]]", "curves.c must be points from 0 to below 360"),
+    "no TOML": ("groups = {", "a TOML file"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_table_is_one_line_that_names_channel_and_field(what: str, tmp_path: Path) -> None:
+    text, line = WRONG[what]
+    path = written(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        load_scene("hammer", {"channels": str(path)})
+    said = str(caught.value)
+    assert "\n" not in said
+    assert len(said) < 400
+    assert line in said, said
+    assert "mine.toml" in said or what == "rate of too many places"  # which is the whole scene's to know
