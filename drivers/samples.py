@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rig.samples import Columns
-from rig.wire import Continuity
+from rig.wire import Continuity, start_s
 
 
 class StreamEndedError(EOFError):
@@ -21,7 +21,7 @@ class Samples(Columns):
 
     Attributes:
         index: Number of the first row since the start of the rig's stream, at `rate_hz`.
-        tick: Time of the first row [ticks of the simulated clock].
+        tick: Time of the first row, to the nearest [ticks of the simulated clock]; `times_s` is exact.
         rate_hz: Rows per second [Hz].
         tick_rate_hz: Ticks per second [Hz].
         names: Names of the columns, which are channels.
@@ -46,14 +46,15 @@ class Samples(Columns):
     @property
     def times_s(self) -> np.ndarray:
         """Simulated time of each row [s], shape (rows,)."""
-        return self.tick / self.tick_rate_hz + np.arange(len(self.values)) / self.rate_hz
+        return start_s(self.tick, self.rate_hz, self.tick_rate_hz) + np.arange(len(self.values)) / self.rate_hz
 
     def rows(self, start: int, stop: int) -> Samples:
         """Some of the rows."""
+        first_s = start_s(self.tick, self.rate_hz, self.tick_rate_hz) + start / self.rate_hz
         return replace(
             self,
             index=self.index + start,
-            tick=self.tick + round(start * self.tick_rate_hz / self.rate_hz),
+            tick=round(first_s * self.tick_rate_hz),
             values=self.values[start:stop],
             gap=0 if start else self.gap,
         )

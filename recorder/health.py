@@ -280,7 +280,7 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
             edges.append(row_times_s(key, block))
             return
         tick, index = starts.setdefault(key, (block.tick, block.index))
-        if abs(block.tick - tick - (block.index - index) * block.tick_rate_hz / block.rate_hz) > 0.5:
+        if abs(block.tick - tick - (block.index - index) * block.tick_rate_hz / block.rate_hz) > 1.0:
             misplaced[key] = misplaced.get(key, 0) + 1
         if key in watches:
             watches[key].add(block.index, block.values)

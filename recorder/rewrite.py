@@ -326,12 +326,7 @@ def _narrowed(
 def _trimmed(key: str, block: Block, from_tick: float, to_tick: float, columns: list[int] | None) -> Block | None:
     """The rows of a block between two ticks, with their own tick and number; the same block where it keeps all."""
     rows = len(block.values)
-    if key == EDGES:
-        ticks = block.tick + block.values[:, 0]
-        a_row = 0.0
-    else:
-        a_row = block.tick_rate_hz / block.rate_hz
-        ticks = block.tick + a_row * np.arange(rows)
+    ticks = block.tick + block.values[:, 0] if key == EDGES else block.times_s * block.tick_rate_hz
     kept = np.flatnonzero((ticks >= from_tick) & (ticks < to_tick))
     if not len(kept):
         return None
@@ -339,6 +334,5 @@ def _trimmed(key: str, block: Block, from_tick: float, to_tick: float, columns: 
     if (first, last) == (0, rows) and columns is None:
         return block
     values = block.values[first:last] if columns is None else block.values[first:last, columns]
-    # A row lies on a whole tick: rates divide the tick rate.
-    tick = block.tick + round(first * a_row)
+    tick = block.tick if key == EDGES else round(float(ticks[first]))
     return Block(tick, block.index + first, block.rate_hz, block.tick_rate_hz, values)

@@ -68,9 +68,10 @@ class View:
         return tuple(f"{channel.name} [{channel.unit}]" for channel in self.channels)
 
     def takes(self, group: Group) -> bool:
-        """Whether a group can join without a second unit in any array."""
+        """Whether a group can join: it has the same rate, and no array gets a second unit."""
         units = {slot: channel.unit for slot, channel in zip(self.slots, self.channels, strict=True)}
-        return all(units.get(slot_of(channel), channel.unit) == channel.unit for channel in group.channels)
+        alike = all(channel.rate_hz == group.rate_hz for channel in self.channels)
+        return alike and all(units.get(slot_of(channel), channel.unit) == channel.unit for channel in group.channels)
 
     def join(self, group: Group) -> None:
         """Add a group's channels behind the others."""

@@ -80,12 +80,21 @@ def schema_of(key: str) -> str | None:
     return SAMPLE_SCHEMA if key.startswith(SENSORS + "/") else None
 
 
+def start_s(tick: int, rate_hz: float, tick_rate_hz: float) -> float:
+    """Time of a row that is told to the nearest tick [s]: rows of an even stream lie at whole numbers over the rate."""
+    if rate_hz:
+        row = round(tick * rate_hz / tick_rate_hz)
+        if abs(row * tick_rate_hz / rate_hz - tick) <= 0.5:
+            return row / rate_hz
+    return tick / tick_rate_hz
+
+
 @dataclass(frozen=True, slots=True)
 class Block:
     """Consecutive rows of one stream.
 
     Attributes:
-        tick: Time of the first row [ticks].
+        tick: Time of the first row, to the nearest tick [ticks]; `start_s` is exact.
         index: Number of the first row since the start of the stream.
         rate_hz: Rows per simulated second [Hz].
         tick_rate_hz: Ticks per simulated second [Hz].
@@ -99,10 +108,14 @@ class Block:
     values: np.ndarray = field(repr=False)
 
     @property
+    def start_s(self) -> float:
+        """Simulated time of the first row [s]."""
+        return start_s(self.tick, self.rate_hz, self.tick_rate_hz)
+
+    @property
     def times_s(self) -> np.ndarray:
         """Simulated time of each row [s], shape (rows,)."""
-        ticks_a_row = self.tick_rate_hz / self.rate_hz
-        return (self.tick + ticks_a_row * np.arange(len(self.values))) / self.tick_rate_hz
+        return self.start_s + np.arange(len(self.values)) / self.rate_hz
 
 
 def encode_block(block: Block) -> bytes:

@@ -17,7 +17,7 @@ from replays.recordings.experiment import Experiment
 from rig.channels import Channel, Group
 from rig.errors import InputError
 from rig.offline import frames
-from rig.scenes import Scene
+from rig.scenes import Scene, rig_table
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.formula import Formulas
 from rig.sensors.places import between, fits
@@ -351,10 +351,11 @@ def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chun
 
 def bare(experiment: Experiment) -> Experiment:
     """The same motion with one cheap sensor: rows stay as far apart as they were."""
+    groups = (experiment.scene.channels or rig_table()).groups.values()
+    fewest = min(groups, key=lambda group: len(group.channels))
     return experiment.changed(
         {
-            "channels": None,
-            "sensors.groups": ["hammer"],
+            "sensors.groups": [fewest.name],
             "sensors.chain": "ideal",
             "sensors.rate_hz": TICK_RATE_HZ // experiment.simulation().row_ticks,
         }

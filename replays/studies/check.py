@@ -94,6 +94,7 @@ def _states(scene: Scene, changes: dict[str, float]) -> tuple[np.ndarray, int]:
     """States at the truth's rate, shape (n, N_STATE), and the number of contacts."""
     document = scene.model_dump()
     document["sensors"] |= bare_sensors(scene.sensors.truth_rate_hz)
+    document["channels"] = None
     document["engine"] |= changes
     simulation = Simulation(parse_scene({**document, "fidelity": "given"}))
     every = simulation.tick_rate_hz // scene.sensors.truth_rate_hz // simulation.row_ticks

@@ -433,7 +433,7 @@ def _table(
 ) -> ExportTable | None:
     block = next(block for block in recording.blocks(key) if len(block.values))
     rate = block.rate_hz
-    zero_s = block.tick / block.tick_rate_hz - block.index / rate  # of the stream's row 0
+    zero_s = block.start_s - block.index / rate  # of the stream's row 0
     low, high = stream.first_time_s, stream.last_time_s
     # A little room for the rounding of times.
     first = math.ceil((max(low, -math.inf if from_s is None else from_s) - zero_s) * rate - 1e-6)
