@@ -175,6 +175,7 @@ class RealTime(Clock):
             about 0.1 ms late.
         now_ns: Time source [ns], monotonic.
         sleep: Sleeps for a number of seconds; None: in a way that `wake` ends.
+        utc_ns: The host's clock [unix ns].
     """
 
     pace = "real-time"
@@ -185,8 +186,10 @@ class RealTime(Clock):
         spin_s: float = 0.0,
         now_ns: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], object] | None = None,
+        utc_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         super().__init__(now_ns=now_ns)
+        self._utc_ns = utc_ns
         self._spin_ns = round(spin_s * _NS)
         self._woken = threading.Event()
         self._sleep = sleep or self._woken.wait
@@ -195,6 +198,16 @@ class RealTime(Clock):
     def deadline_ns(self, tick: int) -> int:
         """When a tick is due, in the time of the time source [ns]."""
         return self._origin_ns + (tick - self._origin_tick) * _NS // self._tick_rate_hz
+
+    def statistics(self) -> dict[str, object]:
+        """The same, and when in UTC a tick was due: by the host's clock, whose own error comes to the uncertainty."""
+        before, utc_ns = self._now_ns(), self._utc_ns()
+        after = self._now_ns()
+        now = (before + after) // 2
+        tick = self._origin_tick + (now - self._origin_ns) * self._tick_rate_hz // _NS
+        since_ns = now - self.deadline_ns(tick)
+        utc = {"tick": tick, "utc_s": (utc_ns - since_ns) / _NS, "uncertainty_s": (after - before + 1) / 2 / _NS}
+        return {**super().statistics(), "utc": utc}
 
     def position(self) -> int:
         """The tick that it is now by the wall clock."""
