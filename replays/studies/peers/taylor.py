@@ -9,9 +9,9 @@ The root at the rim. delta^1.5 has a branch point at delta = 0, so a contact sta
 series is carried on past the onset to a depth h, and a contact ends at that depth too. What is left out is the impulse
 K h^2.5 / (2.5 rate) twice a contact; h is chosen for it to change a speed by `_MARGIN` times the tolerance, in m/s.
 Against 1e-2, 1e-4 costs nothing and is 1.5 to 9 times as exact at tolerance 1e-3, over 48 scenes, of which none ends on
-a wrong branch any more. From there the steps grow with the distance from the branch point, about 13 % a step. (Between
-h for 1 and for 1e-6 times the tolerance, the first 0.1 s of the hammer scene move by 1.4e-11 scaled at tolerance 1e-15:
-the noise of rounding.)
+a wrong branch any more. (In the chart's own hammer scene chance favours 1e-2 at tolerance 1e-4.) From there the steps
+grow with the distance from the branch point, about 13 % a step. (Between h for 1 and for 1e-6 times the tolerance, the
+first 0.1 s of the hammer scene move by 1.4e-11 scaled at tolerance 1e-15: the noise of rounding.)
 
 Its best build: `fast_math`, with the code unrolled as heyoka has it by default. Measured in the same rounds on the
 chart's 1 s from impacts to whirl, tolerances 1e-3 to 1e-15: `fast_math` takes 7 to 19 % off and leaves every error as
