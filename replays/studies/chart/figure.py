@@ -65,13 +65,14 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
 def _caption(figure: Any, rows: list[Row], said: str, command: str, note: str) -> None:
     last = rows[-1]
     machine = " ".join(last["machine"].split())
+    unbroken = command.replace(" ", "\N{NO-BREAK SPACE}")  # a command stays on one line
     text = (
-        f"{said} Made by `{command}` ({last['mode']}): one thread on {machine}; {last['versions']}; "
+        f"{said} Made by `{unbroken}` ({last['mode']}): one thread on {machine}; {last['versions']}; "
         f"commit {last['commit'] or 'unknown'}, {last['date']}."
     )
     text = f"{text} {note[:1].upper()}{note[1:]}." if note else text
-    figure.text(0.01, 0.1 / figure.get_size_inches()[1], "\n".join(textwrap.wrap(text, 152)), fontsize=9, color=QUIET,
-                va="bottom", linespacing=1.3)  # fmt: skip
+    lines = "\n".join(textwrap.wrap(text, 152, break_on_hyphens=False)).replace("\N{NO-BREAK SPACE}", " ")
+    figure.text(0.01, 0.1 / figure.get_size_inches()[1], lines, fontsize=9, color=QUIET, va="bottom", linespacing=1.3)
 
 
 def _grid(figure: Any, height: float, title: str, *, down: int = 1, across: int = 2, left: float = 0.7) -> Any:
