@@ -13,10 +13,11 @@ from replays.studies.chart import figure, measure, session
 from replays.studies.chart.figure import draw
 from replays.studies.chart.measure import OFF, Budget, Run, block_statistics, elastic_forces, point, run_engine
 from replays.studies.chart.methods import competitors
+from replays.studies.chart.panel import own_speed
 from replays.studies.chart.phases import PANELS, plan, problem_of
 from replays.studies.chart.profile import draw_scene, shares
 from replays.studies.chart.session import make_chart
-from replays.studies.chart.store import COLUMNS, KEY, Store
+from replays.studies.chart.store import COLUMNS, KEY, Store, read_table
 from replays.studies.peers import PEERS, Setting
 from replays.studies.peers.problem import Problem
 from replays.studies.peers.reference import Reference
@@ -180,6 +181,18 @@ def test_profile_shares_by_hand() -> None:
     assert len(curves["never"][0]) == 0
 
 
+def test_profile_of_a_bound_is_held_against_the_best_of_all() -> None:
+    points = [
+        {"phase": "a", "method": "led", "cpu_s": 4.0, "own_cpu_s": 1.0, "failure": ""},
+        {"phase": "a", "method": "other", "cpu_s": 2.0, "own_cpu_s": None, "failure": ""},
+        {"phase": "b", "method": "led", "cpu_s": 3.0, "own_cpu_s": 2.0, "failure": ""},
+        {"phase": "b", "method": "other", "cpu_s": 1.0, "own_cpu_s": None, "failure": ""},
+    ]
+    curves = shares(points, column="own_cpu_s")
+    assert list(curves) == ["led"]
+    assert curves["led"][0].tolist() == [0.5, 2.0]
+
+
 def test_draws_are_the_same_again_and_differ() -> None:
     assert draw_scene(3) == draw_scene(3)
     assert draw_scene(3).commands != draw_scene(4).commands
@@ -215,6 +228,25 @@ def test_failures_are_drawn_not_dropped(tmp_path: Path) -> None:
         assert f'id="failure-rk4-{kind}"' in drawn
     assert "wrong number of contacts" in drawn
     assert "rig chart --somehow" in drawn
+
+
+def test_a_bound_is_drawn_and_named_beside_the_method_it_bounds(tmp_path: Path) -> None:
+    stamp = {"commit": "abc", "date": "2026-01-01", "machine": "m", "versions": "v"}
+    blank = {name: None for name in COLUMNS if name not in KEY and name not in ("title", "family")}
+    measured = {"error": 1e-4, "speed": 100.0, "speed_min": 90.0, "speed_max": 110.0, "tolerance": 1e-6,
+                "cpu_s": 0.01, "own_cpu_s": 0.008, "failure": "", "known_failure": ""}  # fmt: skip
+    led = row(**{**blank, **stamp, **measured}, method="heyoka", title="heyoka", family="heyoka", rung="1e-6")
+    assert own_speed(led) == pytest.approx(125.0)
+    draw([led], tmp_path, ["exact"], command="rig chart")
+    drawn = (tmp_path / "chart-exact.svg").read_text(encoding="utf-8")
+    assert 'id="heyoka-bound"' in drawn
+    assert "heyoka alone: a bound" in drawn
+
+
+def test_a_table_of_an_earlier_version_is_read() -> None:
+    rows = read_table(Path(figure.__file__).parents[2] / "figures")
+    assert rows
+    assert all("own_cpu_s" in one for one in rows)
 
 
 def test_a_small_chart_end_to_end_resumes_and_says_what_is_missing(

@@ -10,7 +10,7 @@ import pytest
 from replays.studies.peers import ERROR_SCALE, PEERS, Peer, Problem, Setting, scaled_error
 from replays.studies.peers.plain_python import PlainPython
 from replays.studies.peers.reference import find_reference
-from replays.studies.peers.right_hand_side import derivative, pack, switching
+from replays.studies.peers.right_hand_side import derivative, jacobian, pack, switching
 from replays.studies.peers.solution import MISSED_HAMMER
 from replays.studies.peers.window import cut_window
 from rig.errors import InputError
@@ -84,6 +84,19 @@ def test_compiled_and_plain_python_are_the_same_equations(changes: dict, phase: 
         np.testing.assert_allclose(switching(0.0213, y, parameters), plain.switching(0.0213, y), atol=1e-15)
 
 
+def test_the_matrix_of_the_implicit_methods_is_the_slope_of_the_rates() -> None:
+    given = replace(problem(0.03), phase=TOUCHING, onset_speed=0.1)
+    parameters = pack(given)
+    for y in states_in_contact(given, count=3):
+        slopes = jacobian(0.0213, y, parameters)
+        for i in range(14):
+            step = np.zeros(14)
+            step[i] = 1e-6 * STATE_SCALE[i]
+            change = derivative(0.0213, y + step, parameters) - derivative(0.0213, y - step, parameters)
+            found, wanted = slopes @ (2.0 * step) / STATE_SCALE, change / STATE_SCALE
+            np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-3 * np.max(np.abs(wanted)))
+
+
 @pytest.mark.parametrize("changes", [{}, {"drive.mode": "ideal"}, {"model.magnet": "cylinders"}])
 @pytest.mark.parametrize("phase", [FLIGHT, TOUCHING, FORWARD, ROLLING])
 def test_heyoka_has_the_same_equations(changes: dict, phase: int) -> None:
@@ -135,6 +148,22 @@ def test_a_contact_without_sliding_rolls_from_the_start() -> None:
         assert solution.contacts == 2
         assert solution.switches == 4
         assert np.max(np.abs(solution.states[:, [1, 2, 3, 5, 9]])) < 1e-12
+
+
+def test_a_drop_without_sliding_does_not_stall_where_the_law_would_pull() -> None:
+    # Friction and normal force reach 0 at one instant: a loose series must not slide on under a force that pulls.
+    given = problem(0.5, scene="drop", friction="exact")
+    solution = solve("heyoka", given, 1e-4)
+    assert solution.failure is None
+    assert solution.switches < 200
+
+
+def test_the_own_time_of_a_library_is_told_where_python_leads_it() -> None:
+    given = problem(0.03)
+    led = solve("heyoka", given, 1e-8)
+    assert led.own_s is not None
+    assert 0.0 < led.own_s < led.cpu_s
+    assert solve("cvode-adams", given, 1e-8).own_s is None
 
 
 def test_a_drop_meets_the_ring_after_the_time_of_a_pendulum() -> None:

@@ -20,6 +20,7 @@ from replays.studies.chart.panel import (
     draw_work,
     label_lines,
     mark_better,
+    own_speed,
     window,
 )
 from replays.studies.chart.phases import MEMORY_CASES, PHASES, RUB, SMOOTHING
@@ -64,13 +65,14 @@ def draw(rows: list[Row], folder: Path, panels: list[str], *, command: str, note
 def _caption(figure: Any, rows: list[Row], said: str, command: str, note: str) -> None:
     last = rows[-1]
     machine = " ".join(last["machine"].split())
+    unbroken = command.replace(" ", "\N{NO-BREAK SPACE}")  # a command stays on one line
     text = (
-        f"{said} Made by `{command}` ({last['mode']}): one thread on {machine}; {last['versions']}; "
+        f"{said} Made by `{unbroken}` ({last['mode']}): one thread on {machine}; {last['versions']}; "
         f"commit {last['commit'] or 'unknown'}, {last['date']}."
     )
     text = f"{text} {note[:1].upper()}{note[1:]}." if note else text
-    figure.text(0.01, 0.1 / figure.get_size_inches()[1], "\n".join(textwrap.wrap(text, 152)), fontsize=9, color=QUIET,
-                va="bottom", linespacing=1.3)  # fmt: skip
+    lines = "\n".join(textwrap.wrap(text, 152, break_on_hyphens=False)).replace("\N{NO-BREAK SPACE}", " ")
+    figure.text(0.01, 0.1 / figure.get_size_inches()[1], lines, fontsize=9, color=QUIET, va="bottom", linespacing=1.3)
 
 
 def _grid(figure: Any, height: float, title: str, *, down: int = 1, across: int = 2, left: float = 0.7) -> Any:
@@ -86,8 +88,16 @@ def _grid(figure: Any, height: float, title: str, *, down: int = 1, across: int 
 _HOW = (
     "Points: median of at least 3 runs (in a quick chart, long runs count alone), bars from least to "
     "greatest, compile time apart; same equations, same corners of the hammer, right-hand sides compiled unless said. "
-    "Error: RMS over 1 ms instants of 7 scaled states."
+    "scipy's steps are Python. Error: RMS over 1 ms instants of 7 scaled states."
 )
+
+
+def _led(rows: list[Row], panel: str) -> str:
+    """What must be said where a Python loop drives a library."""
+    led = sorted({row["method"] for row in rows if row["panel"] == panel and row["own_cpu_s"]})
+    if not led:
+        return ""
+    return f" Hollow or dotted: {' and '.join(led)} alone, without the time of our Python loop that drives it."
 
 
 def _select(rows: list[Row], panel: str, phase: str, cases: tuple[str, ...] = ()) -> list[Row]:
@@ -120,7 +130,7 @@ def _hero(figure: Any, rows: list[Row]) -> str:
         draw_profile(right, rows)
     else:
         draw_frames(right, chosen, rows)
-    return _HOW
+    return _HOW + _led(rows, "exact")
 
 
 def _exact(figure: Any, rows: list[Row]) -> str:
@@ -146,7 +156,7 @@ def _windows(figure: Any, rows: list[Row], panel: str, title: str, *, smoothed: 
         if i % across:
             axes.set_ylabel("")
     draw_legend(figure, rows, (panel,), figure.add_subplot(grid[:, across]), smoothed=smoothed)
-    return _HOW
+    return _HOW + _led(rows, panel)
 
 
 def _memory(figure: Any, rows: list[Row]) -> str:
@@ -160,9 +170,9 @@ def _memory(figure: Any, rows: list[Row]) -> str:
         if i:
             axes.set_ylabel("")
     draw_legend(figure, rows, ("memory",), figure.add_subplot(grid[0, 2]))
-    return _HOW + (
-        " Friction is left out here, so that every method runs. 'No events': v₀ is latched at a step's end, not where "
-        "the contact begins."
+    return (
+        f"{_HOW}{_led(rows, 'memory')} Friction is left out here, so that every method runs. 'No events': v₀ is "
+        "latched at a step's end, not where the contact begins."
     )
 
 
@@ -174,7 +184,8 @@ def _profile_figure(figure: Any, rows: list[Row]) -> str:
     chaos = f" {chaotic} draws without a sharp reference (chaotic) are left out for all." if chaotic else ""
     return (
         f"Each method walks down its ladder to the first setting that comes within {TARGET:g} of the scene's own "
-        f"reference, exact Coulomb, 0.15 s, and is timed there; curves that end below 100 % did not get there.{chaos}"
+        "reference, exact Coulomb, 0.15 s, and is timed there; curves that end below 100 % did not get "
+        f"there.{chaos}{_led(rows, 'profile')}"
     )
 
 
@@ -186,11 +197,11 @@ def _work(figure: Any, rows: list[Row]) -> str:
     grid.update(wspace=0.3)
     draw_work(figure.add_subplot(grid[0, 0]), chosen, rows)
     draw_frames(figure.add_subplot(grid[0, 1]), chosen, rows)
-    draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 2]), failures=False)
+    draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 2]), failures=False, bounds=False)
     return (
-        "Evaluations as each library counts them: split's are its kicks, a Taylor series' its order times its steps. "
-        "Worst frame: the longest call of 1 ms, each frame's least of several passes, so that the machine's own pauses "
-        "are left out; peers are not stepped frame by frame."
+        "Evaluations as each library counts them: a Taylor series' are its order times its steps; split's are its "
+        "kicks and those of its series. Worst frame: the longest call of 1 ms, each frame's least of several passes, "
+        "so that the machine's own pauses are left out; peers are not stepped frame by frame."
     )
 
 
@@ -229,13 +240,17 @@ def _rub(figure: Any, rows: list[Row]) -> str:
     axes = figure.add_subplot(grid[0, 3])
     for place, row in zip(y, points, strict=True):
         axes.barh(place, row["speed"] or 0.0, color=look(row, rows)["color"], height=0.55, zorder=2)
-        axes.text((row["speed"] or 0.0) * 1.08, place, f"{row['speed'] or 0.0:.3g}", va="center", fontsize=9, color=INK)
+        bound = own_speed(row) or 0.0
+        axes.barh(place, bound, color="none", edgecolor=look(row, rows)["color"], height=0.55, lw=0.8, ls=":")
+        said = f"{row['speed'] or 0.0:.3g}" + (f", bound {bound:.3g}" if bound else "")
+        axes.text(max(row["speed"] or 0.0, bound) * 1.08, place, said, va="center", fontsize=9, color=INK)
     axes.set(xscale="log", xlabel="times real time\n[s/s]", ylim=(-0.7, n - 0.3), yticks=y)
     axes.set_yticklabels([])
-    axes.set_xlim(right=axes.get_xlim()[1] * 6.0)
+    axes.minorticks_off()
+    axes.set_xlim(right=axes.get_xlim()[1] * 20.0)
     against = f"{tight['title']}, {tight['rung']}" if tight is not None else "none"
     return (
         f"Ring moved sideways by 0.8 mm, unbalance 0.3 mm, 12 Hz, {points[0]['simulated_s']:g} s: two runs that begin "
         f"5e-10 rad apart are wholly apart after 0.4 s. Means with 95 % bootstrap bars over blocks of 0.5 s; "
-        f"the band is {against}."
+        f"the band is {against}.{_led(rows, RUB)}"
     )

@@ -41,8 +41,21 @@ def look(row: Row, rows: list[Row]) -> dict[str, Any]:
             "mew": 0.5, "zorder": 5 if marker == "*" else 4}  # fmt: skip
 
 
+def look_of_bound(row: Row, rows: list[Row]) -> dict[str, Any]:
+    """Line and marker of what a library would reach if the Python loop that drives it cost nothing."""
+    style = look(row, rows)
+    return style | {"ls": (0, (1, 1.4)), "lw": 0.9, "mfc": "white", "mew": 0.8}
+
+
 def draw_legend(
-    figure: Any, rows: list[Row], panels: tuple[str, ...], place: Any, *, smoothed: bool = False, failures: bool = True
+    figure: Any,
+    rows: list[Row],
+    panels: tuple[str, ...],
+    place: Any,
+    *,
+    smoothed: bool = False,
+    failures: bool = True,
+    bounds: bool = True,
 ) -> None:
     """Our engines first, then peers by family, then what the marks mean."""
     from matplotlib.lines import Line2D
@@ -60,6 +73,10 @@ def draw_legend(
         for row in members:
             style = {key: value for key, value in look(row, rows).items() if key != "zorder"}
             entries.append((Line2D([], [], **style), row["title"]))
+            points = [one for one in rows if one["panel"] in panels and one["method"] == row["method"]]
+            if bounds and any(one["own_cpu_s"] for one in points):
+                style = {key: value for key, value in look_of_bound(row, rows).items() if key != "zorder"}
+                entries.append((Line2D([], [], **style), f"{row['method']} alone: a bound"))
         if smoothed and family == OURS:
             color, dash = traits("tsit5").colour, (0, (1, 1.4))
             handle = Line2D([], [], color=color, ls=dash, marker=traits("tsit5").marker, mfc="white", ms=5.5)

@@ -59,6 +59,8 @@ class Run:
     """Kind: "", nan, hammer, budget, error, contacts or branch."""
     message: str = ""
     compile_s: float = 0.0
+    own_costs: list[float] = field(default_factory=list)
+    """Of the same runs, processor time inside the library's own calls [s], where a Python loop drives it."""
     energy_residual: float | None = None
     worst_frame_s: float | None = None
     onsets: np.ndarray = field(default_factory=lambda: np.empty(0))
@@ -183,7 +185,9 @@ def _kind_of(failure: str) -> str:
 
 def run_peer(name: str, setting: Setting, problem: Problem, budget: Budget) -> Run:
     """Run a peer; the first run counts only where it is long, as it may load what the others find loaded."""
-    peer, costs, compile_s = PEERS[name], [], 0.0
+    peer, compile_s = PEERS[name], 0.0
+    costs: list[float] = []
+    own_costs: list[float] = []
     solution: Solution | None = None
     while solution is None or len(costs) < budget.runs:
         fresh = solution is None
@@ -191,6 +195,7 @@ def run_peer(name: str, setting: Setting, problem: Problem, budget: Budget) -> R
         compile_s = max(compile_s, solution.compile_s)
         if not fresh or solution.failure is not None or solution.cpu_s > 0.2 or solution.cpu_s > budget.single_s:
             costs.append(solution.cpu_s)
+            own_costs += [solution.own_s] if solution.own_s else []
         if solution.failure is not None or solution.cpu_s > budget.single_s:
             break
     good: np.ndarray = np.isfinite(solution.states.sum(axis=1))
@@ -206,6 +211,7 @@ def run_peer(name: str, setting: Setting, problem: Problem, budget: Budget) -> R
         failure=_kind_of(message),
         message=message,
         compile_s=compile_s,
+        own_costs=own_costs,
         onsets=np.array([time_s for time_s, _ in solution.onsets]),
     )
 
@@ -322,6 +328,7 @@ def _cost(done: Run, problem: Problem) -> dict[str, Any]:
         "speed_min": done.reached_s / max(costs),
         "speed_max": done.reached_s / min(costs),
         "compile_s": done.compile_s,
+        "own_cpu_s": statistics.median(done.own_costs) if done.own_costs else None,
         "steps": done.steps,
         "evaluations": done.evaluations,
         "contacts": done.contacts,

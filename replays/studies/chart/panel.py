@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.chart.look import ALARM, FAILURES, Row, look
+from replays.studies.chart.look import ALARM, FAILURES, Row, look, look_of_bound
 from replays.studies.chart.methods import OURS
 from replays.studies.chart.profile import TARGET, shares
 
@@ -25,6 +25,11 @@ def _inside(error: float) -> float:
 def _placed(row: Row) -> float:
     """Where a point's error is drawn."""
     return _inside(row["error"])
+
+
+def own_speed(row: Row) -> float | None:
+    """Times real time by a library's own time alone, where a Python loop drives it and that was measured."""
+    return row["speed"] * row["cpu_s"] / row["own_cpu_s"] if row["own_cpu_s"] and row["speed"] else None
 
 
 def _fineness(row: Row) -> float:
@@ -45,7 +50,8 @@ def window(axes: Any, rows: list[Row], all_rows: list[Row], *, title: str) -> No
     for row in points:
         lines.setdefault((row["method"], row["case"]), []).append(row)
     axes.set(xscale="log", yscale="log")
-    speeds = [row["speed"] for row in points if row["speed"] and row["error"]] or [1.0, 100.0]
+    speeds = [own_speed(row) or row["speed"] for row in points if row["speed"] and row["error"]]
+    speeds += [row["speed"] for row in points if row["speed"] and row["error"]] or [1.0, 100.0]
     low, high = 0.45 * min(speeds), 2.2 * max(speeds)
     axes.set(xlim=(_LEFT, _EDGE), ylim=(low, high))
     axes.axvspan(_RIGHT, _EDGE, color="#f4ecec", zorder=0, lw=0)
@@ -63,6 +69,9 @@ def window(axes: Any, rows: list[Row], all_rows: list[Row], *, title: str) -> No
         if len(good):
             axes.errorbar(x, y, yerr=spread.T.clip(0.0), fmt="none", ecolor=style["color"], elinewidth=1.0, zorder=3,
                           alpha=0.65)  # fmt: skip
+        bounds = [(_placed(row), speed) for row in good if (speed := own_speed(row)) is not None]
+        if bounds:
+            axes.plot(*zip(*bounds, strict=True), gid=f"{method}-bound", **look_of_bound(line[0], all_rows))
         for row in good:
             if row["failure"] == "contacts":
                 axes.plot(_placed(row), row["speed"], "x", color=ALARM, ms=9, mew=1.6, zorder=9)
@@ -221,6 +230,14 @@ def draw_profile(axes: Any, rows: list[Row]) -> int:
         x = np.concatenate([[1.0], ratios, [top]]) if len(ratios) else np.array([1.0, top])
         y = np.concatenate([[0.0], share, [share[-1]]]) if len(ratios) else np.zeros(2)
         axes.step(x, 100.0 * y, where="post", gid=f"profile-{method}", clip_on=False, **style)
+    for method, (ratios, share) in (shares(fair, column="own_cpu_s") if fair else {}).items():
+        row = next(one for one in fair if one["method"] == method)
+        style = look_of_bound(row, rows)
+        # What would be quicker than the best of all stands at its cost.
+        x = np.concatenate([[1.0], ratios.clip(1.0), [top]])
+        y = np.concatenate([[0.0], share, [share[-1] if len(share) else 0.0]])
+        axes.step(x, 100.0 * y, where="post", gid=f"profile-{method}-bound", color=style["color"], ls=style["ls"],
+                  lw=style["lw"], zorder=style["zorder"])  # fmt: skip
     axes.set(xlim=(1.0, top), ylim=(0.0, 102.0), xlabel="processor time over that of the best [1]",
              ylabel=f"scenes within {TARGET:g} [%]")  # fmt: skip
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")

@@ -79,11 +79,12 @@ def cheapest(contender: Competitor, problem: Problem, reference: Reference, budg
     return {**columns, "failure": columns.get("failure") or "target"}
 
 
-def shares(rows: list[dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def shares(rows: list[dict[str, Any]], column: str = "cpu_s") -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Curves of the profile.
 
     Args:
         rows: Points of the profile, one a scene and method.
+        column: Column that a method's cost is read from; methods without it are left out. The best's is its `cpu_s`.
 
     Returns:
         By method: cost ratios to the best, ascending, shape (n,), and the share of all scenes solved within each,
@@ -94,6 +95,9 @@ def shares(rows: list[dict[str, Any]]) -> dict[str, tuple[np.ndarray, np.ndarray
     best = {
         scene: min((spent for (where, _), spent in cost.items() if where == scene), default=np.inf) for scene in scenes
     }
+    if column != "cpu_s":
+        rows = [row for row in rows if row[column]]
+        cost = {(row["phase"], row["method"]): row[column] for row in rows if not row["failure"]}
     curves = {}
     for method in dict.fromkeys(row["method"] for row in rows):
         ratios = np.sort([cost[scene, method] / best[scene] for scene in scenes if (scene, method) in cost])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import math
 import platform
 from pathlib import Path
@@ -16,16 +17,20 @@ KEY = ("mode", "panel", "phase", "case", "method", "rung")
 """Columns that tell one point from another."""
 COLUMNS = (
     *KEY, "title", "family", "known_failure", "friction", "smoothing_speed", "step_us", "tolerance", "simulated_s",
-    "runs", "cpu_s", "cpu_min_s", "cpu_max_s", "compile_s", "speed", "speed_min", "speed_max", "error",
+    "runs", "cpu_s", "cpu_min_s", "cpu_max_s", "compile_s", "own_cpu_s", "speed", "speed_min", "speed_max", "error",
     "reference", "reference_error", "energy_residual", "steps", "evaluations", "contacts", "contacts_reference",
     "worst_frame_ms", "contact_fraction", "contact_fraction_low", "contact_fraction_high", "rms_force",
     "rms_force_low", "rms_force_high", "impacts_per_s", "impacts_per_s_low", "impacts_per_s_high", "failure",
     "message", "code", "commit", "date", "machine", "versions",
 )  # fmt: skip
-"""Columns of the table; speeds are times real time, forces newtons."""
+"""Columns of the table; speeds are times real time, forces newtons. `own_cpu_s` is a bound: the time inside a library's
+own calls alone, where a Python loop of ours drives it."""
+_LATER = {"own_cpu_s"}
+"""Columns that tables of earlier versions lack."""
 _TEXT = {*KEY, "title", "family", "known_failure", "friction", "reference", "failure", "message", "code", "commit",
          "date", "machine", "versions"}  # fmt: skip
 _LIBRARIES = (provenance.RIG, "numba", "numpy", "scipy", "heyoka", "scikit-sundae", "mujoco")
+_MEASURING = ("measure.py", "phases.py", "profile.py")
 
 Row = dict[str, Any]
 
@@ -103,7 +108,7 @@ def read_table(folder: Path, stem: str = "chart") -> list[Row]:
         with path.open(encoding="utf-8", newline="") as file:
             return [
                 {name: row[name] if name in _TEXT else float(row[name]) if row[name] else None for name in COLUMNS}
-                for row in csv.DictReader(file)
+                for row in ({**dict.fromkeys(_LATER), **row} for row in csv.DictReader(file))
             ]
     except (OSError, KeyError, ValueError, TypeError, csv.Error):
         raise InputError("output", f"a folder with {path.name} of an earlier chart", str(folder)) from None
@@ -113,9 +118,15 @@ def stamp() -> dict[str, str]:
     """What a point is measured with: code, commit, date, machine, versions of libraries."""
     from rig.kernels import source_digest
 
+    # Of the peers' drivers and of how a point is measured, too: a point of other code is measured anew.
+    here = Path(__file__).parent
+    sources = [*here.parent.joinpath("peers").glob("*.py"), *(here / name for name in _MEASURING)]
+    code = hashlib.sha256(source_digest().encode())
+    for path in sorted(sources):
+        code.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     found = {"Python": platform.python_version(), **provenance.versions(*_LIBRARIES)}
     return {
-        "code": source_digest(),
+        "code": code.hexdigest()[:16],
         "commit": provenance.commit(),
         "date": provenance.today(),
         "machine": provenance.machine(),

@@ -6,7 +6,8 @@ scikit-sundae's own interface with plain Python callbacks.
 
 Either way CVODE locates each change of phase with its root finding, and is started anew there and at the hammer's
 corners; v0 is latched at the located onset. Adams iterates by fixed point, BDF by Newton with a dense matrix that
-CVODE makes by differences: its defaults.
+CVODE makes by differences: its defaults. Compiled, BDF is tuned to this problem (`_TUNED`), and of Adams both are
+there, tuned and by its defaults; as installed, nothing is.
 """
 
 from __future__ import annotations
@@ -45,6 +46,32 @@ _INSTANT = 1e-14
 """Less time than this [s] is none."""
 _LATE = -1e-12
 """Penetration [m] of the wrong sign that tells of a change of phase that root finding has missed."""
+
+_ANDERSON = 1
+"""Earlier iterates that its fixed point looks back to."""
+_TUNED: dict[int, tuple[tuple[str, float], ...]] = {
+    ADAMS: (("CVodeSetNonlinConvCoef", 0.01), ("CVodeSetMaxNonlinIters", 5)),
+    BDF: (("CVodeSetNonlinConvCoef", 0.03), ("CVodeSetLSetupFrequency", 40), ("CVodeSetJacEvalFrequency", 200)),
+}
+"""What is set otherwise than CVODE has it, by method; Adams has Anderson's acceleration, too.
+
+Measured with exact friction, no scene chosen: time over that of CVODE's defaults at the same geometric mean error over
+the scenes, from ladders of six tolerances.
+
+    error                            1e-2  1e-3  1e-4  1e-5
+    Adams, whirl, 12 restitutions    0.86  0.79  0.79  0.81
+    Adams, transient, 24 of them     0.94  1.00  0.98  0.96
+    Adams, 27 random scenes          0.97  1.02  1.04  0.98
+    BDF, whirl                       0.83  0.86  0.87
+    BDF, transient                   0.96  1.03  0.97  0.97
+    BDF, random                      1.00  0.98  0.99  0.99
+
+A coefficient of 0.01 alone is a loss for Adams at loose tolerances (1.95 in whirl): its three iterations no longer
+suffice, and steps are rejected. Five of them without Anderson: 0.85 in the transient, but 1.32 in whirl at 1e-2.
+Coefficients of 0.3, 0.03, 0.003 and 0.001 gain no more. Of BDF, orders below 5, the detection of its stability limit
+and a coefficient of 0.01 lose. In a single scene chance moves an error more than any of this: in the chart's own
+hammer scene it favours Adams' defaults (1e-3 to whirl in 15 ms, tuned in 18 to 27).
+"""
 
 _MESSAGES = {
     -2: "more accuracy asked than there is",
@@ -88,6 +115,10 @@ def _library() -> Any:
         "CVodeSetLinearSolver": ([address, address, address], integer),
         "CVodeSetNonlinearSolver": ([address, address], integer),
         "CVodeSetStopTime": ([address, real], integer),
+        "CVodeSetNonlinConvCoef": ([address, real], integer),
+        "CVodeSetMaxNonlinIters": ([address, integer], integer),
+        "CVodeSetLSetupFrequency": ([address, ctypes.c_long], integer),
+        "CVodeSetJacEvalFrequency": ([address, ctypes.c_long], integer),
         "CVodeRootInit": ([address, integer, address], integer),
         "CVodeSetRootDirection": ([address, address], integer),
         "CVodeSetNoInactiveRootWarn": ([address], integer),
@@ -176,7 +207,9 @@ def _loop() -> tuple[Any, float]:
     return run, time.perf_counter() - begin
 
 
-def solve(problem: Problem, *, setting: Setting, budget_s: float, method: int, manner: Manner = PROPER) -> Solution:
+def solve(
+    problem: Problem, *, setting: Setting, budget_s: float, method: int, manner: Manner = PROPER, tuned: bool = True
+) -> Solution:
     """Solve a problem by CVODE.
 
     Args:
@@ -185,6 +218,7 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float, method: int, m
         budget_s: Wall time allowed [s].
         method: ADAMS or BDF.
         manner: How it is driven.
+        tuned: Whether it iterates as suits this problem (`_TUNED`), or as CVODE does by itself.
     """
     if manner.plain:
         return _solve_plain(problem, setting=setting, budget_s=budget_s, method=method)
@@ -202,7 +236,9 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float, method: int, m
     journal = Journal(problem.times, budget_s, compiling_s)
     journal.states[0] = problem.y0
     with ExitStack() as stack:
-        session = _Session(library, problem, parameters, setting, method=method, events=manner.events, stack=stack)
+        session = _Session(
+            library, problem, parameters, setting, method=method, events=manner.events, tuned=tuned, stack=stack
+        )
         library.CVodeSetStopTime(session.memory, corners[0])
         done = False
         while not done:
@@ -243,6 +279,7 @@ class _Session:
         *,
         method: int,
         events: bool,
+        tuned: bool,
         stack: ExitStack,
     ) -> None:
         rates, switches, rates_by_sign = vector_callbacks()
@@ -270,7 +307,7 @@ class _Session:
         _check("CVodeSVtolerances", library.CVodeSVtolerances(self.memory, setting.tolerance, absolute))
         _check("CVodeSetUserData", library.CVodeSetUserData(self.memory, parameters.ctypes.data))
         if method == ADAMS:
-            iteration = library.SUNNonlinSol_FixedPoint(self.place, 0, context)
+            iteration = library.SUNNonlinSol_FixedPoint(self.place, _ANDERSON if tuned else 0, context)
             stack.callback(library.SUNNonlinSolFree, iteration)
             _check("CVodeSetNonlinearSolver", library.CVodeSetNonlinearSolver(self.memory, iteration))
         else:
@@ -279,6 +316,8 @@ class _Session:
             linear = library.SUNLinSol_Dense(self.place, matrix, context)
             stack.callback(library.SUNLinSolFree, linear)
             _check("CVodeSetLinearSolver", library.CVodeSetLinearSolver(self.memory, linear, matrix))
+        for name, value in _TUNED[method] if tuned else ():
+            _check(name, getattr(library, name)(self.memory, value))
         if events:
             _check("CVodeRootInit", library.CVodeRootInit(self.memory, N_SWITCH, switches.address))
             falling = np.full(N_SWITCH, -1, np.int32)

@@ -28,7 +28,9 @@ from rig.kernels.records import layout, plain
 N_STATE, N_VECTOR, N_OBSERVED = S.N_STATE, S.N_VECTOR, S.N_OBSERVED
 N_SWITCH = 2
 """Switching functions: the gap, and the friction's (v_t while sliding, what is left of mu F_n while rolling)."""
-
+STATE_SCALE = S.STATE_SCALE
+_DIFFERENCE = 1.5e-8
+"""Relative step of differences: the root of the rounding unit."""
 
 PARAMETERS = np.dtype(
     [
@@ -158,6 +160,18 @@ def derivative(t, y, parameters):
 
 
 @njit(cache=True)
+def jacobian(t, y, parameters):
+    """Slopes of the rates by the states, by differences, shape (14, 14)."""
+    slopes = np.empty((N_STATE, N_STATE))
+    here, moved = derivative(t, y, parameters), y.copy()
+    for i in range(N_STATE):
+        moved[i] = y[i] + _DIFFERENCE * max(abs(y[i]), STATE_SCALE[i])
+        slopes[:, i] = (derivative(t, moved, parameters) - here) / (moved[i] - y[i])
+        moved[i] = y[i]
+    return slopes
+
+
+@njit(cache=True)
 def derivative_by_sign(t, y, parameters):
     """The same for solvers without events: the right-hand side itself asks for the gap's sign."""
     f = np.empty(N_STATE)
@@ -259,7 +273,7 @@ def compile_s() -> float:
     """Compile what Python calls, or load it from numba's cache; how long the first call took [s]."""
     begin = time.perf_counter()
     vector, struct = types.float64[::1], from_dtype(PARAMETERS)[::1]
-    state_only: list[Any] = [derivative, derivative_by_sign, switching, follow_sign]
+    state_only: list[Any] = [derivative, jacobian, derivative_by_sign, switching, follow_sign]
     for function in state_only:
         function.compile((types.float64, vector, struct))
     take: Any = take_switch

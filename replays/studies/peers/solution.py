@@ -60,6 +60,8 @@ class Solution:
         failure: Why it failed, or None.
         phase: Phase of the contact at the end.
         onset_speed: v0 at the end [m/s].
+        own_s: Processor time inside the library's own calls alone [s], where a Python loop of ours drives it: what is
+            left if that loop cost nothing. None where there is no such loop, or where it costs as good as nothing.
     """
 
     times: np.ndarray
@@ -74,6 +76,7 @@ class Solution:
     failure: str | None
     phase: int
     onset_speed: float
+    own_s: float | None = None
 
 
 @dataclass
@@ -92,6 +95,7 @@ class Journal:
     phase: int = 0
     onset_speed: float = 0.0
     failure: str | None = None
+    own_s: float | None = None
     _begin: float = field(default_factory=time.perf_counter)
     _cpu_begin: float = field(default_factory=time.thread_time)
 
@@ -131,4 +135,5 @@ class Journal:
             failure=self.failure,
             phase=self.phase,
             onset_speed=self.onset_speed,
+            own_s=self.own_s,
         )
