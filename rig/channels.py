@@ -18,6 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, P
 from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import check, parse_toml
 
+VERSION = 2
+"""Of tables that are made now."""
 TABLE = Path(__file__).with_name("channels.toml")
 
 
@@ -119,6 +121,8 @@ class ChannelTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     groups: dict[str, Group]
+    version: Annotated[int, Field(ge=1, le=2)] = 1
+    """How to read the table: 1 is of recordings before 0.2, whose filters were digital ones on rows of 25 us."""
     curves: dict[str, tuple[tuple[FiniteFloat, FiniteFloat], ...]] = {}
     """What formulas may use of an angle: points (degrees, value), periodic in a turn."""
 
@@ -158,7 +162,7 @@ class ChannelTable(BaseModel):
                 )
                 group = group.model_copy(update={"rate_hz": rate_hz, "channels": rows})
             kept[name] = group
-        return ChannelTable(groups=kept, curves=self.curves)
+        return self.model_copy(update={"groups": kept})
 
 
 def parse_table(text: str) -> ChannelTable:
@@ -200,7 +204,8 @@ def table_of(groups: dict[str, Any], curves: dict[str, Any] | None = None) -> Ch
             for number, row in enumerate(body["channels"], 1)
         ]
         made[name] = {"name": name, "title": body["title"], "rate_hz": body["rate_hz"], "channels": tuple(rows)}
-    return check(ChannelTable, {"groups": made, "curves": curves or {}}, field="channel table")
+    table = {"groups": made, "version": VERSION, "curves": curves or {}}
+    return check(ChannelTable, table, field="channel table")
 
 
 def check_signals(channels: Iterable[Channel], known: Collection[str]) -> None:

@@ -103,7 +103,7 @@ class Edit:
             rows = (group.channels[column] for column in columns)
             renamed = tuple(row.model_copy(update={"name": names.get(row.name, row.name)}) for row in rows)
             groups[group.name] = group.model_copy(update={"channels": renamed})
-        edited = {**catalogue, "table": ChannelTable(groups=groups).model_dump(mode="json")}
+        edited = {**catalogue, "table": table.model_copy(update={"groups": groups}).model_dump(mode="json")}
         return edited if self._truth else {**edited, "truth": {}}
 
 

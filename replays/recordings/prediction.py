@@ -51,6 +51,7 @@ class Measured:
         floor: Standard deviation of noise and rounding of each channel [its unit], shape (channels,).
         random: Whether that is noise (True) or a bound of the rounding, shape (channels,).
         ideal: Whether the scene left filters and noise out.
+        version: Of the channel table.
     """
 
     group: str
@@ -61,6 +62,7 @@ class Measured:
     floor: np.ndarray
     random: np.ndarray
     ideal: bool
+    version: int = 2
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -136,6 +138,7 @@ def measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf)
             floor=floor / np.abs([channel.sensitivity_v for channel in channels]),
             random=random,
             ideal=ideal,
+            version=recording.table.version,
         )
     if not found:
         raise InputError("file", "a recording with two samples of a channel that the model knows", str(recording.path))
@@ -162,14 +165,17 @@ class Prediction:
 class _Channels:
     """Turns rows of the model into what channels of one rate show without noise, on the recorded rows."""
 
-    def __init__(self, parts: Sequence[Measured], *, rate_hz: int, row_rate_hz: int, formulas: Formulas) -> None:
+    def __init__(
+        self, parts: Sequence[Measured], *, rate_hz: int, row_rate_hz: int, formulas: Formulas, digital: bool
+    ) -> None:
         self._parts, self._rate_hz = parts, rate_hz
         self.apart, self._in_a_row = between(rate_hz, row_rate_hz)
         groups = [Group(name=part.group, title=part.group, rate_hz=rate_hz, channels=part.fine) for part in parts]
         self._groups = {group.name: group for group in groups}
         self._conditioner = Conditioner(
-            groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal, formulas=formulas
-        )
+            groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal, digital=digital,
+            formulas=formulas,
+        )  # fmt: skip
         self._last: np.ndarray | None = None
         self._counts: dict[str, list[np.ndarray]] = {part.group: [] for part in parts}
         self._first = 0
@@ -232,11 +238,13 @@ def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> 
     for part in parts.values():
         rate = part.channels[0].rate_hz
         places = part.times_s * rate
-        exact = fits(rate, row_rate_hz) and bool(np.abs(places - np.rint(places)).max() < 1e-6)
+        digital = part.version < 2
+        even = row_rate_hz % rate == 0 if digital else fits(rate, row_rate_hz)
+        exact = even and bool(np.abs(places - np.rint(places)).max() < 1e-6)
         # A clock that does not divide ours is read off every row of the model.
         rates.setdefault((rate if exact else row_rate_hz, part.ideal), []).append(part)
     return [
-        _Channels(alike, rate_hz=rate, row_rate_hz=row_rate_hz, formulas=scene.formulas())
+        _Channels(alike, rate_hz=rate, row_rate_hz=row_rate_hz, formulas=scene.formulas(), digital=alike[0].version < 2)
         for (rate, _), alike in rates.items()
     ]
 

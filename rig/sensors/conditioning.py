@@ -256,6 +256,28 @@ def _coefficients(
     return step, np.stack([settled.real, settled.imag], axis=1), np.hstack([rows, waves])
 
 
+def _digital(channel: Channel, row_rate_hz: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `_coefficients`, for samples on rows, of filters by the bilinear transform with their corners in place."""
+
+    def warped(hz: float) -> float:
+        return row_rate_hz / math.pi * math.tan(math.pi * hz / row_rate_hz)
+
+    bent = {"bandwidth_hz": min(channel.bandwidth_hz, 0.49 * row_rate_hz), "highpass_hz": channel.highpass_hz}
+    bent = {name: warped(hz) for name, hz in bent.items()}
+    known_hz = math.inf if channel.bandwidth_hz < 0.45 * row_rate_hz else row_rate_hz
+    poles, residues, direct = channel_poles(channel.model_copy(update=bent), known_hz)
+    p, r = poles / row_rate_hz, residues / row_rate_hz
+    # r / (s - p) with s = 2 (z - 1) / (z + 1) is k + q / (z - f).
+    f = (2.0 + p) / (2.0 - p)
+    k, q = r / (2.0 - p), 4.0 * r / (2.0 - p) ** 2
+    step = np.zeros((len(p), _POLE))
+    step[:, 0], step[:, 1], step[:, 3], step[:, 7] = f.real, f.imag, q.real, q.imag
+    settled = q / (1.0 - f)
+    phase = np.zeros((1, 4 + 2 * len(p)))
+    phase[0, 1], phase[0, 4::2] = direct + k.real.sum(), 1.0
+    return step, np.stack([settled.real, settled.imag], axis=1), phase
+
+
 class Conditioner:
     """Turns rows into counts, block by block; cutting a run into blocks in another way changes no bit.
 
@@ -270,6 +292,7 @@ class Conditioner:
         seed: Of the noise.
         noise: Whether there is any.
         ideal: Leave everything out but range and converter.
+        digital: Filters as tables of version 1 have them: by the bilinear transform, at the rate of the rows.
         formulas: Signals that are made of the model's; without them channels feel the model's own only.
     """
 
@@ -281,6 +304,7 @@ class Conditioner:
         seed: int,
         noise: bool,
         ideal: bool = False,
+        digital: bool = False,
         formulas: Formulas | None = None,
     ) -> None:
         self.groups = tuple(groups)
@@ -315,7 +339,10 @@ class Conditioner:
             )
             alike = poles.tobytes()
             if alike not in made:
-                made[alike] = _coefficients(poles / row_rate_hz, residues / row_rate_hz, direct, self._parts)
+                if digital and len(poles):
+                    made[alike] = _digital(channel, row_rate_hz)
+                else:
+                    made[alike] = _coefficients(poles / row_rate_hz, residues / row_rate_hz, direct, self._parts)
             step, settling, phase = made[alike]
             steps[of, : len(poles), :, lane], self._settling[of, : len(poles), :, lane] = step, settling
             phases[of, :, : phase.shape[1], lane] = phase

@@ -14,7 +14,7 @@ from replays.recordings.formats.mapped import BITS, MappedSignal
 from replays.recordings.formats.mapping import Mapping
 from replays.recordings.formats.selection import NO_VOLTS
 from rig import units
-from rig.channels import Channel, ChannelTable, Group, default_table
+from rig.channels import VERSION, Channel, ChannelTable, Group, default_table
 from rig.errors import InputError, Words
 from rig.outside import check
 
@@ -224,7 +224,7 @@ def quantise(
         tables[name] = Group(name=name, title=title, rate_hz=group.rate_hz, channels=tuple(channels))
         counts[name] = np.stack(columns, axis=1)
         present[name] = np.all([np.isfinite(entry.values) for entry in group.channels.values()], axis=0)
-    return ChannelTable(groups=tables), counts, present, told
+    return ChannelTable(groups=tables, version=VERSION), counts, present, told
 
 
 def _counts(entry: MappedSignal, rate_hz: int) -> tuple[Channel, np.ndarray, str]:
