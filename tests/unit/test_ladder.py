@@ -89,6 +89,9 @@ def test_quantities_read_closed_forms() -> None:
         assert QUANTITIES[name].read(turning) == pytest.approx(value, rel=1e-6), name
     assert QUANTITIES["outcome"].read(turning) == "backward whirl"
     assert ending(turning).word == "rolling backward whirl"
+    noise = np.linspace(-1e-12, 1e-12, 1000)
+    standing = trace(contact_impulse=t, ring_y=-np.ones(1000), sliding_speed=noise, theta_rate=0.1 * noise)
+    assert (ending(standing).word, ending(standing).rolling_share) == ("resting", 1.0)
     apart = trace(penetration=-np.ones(100), ring_x=np.ones(100))
     assert QUANTITIES["outcome"].read(apart) == "no contact"
     assert math.isnan(QUANTITIES["whirl_frequency"].read(apart))  # pyright: ignore[reportArgumentType]

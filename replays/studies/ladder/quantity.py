@@ -17,7 +17,9 @@ from rig.orbit import phase, whirl_frequency
 SETTLED = 0.25
 """The settled phase is this last part of a run."""
 ROLLS = 0.02
-"""A contact rolls while it slides by less than this part of the surface's speed."""
+"""A contact rolls while it slides by less than this part of the surface's speed ..."""
+STILL = 1e-4
+"""... or than this, as where the shaft stands and both are rounding [m/s]."""
 LASTS = 0.5
 """Contact lasts where it is more than this part of the settled phase: then it turns, or rests, and rolls or slides."""
 STAYS = 0.95
@@ -175,7 +177,8 @@ def _dissipated(trace: Trace) -> float:
 
 
 def _slides(trace: Trace) -> np.ndarray:
-    return np.abs(trace.column("sliding_speed")) > ROLLS * trace.surface_radius * np.abs(trace.column("theta_rate"))
+    surface_speed = trace.surface_radius * np.abs(trace.column("theta_rate"))
+    return np.abs(trace.column("sliding_speed")) > np.maximum(ROLLS * surface_speed, STILL)
 
 
 def _time_to_roll(trace: Trace) -> float:
