@@ -6,6 +6,7 @@ import json
 import math
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from replays.studies.ladder.measurement import Candidate, Measurement, measure
 from replays.studies.ladder.pick import with_pick, write_pick
 from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, ending, parse_quantities
 from replays.studies.ladder.search import LEVELS, WORTH, Ladder, search
+from replays.studies.run import Timed, run_scene
 from rig.cli.ladder import engines_table, levels_table
 from rig.cli.main import main
 from rig.errors import InputError
@@ -136,6 +138,20 @@ def test_a_model_without_friction_has_another_outcome_whatever_is_asked_for() ->
     assert whirl is not None
     assert flight is not None
     assert (whirl.word, flight.word) == ("rolling backward whirl", "flight")
+
+
+def test_a_first_run_in_short_blocks_is_no_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene("hammer", {"duration_s": 0.1})
+
+    def timed(simulation: Simulation, *, keep: bool, **options: Any) -> Timed:
+        done = run_scene(simulation, keep=keep, **options)
+        return done._replace(cpu_s=5.0 if keep else 1.5)
+
+    monkeypatch.setattr("replays.studies.ladder.measurement.run_scene", timed)
+    candidate = Candidate(ModelLevels(), "torque", "split", 25, 3e-4)
+    for runs, cost in ((1, 5.0), (3, 1.5)):
+        measured = measure(scene, candidate, ["spin"], runs=runs)
+        assert (measured.cpu_s * 0.1, measured.runs) == pytest.approx((cost, 1))
 
 
 def test_what_saves_less_than_a_tenth_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,6 +326,11 @@ def test_no_pick_is_one_line(capsys: pytest.CaptureFixture[str], path: Path, tmp
 )
 def test_wrong_input_is_one_line(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], says: str) -> None:
     assert says in refused(capsys, "ladder", "hammer", *arguments)
+
+
+def test_a_quantity_that_is_rounding_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(capsys, "ladder", "drop", "-q", "spin", "-t", "1", "--set", "duration_s=0.1")
+    assert "--quantity must be one that two accurate engines agree on in scene drop; instead received 'spin'" in line
 
 
 def test_parse_quantities_gives_each_its_tolerance() -> None:

@@ -270,8 +270,8 @@ def _standard(work: _Work) -> _Standard:
     """The full model by two unlike engines.
 
     Raises:
-        InputError: One of them fails, they end in different ways, the scene has no such quantity, or a tolerance is
-            finer than their distance.
+        InputError: One of them fails, they end in different ways or hardly agree on a quantity, the scene has no such,
+            or a tolerance is finer than their distance.
     """
     # Of model levels the last choice is full, of the drive the scene's own.
     levels: Any = {name: choices[-1] for name, choices in LEVELS.items() if name != "drive"}
@@ -293,6 +293,8 @@ def _standard(work: _Work) -> _Standard:
     distances = standard.against(unlike.values, reference.values)
     own = {name: max(error, _resolution(name, reference)) for name, error in distances.items()}
     for name, error in own.items():
+        if error > 0.5:
+            raise InputError("--quantity", f"one that two accurate engines agree on in scene {work.scene.name}", name)
         if error > 0.5 * work.tolerances[name]:
             must = f"at least {2.0 * error:.2g} for {name}, twice the reference's own error"
             raise InputError("--tolerance", must, work.tolerances[name])
