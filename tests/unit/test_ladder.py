@@ -23,6 +23,7 @@ from rig.cli.main import main
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.levels import ModelLevels
+from rig.offline import simulate
 from rig.scenes import Scene, load_scene
 from rig.simulation import Simulation
 from tests.commands import check_legible
@@ -71,7 +72,7 @@ def trace(**columns: np.ndarray) -> Trace:
     rows = np.zeros((n, N_ROW))
     for name, values in columns.items():
         rows[:, COLUMN[name]] = values
-    return Trace(np.arange(n) * 1e-3, rows, 7.0, 1e-3, 0.0125, 0.5)
+    return Trace(np.arange(n) * 1e-3, rows, 7.0, 1e-3, 0.0125, 0.5, 0.3)
 
 
 def test_quantities_read_closed_forms() -> None:
@@ -126,6 +127,16 @@ WHIRL = Ending(touches=True, contact_share=1.0, turns=-40.0, rolling_share=1.0)
 def test_outcomes_have_a_word_and_limits_that_are_soft(change: dict[str, float], word: str, alike: bool) -> None:
     other = WHIRL._replace(**change)
     assert (other.word, WHIRL.alike(other), other.alike(WHIRL)) == (word, alike, alike)
+
+
+def test_time_to_roll_sees_every_slip() -> None:
+    scene = load_scene("hammer", {"duration_s": 0.06})
+    run = simulate(scene)  # with rows every 50 us
+    radius = run.simulation.model.constants.shaft.radius
+    slides = np.abs(run["sliding_speed"]) > 0.02 * radius * np.abs(run["theta_rate"])
+    last = run.times_s[slides | (run["penetration"] <= 0.0)][-1]
+    found = measure(scene, Candidate(ModelLevels(), "torque", "split", 25, 3e-4), ["time_to_roll"], runs=1)
+    assert found.values["time_to_roll"] == pytest.approx(last + 25e-6, abs=26e-6)
 
 
 def test_a_model_without_friction_has_another_outcome_whatever_is_asked_for() -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending
+from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending, slides
 from replays.studies.run import bare_sensors, run_scene
 from rig.engines import ENGINES
 from rig.errors import InputError, SimulationError
@@ -21,7 +22,7 @@ from rig.simulation import Simulation
 GRID_TICKS = 1_000
 """Quantities are read every 1 ms."""
 _FINEST_ROW_US = 25
-"""The first impact is looked for on rows this far apart, or a fixed step apart [us]."""
+"""Instants are looked for on rows this far apart, or a fixed step apart [us]."""
 _ENOUGH_S = 1.0
 """No further run is timed once this much processor time is spent on one candidate."""
 _LEAST_S = 0.1
@@ -157,7 +158,7 @@ def measure(
                 spent.append(done.cpu_s)
             if first:
                 health = simulation.health()
-                trace = _trace(scene, candidate, simulation, done.rows, health, "first_impact_time" in quantities)
+                trace = _trace(scene, candidate, simulation, done.rows, health, quantities)
     except SimulationError as error:
         nothing: dict[str, Value] = dict.fromkeys(quantities, math.nan)
         return Measurement(candidate, nothing, None, math.nan, (math.nan, math.nan), 0, 0, math.nan, str(error))
@@ -207,7 +208,12 @@ def saving(
 
 
 def _trace(
-    scene: Scene, candidate: Candidate, simulation: Simulation, rows: np.ndarray, health: dict[str, Any], first: bool
+    scene: Scene,
+    candidate: Candidate,
+    simulation: Simulation,
+    rows: np.ndarray,
+    health: dict[str, Any],
+    quantities: list[str],
 ) -> Trace:
     constants = simulation.model.constants
     spacing = max(GRID_TICKS, simulation.row_ticks) / simulation.tick_rate_hz
@@ -217,25 +223,38 @@ def _trace(
         peak_force=health["peak_normal_force_n"],
         clearance=constants.contact.clearance,
         surface_radius=constants.shaft.radius,
-        first_impact_s=first_impact(scene, candidate) if first else math.nan,
+        first_impact_s=first_impact(scene, candidate) if "first_impact_time" in quantities else math.nan,
+        rolls_s=_rolls_from(scene, candidate) if "time_to_roll" in quantities else math.nan,
     )
 
 
-def first_impact(scene: Scene, candidate: Candidate) -> float:
-    """Instant of the first contact [s], nan where there is none: from the gap, its rate and its acceleration before.
-
-    A run of its own, with a row at every step; an adaptive engine's grid is 25 us for it.
-    """
+def _finely(scene: Scene, candidate: Candidate) -> Iterator[tuple[Simulation, int, np.ndarray]]:
+    """A run of its own with a row at every step, of an adaptive engine every 25 us: blocks, with the tick of each."""
     adaptive = ENGINES[candidate.engine].tolerance > 0.0
     step_us = min(candidate.step_us, _FINEST_ROW_US) if adaptive else candidate.step_us
     rate = 1_000_000 // step_us
     fine = replace(candidate, step_us=step_us).scene(scene, sensors=bare_sensors(rate))
     simulation = Simulation(fine)
     block = max(1, GRID_TICKS // simulation.block_ticks) * simulation.block_ticks
+    while (start := simulation.tick) < simulation.end_tick:
+        yield simulation, start, simulation.advance(min(block, simulation.end_tick - start)).rows
+
+
+def _rolls_from(scene: Scene, candidate: Candidate) -> float:
+    """When it begins to roll for good [s], nan where it does not."""
+    rolls = end = 0
+    for simulation, start, rows in _finely(scene, candidate):
+        loose = slides(rows, simulation.model.constants.shaft.radius) | (rows[:, COLUMN["penetration"]] <= 0.0)
+        if loose.any():
+            rolls = start + (int(np.flatnonzero(loose)[-1]) + 1) * simulation.row_ticks
+        end = simulation.end_tick
+    return rolls * 1e-6 if rolls < end else math.nan
+
+
+def first_impact(scene: Scene, candidate: Candidate) -> float:
+    """Instant of the first contact [s], nan where there is none: from the gap, its rate and its acceleration before."""
     last: np.ndarray | None = None
-    while simulation.tick < simulation.end_tick:
-        start = simulation.tick
-        rows = simulation.advance(min(block, simulation.end_tick - start)).rows
+    for simulation, start, rows in _finely(scene, candidate):
         gap = rows[:, COLUMN["penetration"]]
         touched = np.flatnonzero((gap >= 0.0) | (rows[:, COLUMN["contact_impulse"]] > 0.0))
         hit = int(touched[0]) if len(touched) else len(rows)

@@ -44,6 +44,8 @@ class Trace(NamedTuple):
     """R_S [m]."""
     first_impact_s: float
     """Located between steps [s]; nan where there is none or where nobody asked."""
+    rolls_s: float
+    """When it begins to roll for good [s]; nan alike."""
 
     def column(self, name: str) -> np.ndarray:
         """One signal, shape (n,)."""
@@ -96,12 +98,18 @@ class Ending(NamedTuple):
         return turned and abs(self.rolling_share - other.rolling_share) <= 0.5
 
 
+def slides(rows: np.ndarray, surface_radius: float) -> np.ndarray:
+    """In which of some rows it slides, were it in contact."""
+    surface_speed = surface_radius * np.abs(rows[:, COLUMN["theta_rate"]])
+    return np.abs(rows[:, COLUMN["sliding_speed"]]) > np.maximum(ROLLS * surface_speed, STILL)
+
+
 def ending(trace: Trace) -> Ending:
     """How a run ends."""
     # By the impulse: an impact law touches without being in contact at any instant.
     pushed = np.diff(trace.settled("contact_impulse")) > 0.0
     angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
-    rolls = ~_slides(trace)[-trace.settled_rows :]
+    rolls = ~slides(trace.rows[-trace.settled_rows :], trace.surface_radius)
     return Ending(
         touches=bool(pushed.any()),
         contact_share=float(np.mean(pushed)),
@@ -176,18 +184,6 @@ def _dissipated(trace: Trace) -> float:
     return float(sum(trace.column(name)[-1] for name in DISSIPATED))
 
 
-def _slides(trace: Trace) -> np.ndarray:
-    surface_speed = trace.surface_radius * np.abs(trace.column("theta_rate"))
-    return np.abs(trace.column("sliding_speed")) > np.maximum(ROLLS * surface_speed, STILL)
-
-
-def _time_to_roll(trace: Trace) -> float:
-    loose = _slides(trace) | (trace.column("penetration") <= 0.0)
-    if loose[-1]:
-        return math.nan
-    return float(trace.times_s[np.flatnonzero(loose)[-1] + 1]) if loose.any() else 0.0
-
-
 def _rebound(trace: Trace) -> float:
     rises = np.flatnonzero(np.diff(trace.column("contact_impulse")) > 0.0)
     later = rises[1:][np.diff(rises) > 2]
@@ -251,8 +247,8 @@ QUANTITIES = {
         Quantity("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipated),
         Quantity("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction),
         Quantity(
-            "time_to_roll", "s", "transient", f"until it rolls for good (slip below {ROLLS:.0%}), to 1 ms",
-            _time_to_roll, resolution=1e-3,
+            "time_to_roll", "s", "transient", f"until it rolls for good (slip below {ROLLS:.0%}), to 50 us",
+            lambda trace: trace.rolls_s, resolution=50e-6,
         ),
         Quantity(
             "first_impact_time", "s", "first impact", "located between two steps", lambda trace: trace.first_impact_s
