@@ -24,7 +24,7 @@ from rig.errors import InputError
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.levels import ModelLevels
 from rig.offline import simulate
-from rig.scenes import Scene, load_scene
+from rig.scenes import Scene, load_scene, parse_scene
 from rig.simulation import Simulation
 from tests.commands import check_legible
 
@@ -194,7 +194,20 @@ def test_what_saves_less_than_a_tenth_is_not_left_out(monkeypatch: pytest.Monkey
     # Where that is all that it saves, the scene stays as it was given.
     extra.update({"two-houses": 0.0, "inner-house": 0.0})
     given = load_scene("hammer", {"engine.name": "tsit5", "engine.step_us": 50})
-    assert search(given, {"spin": 0.1}).picked.candidate.engine == "tsit5"
+    again = search(given, {"spin": 0.1})
+    assert (again.picked.candidate.engine, again.savings) == ("tsit5", {})
+    # What the scene leaves out already is told where it is what the search picks, too.
+    given = load_scene("hammer", {"engine.tolerance": 3e-2, "engine.companion": False})
+    again = search(given, {"spin": 0.1})
+    assert (again.picked.candidate, list(again.savings)) == (again.given.candidate, ["magnet"])
+
+
+def test_a_pick_has_no_companion_and_an_old_one_what_the_scene_has(found: Ladder) -> None:
+    assert (found.given.candidate.companion, found.picked.candidate.companion) == (True, False)
+    pick = pick_of(found).model_copy(update={"engine": "split", "step_us": 25, "engine_tolerance": 3e-4})
+    for companion, has in ((pick.companion, False), (None, True)):
+        applied = pick.model_copy(update={"companion": companion}).apply({})
+        assert parse_scene(applied).engine.companion == has
 
 
 def test_rungs_are_the_models_own_and_are_tried_one_at_a_time(found: Ladder) -> None:
@@ -249,6 +262,7 @@ def test_a_pick_comes_into_force_and_says_so(found: Ladder, path: Path) -> None:
     assert pick.engine in scene.fidelity_line
     assert scene.engine.name == pick.engine
     assert scene.engine.step_us == pick.step_us
+    assert scene.engine.companion == pick.companion
     assert scene.model.magnet == pick.magnet
     assert scene.sensors.chain == pick.sensors
     document = Simulation(scene).scene_document()["scene"]

@@ -38,12 +38,14 @@ class Candidate:
     engine: str
     step_us: int
     tolerance: float = 0.0
+    companion: bool = False
+    """Only where a scene as given has one: of all others the search itself tells the error."""
 
     @property
     def method(self) -> str:
         """Engine and step in words."""
         finest = f", {self.tolerance:.0e}".replace("e-0", "e-") if self.tolerance else ""
-        return f"{self.engine} {self.step_us} us{finest}"
+        return f"{self.engine} {self.step_us} us{finest}{', companion' if self.companion else ''}"
 
     @property
     def label(self) -> str:
@@ -61,8 +63,8 @@ class Candidate:
         return replace(self, levels=ModelLevels(**{**self.levels.model_dump(), **levels}), drive=drive)  # pyright: ignore[reportArgumentType]
 
     def with_engine(self, engine: str, step_us: int, tolerance: float) -> Candidate:
-        """The same on another engine."""
-        return replace(self, engine=engine, step_us=step_us, tolerance=tolerance)
+        """The same on another engine, without a companion."""
+        return replace(self, engine=engine, step_us=step_us, tolerance=tolerance, companion=False)
 
     def scene(self, scene: Scene, *, sensors: dict[str, Any] | None = None) -> Scene:
         """The scene on this candidate.
@@ -75,6 +77,7 @@ class Candidate:
             InputError: The engine cannot take the model, or its step does not fit the rates of the sensors.
         """
         data = scene.model_dump()
+        engine = {"name": self.engine, "step_us": self.step_us, "tolerance": self.tolerance}
         return parse_scene(
             {
                 **data,
@@ -82,7 +85,7 @@ class Candidate:
                 "pick": None,
                 "model": self.levels.model_dump(),
                 "drive": {**data["drive"], "mode": self.drive},
-                "engine": {"name": self.engine, "step_us": self.step_us, "tolerance": self.tolerance},
+                "engine": {**engine, "companion": self.companion},
                 "sensors": bare_sensors() if sensors is None else {**data["sensors"], **sensors},
             }
         )

@@ -156,7 +156,7 @@ def search(
     full = work.run(standard.full.with_engine(*settings.usual(scene, standard.full, settings.REFERENCE[0])), sensors={})
     own = _as_given(work, standard)
     if own.passes and work.saving(picked.measured.candidate, own.measured.candidate) <= WORTH:
-        picked, savings = own, {}
+        picked, savings = own, savings if own.measured.candidate == picked.measured.candidate else {}
     return Ladder(
         scene=scene,
         tolerances=tolerances,
