@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+_COUNTS = (
+    "What counts, such as whirl_frequency, mean_normal_force or outcome (any other word lists all); may be repeated."
+)
+
+
 def ladder(
     scene: SceneName,
     *,
-    quantity: Annotated[
-        list[str], typer.Option("--quantity", "-q", metavar="QUANTITY", help="What counts; may be repeated.")
-    ],
+    quantity: Annotated[list[str], typer.Option("--quantity", "-q", metavar="QUANTITY", help=_COUNTS)],
     tolerance: Annotated[
         list[float],
         typer.Option("--tolerance", "-t", metavar="PART", help="Error allowed, as a part: one for all, or each."),

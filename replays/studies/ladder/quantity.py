@@ -199,19 +199,6 @@ def _rebound(trace: Trace) -> float:
     return float(y[top] - 0.5 * slope * slope / bend + trace.clearance)
 
 
-def _outcome(trace: Trace) -> str:
-    share = _contact_fraction_settled(trace)
-    if share == 0.0:
-        impulse = trace.settled("contact_impulse")
-        return "no contact" if impulse[-1] == impulse[0] else "bouncing"
-    if share < 0.95:
-        return "bouncing"
-    angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
-    if abs(angle[-1] - angle[0]) < 2.0 * math.pi:
-        return "resting"
-    return "forward whirl" if angle[-1] > angle[0] else "backward whirl"
-
-
 def _fraction(trace: Trace) -> float:
     return float(np.mean(trace.column("penetration") > 0.0))
 
@@ -256,7 +243,7 @@ QUANTITIES = {
         Quantity(
             "rebound_height", "m", "first impact", "top of the first rebound above the ring's lowest point", _rebound
         ),
-        Quantity("outcome", "", _LAST, "no contact, bouncing, resting, forward whirl or backward whirl", _outcome),
+        Quantity("outcome", "", _LAST, "how it ends, in a word", lambda trace: ending(trace).word),
     )
 }  # fmt: skip
 
