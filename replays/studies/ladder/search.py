@@ -415,8 +415,8 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
                 break
             candidate = best.candidate.with_engine(engine, step_us, tolerance)
             work.progress(candidate.method)
-            # What takes longer than the reference is of no interest, and may be a stall.
-            limit_s = max(1.0, 5.0 * standard.reference.cpu_s * work.scene.duration_s)
+            # What takes far longer than the reference may be a stall; the finest of small fixed steps takes five times.
+            limit_s = max(1.0, 10.0 * standard.reference.cpu_s * work.scene.duration_s)
             done = work.run(candidate, sensors=work.sensors, limit_s=limit_s)
             step = standard.step("engine", candidate.method, done, standard.all_errors(done, best))
             work.steps.append(step)
