@@ -164,6 +164,16 @@ def test_a_first_run_in_short_blocks_is_no_cost(monkeypatch: pytest.MonkeyPatch)
         assert (measured.cpu_s * 0.1, measured.runs) == pytest.approx((cost, 1))
 
 
+def test_a_run_is_given_up_by_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(0, 10**9, 1000))
+    monkeypatch.setattr("replays.studies.run.time.perf_counter", lambda: next(clock))  # a machine that is busy
+    scene = load_scene("hammer", {"duration_s": 0.1})
+    candidate = Candidate(ModelLevels(), "torque", "split", 25, 3e-4)
+    failures = [measure(scene, candidate, ["spin"], runs=1, limit_s=limit_s).failure for limit_s in (60.0, 0.0)]
+    assert failures[0] == ""
+    assert failures[1].startswith("given up after 0 s")
+
+
 def test_what_saves_less_than_a_tenth_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     extra = {"cylinders": 0.5, "map": 0.05, "euler": 0.05, "two-houses": 0.4, "inner-house": 0.2, "exact": 0.5}
 

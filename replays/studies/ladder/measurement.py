@@ -139,7 +139,7 @@ def measure(
         quantities: What to read.
         runs: Runs to time, fewer where they take long; 1 for values alone, whose time is a rough one.
         sensors: Changes to the scene's own sensors; None to leave the sensors out.
-        limit_s: Wall time after which a run is given up as a failure [s].
+        limit_s: Processor time after which a run is given up as a failure [s].
     """
     placed = candidate.scene(scene, sensors=sensors)
     Simulation(placed).warm_up()  # compiling is no part of the cost
