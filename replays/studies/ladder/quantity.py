@@ -44,7 +44,7 @@ class Trace(NamedTuple):
     """R_S [m]."""
     first_impact_s: float
     """Located between steps [s]; nan where there is none or where nobody asked."""
-    rolls_s: float
+    rolls_s: float = math.nan
     """When it begins to roll for good [s]; nan alike."""
 
     def column(self, name: str) -> np.ndarray:
