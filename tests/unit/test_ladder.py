@@ -90,12 +90,13 @@ def test_quantities_read_closed_forms() -> None:
     }  # fmt: skip
     for name, value in expected.items():
         assert QUANTITIES[name].read(turning) == pytest.approx(value, rel=1e-6), name
-    assert QUANTITIES["outcome"].read(turning) == ending(turning).word == "rolling backward whirl"
+    assert QUANTITIES["outcome"].read(turning) == "backward whirl"
+    assert ending(turning).word == "rolling backward whirl"
     noise = np.linspace(-1e-12, 1e-12, 1000)
     standing = trace(contact_impulse=t, ring_y=-np.ones(1000), sliding_speed=noise, theta_rate=0.1 * noise)
     assert (ending(standing).word, ending(standing).rolling_share) == ("resting", 1.0)
     apart = trace(penetration=-np.ones(100), ring_x=np.ones(100))
-    assert QUANTITIES["outcome"].read(apart) == "flight"
+    assert QUANTITIES["outcome"].read(apart) == "no contact"
     assert math.isnan(QUANTITIES["whirl_frequency"].read(apart))  # pyright: ignore[reportArgumentType]
 
 
@@ -103,8 +104,8 @@ def test_errors_are_parts_of_the_value_and_a_wrong_outcome_is_infinite() -> None
     for name in ("spin", "force_ripple", "contact_fraction"):
         assert QUANTITIES[name].error(6.3, 6.0) == pytest.approx(0.05)
         assert QUANTITIES[name].error(math.nan, 6.0) == QUANTITIES[name].error(1e-9, 0.0) == math.inf
-    assert QUANTITIES["outcome"].error("bounces", "resting") == math.inf
-    assert QUANTITIES["outcome"].error("bounces", "bounces") == 0.0
+    assert QUANTITIES["outcome"].error("bouncing", "backward whirl") == math.inf
+    assert QUANTITIES["outcome"].error("bouncing", "bouncing") == 0.0
 
 
 WHIRL = Ending(touches=True, contact_share=1.0, turns=-40.0, rolling_share=1.0)

@@ -104,6 +104,13 @@ def slides(rows: np.ndarray, surface_radius: float) -> np.ndarray:
     return np.abs(rows[:, COLUMN["sliding_speed"]]) > np.maximum(ROLLS * surface_speed, STILL)
 
 
+def rolls_from(times_s: np.ndarray, rows: np.ndarray, surface_radius: float) -> float:
+    """When it begins to roll for good, by the rows of a whole run [s]; nan where it does not."""
+    loose = np.flatnonzero(slides(rows, surface_radius) | (rows[:, COLUMN["penetration"]] <= 0.0))
+    first = int(loose[-1]) + 1 if len(loose) else 0
+    return float(times_s[first]) if first < len(times_s) else math.nan
+
+
 def ending(trace: Trace) -> Ending:
     """How a run ends."""
     # By the impulse: an impact law touches without being in contact at any instant.
@@ -199,6 +206,19 @@ def _rebound(trace: Trace) -> float:
     return float(y[top] - 0.5 * slope * slope / bend + trace.clearance)
 
 
+def _outcome(trace: Trace) -> str:
+    share = _contact_fraction_settled(trace)
+    if share == 0.0:
+        impulse = trace.settled("contact_impulse")
+        return "no contact" if impulse[-1] == impulse[0] else "bouncing"
+    if share < 0.95:
+        return "bouncing"
+    angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
+    if abs(angle[-1] - angle[0]) < 2.0 * math.pi:
+        return "resting"
+    return "forward whirl" if angle[-1] > angle[0] else "backward whirl"
+
+
 def _fraction(trace: Trace) -> float:
     return float(np.mean(trace.column("penetration") > 0.0))
 
@@ -243,7 +263,7 @@ QUANTITIES = {
         Quantity(
             "rebound_height", "m", "first impact", "top of the first rebound above the ring's lowest point", _rebound
         ),
-        Quantity("outcome", "", _LAST, "how it ends, in a word", lambda trace: ending(trace).word),
+        Quantity("outcome", "", _LAST, "no contact, bouncing, resting, forward whirl or backward whirl", _outcome),
     )
 }  # fmt: skip
 
