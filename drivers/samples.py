@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rig.samples import Columns
-from rig.wire import Continuity, start_s
+from rig.wire import Continuity, row_times_s
 
 
 class StreamEndedError(EOFError):
@@ -46,15 +46,15 @@ class Samples(Columns):
     @property
     def times_s(self) -> np.ndarray:
         """Simulated time of each row [s], shape (rows,)."""
-        return start_s(self.tick, self.rate_hz, self.tick_rate_hz) + np.arange(len(self.values)) / self.rate_hz
+        return row_times_s(self.tick, self.rate_hz, self.tick_rate_hz, len(self.values))
 
     def rows(self, start: int, stop: int) -> Samples:
         """Some of the rows."""
-        first_s = start_s(self.tick, self.rate_hz, self.tick_rate_hz) + start / self.rate_hz
+        first_s = row_times_s(self.tick, self.rate_hz, self.tick_rate_hz, start + 1)[start]
         return replace(
             self,
             index=self.index + start,
-            tick=round(first_s * self.tick_rate_hz),
+            tick=round(float(first_s) * self.tick_rate_hz),
             values=self.values[start:stop],
             gap=0 if start else self.gap,
         )

@@ -326,7 +326,7 @@ def _narrowed(
 def _trimmed(key: str, block: Block, from_tick: float, to_tick: float, columns: list[int] | None) -> Block | None:
     """The rows of a block between two ticks, with their own tick and number; the same block where it keeps all."""
     rows = len(block.values)
-    ticks = block.tick + block.values[:, 0] if key == EDGES else block.times_s * block.tick_rate_hz
+    ticks = block.tick + block.values[:, 0] if key == EDGES else np.round(block.times_s * block.tick_rate_hz, 6)
     kept = np.flatnonzero((ticks >= from_tick) & (ticks < to_tick))
     if not len(kept):
         return None

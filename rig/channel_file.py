@@ -36,8 +36,6 @@ from pydantic import AfterValidator, Field
 from rig.channels import TABLE, ChannelTable, raw_groups, table_of
 from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import Written, check, read_toml
-from rig.parameters import load_parameters
-from rig.sensors.formula import Formulas
 
 KIND = "user"
 """Provenance of what stands in such a file."""
@@ -95,9 +93,7 @@ def read_channels(path: Path) -> ChannelTable:
         file = check(_File, read_toml(path), field="")
         curves = {name: _curve(name, given, path.parent) for name, given in file.curves.items()}
         table = table_of(_merged(file), curves)
-        formulas = Formulas(load_parameters().numbers(), table.curves)
         for channel in table.channels.values():
-            formulas.column(channel.name, channel.signal)
             if channel.bandwidth_hz > MOST_HZ:
                 raise InputError(f"channel {channel.name}.bandwidth_hz", f"at most {MOST_HZ:g}", channel.bandwidth_hz)
         return table
@@ -160,8 +156,10 @@ def _merged(file: _File) -> dict[str, Any]:
 
 def _curve(name: str, given: str | tuple[tuple[float, float], ...], folder: Path) -> tuple[tuple[float, float], ...]:
     """The points of a curve, from its file or as they are given: degrees from 0 up to 360, and finite values."""
-    field, points = f"curves.{name}", given
-    if isinstance(given, str):
+    field = f"curves.{name}"
+    if not isinstance(given, str):
+        points = given
+    else:
         try:
             table = np.loadtxt(folder / given, delimiter=",", comments="#", ndmin=2, max_rows=10_001)
         except OSError as error:

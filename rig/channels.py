@@ -148,9 +148,9 @@ class ChannelTable(BaseModel):
         return {channel.name: channel for group in self.groups.values() for channel in group.channels}
 
     def only(self, names: tuple[str, ...], rate_hz: int | None = None) -> ChannelTable:
-        """The table with only the named groups, and another sample rate where one is given."""
+        """The table with only the named groups, all where none is named, and another sample rate where one is given."""
         kept = {}
-        for name in names:
+        for name in names or self.groups:
             group = self.groups[name]
             if rate_hz is not None:
                 # A slower channel needs its anti-alias filter at a quarter of its own rate.

@@ -21,8 +21,8 @@ _DOCUMENTS = {
     ),
     wire.STATUS: (
         "published twice a second and on request: state, pace, lateness, overruns, real-time factor, queue, clients, "
-        "spin, engine, energy residual (its error estimate), warnings; in real time `utc`: a tick, the UTC at which it was "
-        "due by the host's clock, and how well the two are known to each other"
+        "spin, engine, energy residual (its error estimate), warnings; in real time `utc`: a tick, the UTC at which "
+        "it was due by the host's clock, and how well the two are known to each other"
     ),
     wire.CATALOGUE: "on request: the channel table with calibration, truth tables with units",
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",

@@ -82,7 +82,7 @@ class Motion:
             engine.advance(constants, inputs, self.y, self.memory, tick, step, steps, stride, out)
             if not whole and not beyond:
                 rows[row] = out[0]
-            elif not whole and beyond + ticks == row_ticks and row + 1 < len(rows):
+            elif not whole and beyond + steps * step == row_ticks and row + 1 < len(rows):
                 rows[row + 1] = out[1]
             tick += steps * step
 

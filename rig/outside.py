@@ -52,7 +52,8 @@ class Written(BaseModel):
     def _no_truth_for_a_number(cls, data: Any) -> Any:
         # Python takes true for 1; a file that says so means something else.
         for name, value in data.items() if isinstance(data, dict) else ():
-            if isinstance(value, bool) and name in cls.model_fields and cls.model_fields[name].annotation is not bool:
+            kind = cls.model_fields[name].annotation if name in cls.model_fields else bool
+            if isinstance(value, bool) and bool not in (kind, *get_args(kind)):
                 raise InputError(name, "something else than true or false", value)
             if (
                 isinstance(value, str)

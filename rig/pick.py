@@ -50,6 +50,8 @@ class Pick(Written):
     engine: str
     step_us: int
     engine_tolerance: FiniteFloat = 0.0
+    companion: bool | None = None
+    """None in a pick of an earlier version: what the scene has."""
     quantities: tuple[PickedQuantity, ...]
     cpu_s: FiniteFloat
     """Processor time of a simulated second of the pick, with its sensors [s]."""
@@ -73,7 +75,9 @@ class Pick(Written):
     def apply(self, data: dict[str, Any]) -> dict[str, Any]:
         """The fields of a scene with the pick's in their place."""
         levels = {name: getattr(self, name) for name in ModelLevels.model_fields}
-        engine = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
+        engine: dict[str, Any] = {"name": self.engine, "step_us": self.step_us, "tolerance": self.engine_tolerance}
+        if self.companion is not None:
+            engine["companion"] = self.companion
         return {
             **data,
             "model": levels,

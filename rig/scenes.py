@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import tomllib
 from functools import cache
 from itertools import pairwise
@@ -17,21 +16,15 @@ from rig.channels import ChannelTable, check_signals, default_table
 from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand
 from rig.engines import ENGINES
 from rig.errors import InputError, Words, such_as
+from rig.formula import Formulas
 from rig.kernels.signals import COLUMN
 from rig.levels import ModelLevels
 from rig.outside import Written, check, parse_toml, read_toml, table_in
 from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
 from rig.pick import Pick, digest, equations_digest
-from rig.sensors.formula import Formulas
-from rig.sensors.places import fits, unfit
+from rig.sampling import check_rates, row_ticks
 
 SCENES = Path(__file__).with_name("scenes")
-ROW_TICKS = 25
-"""How far apart rows are [ticks], ..."""
-ROWS_ELSE = (25, 20, 10, 5, 4, 2)
-"""... or where that does not divide the periods of samples and truth, ..."""
-ROWS_A_WAVE = 7.5
-"""... and how many there are at least in a period of the highest bandwidth."""
 _APART_S = 0.01
 """Least time between two points of a speed profile [s]: well above any step."""
 
@@ -230,9 +223,14 @@ class Scene(Written):
     @field_validator("channels", mode="before")
     @classmethod
     def _read_table(cls, channels: Any) -> Any:
-        if isinstance(channels, str | Path):
-            return read_channels(Path(channels))
-        return channels
+        if not isinstance(channels, str | Path):
+            return channels
+        table = read_channels(Path(channels))
+        try:
+            Formulas(load_parameters().numbers(), table.curves).check(table)
+        except InputError as error:
+            raise InputError(f"{Path(channels).name}: {error.field}", error.must, error.received) from None
+        return table
 
     @model_validator(mode="after")
     def _possible_sensors(self) -> Scene:
@@ -240,14 +238,8 @@ class Scene(Written):
         for name in self.sensors.groups:
             if name not in known or self.sensors.groups.count(name) > 1:
                 raise InputError("sensors.groups", f"a list of different names out of {', '.join(known)}", name)
-        formulas = self.formulas()
-        for channel in self.table.channels.values():
-            formulas.column(channel.name, channel.signal)
-        row_rate_hz = 1_000_000 // self.row_ticks
-        for group in self.table.groups.values():
-            if not fits(group.rate_hz, row_rate_hz):
-                field = "sensors.rate_hz" if self.sensors.rate_hz else f"groups.{group.name}.rate_hz"
-                raise unfit(field, group.rate_hz, row_rate_hz)
+        self.formulas().check(self.table)
+        check_rates(self.table, 1_000_000 // self.row_ticks, field="sensors.rate_hz" if self.sensors.rate_hz else "")
         return self
 
     @model_validator(mode="after")
@@ -312,26 +304,17 @@ class Scene(Written):
     @property
     def table(self) -> ChannelTable:
         """Channel table of the sensors that are on, at their rates."""
-        whole = self.channels or rig_table()
-        return whole.only(self.sensors.groups or tuple(whole.groups), self.sensors.rate_hz or None)
+        return (self.channels or rig_table()).only(self.sensors.groups, self.sensors.rate_hz or None)
 
     @property
     def row_ticks(self) -> int:
         """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step."""
-        table = self.table
-        rates = [group.rate_hz for group in table.groups.values()]
-        # Samples and truth fall on rows where their periods are whole ticks.
-        periods = [1_000_000 // rate for rate in (self.sensors.truth_rate_hz, *rates) if 1_000_000 % rate == 0]
-        if self.sensors.chain == "ideal" and len(periods) > len(rates):
-            return math.gcd(*periods)
-        longest = 1e6 / ROWS_A_WAVE / max(channel.bandwidth_hz for channel in table.channels.values())
-        fit = [ticks for ticks in ROWS_ELSE if ticks <= longest and all(period % ticks == 0 for period in periods)]
-        return fit[0] if fit else 1
+        sensors = self.sensors
+        return row_ticks(self.table, truth_rate_hz=sensors.truth_rate_hz, ideal=sensors.chain == "ideal")
 
     def formulas(self) -> Formulas:
         """What the channels' formulas may use."""
-        numbers = self.load_parameters().numbers()
-        return Formulas(numbers, self.table.curves, numbers["shaft.arm_disk"])
+        return Formulas(self.load_parameters().numbers(), self.table.curves)
 
     def load_parameters(self) -> ParameterSet:
         """The scene's parameters with its own changes applied."""

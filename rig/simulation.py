@@ -12,7 +12,7 @@ from bisect import insort
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from rig.motion import BRANCH_ALARM, FINER, FINEST, Accuracy, Motion, energy_bal
 from rig.scenes import Scene, load_scene, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
+from rig.speed_target import Segment, segments
 from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key
 
 TICK_RATE_HZ = 1_000_000
@@ -84,15 +85,6 @@ _CHANGING = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class _Segment:
-    """The speed target from a tick on: `speed + slope (t - tick)` [rad/s]."""
-
-    tick: int
-    speed: float
-    slope: float
-
-
 class Simulation:
     """One run of one scene.
 
@@ -134,7 +126,7 @@ class Simulation:
         self.kept_every = math.gcd(*whole) // self.row_ticks if len(whole) == len(groups) else 1
         self.block_ticks = math.lcm(self.row_ticks, TICK_RATE_HZ // sensors.truth_rate_hz, *whole)
         self.end_tick = math.ceil(max(1, round(scene.duration_s * TICK_RATE_HZ)) / self.block_ticks) * self.block_ticks
-        formulas = scene.formulas()
+        self._formulas = scene.formulas()
         self._conditioners = [
             Conditioner(
                 [group for group in groups if group.rate_hz == rate],
@@ -142,7 +134,7 @@ class Simulation:
                 seed=scene.seed,
                 noise=sensors.noise,
                 ideal=sensors.chain == "ideal",
-                formulas=copy.copy(formulas),
+                columns=self._formulas.columns(group for group in groups if group.rate_hz == rate),
             )
             for rate in dict.fromkeys(group.rate_hz for group in groups)
         ]
@@ -156,7 +148,7 @@ class Simulation:
         }
 
         self.tick = 0
-        self._segments = self._profile()
+        self._segments = segments(scene.drive.profile or ((0.0, scene.drive.speed_hz),), TICK_RATE_HZ)
         self._engaged = scene.initial.magnets
         self._pulse: tuple[HammerCommand, int, int] | None = None
         self._pending = sorted(
@@ -393,18 +385,7 @@ class Simulation:
             )
         return self.model.state(ring_x=x, ring_y=y, spin=spin)
 
-    def _profile(self) -> list[_Segment]:
-        drive = self.scene.drive
-        points = [
-            (round(time * TICK_RATE_HZ), 2.0 * math.pi * hz) for time, hz in (drive.profile or ((0.0, drive.speed_hz),))
-        ]
-        segments = [
-            _Segment(tick=t0, speed=w0, slope=(w1 - w0) / (t1 - t0) * TICK_RATE_HZ)
-            for (t0, w0), (t1, w1) in pairwise(points)
-        ]
-        return [*segments, _Segment(tick=points[-1][0], speed=points[-1][1], slope=0.0)]
-
-    def _segment(self) -> _Segment:
+    def _segment(self) -> Segment:
         return max(
             (segment for segment in self._segments if segment.tick <= self.tick), key=lambda segment: segment.tick
         )
@@ -432,9 +413,9 @@ class Simulation:
         segment = self._segment()
         now = segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
         length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
-        hold = _Segment(tick=self.tick + length, speed=target, slope=0.0)
+        hold = Segment(tick=self.tick + length, speed=target, slope=0.0)
         slope = (target - now) / length * TICK_RATE_HZ if length else 0.0
-        self._segments = [_Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
+        self._segments = [Segment(tick=self.tick, speed=now, slope=slope), hold] if length else [hold]
 
     def _release(self) -> None:
         # What the magnets hold is gone with them: booked, so that the ledger closes. A release that a scene has timed
@@ -479,7 +460,8 @@ class Simulation:
         )
 
     def _condition(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        return {name: counts for each in self._conditioners for name, counts in each.counts(rows).items()}
+        made = self._formulas.values(rows)
+        return {name: counts for each in self._conditioners for name, counts in each.counts(rows, made).items()}
 
     def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
         found = {}

@@ -80,13 +80,15 @@ def schema_of(key: str) -> str | None:
     return SAMPLE_SCHEMA if key.startswith(SENSORS + "/") else None
 
 
-def start_s(tick: int, rate_hz: float, tick_rate_hz: float) -> float:
-    """Time of a row that is told to the nearest tick [s]: rows of an even stream lie at whole numbers over the rate."""
-    if rate_hz:
-        row = round(tick * rate_hz / tick_rate_hz)
-        if abs(row * tick_rate_hz / rate_hz - tick) <= 0.5:
-            return row / rate_hz
-    return tick / tick_rate_hz
+def row_times_s(tick: int, rate_hz: float, tick_rate_hz: float, rows: int) -> np.ndarray:
+    """Times of consecutive rows of which the first is told to the nearest tick [s], shape (rows,).
+
+    Rows of an even stream lie at whole numbers over the rate, which need not be whole ticks.
+    """
+    first = round(tick * rate_hz / tick_rate_hz)
+    if abs(first * tick_rate_hz / rate_hz - tick) <= 0.5:
+        return (first + np.arange(rows)) / rate_hz
+    return tick / tick_rate_hz + np.arange(rows) / rate_hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +112,12 @@ class Block:
     @property
     def start_s(self) -> float:
         """Simulated time of the first row [s]."""
-        return start_s(self.tick, self.rate_hz, self.tick_rate_hz)
+        return float(row_times_s(self.tick, self.rate_hz, self.tick_rate_hz, 1)[0])
 
     @property
     def times_s(self) -> np.ndarray:
         """Simulated time of each row [s], shape (rows,)."""
-        return self.start_s + np.arange(len(self.values)) / self.rate_hz
+        return row_times_s(self.tick, self.rate_hz, self.tick_rate_hz, len(self.values))
 
 
 def encode_block(block: Block) -> bytes:

@@ -16,11 +16,11 @@ from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
 from rig.channels import Channel, Group
 from rig.errors import InputError
+from rig.formula import Formulas
 from rig.offline import frames
+from rig.sampling import between, fits
 from rig.scenes import Scene, rig_table
 from rig.sensors.conditioning import Conditioner
-from rig.sensors.formula import Formulas
-from rig.sensors.places import between, fits
 from rig.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
 
 _FINE_BITS = 32
@@ -174,9 +174,9 @@ class _Channels:
         self._groups = {group.name: group for group in groups}
         self._conditioner = Conditioner(
             groups, row_rate_hz=row_rate_hz, seed=0, noise=False, ideal=parts[0].ideal, digital=digital,
-            formulas=formulas,
+            columns=formulas.columns(groups),
         )  # fmt: skip
-        self._last: np.ndarray | None = None
+        self._formulas, self._last = formulas, np.empty((0, 0))
         self._counts: dict[str, list[np.ndarray]] = {part.group: [] for part in parts}
         self._first = 0
 
@@ -185,14 +185,13 @@ class _Channels:
         self._first = row * self._in_a_row // self.apart
 
     def take(self, rows: np.ndarray) -> None:
-        if self._last is not None:
+        if len(self._last):
             rows = np.concatenate([self._last, rows])
-        self._last = rows[-1:]
-        for name, counts in self._conditioner.counts(rows).items():
+        self._last = rows[-1:].copy()
+        for name, counts in self._conditioner.counts(rows, self._formulas.values(rows)).items():
             self._counts[name].append(counts)
 
     def values(self) -> dict[str, np.ndarray]:
-        assert self._last is not None
         self.take(self._last)  # for the sample on the last row
         found = {}
         for part in self._parts:

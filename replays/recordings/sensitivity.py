@@ -23,7 +23,8 @@ from rig.commands import check_command
 from rig.errors import InputError, SimulationError
 from rig.model import build_model
 from rig.parameters import load_parameters
-from rig.scenes import ROW_TICKS, Scene, TimedCommand, change_scene, parse_scene
+from rig.sampling import ROW_TICKS
+from rig.scenes import Scene, TimedCommand, change_scene, parse_scene
 from rig.simulation import TICK_RATE_HZ
 
 CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}

@@ -17,12 +17,15 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+_COUNTS = (
+    "What counts, such as whirl_frequency, mean_normal_force or outcome (any other word lists all); may be repeated."
+)
+
+
 def ladder(
     scene: SceneName,
     *,
-    quantity: Annotated[
-        list[str], typer.Option("--quantity", "-q", metavar="QUANTITY", help="What counts; may be repeated.")
-    ],
+    quantity: Annotated[list[str], typer.Option("--quantity", "-q", metavar="QUANTITY", help=_COUNTS)],
     tolerance: Annotated[
         list[float],
         typer.Option("--tolerance", "-t", metavar="PART", help="Error allowed, as a part: one for all, or each."),
@@ -103,7 +106,10 @@ def _show(document: dict[str, Any], console: Console) -> None:
     own = ", ".join(f"{entry['as_given_error']:.1e}" if entry["as_given_error"] is not None else "infinite"
                     for entry in document["quantities"])  # fmt: skip
     saved = ", ".join(f"{level} {pick[level]} saves {part:.0%}" for level, part in document["savings"].items())
-    echo(f"  {saved or 'nothing is left out'}; outcome {document['picked']['outcome']} as of the full model")
+    picked, given = document["picked"], document["given"]
+    same = (picked["engine"], picked["model"]) == (given["engine"], given["model"])
+    none = "the scene as it is given" if same else "nothing is left out"
+    echo(f"  {saved or none}; outcome {picked['outcome']} as of the full model")
     echo(
         f"  a simulated second takes {pick['cpu_s'] * 1e3:.3g} ms of processor time with the picked sensors, "
         f"{pick['cpu_given_s'] * 1e3:.3g} ms as the scene is given (errors {own} in {', '.join(names)}), "
@@ -111,6 +117,8 @@ def _show(document: dict[str, Any], console: Console) -> None:
     )
     if pick["sensors"] == "ideal":
         echo("  sensors ideal: these quantities are the model's own; --keep sensors keeps the chain")
+    if given["engine"].endswith("companion") and not pick["companion"]:
+        echo("  no companion: the errors are measured here, a run does not estimate its own")
     echo(
         f"  reference: full model by {document['reference']['engine']}, its own error the distance to "
         f"{document['reference']['unlike']}; seed {pick['seed']}, {pick['date']}, rig {pick['rig']} {pick['commit']}"

@@ -1,41 +1,30 @@
 """Signal conditioning of all sensors: sensitivity, range, anti-alias filter and AC coupling, noise, converter.
 
-A channel is a chain in continuous time. Its filters are solved exactly, by partial fractions of their transfer
-function: every pole p has a state w of its own,
-
-    w' = p w + r u(t),    volts behind the filters = direct u(t) + sum of Re w,
-
-with u the cubic through the last four rows. So a sample may fall between rows, at any rate, and neither the engine's
-step nor the way a run is cut into calls has a part in what the chain does. A cubic errs by (2 pi f T)^4 / 24 of a sine
-of frequency f at most, rows T apart: 3e-5 at 1 kHz and 25 us.
+A channel is a chain in continuous time (`rig.sensors.filters`), and so its samples lie where its rate puts them.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
 
-from rig.channels import Channel, Group
+from rig.channels import Group, check_signals
+from rig.kernels.signals import COLUMN
 from rig.kernels.stage import kernel
-from rig.sensors.formula import Formulas
+from rig.sampling import between
+from rig.sensors.filters import POLE, channel_poles, coefficients, digital_coefficients
 from rig.sensors.noise import draw, noise_streams
-from rig.sensors.places import between
 
 _LANES = 16
 """Channels that one pass takes, side by side."""
 _CHUNK = 64
 """Rows that are filtered at a time."""
-_NODES = (1.0, 0.0, -1.0, -2.0)
-"""Where the four rows stand that a cubic goes through, in rows from the start of the interval it is for."""
 
 _GAIN, _BIAS, _LOW, _HIGH, _NOISE, _LSB, _LIMIT = range(7)
 """Rows of the table of channels: volts per SI unit; volts at zero; output limits [V]; noise [V]; converter step [V];
 largest count."""
-_POLE = 10
-"""Numbers of a pole's step: the state's factor, and what the four rows add to it; real and imaginary parts."""
 
 
 @kernel
@@ -46,7 +35,7 @@ def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
     channels may go side by side.
 
     Args:
-        step: Of the poles, shape (poles * _POLE * _LANES,).
+        step: Of the poles, shape (poles * POLE * _LANES,).
         wave: Their states, in and out, shape (poles * 2 * _LANES,).
         phases: What a sample is made of, by its place, shape (parts * (4 + 2 * poles) * _LANES,).
         volts: Two rows before the first, the first, and `rows` more, shape ((rows + 3) * _LANES,).
@@ -59,7 +48,7 @@ def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
     Returns:
         Place of the next sample behind the last row.
     """
-    poles = len(step) // (_POLE * _LANES)
+    poles = len(step) // (POLE * _LANES)
     sample = 0
     for n in range(rows):
         at = n * _LANES
@@ -82,7 +71,7 @@ def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
             late += apart
         late -= parts
         for pole in range(poles):
-            real, of = 2 * pole * _LANES, pole * _POLE * _LANES
+            real, of = 2 * pole * _LANES, pole * POLE * _LANES
             for c in range(_LANES):
                 a, b = wave[real + c], wave[real + _LANES + c]
                 before, now = volts[at + _LANES + c], volts[at + 2 * _LANES + c]
@@ -142,7 +131,7 @@ def _condition(rows, made, late, apart, parts, columns, places, scales, past, wa
         scales: Of the channels by sixteen, shape (sets, 7, _LANES).
         past: Their volts at the two rows before the first, in and out, shape (sets, 2 * _LANES).
         waves: States of their poles, in and out, shape (sets, poles * 2 * _LANES).
-        steps: Steps of their poles, shape (sets, poles * _POLE * _LANES).
+        steps: Steps of their poles, shape (sets, poles * POLE * _LANES).
         phases: Samples, shape (sets, parts * (4 + 2 * poles) * _LANES).
         streams: Of their noise, in and out, shape (c, 4); (0, 4): no noise.
         counts: Out, one group behind the other, each (samples, channels).
@@ -187,97 +176,6 @@ def _condition(rows, made, late, apart, parts, columns, places, scales, past, wa
             past[part, n] = volts[n]
 
 
-def channel_poles(channel: Channel, row_rate_hz: float = math.inf) -> tuple[np.ndarray, np.ndarray, float]:
-    """Poles of a channel's filters [rad/s], one of each pair, their residues, and what goes straight through.
-
-    A Butterworth low-pass at the channel's bandwidth (none where rows cannot show what it takes away), and a
-    first-order high-pass where the channel is AC-coupled.
-    """
-    order = channel.filter_order if channel.bandwidth_hz < 0.45 * row_rate_hz else 0
-    corner, held = 2.0 * math.pi * channel.bandwidth_hz, 2.0 * math.pi * channel.highpass_hz
-    angles = [math.pi * (2 * n + order + 1) / (2 * order) for n in range(order)]
-    low = [corner * complex(math.cos(angle), math.sin(angle)) for angle in angles]
-    found, residues = [], []
-    for n, pole in enumerate([*low, complex(-held)] if held else low):
-        if pole.imag < -1e-9 * abs(pole):
-            continue  # the other of a pair
-        residue = complex(pole) if held else complex(1.0)
-        for m, other in enumerate(low):
-            residue *= corner / (pole - other) if m != n else corner
-        if n < order and held:
-            residue /= pole + held
-        found.append(pole)
-        residues.append(residue * (2.0 if pole.imag > 1e-9 * abs(pole) else 1.0))
-    return np.array(found, complex), np.array(residues, complex), 0.0 if low else 1.0
-
-
-def _held(poles: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Integrals of exp(p (length - t)) times the four rows' weights, from 0 to the length.
-
-    Args:
-        poles: Per row, shape (p,).
-        lengths: In rows, shape (n,).
-
-    Returns:
-        Shape (p, n, 4).
-    """
-    places, weights = np.polynomial.legendre.leggauss(24)
-    t = 0.5 * lengths[:, None] * (places + 1.0)
-    falling = np.exp(poles[:, None, None] * (lengths[:, None] - t)) * (0.5 * lengths[:, None] * weights)
-    return np.einsum("pnt,ntr->pnr", falling, _cubics(t))
-
-
-def _cubics(t: np.ndarray) -> np.ndarray:
-    """Weights of the four rows at places in the interval, shape (..., 4)."""
-    return np.stack([math.prod((t - b) / (a - b) for b in _NODES if b != a) for a in _NODES], axis=-1)
-
-
-def _coefficients(
-    poles: np.ndarray, residues: np.ndarray, direct: float, parts: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of one filter: the steps of its poles, their state in the steady state of 1 V, and samples by their place.
-
-    Args:
-        poles: Per row, shape (p,).
-        residues: Per row, shape (p,).
-        direct: What goes straight through.
-        parts: Places of samples in a row.
-
-    Returns:
-        Shapes (p, _POLE), (p, 2), (parts, 4 + 2 p).
-    """
-    factor, settled = np.exp(poles), -residues / poles
-    held = residues[:, None] * _held(poles, np.ones(1))[:, 0]
-    step = np.hstack([factor.real[:, None], factor.imag[:, None], held.real, held.imag])
-    places = np.arange(parts) / parts
-    turned = np.exp(poles * places[:, None])
-    rows = direct * _cubics(places) + (residues[:, None, None] * _held(poles, places)).real.sum(axis=0)
-    waves = np.stack([turned.real, turned.imag], axis=2).reshape(parts, -1)
-    return step, np.stack([settled.real, settled.imag], axis=1), np.hstack([rows, waves])
-
-
-def _digital(channel: Channel, row_rate_hz: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As `_coefficients`, for samples on rows, of filters by the bilinear transform with their corners in place."""
-
-    def warped(hz: float) -> float:
-        return row_rate_hz / math.pi * math.tan(math.pi * hz / row_rate_hz)
-
-    bent = {"bandwidth_hz": min(channel.bandwidth_hz, 0.49 * row_rate_hz), "highpass_hz": channel.highpass_hz}
-    bent = {name: warped(hz) for name, hz in bent.items()}
-    known_hz = math.inf if channel.bandwidth_hz < 0.45 * row_rate_hz else row_rate_hz
-    poles, residues, direct = channel_poles(channel.model_copy(update=bent), known_hz)
-    p, r = poles / row_rate_hz, residues / row_rate_hz
-    # r / (s - p) with s = 2 (z - 1) / (z + 1) is k + q / (z - f).
-    f = (2.0 + p) / (2.0 - p)
-    k, q = r / (2.0 - p), 4.0 * r / (2.0 - p) ** 2
-    step = np.zeros((len(p), _POLE))
-    step[:, 0], step[:, 1], step[:, 3], step[:, 7] = f.real, f.imag, q.real, q.imag
-    settled = q / (1.0 - f)
-    phase = np.zeros((1, 4 + 2 * len(p)))
-    phase[0, 1], phase[0, 4::2] = direct + k.real.sum(), 1.0
-    return step, np.stack([settled.real, settled.imag], axis=1), phase
-
-
 class Conditioner:
     """Turns rows into counts, block by block; cutting a run into blocks in another way changes no bit.
 
@@ -293,7 +191,7 @@ class Conditioner:
         noise: Whether there is any.
         ideal: Leave everything out but range and converter.
         digital: Filters as tables of version 1 have them: by the bilinear transform, at the rate of the rows.
-        formulas: Signals that are made of the model's; without them channels feel the model's own only.
+        columns: Of each channel's signal in the rows, or behind them; the model's own unless given.
     """
 
     def __init__(
@@ -305,14 +203,16 @@ class Conditioner:
         noise: bool,
         ideal: bool = False,
         digital: bool = False,
-        formulas: Formulas | None = None,
+        columns: Sequence[int] | None = None,
     ) -> None:
         self.groups = tuple(groups)
         self._apart, self._parts = between(self.groups[0].rate_hz, row_rate_hz)
         self._late = 0
         channels = [channel for group in self.groups for channel in group.channels]
-        self._formulas = formulas or Formulas()
-        self._columns = np.array([self._formulas.column(channel.name, channel.signal) for channel in channels])
+        if columns is None:
+            check_signals(channels, COLUMN)
+            columns = [COLUMN[channel.signal] for channel in channels]
+        self._columns = np.array(columns)
         self._spans: list[tuple[str, int, int]] = []
         for group in self.groups:
             self._spans.append((group.name, sum(width for _, _, width in self._spans), len(group.channels)))
@@ -324,7 +224,7 @@ class Conditioner:
         # Lanes without a channel make zeros.
         self._scales = np.zeros((sets, 7, _LANES))
         self._scales[:, _LSB] = 1.0
-        steps, self._settling = np.zeros((sets, most, _POLE, _LANES)), np.zeros((sets, most, 2, _LANES))
+        steps, self._settling = np.zeros((sets, most, POLE, _LANES)), np.zeros((sets, most, 2, _LANES))
         phases = np.zeros((sets, self._parts, 4 + 2 * most, _LANES))
         made: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         for c, (channel, (poles, residues, direct)) in enumerate(zip(channels, filters, strict=True)):
@@ -340,9 +240,9 @@ class Conditioner:
             alike = poles.tobytes()
             if alike not in made:
                 if digital and len(poles):
-                    made[alike] = _digital(channel, row_rate_hz)
+                    made[alike] = digital_coefficients(channel, row_rate_hz)
                 else:
-                    made[alike] = _coefficients(poles / row_rate_hz, residues / row_rate_hz, direct, self._parts)
+                    made[alike] = coefficients(poles / row_rate_hz, residues / row_rate_hz, direct, self._parts)
             step, settling, phase = made[alike]
             steps[of, : len(poles), :, lane], self._settling[of, : len(poles), :, lane] = step, settling
             phases[of, :, : phase.shape[1], lane] = phase
@@ -351,16 +251,18 @@ class Conditioner:
         self._past: np.ndarray | None = None
         self._streams = noise_streams([channel.name for channel in channels] if noise and not ideal else [], seed)
 
-    def counts(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+    def counts(self, rows: np.ndarray, made: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Samples from the first of these rows on that lie before the last one.
 
         Args:
             rows: Observed rows from the last one of the call before on, shape (n, N_ROW).
+            made: More signals at the same instants, whose columns are behind those of the rows, shape (n, m).
 
         Returns:
             ADC counts by group, int32, shape (samples, channels).
         """
-        made = self._formulas.values(rows)
+        if made is None:
+            made = np.empty((len(rows), 0))
         if self._past is None:
             self._past = self._settle(rows, made)
         span = (len(rows) - 1) * self._parts

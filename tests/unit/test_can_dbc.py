@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.can import dbc, schedule
+from drivers.can import dbc
 from drivers.can.bus.timing import speed
 from drivers.can.signals import (
     CLASSIC_HZ,
@@ -19,9 +19,9 @@ from drivers.can.signals import (
     Kind,
     command_frame,
     default_messages,
-    make_table,
     parse_command,
 )
+from rig.channel_file import read_channels
 from rig.channels import default_table
 from rig.cli.can_output import CanMessages, CanOptions, CanOutput
 from rig.errors import InputError
@@ -50,28 +50,25 @@ def test_the_load_command_shows_every_message(capsys: pytest.CaptureFixture[str]
     assert "load: at most 125.9 % of the bus" in shown(capsys, "can", "load", "--can-fd", "--can-bitrate", "1M/5M")
 
 
-def test_a_bus_that_gets_too_full_is_told_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    groups = default_table().groups
-    forces = groups["forces"]
-    more = [row.model_copy(update={"name": f"{row.name}_{side}"}) for row in forces.channels[:1] for side in "ab"]
-    fuller = {**groups, "forces": forces.model_copy(update={"channels": (*forces.channels, *more)})}
-    table = make_table(default_table().model_copy(update={"groups": fuller}))
-    monkeypatch.setattr(schedule, "default_messages", lambda: table)
+def test_a_bus_that_gets_too_full_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "fuller.toml"
+    more = ", ".join(f'{{ name = "P_N_{side}", signal = "P_N" }}' for side in "ab")
+    path.write_text(f"[groups.forces]\nchannels = [{more}]")
     warning = (
         "rig: warning: CAN load must be at most 70 % of 1M with classic frames, so that others find room beside them; "
         "instead received 80.5 % with 6 frames an instant (a lower --can-rate or --can-fd helps)\n"
     )
     for command in (["can", "load"], ["can", "dbc"]):
-        assert said(capsys, *command)[2] == warning
-    assert warning in f"{CanOutput('virtual:full')}\n"
+        assert said(capsys, *command, "--channels", str(path))[2] == warning
+    table = read_channels(path)
+    assert warning in f"{CanOutput('virtual:full', channels=table)}\n"
     # What is still carried is only told; what is not is refused.
     assert (
-        CanOutput("virtual:full", CanOptions(messages=CanMessages(can_rate=500))).schedule.warnings(speed("1M")) == []
+        CanOutput("virtual:full", CanOptions(messages=CanMessages(can_rate=500)), table).schedule.warnings(speed("1M"))
+        == []
     )
     with pytest.raises(InputError, match="CAN load must be a schedule of at most 100 % of the bus"):
-        CanOutput("virtual:full", CanOptions(messages=CanMessages(can_bitrate="500k")))
+        CanOutput("virtual:full", CanOptions(messages=CanMessages(can_bitrate="500k")), table)
 
 
 def test_the_usual_bus_is_not_too_full(capsys: pytest.CaptureFixture[str]) -> None:

@@ -167,7 +167,7 @@ def test_a_value_beyond_its_bits_is_refused() -> None:
 def test_a_table_that_does_not_fit_is_refused() -> None:
     group = default_table().groups["hammer"]
     wide = group.channels[0].model_copy(update={"adc_bits": 32})
-    with pytest.raises(ValueError, match="at most 24 bits"):
+    with pytest.raises(ValueError, match=r"channel hammer.adc_bits must be at most 24 on a CAN bus"):
         make_table(ChannelTable(groups={"hammer": group.model_copy(update={"channels": (wide,)})}))
 
 

@@ -14,9 +14,9 @@ from drivers.can.signals import default_messages, messages_for
 from rig.channel_file import read_channels
 from rig.channels import default_table
 from rig.errors import InputError
+from rig.formula import Formulas
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.scenes import load_scene
-from rig.sensors.formula import Formulas
 from rig.simulation import Simulation
 
 MINE = """
@@ -117,7 +117,7 @@ def test_channels_show_what_their_formulas_say(tmp_path: Path) -> None:
 def test_formulas_are_what_they_read() -> None:
     rows = np.random.default_rng(1).normal(size=(50, N_ROW))
     x, y, angle = (rows[:, COLUMN[name]] for name in ("disk_x", "disk_y", "theta"))
-    formulas = Formulas({"ring.clearance": 0.5}, {"cam": ((0.0, 0.0), (90.0, 1.0), (270.0, -1.0))}, 0.314)
+    formulas = Formulas({"ring.clearance": 0.5}, {"cam": ((0.0, 0.0), (90.0, 1.0), (270.0, -1.0))})
     cases = {
         "-disk_x + 2 * disk_y ** 2": -x + 2 * y**2,
         "max(min(disk_x, 0.2), -ring.clearance)": np.clip(x, -0.5, 0.2),

@@ -6,6 +6,7 @@ import json
 import math
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +17,14 @@ from replays.studies.ladder.measurement import Candidate, Measurement, measure
 from replays.studies.ladder.pick import with_pick, write_pick
 from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, ending, parse_quantities
 from replays.studies.ladder.search import LEVELS, WORTH, Ladder, search
+from replays.studies.run import Timed, run_scene
 from rig.cli.ladder import engines_table, levels_table
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.levels import ModelLevels
-from rig.scenes import Scene, load_scene
+from rig.offline import simulate
+from rig.scenes import Scene, load_scene, parse_scene
 from rig.simulation import Simulation
 from tests.commands import check_legible
 
@@ -69,7 +72,7 @@ def trace(**columns: np.ndarray) -> Trace:
     rows = np.zeros((n, N_ROW))
     for name, values in columns.items():
         rows[:, COLUMN[name]] = values
-    return Trace(np.arange(n) * 1e-3, rows, 7.0, 1e-3, 0.0125, 0.5)
+    return Trace(np.arange(n) * 1e-3, rows, 7.0, 1e-3, 0.0125, 0.5, 0.3)
 
 
 def test_quantities_read_closed_forms() -> None:
@@ -89,6 +92,9 @@ def test_quantities_read_closed_forms() -> None:
         assert QUANTITIES[name].read(turning) == pytest.approx(value, rel=1e-6), name
     assert QUANTITIES["outcome"].read(turning) == "backward whirl"
     assert ending(turning).word == "rolling backward whirl"
+    noise = np.linspace(-1e-12, 1e-12, 1000)
+    standing = trace(contact_impulse=t, ring_y=-np.ones(1000), sliding_speed=noise, theta_rate=0.1 * noise)
+    assert (ending(standing).word, ending(standing).rolling_share) == ("resting", 1.0)
     apart = trace(penetration=-np.ones(100), ring_x=np.ones(100))
     assert QUANTITIES["outcome"].read(apart) == "no contact"
     assert math.isnan(QUANTITIES["whirl_frequency"].read(apart))  # pyright: ignore[reportArgumentType]
@@ -123,6 +129,16 @@ def test_outcomes_have_a_word_and_limits_that_are_soft(change: dict[str, float],
     assert (other.word, WHIRL.alike(other), other.alike(WHIRL)) == (word, alike, alike)
 
 
+def test_time_to_roll_sees_every_slip() -> None:
+    scene = load_scene("hammer", {"duration_s": 0.06})
+    run = simulate(scene)  # with rows every 50 us
+    radius = run.simulation.model.constants.shaft.radius
+    slides = np.abs(run["sliding_speed"]) > 0.02 * radius * np.abs(run["theta_rate"])
+    last = run.times_s[slides | (run["penetration"] <= 0.0)][-1]
+    found = measure(scene, Candidate(ModelLevels(), "torque", "split", 25, 3e-4), ["time_to_roll"], runs=1)
+    assert found.values["time_to_roll"] == pytest.approx(last + 25e-6, abs=26e-6)
+
+
 def test_a_model_without_friction_has_another_outcome_whatever_is_asked_for() -> None:
     scene = load_scene("hammer")
     full = Candidate(ModelLevels(), "torque", "split", scene.engine.step_us, scene.engine.tolerance)
@@ -133,6 +149,30 @@ def test_a_model_without_friction_has_another_outcome_whatever_is_asked_for() ->
     assert whirl is not None
     assert flight is not None
     assert (whirl.word, flight.word) == ("rolling backward whirl", "flight")
+
+
+def test_a_first_run_in_short_blocks_is_no_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene("hammer", {"duration_s": 0.1})
+
+    def timed(simulation: Simulation, *, keep: bool, **options: Any) -> Timed:
+        done = run_scene(simulation, keep=keep, **options)
+        return done._replace(cpu_s=5.0 if keep else 1.5)
+
+    monkeypatch.setattr("replays.studies.ladder.measurement.run_scene", timed)
+    candidate = Candidate(ModelLevels(), "torque", "split", 25, 3e-4)
+    for runs, cost in ((1, 5.0), (3, 1.5)):
+        measured = measure(scene, candidate, ["spin"], runs=runs)
+        assert (measured.cpu_s * 0.1, measured.runs) == pytest.approx((cost, 1))
+
+
+def test_a_run_is_given_up_by_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(0, 10**9, 1000))
+    monkeypatch.setattr("replays.studies.run.time.perf_counter", lambda: next(clock))  # a machine that is busy
+    scene = load_scene("hammer", {"duration_s": 0.1})
+    candidate = Candidate(ModelLevels(), "torque", "split", 25, 3e-4)
+    failures = [measure(scene, candidate, ["spin"], runs=1, limit_s=limit_s).failure for limit_s in (60.0, 0.0)]
+    assert failures[0] == ""
+    assert failures[1].startswith("given up after 0 s")
 
 
 def test_what_saves_less_than_a_tenth_is_not_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,7 +204,20 @@ def test_what_saves_less_than_a_tenth_is_not_left_out(monkeypatch: pytest.Monkey
     # Where that is all that it saves, the scene stays as it was given.
     extra.update({"two-houses": 0.0, "inner-house": 0.0})
     given = load_scene("hammer", {"engine.name": "tsit5", "engine.step_us": 50})
-    assert search(given, {"spin": 0.1}).picked.candidate.engine == "tsit5"
+    again = search(given, {"spin": 0.1})
+    assert (again.picked.candidate.engine, again.savings) == ("tsit5", {})
+    # What the scene leaves out already is told where it is what the search picks, too.
+    given = load_scene("hammer", {"engine.tolerance": 3e-2, "engine.companion": False})
+    again = search(given, {"spin": 0.1})
+    assert (again.picked.candidate, list(again.savings)) == (again.given.candidate, ["magnet"])
+
+
+def test_a_pick_has_no_companion_and_an_old_one_what_the_scene_has(found: Ladder) -> None:
+    assert (found.given.candidate.companion, found.picked.candidate.companion) == (True, False)
+    pick = pick_of(found).model_copy(update={"engine": "split", "step_us": 25, "engine_tolerance": 3e-4})
+    for companion, has in ((pick.companion, False), (None, True)):
+        applied = pick.model_copy(update={"companion": companion}).apply({})
+        assert parse_scene(applied).engine.companion == has
 
 
 def test_rungs_are_the_models_own_and_are_tried_one_at_a_time(found: Ladder) -> None:
@@ -219,6 +272,7 @@ def test_a_pick_comes_into_force_and_says_so(found: Ladder, path: Path) -> None:
     assert pick.engine in scene.fidelity_line
     assert scene.engine.name == pick.engine
     assert scene.engine.step_us == pick.step_us
+    assert scene.engine.companion == pick.companion
     assert scene.model.magnet == pick.magnet
     assert scene.sensors.chain == pick.sensors
     document = Simulation(scene).scene_document()["scene"]
@@ -307,6 +361,11 @@ def test_no_pick_is_one_line(capsys: pytest.CaptureFixture[str], path: Path, tmp
 )
 def test_wrong_input_is_one_line(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], says: str) -> None:
     assert says in refused(capsys, "ladder", "hammer", *arguments)
+
+
+def test_a_quantity_that_is_rounding_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(capsys, "ladder", "drop", "-q", "spin", "-t", "1", "--set", "duration_s=0.1")
+    assert "--quantity must be one that two accurate engines agree on in scene drop; instead received 'spin'" in line
 
 
 def test_parse_quantities_gives_each_its_tolerance() -> None:

@@ -12,7 +12,8 @@ import pytest
 from rig.channels import Channel, Group, default_table
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.scenes import load_scene
-from rig.sensors.conditioning import Conditioner, channel_poles
+from rig.sensors.conditioning import Conditioner
+from rig.sensors.filters import channel_poles
 from rig.sensors.keyphasor import Keyphasor
 from rig.sensors.noise import EDGE, draw, noise_streams
 from rig.simulation import Simulation

@@ -25,11 +25,11 @@ def draw(ladder: Ladder, folder: Path) -> list[Path]:
     names = list(ladder.tolerances)[:_MOST]
     columns = len(names) + 1
     figure = new_figure(
-        10.6,
+        10.4 + 0.8 * len(names),  # the evidence has room above the legend
         f"No more model than scene {ladder.scene.name} needs\n({ladder.scene.duration_s:g} s; parameters: "
         f"{ladder.scene.parameters}, not validated on a rig)",
     )
-    axes = figure.subplots(2, columns, squeeze=False, height_ratios=(1.0, 1.1))
+    axes = figure.subplots(2, columns, squeeze=False, height_ratios=(1.0, 1.0 + 0.23 * len(names)))
     levels = [step for step in ladder.steps if step.stage in ("full", "single", "together")]
     for column, name in enumerate(names):
         _draw_levels(axes[0, column], ladder, levels, name, named=column == 0)
@@ -128,7 +128,7 @@ def _draw_work(axes: Any, levels: list[Step]) -> None:
     axes.set_ylim(len(levels) - 0.4, -0.6)
     axes.set_yticks(range(len(levels)), [""] * len(levels))
     axes.grid(visible=False, axis="y")
-    axes.set_xlabel("processor time of a simulated second [ms]")
+    axes.set_xlabel("processor time of a\nsimulated second [ms]")
     axes.set_title("What each level costs by the\nfirst engine that takes it")
 
 

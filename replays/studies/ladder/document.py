@@ -48,7 +48,6 @@ def ladder_document(ladder: Ladder) -> dict[str, Any]:
             {
                 "stage": step.stage,
                 "label": step.label,
-                "model": step.measured.candidate.model,
                 **_run(step.measured, scene.duration_s),
                 "cost": _run(step.cost, scene.duration_s) if step.cost else None,
                 "errors": _errors(step.errors),
@@ -80,6 +79,7 @@ def pick_of(ladder: Ladder) -> Pick:
         engine=candidate.engine,
         step_us=candidate.step_us,
         engine_tolerance=candidate.tolerance,
+        companion=candidate.companion,
         quantities=tuple(
             PickedQuantity(
                 quantity=name,
@@ -126,6 +126,7 @@ def versions() -> dict[str, str]:
 def _run(measured: Measurement, simulated_s: float) -> dict[str, Any]:
     return {
         "engine": measured.candidate.method,
+        "model": measured.candidate.model,
         "values": {name: _number(value) for name, value in measured.values.items()},
         "outcome": measured.ending.word if measured.ending else None,
         "contact_share": measured.ending.contact_share if measured.ending else None,

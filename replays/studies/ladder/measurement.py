@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import statistics
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending
+from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending, slides
 from replays.studies.run import bare_sensors, run_scene
 from rig.engines import ENGINES
 from rig.errors import InputError, SimulationError
@@ -21,7 +22,7 @@ from rig.simulation import Simulation
 GRID_TICKS = 1_000
 """Quantities are read every 1 ms."""
 _FINEST_ROW_US = 25
-"""The first impact is looked for on rows this far apart, or a fixed step apart [us]."""
+"""Instants are looked for on rows this far apart, or a fixed step apart [us]."""
 _ENOUGH_S = 1.0
 """No further run is timed once this much processor time is spent on one candidate."""
 _LEAST_S = 0.1
@@ -37,12 +38,14 @@ class Candidate:
     engine: str
     step_us: int
     tolerance: float = 0.0
+    companion: bool = False
+    """Only where a scene as given has one: of all others the search itself tells the error."""
 
     @property
     def method(self) -> str:
         """Engine and step in words."""
         finest = f", {self.tolerance:.0e}".replace("e-0", "e-") if self.tolerance else ""
-        return f"{self.engine} {self.step_us} us{finest}"
+        return f"{self.engine} {self.step_us} us{finest}{', companion' if self.companion else ''}"
 
     @property
     def label(self) -> str:
@@ -60,8 +63,8 @@ class Candidate:
         return replace(self, levels=ModelLevels(**{**self.levels.model_dump(), **levels}), drive=drive)  # pyright: ignore[reportArgumentType]
 
     def with_engine(self, engine: str, step_us: int, tolerance: float) -> Candidate:
-        """The same on another engine."""
-        return replace(self, engine=engine, step_us=step_us, tolerance=tolerance)
+        """The same on another engine, without a companion."""
+        return replace(self, engine=engine, step_us=step_us, tolerance=tolerance, companion=False)
 
     def scene(self, scene: Scene, *, sensors: dict[str, Any] | None = None) -> Scene:
         """The scene on this candidate.
@@ -74,6 +77,7 @@ class Candidate:
             InputError: The engine cannot take the model, or its step does not fit the rates of the sensors.
         """
         data = scene.model_dump()
+        engine = {"name": self.engine, "step_us": self.step_us, "tolerance": self.tolerance}
         return parse_scene(
             {
                 **data,
@@ -81,7 +85,7 @@ class Candidate:
                 "pick": None,
                 "model": self.levels.model_dump(),
                 "drive": {**data["drive"], "mode": self.drive},
-                "engine": {"name": self.engine, "step_us": self.step_us, "tolerance": self.tolerance},
+                "engine": {**engine, "companion": self.companion},
                 "sensors": bare_sensors() if sensors is None else {**data["sensors"], **sensors},
             }
         )
@@ -135,7 +139,7 @@ def measure(
         quantities: What to read.
         runs: Runs to time, fewer where they take long; 1 for values alone, whose time is a rough one.
         sensors: Changes to the scene's own sensors; None to leave the sensors out.
-        limit_s: Wall time after which a run is given up as a failure [s].
+        limit_s: Processor time after which a run is given up as a failure [s].
     """
     placed = candidate.scene(scene, sensors=sensors)
     Simulation(placed).warm_up()  # compiling is no part of the cost
@@ -147,17 +151,17 @@ def measure(
             simulation = Simulation(placed)
             _ = simulation.first_row
             first = trace is None
-            # Short blocks where a stall has to be noticed, long ones where time is measured.
+            # Short blocks, which cost, where a stall has to be noticed; long ones where time is measured.
             blocks = max(1, (GRID_TICKS if first else 100_000) // simulation.block_ticks)
             every = max(1, GRID_TICKS // simulation.row_ticks)
             done = run_scene(
                 simulation, block_ticks=blocks * simulation.block_ticks, every=every, keep=first, limit_s=limit_s
             )
-            if not first or runs == 1 or done.cpu_s > _ENOUGH_S:
+            if not first or runs == 1:
                 spent.append(done.cpu_s)
             if first:
                 health = simulation.health()
-                trace = _trace(scene, candidate, simulation, done.rows, health, "first_impact_time" in quantities)
+                trace = _trace(scene, candidate, simulation, done.rows, health, quantities)
     except SimulationError as error:
         nothing: dict[str, Value] = dict.fromkeys(quantities, math.nan)
         return Measurement(candidate, nothing, None, math.nan, (math.nan, math.nan), 0, 0, math.nan, str(error))
@@ -207,7 +211,12 @@ def saving(
 
 
 def _trace(
-    scene: Scene, candidate: Candidate, simulation: Simulation, rows: np.ndarray, health: dict[str, Any], first: bool
+    scene: Scene,
+    candidate: Candidate,
+    simulation: Simulation,
+    rows: np.ndarray,
+    health: dict[str, Any],
+    quantities: list[str],
 ) -> Trace:
     constants = simulation.model.constants
     spacing = max(GRID_TICKS, simulation.row_ticks) / simulation.tick_rate_hz
@@ -217,25 +226,38 @@ def _trace(
         peak_force=health["peak_normal_force_n"],
         clearance=constants.contact.clearance,
         surface_radius=constants.shaft.radius,
-        first_impact_s=first_impact(scene, candidate) if first else math.nan,
+        first_impact_s=first_impact(scene, candidate) if "first_impact_time" in quantities else math.nan,
+        rolls_s=_rolls_from(scene, candidate) if "time_to_roll" in quantities else math.nan,
     )
 
 
-def first_impact(scene: Scene, candidate: Candidate) -> float:
-    """Instant of the first contact [s], nan where there is none: from the gap, its rate and its acceleration before.
-
-    A run of its own, with a row at every step; an adaptive engine's grid is 25 us for it.
-    """
+def _finely(scene: Scene, candidate: Candidate) -> Iterator[tuple[Simulation, int, np.ndarray]]:
+    """A run of its own with a row at every step, of an adaptive engine every 25 us: blocks, with the tick of each."""
     adaptive = ENGINES[candidate.engine].tolerance > 0.0
     step_us = min(candidate.step_us, _FINEST_ROW_US) if adaptive else candidate.step_us
     rate = 1_000_000 // step_us
     fine = replace(candidate, step_us=step_us).scene(scene, sensors=bare_sensors(rate))
     simulation = Simulation(fine)
     block = max(1, GRID_TICKS // simulation.block_ticks) * simulation.block_ticks
+    while (start := simulation.tick) < simulation.end_tick:
+        yield simulation, start, simulation.advance(min(block, simulation.end_tick - start)).rows
+
+
+def _rolls_from(scene: Scene, candidate: Candidate) -> float:
+    """When it begins to roll for good [s], nan where it does not."""
+    rolls = end = 0
+    for simulation, start, rows in _finely(scene, candidate):
+        loose = slides(rows, simulation.model.constants.shaft.radius) | (rows[:, COLUMN["penetration"]] <= 0.0)
+        if loose.any():
+            rolls = start + (int(np.flatnonzero(loose)[-1]) + 1) * simulation.row_ticks
+        end = simulation.end_tick
+    return rolls * 1e-6 if rolls < end else math.nan
+
+
+def first_impact(scene: Scene, candidate: Candidate) -> float:
+    """Instant of the first contact [s], nan where there is none: from the gap, its rate and its acceleration before."""
     last: np.ndarray | None = None
-    while simulation.tick < simulation.end_tick:
-        start = simulation.tick
-        rows = simulation.advance(min(block, simulation.end_tick - start)).rows
+    for simulation, start, rows in _finely(scene, candidate):
         gap = rows[:, COLUMN["penetration"]]
         touched = np.flatnonzero((gap >= 0.0) | (rows[:, COLUMN["contact_impulse"]] > 0.0))
         hit = int(touched[0]) if len(touched) else len(rows)

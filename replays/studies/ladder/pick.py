@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -99,17 +100,15 @@ def pick_table(pick: Pick) -> str:
     """The pick as TOML, with a table for each quantity."""
     data = pick.model_dump(mode="json")
     quantities = data.pop("quantities")
-    lines = ["[pick]", _COMMENT, *(f"{key} = {_value(value)}" for key, value in data.items())]
+    lines = ["[pick]", _COMMENT, *_entries(data)]
     for entry in quantities:
-        lines += ["", "[[pick.quantities]]"]
-        lines += [f"{key} = {_value(value)}" for key, value in entry.items()]
+        lines += ["", "[[pick.quantities]]", *_entries(entry)]
     return "\n".join(lines) + "\n"
 
 
-def _value(value: str | float) -> str:
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    return repr(value)
+def _entries(data: dict[str, str | float | bool]) -> list[str]:
+    # Words, numbers and truth are written alike in both languages.
+    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in data.items()]
 
 
 def _as_given(path: Path) -> Scene:

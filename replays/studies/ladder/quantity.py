@@ -17,7 +17,9 @@ from rig.orbit import phase, whirl_frequency
 SETTLED = 0.25
 """The settled phase is this last part of a run."""
 ROLLS = 0.02
-"""A contact rolls while it slides by less than this part of the surface's speed."""
+"""A contact rolls while it slides by less than this part of the surface's speed ..."""
+STILL = 1e-4
+"""... or than this, as where the shaft stands and both are rounding [m/s]."""
 LASTS = 0.5
 """Contact lasts where it is more than this part of the settled phase: then it turns, or rests, and rolls or slides."""
 STAYS = 0.95
@@ -42,6 +44,8 @@ class Trace(NamedTuple):
     """R_S [m]."""
     first_impact_s: float
     """Located between steps [s]; nan where there is none or where nobody asked."""
+    rolls_s: float = math.nan
+    """When it begins to roll for good [s]; nan alike."""
 
     def column(self, name: str) -> np.ndarray:
         """One signal, shape (n,)."""
@@ -94,12 +98,25 @@ class Ending(NamedTuple):
         return turned and abs(self.rolling_share - other.rolling_share) <= 0.5
 
 
+def slides(rows: np.ndarray, surface_radius: float) -> np.ndarray:
+    """In which of some rows it slides, were it in contact."""
+    surface_speed = surface_radius * np.abs(rows[:, COLUMN["theta_rate"]])
+    return np.abs(rows[:, COLUMN["sliding_speed"]]) > np.maximum(ROLLS * surface_speed, STILL)
+
+
+def rolls_from(times_s: np.ndarray, rows: np.ndarray, surface_radius: float) -> float:
+    """When it begins to roll for good, by the rows of a whole run [s]; nan where it does not."""
+    loose = np.flatnonzero(slides(rows, surface_radius) | (rows[:, COLUMN["penetration"]] <= 0.0))
+    first = int(loose[-1]) + 1 if len(loose) else 0
+    return float(times_s[first]) if first < len(times_s) else math.nan
+
+
 def ending(trace: Trace) -> Ending:
     """How a run ends."""
     # By the impulse: an impact law touches without being in contact at any instant.
     pushed = np.diff(trace.settled("contact_impulse")) > 0.0
     angle = phase(trace.settled("ring_x"), trace.settled("ring_y"))
-    rolls = ~_slides(trace)[-trace.settled_rows :]
+    rolls = ~slides(trace.rows[-trace.settled_rows :], trace.surface_radius)
     return Ending(
         touches=bool(pushed.any()),
         contact_share=float(np.mean(pushed)),
@@ -174,17 +191,6 @@ def _dissipated(trace: Trace) -> float:
     return float(sum(trace.column(name)[-1] for name in DISSIPATED))
 
 
-def _slides(trace: Trace) -> np.ndarray:
-    return np.abs(trace.column("sliding_speed")) > ROLLS * trace.surface_radius * np.abs(trace.column("theta_rate"))
-
-
-def _time_to_roll(trace: Trace) -> float:
-    loose = _slides(trace) | (trace.column("penetration") <= 0.0)
-    if loose[-1]:
-        return math.nan
-    return float(trace.times_s[np.flatnonzero(loose)[-1] + 1]) if loose.any() else 0.0
-
-
 def _rebound(trace: Trace) -> float:
     rises = np.flatnonzero(np.diff(trace.column("contact_impulse")) > 0.0)
     later = rises[1:][np.diff(rises) > 2]
@@ -248,8 +254,8 @@ QUANTITIES = {
         Quantity("dissipated_energy", "J", "whole run", "the engine's own integrals of all losses", _dissipated),
         Quantity("contact_fraction", "1", "whole run", "share of instants in contact, every 1 ms", _fraction),
         Quantity(
-            "time_to_roll", "s", "transient", f"until it rolls for good (slip below {ROLLS:.0%}), to 1 ms",
-            _time_to_roll, resolution=1e-3,
+            "time_to_roll", "s", "transient", f"until it rolls for good (slip below {ROLLS:.0%}), to 50 us",
+            lambda trace: trace.rolls_s, resolution=50e-6,
         ),
         Quantity(
             "first_impact_time", "s", "first impact", "located between two steps", lambda trace: trace.first_impact_s

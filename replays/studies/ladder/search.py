@@ -156,7 +156,7 @@ def search(
     full = work.run(standard.full.with_engine(*settings.usual(scene, standard.full, settings.REFERENCE[0])), sensors={})
     own = _as_given(work, standard)
     if own.passes and work.saving(picked.measured.candidate, own.measured.candidate) <= WORTH:
-        picked, savings = own, {}
+        picked, savings = own, savings if own.measured.candidate == picked.measured.candidate else {}
     return Ladder(
         scene=scene,
         tolerances=tolerances,
@@ -270,8 +270,8 @@ def _standard(work: _Work) -> _Standard:
     """The full model by two unlike engines.
 
     Raises:
-        InputError: One of them fails, they end in different ways, the scene has no such quantity, or a tolerance is
-            finer than their distance.
+        InputError: One of them fails, they end in different ways or hardly agree on a quantity, the scene has no such,
+            or a tolerance is finer than their distance.
     """
     # Of model levels the last choice is full, of the drive the scene's own.
     levels: Any = {name: choices[-1] for name, choices in LEVELS.items() if name != "drive"}
@@ -293,6 +293,8 @@ def _standard(work: _Work) -> _Standard:
     distances = standard.against(unlike.values, reference.values)
     own = {name: max(error, _resolution(name, reference)) for name, error in distances.items()}
     for name, error in own.items():
+        if error > 0.5:
+            raise InputError("--quantity", f"one that two accurate engines agree on in scene {work.scene.name}", name)
         if error > 0.5 * work.tolerances[name]:
             must = f"at least {2.0 * error:.2g} for {name}, twice the reference's own error"
             raise InputError("--tolerance", must, work.tolerances[name])
@@ -413,8 +415,8 @@ def _engines(work: _Work, standard: _Standard, best: Measurement) -> tuple[list[
                 break
             candidate = best.candidate.with_engine(engine, step_us, tolerance)
             work.progress(candidate.method)
-            # What takes longer than the reference is of no interest, and may be a stall.
-            limit_s = max(1.0, 5.0 * standard.reference.cpu_s * work.scene.duration_s)
+            # What takes far longer than the reference may be a stall; the finest of small fixed steps takes five times.
+            limit_s = max(1.0, 10.0 * standard.reference.cpu_s * work.scene.duration_s)
             done = work.run(candidate, sensors=work.sensors, limit_s=limit_s)
             step = standard.step("engine", candidate.method, done, standard.all_errors(done, best))
             work.steps.append(step)

@@ -42,7 +42,10 @@ def usual(scene: Scene, candidate: Candidate, engine: str) -> tuple[str, int, fl
 
 def as_given(scene: Scene) -> Candidate:
     """The scene's own model, engine and step."""
-    return Candidate(scene.model, scene.drive.mode, scene.engine.name, scene.engine.step_us, scene.engine.tolerance)
+    engine = scene.engine
+    return Candidate(
+        scene.model, scene.drive.mode, engine.name, engine.step_us, engine.tolerance, companion=engine.companion
+    )
 
 
 def tried(scene: Scene, candidate: Candidate) -> dict[str, list[tuple[int, float]]]:

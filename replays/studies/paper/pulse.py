@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from replays.studies.ladder.quantity import QUANTITIES, Trace
+from replays.studies.ladder.quantity import QUANTITIES, Trace, rolls_from
 from replays.studies.run import end_with_parent
 from rig.errors import InputError
 from rig.offline import Run, simulate
@@ -137,14 +137,15 @@ def outcome(pulse: Pulse) -> Outcome:
 
 def trace_of(run: Run) -> Trace:
     """A run as the ladder's quantities read it."""
-    contact = run.simulation.model.constants.contact
+    contact, radius = run.simulation.model.constants.contact, run.simulation.model.constants.shaft.radius
     return Trace(
         times_s=run.times_s,
         rows=run.signals,
         peak_force=float(run.simulation.health()["peak_normal_force_n"]),
         clearance=contact.clearance,
-        surface_radius=run.simulation.model.constants.shaft.radius,
+        surface_radius=radius,
         first_impact_s=math.nan,
+        rolls_s=rolls_from(run.times_s, run.signals, radius),
     )
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from rig.channels import ChannelTable, Group
 from rig.errors import InputError, UnknownNameError
 from rig.kernels.signals import COLUMN, N_ROW
 
@@ -55,16 +56,14 @@ class Formulas:
     Args:
         parameters: Values by name, SI.
         curves: Functions of an angle [rad], periodic in a turn: points (degrees, value).
-        arm_disk: Distance of the disk from the pivot [m].
     """
 
     def __init__(
         self,
         parameters: Mapping[str, float] | None = None,
         curves: Mapping[str, Curve] | None = None,
-        arm_disk: float = 1.0,
     ) -> None:
-        self._parameters, self._arm_disk = parameters or {}, arm_disk
+        self._parameters = parameters or {}
         self._curves = {name: np.array(points, float).T for name, points in (curves or {}).items()}
         self._made: list[Callable[[np.ndarray], Any]] = []
 
@@ -87,6 +86,18 @@ class Formulas:
             raise InputError(field, "one of the model's signals, or a formula of them", signal) from None
         self._made.append(self._read(tree, field, 0))
         return N_ROW + len(self._made) - 1
+
+    def columns(self, groups: Iterable[Group]) -> list[int]:
+        """Columns of the signals of all channels of some groups, in their order, as `column`."""
+        return [self.column(channel.name, channel.signal) for group in groups for channel in group.channels]
+
+    def check(self, table: ChannelTable) -> None:
+        """Refuse channels that feel neither a signal of the model nor a formula.
+
+        Raises:
+            InputError: The first of them.
+        """
+        self.columns(table.groups.values())
 
     def knows(self, channel: str, signal: str) -> bool:
         """Whether there is such a signal, or it is a formula."""
@@ -151,7 +162,7 @@ class Formulas:
             act = FUNCTIONS[name][1]
             return lambda rows: act(*(each(rows) for each in of))
         if name in PLACES:
-            column, arm = COLUMN[PLACES[name]], self._arm_disk
+            column, arm = COLUMN[PLACES[name]], self._parameters["shaft.arm_disk"]
             return lambda rows: of[0](rows) / arm * rows[:, column]
         degrees, values = self._curves[name]
         return lambda rows: np.interp(np.degrees(of[0](rows)), degrees, values, period=360.0)

@@ -1,0 +1,70 @@
+"""How far apart rows of the model are for the sensors, and where the samples of a rate fall between them."""
+
+from __future__ import annotations
+
+import math
+
+from rig.channels import ChannelTable
+from rig.errors import InputError
+
+TICKS_HZ = 1_000_000
+ROW_TICKS = 25
+"""How far apart rows are [ticks], ..."""
+_ELSE = (25, 20, 10, 5, 4, 2)
+"""... or where that does not divide the periods of samples and truth, ..."""
+_A_WAVE = 7.5
+"""... and how many there are at least in a period of the highest bandwidth."""
+_MOST = 4096
+"""Most places between rows that the samples of one rate may have: what each is made of is worked out beforehand."""
+
+
+def row_ticks(table: ChannelTable, *, truth_rate_hz: int, ideal: bool) -> int:
+    """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step.
+
+    Args:
+        table: What is measured.
+        truth_rate_hz: Rate of the truth [Hz].
+        ideal: Whether there are no filters.
+    """
+    rates = [group.rate_hz for group in table.groups.values()]
+    # Samples and truth fall on rows where their periods are whole ticks.
+    periods = [TICKS_HZ // rate for rate in (truth_rate_hz, *rates) if TICKS_HZ % rate == 0]
+    if ideal and len(periods) > len(rates):
+        return math.gcd(*periods)
+    longest = TICKS_HZ / _A_WAVE / max(channel.bandwidth_hz for channel in table.channels.values())
+    fit = [ticks for ticks in _ELSE if ticks <= longest and all(period % ticks == 0 for period in periods)]
+    return fit[0] if fit else 1
+
+
+def check_rates(table: ChannelTable, row_rate_hz: int, *, field: str) -> None:
+    """Refuse rates whose samples fall on too many places between rows.
+
+    Args:
+        table: What is measured.
+        row_rate_hz: Rows a second [Hz].
+        field: What errors call a rate; empty: that of its group.
+
+    Raises:
+        InputError: The first of them, and the nearest that would do.
+    """
+    for group in table.groups.values():
+        rate = group.rate_hz
+        if not fits(rate, row_rate_hz):
+            near = [other for away in range(5000) for other in (rate - away, rate + away) if other > 0]
+            such = sorted([other for other in near if fits(other, row_rate_hz)][:2])
+            must = (
+                f"one whose samples fall on at most {_MOST} places between the rows of {row_rate_hz} Hz that they are"
+            )
+            must += f" made of, such as {' or '.join(map(str, such))}"
+            raise InputError(field or f"groups.{group.name}.rate_hz", must, rate)
+
+
+def between(rate_hz: int, row_rate_hz: int) -> tuple[int, int]:
+    """From sample to sample in parts of a row, and how many parts a row has."""
+    common = math.gcd(rate_hz, row_rate_hz)
+    return row_rate_hz // common, rate_hz // common
+
+
+def fits(rate_hz: int, row_rate_hz: int) -> bool:
+    """Whether samples of a rate fall on few enough places between rows."""
+    return between(rate_hz, row_rate_hz)[1] <= _MOST
