@@ -8,7 +8,9 @@ from rig.kernels import signals as S
 from rig.kernels.stage import stage
 
 KEYPHASOR_WIDTH = math.radians(10.0)
-"""Angle over which the mark is seen [rad]."""
+"""Angle over which the mark is seen [rad], ..."""
+_EDGE = math.radians(1.0)
+"""... and over which it comes into sight and goes, as wide as the probe's tip: both assumed [rad]."""
 
 
 @stage
@@ -55,7 +57,9 @@ def write_observed(
     out[S.RING_X] = lA * ux - state.x_ih - contact.offset_x
     out[S.RING_Y] = lA * uy - state.y_ih - contact.offset_y
     out[S.SPIN_RATE] = state.dth
-    out[S.KEYPHASOR] = 1.0 if state.theta % (2.0 * math.pi) < KEYPHASOR_WIDTH else 0.0
+    ahead = (state.theta + math.pi) % (2.0 * math.pi) - math.pi
+    seen = 0.5 + min(ahead, KEYPHASOR_WIDTH - ahead) / _EDGE
+    out[S.KEYPHASOR] = min(max(seen, 0.0), 1.0)
     out[S.DRIVE_TORQUE] = motion.torque
     out[S.MAGNET_X] = magnets.x
     out[S.MAGNET_Y] = magnets.y
