@@ -320,7 +320,7 @@ def _narrowed(
     if channels and "keyphasor" not in channels:
         columns.pop(EDGES, None)
     truth = {name: table for name, table in recording.catalogue.get("truth", {}).items() if f"{TRUTH}/{name}" in keys}
-    return {**recording.catalogue, "table": {"groups": groups}, "truth": truth}, columns
+    return {**recording.catalogue, "table": {**recording.catalogue["table"], "groups": groups}, "truth": truth}, columns
 
 
 def _trimmed(key: str, block: Block, from_tick: float, to_tick: float, columns: list[int] | None) -> Block | None:

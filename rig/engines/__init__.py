@@ -63,7 +63,7 @@ ENGINES = {
     "rk4": Method("classical Runge-Kutta, events located", 5, 0.0, (*_BY_STATE, "exact")),
     "verlet": Method("velocity Verlet, order 2, events located", 5, 0.0, (*_BY_STATE, "exact")),
     "semi-implicit-euler": Method("symplectic Euler, order 1, events located", 5, 0.0, _BY_STATE),
-    "rosenbrock": Method("RODAS 4(3), linearly implicit, adaptive, events located", 50, 1e-6, (*_BY_STATE, "exact")),
+    "rosenbrock": Method("RODAS 4(3), linearly implicit, adaptive, events located", 50, 1e-7, (*_BY_STATE, "exact")),
 }
 """Engines, the default first."""
 

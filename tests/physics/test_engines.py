@@ -234,7 +234,7 @@ def test_engines_without_exact_friction_say_so(engine: str) -> None:
 @pytest.mark.parametrize("smoothing_speed", [1e-4, 1e-6])
 def test_linearly_implicit_engine_holds_at_any_smoothing_speed(smoothing_speed: float) -> None:
     exact = motion(ready("hammer", "rk8"), 0.15)
-    implicit = ready("hammer", "rosenbrock", smoothing_speed, model__friction="smoothed")
+    implicit = ready("hammer", "rosenbrock", smoothing_speed, model__friction="smoothed", engine__tolerance=1e-6)
     assert distance(motion(implicit, 0.15), exact) < 4e-3
     assert implicit._motion.memory[CEILING] == 0.0
     assert abs(implicit.health()["energy"]["residual_share"]) < 3e-5

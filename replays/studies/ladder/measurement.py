@@ -83,6 +83,7 @@ class Candidate:
                 **data,
                 "fidelity": "given",
                 "pick": None,
+                "channels": None,
                 "model": self.levels.model_dump(),
                 "drive": {**data["drive"], "mode": self.drive},
                 "engine": {**engine, "companion": self.companion},
