@@ -19,6 +19,8 @@ from rig.sensors.noise import draw, noise_streams
 
 _LANES = 16
 """Channels that one pass takes, side by side."""
+_SOMETHING = 1e-25
+"""Added to all volts: without it filters of silent channels decay to where a processor takes a hundred times as long."""
 _CHUNK = 64
 """Rows that are filtered at a time."""
 
@@ -52,6 +54,15 @@ def _filter(step, wave, phases, volts, rows, late, apart, parts, out):
     sample = 0
     for n in range(rows):
         at = n * _LANES
+        if late == 0:
+            # On the row itself, a sample is what goes straight through, and the poles' states.
+            for c in range(_LANES):
+                out[sample + c] = phases[_LANES + c] * volts[at + 2 * _LANES + c]
+            for pole in range(poles):
+                for c in range(_LANES):
+                    out[sample + c] += wave[2 * pole * _LANES + c]
+            sample += _LANES
+            late = apart
         while late < parts:
             phase = late * (4 + 2 * poles) * _LANES
             for c in range(_LANES):
@@ -92,7 +103,7 @@ def _limited(scale, volts):
     """From signals to volts within the conditioner's range, in place, shape (rows * _LANES,)."""
     for n in range(0, len(volts), _LANES):
         for c in range(_LANES):
-            v = scale[c + _BIAS * _LANES] + scale[c + _GAIN * _LANES] * volts[n + c]
+            v = scale[c + _BIAS * _LANES] + scale[c + _GAIN * _LANES] * volts[n + c] + _SOMETHING
             volts[n + c] = min(max(v, scale[c + _LOW * _LANES]), scale[c + _HIGH * _LANES])
 
 

@@ -12,10 +12,10 @@ from rig.kernels.stage import kernel
 def series_at(Y, s, x):
     """State and integrals at s, and the root of the penetration, into x, shape (ROOT + 1,)."""
     for i in range(len(x)):
-        x[i] = Y[ORDER, i]
-    for k in range(ORDER - 1, -1, -1):
-        for i in range(len(x)):
-            x[i] = x[i] * s + Y[k, i]
+        value = Y[ORDER, i]
+        for k in range(ORDER - 1, -1, -1):
+            value = value * s + Y[k, i]
+        x[i] = value
 
 
 @kernel
