@@ -82,7 +82,7 @@ class EngineChoice(Written):
 
     name: str = next(iter(ENGINES))
     step_us: Annotated[int, Field(ge=1, le=1000)] = 0
-    """Step [us], a whole number of ticks; left out: the engine's own."""
+    """Longest step [us]: steps end on the rows that sensors see, 25 us apart or closer; left out: the engine's own."""
     tolerance: Annotated[FiniteFloat, Field(ge=0.0, le=0.1)] = 0.0
     """Scaled error: of the whole run with split, of a step with another adaptive engine; left out: the engine's own."""
     companion: bool = False

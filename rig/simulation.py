@@ -280,6 +280,7 @@ class Simulation:
         balance = energy_balance(last[None, :], first)
         residual, dissipated = float(balance["residual"][0]), float(balance["dissipated"][0])
         memory, warnings = self._motion.memory, list[str]()
+        choice = {**self.scene.engine.model_dump(), "step_us": self._step_ticks}
         if self._accuracy.doubted_s is not None:
             warnings.append(self._accuracy.warning())
         # Where little is dissipated, what was stored is what the ledger has to account for.
@@ -314,7 +315,7 @@ class Simulation:
                 "alarm_share": self._method.energy,
             },
             "accuracy": None if self._companion is None else self._accuracy.document(),
-            "engine": {**self.scene.engine.model_dump(), "levels": self.scene.model.model_dump()},
+            "engine": {**choice, "levels": self.scene.model.model_dump()},
             "contacts": int(memory[CONTACTS]),
             "peak_normal_force_n": float(memory[PEAK_FORCE]),
             "steps": int(memory[STEPS]),

@@ -20,7 +20,7 @@ from rig.sensors.noise import draw, noise_streams
 _LANES = 16
 """Channels that one pass takes, side by side."""
 _SOMETHING = 1e-25
-"""Added to all volts: without it filters of silent channels decay to where a processor takes a hundred times as long."""
+"""Added to all volts: filters of silent channels else decay to where a processor takes a hundred times as long."""
 _CHUNK = 64
 """Rows that are filtered at a time."""
 
