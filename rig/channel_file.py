@@ -5,7 +5,7 @@ The file says what is different from the built-in table (`rig/channels.toml`), o
     drop = ["accelerations", "hammer"]          # groups or channels that are left out
 
     [channels.disk_x]                           # other numbers of a channel that there is
-    sensitivity_v = 7.87
+    sensitivity_v = 4.5
 
     [groups.probes]                             # of a group that there is; `channels` are added to it
     rate_hz = 51200
@@ -35,7 +35,7 @@ from pydantic import AfterValidator, Field
 
 from rig.channels import TABLE, ChannelTable, raw_groups, table_of
 from rig.errors import InputError, UnknownNameError, Words
-from rig.outside import Written, check, read_toml
+from rig.outside import Written, check, open_file, read_toml
 
 KIND = "user"
 """Provenance of what stands in such a file."""
@@ -161,7 +161,8 @@ def _curve(name: str, given: str | tuple[tuple[float, float], ...], folder: Path
         points = given
     else:
         try:
-            table = np.loadtxt(folder / given, delimiter=",", comments="#", ndmin=2, max_rows=10_001)
+            with open_file(folder / given) as file:
+                table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, max_rows=10_001)
         except OSError as error:
             raise InputError(field, "a file that can be read, degrees and values", Words(error.strerror)) from None
         except ValueError as error:

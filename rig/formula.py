@@ -64,6 +64,9 @@ class Formulas:
         curves: Mapping[str, Curve] | None = None,
     ) -> None:
         self._parameters = parameters or {}
+        for name in curves or {}:
+            if name in {*FUNCTIONS, *PLACES, *COLUMN, "pi"}:
+                raise InputError(f"curves.{name}", "of a name that no signal and no function has", name)
         self._curves = {name: np.array(points, float).T for name, points in (curves or {}).items()}
         self._made: list[Callable[[np.ndarray], Any]] = []
 

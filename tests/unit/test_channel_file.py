@@ -218,6 +218,8 @@ WRONG = {
         "curves.c must be 2 to 10000 points of ascending angle",
     ),
     "a curve of more than a turn": ("[curves]\nc = [[0, 1], [400, 2]]", "curves.c must be points from 0 to below 360"),
+    "a curve that is a function": ("[curves]\nsin = [[0, 1], [90, 2]]", "curves.sin must be of a name that no signal"),
+    "a curve that is a folder": ('[curves]\nc = "."', "curves.c must be a file that can be read"),
     "no TOML": ("groups = {", "a TOML file"),
 }
 
