@@ -316,15 +316,14 @@ def continue_series(constants, inputs, memory, room, y):
 @kernel
 def read_off(memory, room, y, tick, fraction):
     """State at an instant of the series at hand, into y."""
-    Y, x = room.Y, room.x
+    Y = room.Y
     time = ((tick - memory[TICK]) + (fraction - memory[FRACTION])) * memory[INPUTS]
     s = time
     if time >= memory[SPAN]:
         s = memory[LENGTH]
     elif time > 0.0 and memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
         s = refine(Y, TIME, 0, time, 0.0, memory[LENGTH])
-    series_at(Y, s, x)
-    fill(y, x)
+    series_at(Y, s, y[: S.N_VECTOR])
 
 
 @kernel

@@ -10,7 +10,7 @@ from rig.kernels.stage import kernel
 
 @kernel
 def series_at(Y, s, x):
-    """State and integrals at s, and the root of the penetration, into x, shape (ROOT + 1,)."""
+    """The first columns at s into x: state and integrals, and what follows up to where x ends."""
     for i in range(len(x)):
         value = Y[ORDER, i]
         for k in range(ORDER - 1, -1, -1):
