@@ -18,9 +18,8 @@ SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_
 DISSIPATED = ("bearing_loss", "house_loss", "contact_loss", "friction_loss")
 BRANCH_ALARM = 1e-2
 """Energy residual over dissipated energy above which a run may have missed a contact or made one up."""
-FINER, FINEST = 1.0 / 16.0, 1e-5
-"""Part of the tolerance that a companion is asked for, and what it is asked for at least: where `split` takes no kicks,
-so that both never make the same error."""
+FINER = 1.0 / 16.0
+"""Part of the tolerance that a companion is asked for."""
 DOUBT = 10.0
 """How many times engine.tolerance the estimate may come to before the run is in doubt."""
 _FIRST, _LOST = 1e-9, 0.1

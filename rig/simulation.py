@@ -28,7 +28,7 @@ from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
-from rig.motion import BRANCH_ALARM, FINER, FINEST, Accuracy, Motion, energy_balance
+from rig.motion import BRANCH_ALARM, FINER, Accuracy, Motion, energy_balance
 from rig.scenes import Scene, load_scene, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
@@ -158,9 +158,8 @@ class Simulation:
         self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance)
         self._companion: Motion | None = None
         if choice.companion:
-            finer = min(FINEST, FINER * choice.tolerance)
             stride = self.block_ticks // self._step_ticks
-            self._companion = Motion(initial.copy(), self._step_ticks, stride, finer)
+            self._companion = Motion(initial.copy(), self._step_ticks, stride, FINER * choice.tolerance)
         self._accuracy = Accuracy(choice.tolerance)
         self._rows = np.empty((0, S.N_ROW))
         self._last: np.ndarray | None = None

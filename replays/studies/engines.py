@@ -51,8 +51,6 @@ class Traits(NamedTuple):
     """By how much an engine of low order without corrections may be further off at its own step."""
     coarse_bounce: tuple[bool | None, str] = (None, "")
     """Whether it keeps an impact's energy at a step of 200 µs, and why."""
-    flight_limit: float = 1e-4
-    """Scaled error allowed in free flight, before the allowance."""
     warned_within_ticks: int = 60_000
     """How long a run with a step far too long goes on before it must have warned."""
 

@@ -1,7 +1,7 @@
 """Half of a first start's compiling, in a process of its own beside it: `python -m rig.cli.ahead`.
 
-The kernels of an engine are compiled in the order in which they call each other, and the longest, the series, come
-last. On a second core they are ready by then, and found in the cache.
+Most of it are the series of flight, rolling and sliding, one after the other. On a second core the last of them are
+ready when their turn comes, and found in the cache.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def compile_last() -> None:
 
     from rig.engines.memory import MEMORY
     from rig.engines.taylor.march import room_in
-    from rig.engines.taylor.series import flight, rolling, sliding
+    from rig.engines.taylor.series import rolling, sliding
     from rig.kernels.constants import Inputs
     from rig.kernels.records import packed
     from rig.kernels.signals import N_ROW
@@ -49,7 +49,7 @@ def compile_last() -> None:
     constants, inputs = packed(simulation.model.constants)[0], packed(quiet)[0]
     memory = np.zeros(MEMORY)
     room = room_in(memory)
-    for series in (flight, rolling, sliding):
+    for series in (sliding, rolling):
         series(constants, inputs, memory, 0.0, 0.0, 0.0, 0.0, room.Y, room.A, room.B, room.D, room.acc)
     groups, rows = tuple(simulation.table.groups.values()), np.zeros((1000, N_ROW))
     Conditioner(groups, row_rate_hz=40_000, seed=1, noise=True, ideal=False).counts(rows)

@@ -48,13 +48,11 @@ _BY_STATE = ("none", "smoothed", "switch")
 
 ENGINES = {
     "split": Method(
-        "Taylor series, exact linear flow and kicks in lasting contact",
+        "Taylor series for the accuracy of a whole run, rigid impacts one by one",
         25,
         3e-4,
-        ("none", "exact"),
+        ("none", "smoothed", "exact"),
         ("impact", "compliant"),
-        100,
-        5e-3,
         companion=True,
     ),
     "rk8": Method("Dormand-Prince 8(5,3), events located", 25, 1e-8, (*_BY_STATE, "exact")),

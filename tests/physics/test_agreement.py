@@ -184,7 +184,6 @@ def test_ledgers_close(scene: str) -> None:
 
 @pytest.mark.parametrize("scene", ["hammer", "drop", "stable-run", "run-up"])
 def test_ledger_of_the_default_engine_closes_to_its_own_error(scene: str) -> None:
-    # The kicks' quadrature is of order 2: at 25 us a hammer run leaves a few 1e-5 of the dissipated, at 50 us 2e-3.
     simulation = Simulation(load_scene(scene, {"duration_s": 2.0}))
     assert simulation.scene.engine.name == "split"
     for _ in frames(simulation):

@@ -6,7 +6,6 @@
 | impact quadrature             | an integration of the equation of motion by scipy |
 | limits h w on the map         | where maps of rk4, Verlet and Euler turn unstable |
 | decay of rk4 on an oscillator | abs(R(i h w))^2 a step                            |
-| limit of split's contact kick | 2 sqrt(3)                                         |
 """
 
 from __future__ import annotations

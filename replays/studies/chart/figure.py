@@ -140,8 +140,7 @@ def _exact(figure: Any, rows: list[Row]) -> str:
 def _smoothed(figure: Any, rows: list[Row]) -> str:
     title = f"The smoothed law alone, vₛ = {SMOOTHING * 1e3:g} mm/s"
     return _windows(figure, rows, "smoothed", title) + (
-        " All against the smoothed reference; split takes exact Coulomb only. What smoothing itself costs is on the "
-        "exact charts."
+        " All against the smoothed reference. What smoothing itself costs is on the exact charts."
     )
 
 
@@ -199,8 +198,8 @@ def _work(figure: Any, rows: list[Row]) -> str:
     draw_frames(figure.add_subplot(grid[0, 1]), chosen, rows)
     draw_legend(figure, rows, ("exact",), figure.add_subplot(grid[0, 2]), failures=False, bounds=False)
     return (
-        "Evaluations as each library counts them: a Taylor series' are its order times its steps; split's are its "
-        "kicks and those of its series. Worst frame: the longest call of 1 ms, each frame's least of several passes, "
+        "Evaluations as each library counts them: a Taylor series' are its order times its steps. "
+        "Worst frame: the longest call of 1 ms, each frame's least of several passes, "
         "so that the machine's own pauses are left out; peers are not stepped frame by frame."
     )
 

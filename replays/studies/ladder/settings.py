@@ -9,7 +9,7 @@ from rig.scenes import Scene
 
 REFERENCE = ("rk8", 25, 1e-10)
 UNLIKE = "split"
-"""Another method in other coordinates, at its finest; it converges the models that the reference's cannot take."""
+"""Another method at its finest; it converges the models that the reference's cannot take."""
 _FINEST = 1e-3
 """Of an engine's own tolerance; an engine without one is at its finest with steps of 1 us."""
 _GRIDS = (1000, 500, 250, 200, 125, 100, 50, 25, 20, 10, 5)

@@ -1,7 +1,7 @@
 """The map of every engine over step and stiffness: what becomes of an undamped oscillator's energy in 60 periods.
 
-Two oscillators. The inner house on its beam: part of what `split` solves exactly. The shaft that lies in the ring on a
-linear contact: what `split` kicks. For engines of fixed step theory draws a line h w = const across the map.
+Two oscillators. The inner house on its beam, and the shaft that lies in the ring on a linear contact. For engines of
+fixed step theory draws a line h w = const across the map.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The splitting engine; see `rig.engines.split.method`."""
+"""The default engine; see `rig.engines.split.method`."""
 
 from rig.engines.split.method import ORDER, advance, start
 

@@ -1,25 +1,22 @@
-"""Impulses at one instant: impacts of a rigid contact, and what ends a sliding speed that should be none."""
+"""Impulses at one instant: impacts of a rigid contact.
+
+The direction of the shaft's axis is u = (ux, uy, uz) = (sin b, -sin G cos b, cos G cos b), its rate p: a point at arm l
+is at l u, and the kinematics have no sines. With small angles uz is 1.
+"""
 
 from __future__ import annotations
+
+import math
+from typing import NamedTuple
 
 from rig.engines.events import latch_onset
 from rig.engines.memory import ONSET
 from rig.engines.method import rates
-from rig.engines.split.impulse import mobility_of
-from rig.engines.split.inner_motion import (
-    Axis,
-    Houses,
-    eccentricity,
-    fast,
-    from_coordinates,
-    geometry_of,
-    into_coordinates,
-    motion_of,
-)
 from rig.engines.split.place import HARDEST
 from rig.engines.taylor.place import END_FRACTION, END_TICK
 from rig.kernels import signals as S
-from rig.kernels.contact import FLIGHT
+from rig.kernels.axis import angles_of, axis_of
+from rig.kernels.contact import FLIGHT, NO_FRICTION
 from rig.kernels.stage import kernel
 
 _PRESSED = 0.1
@@ -29,7 +26,149 @@ _APART = 1e-9
 """Least speed at which what leaves leaves [m/s]: 0 has rounding's sign."""
 
 
-@fast
+class Axis(NamedTuple):
+    """Direction of the shaft's axis and its rate, their lateral parts."""
+
+    ux: float  # [1]
+    uy: float  # [1]
+    px: float  # [1/s]
+    py: float  # [1/s]
+
+
+class Houses(NamedTuple):
+    """Displacements and speeds of both houses, horizontal and vertical."""
+
+    x0: float  # inner [m]
+    x1: float  # its rate [m/s]
+    x2: float  # outer [m]
+    x3: float  # its rate [m/s]
+    y0: float  # inner [m]
+    y1: float  # its rate [m/s]
+    y2: float  # outer [m]
+    y3: float  # its rate [m/s]
+
+
+class Geometry(NamedTuple):
+    """What else is known of the axis, by its direction and rate."""
+
+    uz: float  # [1]
+    share: float  # Gamma' sin b, by which the spin w about the axis exceeds theta' [rad/s]
+
+
+class Motion(NamedTuple):
+    """Of the shaft against the ring, where it is nearest to it."""
+
+    nx: float  # direction from the ring's centre to the shaft's
+    ny: float
+    per_distance: float  # 1 / distance of the centres [1/m]
+    depth: float  # penetration [m]; negative is the gap
+    rate: float  # of it [m/s]
+    lateral: float  # speed of the shaft's centre across [m/s]
+
+
+class Plant(NamedTuple):
+    """What a call makes of the constants and the inputs, once."""
+
+    per_Izz: float  # [1/(kg m^2)]
+    per_inner: float  # one over the inner house's mass [1/kg]; 0: it does not move
+    arm: float  # acceleration of the axis by a force at the ring [1/(kg m)]
+    mobility: float  # speed of the shaft at the ring per impulse there [1/kg]
+    spin_mobility: float  # speed of the shaft's surface per impulse along it, by the spin alone [1/kg]
+    friction: float  # mu [1]
+
+
+class Mobility(NamedTuple):
+    """Speed of the shaft against the ring, per impulse [1/kg]."""
+
+    nn: float  # normal, by a normal one
+    tt: float  # across, by one across
+    nt: float  # the one by the other
+
+
+@kernel
+def plant_of(constants, inputs):
+    """What a call makes of the constants and the inputs."""
+    levels, shaft = constants.levels, constants.shaft
+    arm, per_Izz = shaft.arm_ring / shaft.transverse_inertia, 1.0 / shaft.polar_inertia
+    return Plant(
+        per_Izz,
+        1.0 / constants.house.inner_mass if levels.inner_house else 0.0,
+        arm,
+        shaft.arm_ring * arm,
+        0.0 if inputs.ideal_drive else shaft.radius * shaft.radius * per_Izz,
+        constants.contact.friction if levels.friction != NO_FRICTION else 0.0,
+    )
+
+
+@kernel
+def from_coordinates(constants, y):
+    """Generalised coordinates y as axis, spin about it [rad/s], spin angle [rad], houses."""
+    euler = constants.levels.euler
+    ux, uy, px, py = axis_of(euler, y[S.GAMMA], y[S.BETA], y[S.GAMMA_RATE], y[S.BETA_RATE])
+    axis = Axis(ux, uy, px, py)
+    w = y[S.THETA_RATE] + y[S.GAMMA_RATE] * ux if euler else y[S.THETA_RATE]
+    houses = Houses(y[S.X_IH], y[S.VX_IH], y[S.X_OH], y[S.VX_OH], y[S.Y_IH], y[S.VY_IH], y[S.Y_OH], y[S.VY_OH])
+    return axis, w, y[S.THETA], houses
+
+
+@kernel
+def into_coordinates(constants, axis, w, theta, houses, y):
+    """The same the other way, into y."""
+    euler = constants.levels.euler
+    y[S.THETA] = theta
+    angles = angles_of(euler, axis.ux, axis.uy, axis.px, axis.py)
+    y[S.GAMMA], y[S.BETA], y[S.GAMMA_RATE], y[S.BETA_RATE] = angles
+    y[S.THETA_RATE] = w - axis.ux * y[S.GAMMA_RATE] if euler else w
+    y[S.X_IH], y[S.VX_IH], y[S.X_OH], y[S.VX_OH] = houses.x0, houses.x1, houses.x2, houses.x3
+    y[S.Y_IH], y[S.VY_IH], y[S.Y_OH], y[S.VY_OH] = houses.y0, houses.y1, houses.y2, houses.y3
+
+
+@kernel
+def geometry_of(euler, axis):
+    """What else is known of the axis."""
+    if not euler:
+        return Geometry(1.0, 0.0)
+    ux, uy, px, py = axis
+    uz = math.sqrt(1.0 - (ux * ux + uy * uy))
+    pz = -(ux * px + uy * py) / uz
+    return Geometry(uz, ux / (1.0 - ux * ux) * (uy * pz - uz * py))
+
+
+@kernel
+def eccentricity(constants, axis, houses):
+    """Centre of the shaft in the ring, from the ring's: horizontal, vertical [m]."""
+    contact, lA = constants.contact, constants.shaft.arm_ring
+    both = contact.gap_counts_outer
+    ex = lA * axis.ux - houses.x0 - both * houses.x2 - contact.offset_x
+    ey = lA * axis.uy - houses.y0 - both * houses.y2 - contact.offset_y
+    return ex, ey
+
+
+@kernel
+def motion_of(constants, px, py, houses, ex, ey):
+    """Motion of the shaft against the ring, with rate (px, py) of the axis and eccentricity (ex, ey)."""
+    contact, lA = constants.contact, constants.shaft.arm_ring
+    both = contact.gap_counts_outer
+    distance = math.sqrt(ex * ex + ey * ey)
+    per_distance = 1.0 / distance if distance > 0.0 else 0.0
+    nx, ny = ex * per_distance, ey * per_distance
+    vx = lA * px - houses.x1 - both * houses.x3
+    vy = lA * py - houses.y1 - both * houses.y3
+    return Motion(nx, ny, per_distance, distance - contact.clearance, vx * nx + vy * ny, vy * nx - vx * ny)
+
+
+@kernel
+def mobility_of(plant, euler, axis, nx, ny):
+    """Speed of the shaft against the ring per impulse: less where the axis tilts that way."""
+    un = ut = 0.0
+    if euler:
+        un, ut = axis.ux * nx + axis.uy * ny, axis.uy * nx - axis.ux * ny
+    nn = plant.mobility * (1.0 - un * un) + plant.per_inner
+    tt = plant.mobility * (1.0 - ut * ut) + plant.per_inner + plant.spin_mobility
+    return Mobility(nn, tt, -plant.mobility * un * ut)
+
+
+@kernel
 def _seen(constants, plant, y):
     """Motion at the ring, mobility there and sliding speed [m/s] at the state y."""
     axis, w, _, houses = from_coordinates(constants, y)
@@ -39,7 +178,7 @@ def _seen(constants, plant, y):
     return motion, m, motion.lateral + constants.shaft.radius * w
 
 
-@fast
+@kernel
 def _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt):
     """Impulses jn, normal, and jt, across [N s], on the state y and in its integrals."""
     shaft, euler, per_inner = constants.shaft, constants.levels.euler, plant.per_inner
@@ -87,7 +226,7 @@ def _pressed(constants, inputs, memory, room, y):
     return (room.out[S.PENETRATION_RATE] - before) / _MOMENT_S
 
 
-@fast
+@kernel
 def bounce(constants, inputs, plant, memory, room, y):
     """An impact at the state y, whose gap is closed: Newton's restitution, and Coulomb's friction.
 
@@ -114,10 +253,3 @@ def bounce(constants, inputs, plant, memory, room, y):
         jt = way * jn
     _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt)
     return True
-
-
-@fast
-def hold(constants, inputs, plant, y):
-    """End the sliding at the state y of a contact that rolls: kicks leave it none in the mean of a step only."""
-    motion, m, sliding = _seen(constants, plant, y)
-    _strike(constants, inputs, plant, y, motion, m, sliding, 0.0, sliding / m.tt)
