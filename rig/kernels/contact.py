@@ -49,12 +49,6 @@ def held_speed(speed, contact):
 
 
 @stage
-def damping_per_speed(onset_speed, contact):
-    """What the elastic force grows by, per speed of the penetration [s/m]; v0 [m/s], floored."""
-    return contact.damping_factor / onset_speed
-
-
-@stage
 def damping_ratio(rate, onset_speed, contact):
     """Force without viscous damping over its elastic part, 1 + c delta'/v0 [1]."""
     return 1.0 + contact.damping_factor * rate / onset_speed

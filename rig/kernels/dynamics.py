@@ -12,8 +12,8 @@ have no part in the first equation: this is eq. 17 with its signs, where a Lagra
 sin b T in Q_Gamma. For the same reason the surface speed in eq. 39 is R_S w, which differs from R_S theta' by less
 than 1e-3 but closes the energy ledger.
 
-This is the one statement of the model. Engines that need more than rates take its stages (`rig.engines.split`), or
-code that is made of it by running it on symbols (`rig.engines.taylor`).
+This is the one statement of the model. Engines that need more than rates take code that is made of it by running it on
+symbols (`rig.engines.taylor`).
 """
 
 from __future__ import annotations
