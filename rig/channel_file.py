@@ -25,7 +25,10 @@ What a new channel does not say is in `_PLAIN`; a bandwidth that nobody gave is 
 
 from __future__ import annotations
 
+import io
 import math
+import warnings
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -33,9 +36,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from rig.channels import TABLE, ChannelTable, raw_groups, table_of
+from rig.channels import TABLE, Channel, ChannelTable, raw_groups, table_of
 from rig.errors import InputError, UnknownNameError, Words
-from rig.outside import Written, check, open_file, read_toml
+from rig.outside import TOML_BYTES, Written, check, open_file, read_toml
+from rig.sampling import TICKS_HZ
 
 KIND = "user"
 """Provenance of what stands in such a file."""
@@ -45,8 +49,8 @@ _PLAIN: dict[str, Any] = {
 _RATE_HZ = 20_000
 MOST_HZ = 130_000.0
 """Largest bandwidth: what rows of 1 us can show [Hz]."""
-_MOST = 512
-"""Most channels of a table."""
+_MOST, _MOST_POINTS = 512, 10_000
+"""Most channels of a table, and points of a curve."""
 
 
 def _identifier(name: str) -> str:
@@ -83,8 +87,12 @@ class _File(Written):
     curves: dict[_Name, str | tuple[tuple[float, float], ...]] = Field(default={})
 
 
-def read_channels(path: Path) -> ChannelTable:
+def read_channels(path: Path, check_more: Callable[[ChannelTable], None] = lambda _: None) -> ChannelTable:
     """The channel table that a user's file makes.
+
+    Args:
+        path: The file.
+        check_more: Refuses what is wrong by rules that are not known here.
 
     Raises:
         InputError: The first thing that is wrong in it: its channel and field, behind the file's name.
@@ -93,13 +101,45 @@ def read_channels(path: Path) -> ChannelTable:
         file = check(_File, read_toml(path), field="")
         curves = {name: _curve(name, given, path.parent) for name, given in file.curves.items()}
         table = table_of(_merged(file), curves)
-        for channel in table.channels.values():
-            if channel.bandwidth_hz > MOST_HZ:
-                raise InputError(f"channel {channel.name}.bandwidth_hz", f"at most {MOST_HZ:g}", channel.bandwidth_hz)
+        check_table(table)
+        check_more(table)
         return table
     except InputError as error:
         field = error.field if error.field.startswith(str(path)) else f"{path.name}: {error.field}"
         raise InputError(field, error.must, error.received) from None
+
+
+def check_table(table: ChannelTable) -> None:
+    """Refuse what streams, buses and files could not carry.
+
+    Raises:
+        InputError: The first such thing.
+    """
+    if not table.groups or len(table.channels) > _MOST:
+        raise InputError("groups", f"of 1 to {_MOST} channels together", len(table.channels))
+    for group in table.groups.values():
+        if not 1 <= group.rate_hz <= TICKS_HZ:
+            raise InputError(f"groups.{group.name}.rate_hz", f"from 1 to {TICKS_HZ}", group.rate_hz)
+        for channel in group.channels:
+            field = f"channel {channel.name}"
+            for name in ("bandwidth_hz", "highpass_hz"):
+                if getattr(channel, name) > MOST_HZ:
+                    raise InputError(f"{field}.{name}", f"at most {MOST_HZ:g}", getattr(channel, name))
+            if (channel.rate_hz, channel.group) != (group.rate_hz, group.name):
+                raise InputError(f"{field}.rate_hz", f"that of its group, {group.rate_hz}", channel.rate_hz)
+            gain = channel.sensitivity_v / channel.si
+            if not 1e-30 < abs(gain) < 1e30:
+                raise InputError(f"{field}.sensitivity_v", "of 1e-30 to 1e30 volts per SI unit", gain)
+            for name in ("unit", "label"):
+                if not getattr(channel, name).isprintable():
+                    raise InputError(f"{field}.{name}", "printable, in one line", getattr(channel, name))
+        for name in (group.name, *group.names):
+            try:
+                _identifier(name)
+            except ValueError as error:
+                raise InputError("channels", str(error), name) from None
+    for name, points in table.curves.items():
+        _check_curve(name, points)
 
 
 def _merged(file: _File) -> dict[str, Any]:
@@ -144,35 +184,47 @@ def _merged(file: _File) -> dict[str, Any]:
         if not group["channels"]:
             del groups[name]
         for row in group["channels"]:
+            _check_kinds(row)
             if "bandwidth_hz" not in given.get(row["name"], ()):
                 row["bandwidth_hz"] = min(row.get("bandwidth_hz", math.inf), group["rate_hz"] / 4.0)
             row |= {"kind": KIND} if given.get(row["name"]) else {}
     if not groups:
         raise InputError("drop", "such that a channel is left", list(file.drop))
-    if sum(len(group["channels"]) for group in groups.values()) > _MOST:
-        raise InputError("groups", f"of at most {_MOST} channels together", Words("more"))
     return groups
 
 
+def _check_kinds(row: dict[str, Any]) -> None:
+    """Numbers are no texts, and neither true nor false."""
+    for name, field in Channel.model_fields.items():
+        value = row.get(name)
+        if field.annotation is not str and isinstance(value, bool | str):
+            raise InputError(f"channel {row['name']}.{name}", "a number", value)
+
+
 def _curve(name: str, given: str | tuple[tuple[float, float], ...], folder: Path) -> tuple[tuple[float, float], ...]:
-    """The points of a curve, from its file or as they are given: degrees from 0 up to 360, and finite values."""
+    """The points of a curve, from its file or as they are given."""
     field = f"curves.{name}"
     if not isinstance(given, str):
         points = given
     else:
         try:
-            with open_file(folder / given) as file:
-                table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, max_rows=10_001)
+            with open_file(folder / given) as file, warnings.catch_warnings(action="ignore"):
+                lines = io.StringIO(file.read(TOML_BYTES).decode("utf-8-sig"))
+                table = np.loadtxt(lines, delimiter=",", comments="#", ndmin=2, max_rows=_MOST_POINTS + 1)
         except OSError as error:
-            raise InputError(field, "a file that can be read, degrees and values", Words(error.strerror)) from None
+            received = Words(f"{given} ({error.strerror})")
+            raise InputError(field, "a file that can be read, degrees and values", received) from None
         except ValueError as error:
             raise InputError(field, "a file of lines `degrees, value`", Words(str(error))) from None
         if table.shape[1] != 2:
             raise InputError(field, "a file of lines `degrees, value`", Words(f"{table.shape[1]} columns"))
         points = tuple((float(a), float(b)) for a, b in table)
-    degrees = [a for a, _ in points]
-    if not 2 <= len(points) <= 10_000 or any(b <= a for a, b in pairwise(degrees)):
-        raise InputError(field, "2 to 10000 points of ascending angle", Words(f"{len(points)} points"))
+    return points
+
+
+def _check_curve(name: str, points: tuple[tuple[float, float], ...]) -> None:
+    field, degrees = f"curves.{name}", [a for a, _ in points]
+    if not 2 <= len(points) <= _MOST_POINTS or any(b <= a for a, b in pairwise(degrees)):
+        raise InputError(field, f"2 to {_MOST_POINTS} points of ascending angle", Words(f"{len(points)} points"))
     if not (degrees[0] >= 0.0 and degrees[-1] < 360.0 and all(math.isfinite(value) for _, value in points)):
         raise InputError(field, "points from 0 to below 360 degrees with finite values", [points[0], points[-1]])
-    return points

@@ -87,7 +87,7 @@ class Formulas:
             tree = ast.parse(signal.strip(), mode="eval").body
         except (SyntaxError, ValueError, MemoryError, RecursionError):
             raise InputError(field, "one of the model's signals, or a formula of them", signal) from None
-        self._made.append(self._read(tree, field, 0))
+        self._made.append(self._read(tree, field, signal, 0))
         return N_ROW + len(self._made) - 1
 
     def columns(self, groups: Iterable[Group]) -> list[int]:
@@ -120,12 +120,12 @@ class Formulas:
             found[~np.isfinite(found)] = 0.0
         return found
 
-    def _read(self, node: ast.AST, field: str, depth: int) -> Callable[[np.ndarray], Any]:
+    def _read(self, node: ast.AST, field: str, signal: str, depth: int) -> Callable[[np.ndarray], Any]:
         def inner(each: ast.AST) -> Callable[[np.ndarray], Any]:
-            return self._read(each, field, depth + 1)
+            return self._read(each, field, signal, depth + 1)
 
         if depth > _DEEPEST:
-            raise InputError(field, f"nested at most {_DEEPEST} deep", ast.unparse(node))
+            raise InputError(field, f"nested at most {_DEEPEST} deep", signal[:60])
         match node:
             case ast.Constant(value=bool()):
                 pass
@@ -139,8 +139,8 @@ class Formulas:
                 return lambda rows: math.pi
             case ast.Name(id=name):
                 raise UnknownNameError(field, "made of the model's signals", name, [*COLUMN, *FUNCTIONS, *PLACES])
-            case ast.Attribute():
-                name = ast.unparse(node)
+            case ast.Attribute(value=ast.Name(id=table), attr=key):
+                name = f"{table}.{key}"
                 if name not in self._parameters:
                     raise UnknownNameError(field, "made of the parameters that are numbers", name, self._parameters)
                 value = np.float64(self._parameters[name])
@@ -153,7 +153,7 @@ class Formulas:
                 return lambda rows: act(one(rows), other(rows))
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
                 return self._call(name, [inner(each) for each in args], field)
-        raise InputError(field, "made of numbers, signals, parameters, + - * / ** and functions", ast.unparse(node))
+        raise InputError(field, "made of numbers, signals, parameters, + - * / ** and functions", signal[:60])
 
     def _call(self, name: str, of: list[Callable[[np.ndarray], Any]], field: str) -> Callable[[np.ndarray], Any]:
         known = {**{key: count for key, (count, _) in FUNCTIONS.items()}, **dict.fromkeys([*PLACES, *self._curves], 1)}

@@ -32,8 +32,9 @@ def row_ticks(table: ChannelTable, *, truth_rate_hz: int, ideal: bool) -> int:
     if ideal and len(periods) > len(rates):
         return math.gcd(*periods)
     longest = TICKS_HZ / _A_WAVE / max(channel.bandwidth_hz for channel in table.channels.values())
-    fit = [ticks for ticks in _ELSE if ticks <= longest and all(period % ticks == 0 for period in periods)]
-    return fit[0] if fit else 1
+    fit = [ticks for ticks in (*_ELSE, 1) if ticks <= longest and all(period % ticks == 0 for period in periods)]
+    few = [ticks for ticks in fit if all(fits(rate, TICKS_HZ // ticks) for rate in rates)]
+    return [*few, *fit, 1][0]
 
 
 def check_rates(table: ChannelTable, row_rate_hz: int, *, field: str) -> None:
@@ -55,7 +56,7 @@ def check_rates(table: ChannelTable, row_rate_hz: int, *, field: str) -> None:
             must = (
                 f"one whose samples fall on at most {_MOST} places between the rows of {row_rate_hz} Hz that they are"
             )
-            must += f" made of, such as {' or '.join(map(str, such))}"
+            must += f" made of, such as {' or '.join(map(str, such))}" if such else " made of"
             raise InputError(field or f"groups.{group.name}.rate_hz", must, rate)
 
 

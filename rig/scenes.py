@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from rig.channel_file import read_channels
+from rig.channel_file import check_table, read_channels
 from rig.channels import ChannelTable, check_signals, default_table
 from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand
 from rig.engines import ENGINES
@@ -225,15 +225,13 @@ class Scene(Written):
     def _read_table(cls, channels: Any) -> Any:
         if not isinstance(channels, str | Path):
             return channels
-        table = read_channels(Path(channels))
-        try:
-            Formulas(load_parameters().numbers(), table.curves).check(table)
-        except InputError as error:
-            raise InputError(f"{Path(channels).name}: {error.field}", error.must, error.received) from None
-        return table
+        numbers = load_parameters().numbers()
+        return read_channels(Path(channels), lambda table: Formulas(numbers, table.curves).check(table))
 
     @model_validator(mode="after")
     def _possible_sensors(self) -> Scene:
+        if self.channels is not None:
+            check_table(self.channels)
         known = (self.channels or rig_table()).groups
         for name in self.sensors.groups:
             if name not in known or self.sensors.groups.count(name) > 1:

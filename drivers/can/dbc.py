@@ -43,6 +43,11 @@ def text(table: MessageTable | None = None) -> str:
     return "\n".join([*_head(), *_messages(rows), *_comments(rows), *_attributes(rows), *_values(rows), ""])
 
 
+def _plain(text: str) -> str:
+    """A text that fits between two quotes, in the characters that readers of DBC files take."""
+    return text.replace('"', "'").replace("\\", "/").encode("cp1252", "replace").decode("cp1252")
+
+
 def database(table: MessageTable | None = None) -> Database:
     """The messages as a cantools database."""
     from cantools.database import load_string
@@ -78,7 +83,7 @@ def _signal(row: Message, signal: Signal) -> str:
     return (
         f" SG_ {signal.name}{selection} : {signal.start}|{signal.bits}@1{'-' if signal.signed else '+'} "
         f"({_number(signal.scale)},{_number(signal.offset)}) [{_number(low)}|{_number(high)}] "
-        f'"{signal.unit}" {receiver}'
+        f'"{_plain(signal.unit)}" {receiver}'
     )
 
 
@@ -92,10 +97,10 @@ def _comments(rows: tuple[Message, ...]) -> Iterator[str]:
     for name, label in _NODES.items():
         yield f'CM_ BU_ {name} "{label}.";'
     for row in rows:
-        yield f'CM_ BO_ {row.identifier} "{row.label}.";'
+        yield f'CM_ BO_ {row.identifier} "{_plain(row.label)}.";'
         for signal in row.signals:
             if signal.label:
-                yield f'CM_ SG_ {row.identifier} {signal.name} "{signal.label}.";'
+                yield f'CM_ SG_ {row.identifier} {signal.name} "{_plain(signal.label)}.";'
 
 
 def _attributes(rows: tuple[Message, ...]) -> Iterator[str]:

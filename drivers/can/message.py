@@ -220,7 +220,7 @@ class MessageTable:
                 row.name,
                 row.identifier,
                 row.length,
-                [(each.name, each.start, each.scale, each.offset) for each in row.signals],
+                [(each.name, each.start, each.scale, each.offset, each.unit) for each in row.signals],
             )
             for row in (*self.fd, *self.classic)
         ]

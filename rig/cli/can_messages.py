@@ -36,7 +36,7 @@ def dbc(
         echo_document(text(schedule.table))
         return
     with whole_file(output) as draft:
-        draft.write_text(text(schedule.table), encoding="utf-8")
+        draft.write_text(text(schedule.table), encoding="cp1252")
     echo(f"{output} written")
 
 

@@ -5,7 +5,9 @@ A channel is a chain in continuous time (`rig.sensors.filters`), and so its samp
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -261,6 +263,13 @@ class Conditioner:
         self._waves = np.zeros((sets, most * 2 * _LANES))
         self._past: np.ndarray | None = None
         self._streams = noise_streams([channel.name for channel in channels] if noise and not ideal else [], seed)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Conditioner:
+        """With states of its own; what does not change is shared."""
+        other = copy.copy(self)
+        for name in ("_waves", "_past", "_streams"):
+            setattr(other, name, copy.copy(getattr(self, name)))
+        return other
 
     def counts(self, rows: np.ndarray, made: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Samples from the first of these rows on that lie before the last one.

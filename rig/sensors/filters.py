@@ -19,6 +19,8 @@ from rig.channels import Channel
 
 _NODES = (1.0, 0.0, -1.0, -2.0)
 """Where the four rows stand that a cubic goes through, in rows from the start of the interval it is for."""
+_NEAR = 1e-3
+"""How near a high-pass may come to the low-pass, as a part: of poles that are one, fractions have no parts."""
 POLE = 10
 """Numbers of a pole's step: the state's factor, and what the four rows add to it; real and imaginary parts."""
 
@@ -31,6 +33,8 @@ def channel_poles(channel: Channel, row_rate_hz: float = math.inf) -> tuple[np.n
     """
     order = channel.filter_order if channel.bandwidth_hz < 0.45 * row_rate_hz else 0
     corner, held = 2.0 * math.pi * channel.bandwidth_hz, 2.0 * math.pi * channel.highpass_hz
+    if order and abs(held - corner) < _NEAR * corner:
+        held = (1.0 - _NEAR) * corner
     angles = [math.pi * (2 * n + order + 1) / (2 * order) for n in range(order)]
     low = [corner * complex(math.cos(angle), math.sin(angle)) for angle in angles]
     found, residues = [], []

@@ -18,7 +18,7 @@ from rig.text import printable
 
 _OTHERWISE = "stable-run"
 """The scene whose differences are told of one that does not come with the rig."""
-_BY_IMPORT = {"duration_s", "fidelity", "pick", "set", "commands", "sensors.groups", "sensors.rate_hz"}
+_BY_IMPORT = {"duration_s", "fidelity", "pick", "set", "commands", "channels", "sensors.groups", "sensors.rate_hz"}
 """Fields that an import finds out, and those that are told otherwise."""
 
 
@@ -82,7 +82,9 @@ def _changes(scene: Scene, base: Scene) -> dict[str, Any]:
     ours, theirs = scene.model_dump(), base.model_dump()
     found: dict[str, Any] = {}
     for key, value in ours.items():
-        if isinstance(value, dict) and key not in _BY_IMPORT:
+        if key in _BY_IMPORT:
+            continue
+        if isinstance(value, dict):
             other = {} if key == "engine" and value != theirs[key] else theirs[key]  # an engine brings its own step
             found |= {f"{key}.{name}": each for name, each in value.items() if other.get(name) != each}
         elif value != theirs[key]:

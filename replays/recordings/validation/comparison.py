@@ -152,7 +152,8 @@ def calibration(recording: Recording, experiment: Experiment) -> list[str]:
         if name not in own:
             found.append(f"{name}: not in the channel table of its scene")
             continue
-        like = table.only((own[name].group,), channel.rate_hz).channels[name]
+        rate_hz = None if channel.rate_hz == own[name].rate_hz else channel.rate_hz
+        like = table.only((own[name].group,), rate_hz).channels[name]
         fields = ("signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "filter_order", "highpass_hz",
                   "noise_v", "adc_v", "adc_bits")  # fmt: skip
         off = [f"{key} {getattr(channel, key)} instead of {getattr(like, key)}" for key in fields
