@@ -217,7 +217,7 @@ def simulate(
         scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})
     simulation = Simulation(scene)
     every, end = simulation.kept_every, simulation.end_tick
-    n, table = end // (every * simulation.row_ticks), simulation.table
+    n, table = -(-end // (every * simulation.row_ticks)), simulation.table
     columns = slice(None) if names == NAMES else [COLUMN[name] for name in names]
     edges, events = [], []
     rates = dict.fromkeys(group.rate_hz for group in table.groups.values())
@@ -231,7 +231,7 @@ def simulate(
             shown[rate] = _Rows(stack, folder, f"samples{of}", shape, np.float64)
             counts[rate] = _Rows(stack, folder, f"counts{of}", shape, np.int32)
         for frame in frames(simulation, commands=commands):
-            kept.add(frame.rows[::every, columns])
+            kept.add(frame.rows[-(frame.tick // simulation.row_ticks) % every :: every, columns])
             for rate, groups in alike.items():
                 blocks = [frame.samples[group.name].values for group in groups]
                 counts[rate].add(np.hstack(blocks))

@@ -124,7 +124,7 @@ class Simulation:
         groups = self.table.groups.values()
         whole = [TICK_RATE_HZ // group.rate_hz for group in groups if TICK_RATE_HZ % group.rate_hz == 0]
         self.kept_every = math.gcd(*whole) // self.row_ticks if len(whole) == len(groups) else 1
-        self.block_ticks = math.lcm(self.row_ticks, TICK_RATE_HZ // sensors.truth_rate_hz, *whole)
+        self.block_ticks = math.lcm(self.row_ticks, TICK_RATE_HZ // sensors.truth_rate_hz)
         self.end_tick = math.ceil(max(1, round(scene.duration_s * TICK_RATE_HZ)) / self.block_ticks) * self.block_ticks
         self._formulas = scene.formulas()
         self._conditioners = [

@@ -118,7 +118,8 @@ def table_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
     blocks = frame.samples
     first = next(iter(blocks.values()))
     times = (first.index + np.arange(len(first.values)))[:, None] / first.rate_hz
-    truth = [frame.rows[:: simulation.kept_every]] if _on_rows(simulation) else []
+    every = simulation.kept_every
+    truth = [frame.rows[-(frame.tick // simulation.row_ticks) % every :: every]] if _on_rows(simulation) else []
     sensors = [simulation.table.groups[group].engineering(block.values) for group, block in blocks.items()]
     return np.hstack([times, *truth, *sensors])
 

@@ -49,7 +49,11 @@ def _table(channels: Path | None) -> ChannelTable:
 
 def load(*, messages: CanMessages, channels: ChannelFile = None, form: Form) -> None:
     """Show every message of the rig with its period, share of the bus and longest response time."""
-    schedule, speed = messages.plan(_table(channels))
+    from drivers.can.gateway.samples import steps
+
+    table = _table(channels)
+    schedule, speed = messages.plan(table)
+    steps(table, schedule)
     messages_found = [
         {
             "id": message.identifier,

@@ -122,6 +122,10 @@ class CanOutput:
         if self.interface == "zenoh" and "endpoint" in self._settings:
             parse_loopback(str(self._settings["endpoint"]), field="--can")
         self.schedule, self.speed = options.messages.plan(channels)
+        if channels is not None:
+            from drivers.can.gateway.samples import steps
+
+            steps(channels, self.schedule)
         if options.can_overload:
             self.load = self.schedule.load(self.speed)
         else:

@@ -17,6 +17,7 @@ from rig.errors import InputError
 from rig.formula import Formulas
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.scenes import load_scene
+from rig.sensors.filters import channel_poles
 from rig.simulation import Simulation
 
 MINE = """
@@ -220,6 +221,12 @@ WRONG = {
     "a curve of more than a turn": ("[curves]\nc = [[0, 1], [400, 2]]", "curves.c must be points from 0 to below 360"),
     "a curve that is a function": ("[curves]\nsin = [[0, 1], [90, 2]]", "curves.sin must be of a name that no signal"),
     "a curve that is a folder": ('[curves]\nc = "."', "curves.c must be a file that can be read"),
+    "minus upon minus": (channel(f'signal = "{"-" * 400}P_N"'), "channel a.signal must be nested at most 30 deep"),
+    "a text for a number": (channel('noise_v = "0"'), "channel a.noise_v must be a number"),
+    "truth for a number": (channel("adc_bits = true"), "channel a.adc_bits must be a number"),
+    "an odd unit": (channel('unit = "m\\nm"'), "channel a.unit must be printable"),
+    "a unit of nothing": (channel("si = 1e-320"), "channel a.sensitivity_v must be"),
+    "a high-pass beyond any row": (channel("highpass_hz = 1e308"), "channel a.highpass_hz must be at most 130000"),
     "no TOML": ("groups = {", "a TOML file"),
 }
 
@@ -235,3 +242,81 @@ def test_a_wrong_table_is_one_line_that_names_channel_and_field(what: str, tmp_p
     assert len(said) < 400
     assert line in said, said
     assert "mine.toml" in said or what == "rate of too many places"  # which is the whole scene's to know
+
+
+INLINE = {
+    "group.name": ({"groups": {"g/../*": {"name": "g/../*"}}}, "a name of letters"),
+    "rate": ({"groups": {"g": {"rate_hz": 10**9}}}, "groups.g.rate_hz must be from 1 to 1000000"),
+    "channel rate": ({"groups": {"g": {"channels": {"rate_hz": 2000}}}}, "channel a.rate_hz must be that of its group"),
+    "bandwidth": ({"groups": {"g": {"channels": {"bandwidth_hz": 1e9}}}}, "channel a.bandwidth_hz must be at most"),
+    "curve": ({"curves": {"c": [[3.0, 1.0], [2.0, 1.0]]}}, "curves.c must be 2 to 10000 points of ascending angle"),
+    "nothing": ({"groups": None}, "groups must be of 1 to 512 channels"),
+}
+
+
+@pytest.mark.parametrize("what", INLINE)
+def test_a_table_that_stands_in_the_scene_is_held_to_the_same(what: str, tmp_path: Path) -> None:
+    # As recordings have it: nothing comes in by that door that does not by the other.
+    text = 'base = "none"\n' + channel('signal = "P_N"')
+    document = read_channels(written(tmp_path, text)).model_dump(mode="json")
+    changes, line = INLINE[what]
+    for name, group in (changes.get("groups") or {}).items():
+        whole = document["groups"].pop("g") | {key: value for key, value in group.items() if key != "channels"}
+        whole["channels"][0] |= {"group": whole["name"]} | group.get("channels", {})
+        document["groups"][name] = whole
+    if changes.get("groups", 0) is None:
+        document["groups"] = {}
+    document |= {key: value for key, value in changes.items() if key == "curves"}
+    with pytest.raises(InputError) as caught:
+        load_scene("hammer", {"channels": document})
+    assert line in str(caught.value)
+
+
+def test_a_high_pass_at_the_corner_of_the_low_pass_is_no_double_pole() -> None:
+    from scipy.signal import butter, freqs
+
+    base = default_table().channels["inner_x"]
+    for order in (1, 3, 5, 7):
+        for near in (0.0, 1e-13, 1e-7, 1e-4, 2e-3):
+            held = 50.0 * (1.0 - near)
+            poles, residues, direct = channel_poles(
+                base.model_copy(update={"filter_order": order, "bandwidth_hz": 50.0, "highpass_hz": held})
+            )
+            for frequency_hz in (5.0, 50.0, 500.0):
+                at = 2.0 * math.pi * frequency_hz
+                parts = [
+                    0.5 * (r / (1j * at - p) + r.conjugate() / (1j * at - p.conjugate()))
+                    if abs(p.imag) > 1e-6 else r / (1j * at - p)
+                    for p, r in zip(poles, residues, strict=True)
+                ]  # fmt: skip
+                low = freqs(*butter(order, 2.0 * math.pi * 50.0, analog=True), [at])[1][0]
+                high = freqs(*butter(1, 2.0 * math.pi * held, "highpass", analog=True), [at])[1][0]
+                assert abs(direct + sum(parts) - low * high) < 1e-3, (order, near, frequency_hz)
+
+
+def test_a_slow_group_leaves_blocks_and_lengths_alone(tmp_path: Path) -> None:
+    text = 'base = "none"\n[groups.s]\nrate_hz = 64\n' + channel('signal = "P_N"').partition("\n")[2]
+    scene = load_scene("stable-run", {"channels": str(written(tmp_path, text)), "duration_s": 0.1})
+    simulation = Simulation(scene)
+    frames = [simulation.advance(10_000) for _ in range(10)]
+    assert simulation.end_tick == 100_000
+    assert [len(frame.samples["s"].values) for frame in frames] == [1, 1, 0, 1, 1, 0, 1, 1, 0, 1]
+    assert all(len(block.values) for frame in frames for _, block in frame.blocks())
+    run = rig.simulate(scene)
+    assert run.groups["s"].times_s.tolist() == [n / 64 for n in range(7)]
+    np.testing.assert_array_equal(run.times_s, run.groups["s"].times_s)
+
+
+def test_rates_of_a_sound_card_get_rows_that_they_fit(tmp_path: Path) -> None:
+    for rate in (44_100, 131_072, 262_144):
+        text = 'base = "none"\n' + channel('signal = "P_N"').replace("[groups.g]", f"[groups.g]\nrate_hz = {rate}")
+        assert load_scene("hammer", {"channels": str(written(tmp_path, text))}).table.groups["g"].rate_hz == rate
+
+
+def test_a_dbc_holds_any_unit_and_label(tmp_path: Path) -> None:
+    text = channel(r"""unit = "in\"" ; label = "a \"b\" µ \\ €" """.replace(" ;", ";").strip())
+    messages = messages_for(read_channels(written(tmp_path, text)))
+    signal = next(s for m in database(messages).messages for s in m.signals if s.name in ("a", "a_0"))
+    assert signal.unit == "in'"
+    inches = messages_for(read_channels(written(tmp_path, text.replace('in\\"', "mm"))))
+    assert inches.layout != messages.layout, "another unit is another layout"
