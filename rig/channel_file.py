@@ -25,21 +25,19 @@ What a new channel does not say is in `_PLAIN`; a bandwidth that nobody gave is 
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import AfterValidator, Field
 
 from rig.channels import TABLE, Channel, ChannelTable, raw_groups, table_of
 from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import TOML_BYTES, Written, check, open_file, read_toml
 from rig.sampling import TICKS_HZ
+from rig.text import printable
 
 KIND = "user"
 """Provenance of what stands in such a file."""
@@ -208,17 +206,15 @@ def _curve(name: str, given: str | tuple[tuple[float, float], ...], folder: Path
         points = given
     else:
         try:
-            with open_file(folder / given) as file, warnings.catch_warnings(action="ignore"):
-                lines = io.StringIO(file.read(TOML_BYTES).decode("utf-8-sig"))
-                table = np.loadtxt(lines, delimiter=",", comments="#", ndmin=2, max_rows=_MOST_POINTS + 1)
+            with open_file(folder / given) as file:
+                lines = file.read(TOML_BYTES).decode("utf-8-sig").splitlines()
+            rows = [row.split(",") for line in lines if (row := line.partition("#")[0].strip())]
+            points = tuple((float(degrees), float(value)) for degrees, value in rows)
         except OSError as error:
             received = Words(f"{given} ({error.strerror})")
             raise InputError(field, "a file that can be read, degrees and values", received) from None
         except ValueError as error:
-            raise InputError(field, "a file of lines `degrees, value`", Words(str(error))) from None
-        if table.shape[1] != 2:
-            raise InputError(field, "a file of lines `degrees, value`", Words(f"{table.shape[1]} columns"))
-        points = tuple((float(a), float(b)) for a, b in table)
+            raise InputError(field, "a file of lines `degrees, value`", Words(printable(str(error), 100))) from None
     return points
 
 

@@ -201,7 +201,6 @@ def test_draws_are_the_same_again_and_differ() -> None:
 def test_plan_gives_a_method_only_what_it_takes() -> None:
     tasks = plan(competitors(), mode="full", panels=list(PANELS))
     assert {task.case for task in tasks if task.panel == "memory"} == {"memory", "no memory"}
-    assert not [task for task in tasks if task.panel == "smoothed" and task.method == "split"]
     assert not [task for task in tasks if task.panel == "exact" and task.method == "scipy-bdf-no-events"]
     assert len(set(tasks)) == len(tasks)
 
