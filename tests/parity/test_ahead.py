@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from rig.cli.ahead import compile_last
-from rig.engines.taylor.series import flight, rolling, sliding
+from rig.engines.taylor.series import rolling, sliding
 from rig.simulation import Simulation
 
 
 def test_a_run_compiles_nothing_of_it_again() -> None:
     compile_last()
-    ahead = {kernel: list(kernel.signatures) for kernel in (flight, rolling, sliding)}
+    ahead = {kernel: list(kernel.signatures) for kernel in (rolling, sliding)}
     assert all(len(signatures) == 1 for signatures in ahead.values())
     simulation = Simulation("hammer")
     simulation.advance(simulation.block_ticks)
