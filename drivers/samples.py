@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rig.samples import Columns
-from rig.wire import Continuity, row_times_s
+from rig.wire import Continuity, row_tick, row_times_s
 
 
 class StreamEndedError(EOFError):
@@ -50,11 +50,10 @@ class Samples(Columns):
 
     def rows(self, start: int, stop: int) -> Samples:
         """Some of the rows."""
-        first_s = row_times_s(self.tick, self.rate_hz, self.tick_rate_hz, start + 1)[start]
         return replace(
             self,
             index=self.index + start,
-            tick=round(float(first_s) * self.tick_rate_hz),
+            tick=row_tick(self.tick, self.rate_hz, self.tick_rate_hz, start),
             values=self.values[start:stop],
             gap=0 if start else self.gap,
         )

@@ -42,7 +42,7 @@ def thin(block: wire.Block, step: int) -> wire.Block:
         return block
     first = -block.index % step
     return wire.Block(
-        tick=round((block.start_s + first / block.rate_hz) * block.tick_rate_hz),
+        tick=wire.row_tick(block.tick, block.rate_hz, block.tick_rate_hz, first),
         index=(block.index + first) // step,
         rate_hz=block.rate_hz / step,
         tick_rate_hz=block.tick_rate_hz,

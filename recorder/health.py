@@ -269,7 +269,7 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
         if recording.messages.get(sensor_key(name))
     }
     misplaced: dict[str, int] = {}
-    starts: dict[str, tuple[int, int]] = {}
+    starts: dict[str, tuple[float, int]] = {}
     edges: list[np.ndarray] = []
 
     def watch(key: str, block: Block) -> None:
@@ -279,8 +279,8 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
         if key == EDGES:
             edges.append(row_times_s(key, block))
             return
-        tick, index = starts.setdefault(key, (block.tick, block.index))
-        if abs(block.tick - tick - (block.index - index) * block.tick_rate_hz / block.rate_hz) > 1.0:
+        start_s, index = starts.setdefault(key, (block.start_s, block.index))
+        if abs(block.start_s - start_s - (block.index - index) / block.rate_hz) * block.tick_rate_hz > 0.5:
             misplaced[key] = misplaced.get(key, 0) + 1
         if key in watches:
             watches[key].add(block.index, block.values)

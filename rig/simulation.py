@@ -294,11 +294,6 @@ class Simulation:
         late = sum(tick >= self.end_tick for tick, _ in self._pending)
         if late:
             warnings.append(f"{late} commands of the scene lie after its end and will not be given")
-        longest = self._method.longest_us
-        if self._step_ticks > longest:
-            warnings.append(
-                f"engine.step_us is above {longest}: its energy residual may not show how wrong the engine is"
-            )
         if memory[CEILING]:
             warnings.append(
                 f"{memory[CEILING]:.0f} steps with events that piled up, or above engine.tolerance at least size"

@@ -91,6 +91,11 @@ def row_times_s(tick: int, rate_hz: float, tick_rate_hz: float, rows: int) -> np
     return tick / tick_rate_hz + np.arange(rows) / rate_hz
 
 
+def row_tick(tick: int, rate_hz: float, tick_rate_hz: float, row: int) -> int:
+    """Tick of a row so many behind one, which is told to the nearest tick: not rounded twice."""
+    return round((float(row_times_s(tick, rate_hz, tick_rate_hz, 1)[0]) + row / rate_hz) * tick_rate_hz)
+
+
 @dataclass(frozen=True, slots=True)
 class Block:
     """Consecutive rows of one stream.

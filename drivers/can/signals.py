@@ -18,6 +18,7 @@ of `ODDS` passes all that.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
@@ -318,11 +319,16 @@ def messages_for(channels: ChannelTable) -> MessageTable:
     Raises:
         InputError: They do not fit into messages.
     """
-    known = default_table().channels
+    return default_messages() if unlike(channels, default_table().channels) is None else make_table(channels)
+
+
+def unlike(channels: ChannelTable, known: Mapping[str, Channel]) -> str | None:
+    """Name of the first channel that is not among those known, with the same calibration and unit."""
     for name, channel in channels.channels.items():
-        if name not in known or (known[name].scale, known[name].offset) != (channel.scale, channel.offset):
-            return make_table(channels)
-    return default_messages()
+        like = known.get(name)
+        if like is None or (like.scale, like.offset, like.unit) != (channel.scale, channel.offset, channel.unit):
+            return name
+    return None
 
 
 @cache

@@ -241,7 +241,7 @@ class Twin:
             rows = protocol.Rows(
                 stream=running.number,
                 index=first.index + start,
-                tick=first.tick + round(start * first.tick_rate_hz / first.rate_hz),
+                tick=wire.row_tick(first.tick, first.rate_hz, first.tick_rate_hz, start),
                 rate_hz=first.rate_hz,
                 tick_rate_hz=first.tick_rate_hz,
                 columns=columns,
@@ -255,8 +255,8 @@ class Twin:
         running.parts = [counts[start:]] if start < waiting else []
         running.first = None
         if start < waiting:
-            moved = round(start * first.tick_rate_hz / first.rate_hz)
-            running.first = replace(first, index=first.index + start, tick=first.tick + moved, values=first.values[:0])
+            tick = wire.row_tick(first.tick, first.rate_hz, first.tick_rate_hz, start)
+            running.first = replace(first, index=first.index + start, tick=tick, values=first.values[:0])
 
     def rig_ended(self, reason: str) -> None:
         """The rig publishes nothing more."""

@@ -5,9 +5,8 @@ An engine is a module with `METHOD`, a one-step method that `rig.engines.march` 
 `advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)`: it moves state `y` and `memory` (shape
 (MEMORY,), counters first, see `rig.engines.memory`) on in place by `steps` steps of `step_ticks` and writes one row of
 `rig.kernels.signals.ROW` every `stride` steps, the first at the start, and that at the end where `rows` has room for
-it. It knows no clock, no I/O and no threads, and
-its result does not depend on how a run is cut into calls. Constants and inputs come to it as records
-(`rig.kernels.records`); who calls an `Engine` hands it the tuples.
+it. It knows no clock, no I/O and no threads, and its result does not depend on how a run is cut into calls. Constants
+and inputs come to it as records (`rig.kernels.records`); who calls an `Engine` hands it the tuples.
 """
 
 from __future__ import annotations
@@ -31,8 +30,6 @@ class Method(NamedTuple):
     frictions: tuple[str, ...]
     """Friction laws it can take (`rig.levels`)."""
     contacts: tuple[str, ...] = ("compliant",)
-    longest_us: int = 1000
-    """Longest step at which its error estimate can be trusted [us]; above it a run says so."""
     energy: float = 1e-3
     """Share of what was dissipated up to which its ledger may be open."""
     companion: bool = False

@@ -239,7 +239,7 @@ class Conditioner:
         self._scales[:, _LSB] = 1.0
         steps, self._settling = np.zeros((sets, most, POLE, _LANES)), np.zeros((sets, most, 2, _LANES))
         phases = np.zeros((sets, self._parts, 4 + 2 * most, _LANES))
-        made: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        made: dict[tuple[bytes, bytes, float], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         for c, (channel, (poles, residues, direct)) in enumerate(zip(channels, filters, strict=True)):
             of, lane = divmod(c, _LANES)
             self._scales[of, :, lane] = (
@@ -250,7 +250,7 @@ class Conditioner:
                 channel.lsb_v,
                 2.0 ** (channel.adc_bits - 1) - 1.0,
             )
-            alike = poles.tobytes()
+            alike = (poles.tobytes(), residues.tobytes(), direct)
             if alike not in made:
                 if digital and len(poles):
                     made[alike] = digital_coefficients(channel, row_rate_hz)

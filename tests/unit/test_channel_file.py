@@ -19,6 +19,7 @@ from rig.kernels.signals import COLUMN, N_ROW
 from rig.scenes import load_scene
 from rig.sensors.filters import channel_poles
 from rig.simulation import Simulation
+from rig.wire import row_tick
 
 MINE = """
 drop = ["accelerations", "hammer"]
@@ -320,3 +321,17 @@ def test_a_dbc_holds_any_unit_and_label(tmp_path: Path) -> None:
     assert signal.unit == "in'"
     inches = messages_for(read_channels(written(tmp_path, text.replace('in\\"', "mm"))))
     assert inches.layout != messages.layout, "another unit is another layout"
+
+
+def test_a_channel_of_another_unit_has_messages_of_its_own() -> None:
+    group = default_table().groups["forces"]
+    other = group.channels[0].model_copy(update={"unit": "lbf", "si": 4.448})
+    table = default_table().model_copy(update={"groups": {"forces": group.model_copy(update={"channels": (other,)})}})
+    assert messages_for(table).layout != default_messages().layout
+
+
+def test_the_tick_of_a_row_is_rounded_once() -> None:
+    for first in range(0, 200_000, 777):
+        for row in (0, 1, 17, 512):
+            tick = row_tick(round(first * 1e6 / 51_200), 51_200.0, 1e6, row)
+            assert tick == round((first + row) * 1e6 / 51_200)

@@ -383,3 +383,16 @@ def test_poles_are_butterworths(order: int) -> None:
             for p, r in zip(poles, residues, strict=True)
         )
         assert abs(direct + sums - analogue(channel, frequency_hz)) < 1e-9
+
+
+def test_filters_of_one_pole_are_not_taken_for_each_other() -> None:
+    # A first-order low-pass and an AC coupling at one corner have the same pole.
+    base = default_table().channels["P_E"]
+    low = base.model_copy(update={"name": "low", "filter_order": 1, "bandwidth_hz": 50.0})
+    high = base.model_copy(update={"name": "high", "bandwidth_hz": 30_000.0, "highpass_hz": 50.0})
+    rows = rows_of("P_E", np.where(np.arange(400) < 200, 0.0, 1_000.0))
+    alone = [counts_of(group_of("forces").model_copy(update={"channels": (one,)}), rows, noise=False)[:, 0]
+             for one in (low, high)]  # fmt: skip
+    both = counts_of(group_of("forces").model_copy(update={"channels": (low, high)}), rows, noise=False)
+    np.testing.assert_array_equal(both, np.stack(alone, axis=1))
+    assert np.abs(both[:, 0] - both[:, 1]).max() > 1_000

@@ -7,6 +7,7 @@ import numpy as np
 from drivers.can.bus.frame import BRS, FD, FD_WIDTH, RECORDS, octets
 from drivers.can.message import ABSENT, Message
 from drivers.can.schedule import Schedule
+from drivers.can.signals import unlike
 from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
@@ -94,11 +95,8 @@ def steps(table: ChannelTable, schedule: Schedule) -> tuple[int, dict[bool, int]
         raise InputError("sample rates", "the same for all sensor groups to go on a CAN bus", sorted(rates))
     rate = rates.pop()
     known = {channel.name: channel for row in schedule.table.fd if row.samples for channel in row.samples.channels}
-    for name, channel in table.channels.items():
-        if name not in known or (known[name].scale, known[name].offset) != (channel.scale, channel.offset):
-            raise InputError(
-                f"channel {name}", "calibrated as in the channel table that the messages are made of", name
-            )
+    if (name := unlike(table, known)) is not None:
+        raise InputError(f"channel {name}", "calibrated as in the channel table that the messages are made of", name)
     found = {}
     for fd, wanted in ((True, schedule.fd_hz), (False, schedule.classic_hz)):
         if wanted is not None:

@@ -6,4 +6,3 @@ from rig.engines.taylor.place import SERIES_END
 
 HARDEST = SERIES_END
 """Speed of the hardest rigid impact so far [m/s]."""
-END = HARDEST + 1

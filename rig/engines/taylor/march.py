@@ -406,11 +406,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     if not same_inputs(inputs, memory) or memory[SPAN] < 0.0:
         begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
     count = (steps + stride - 1) // stride
-    for row in range(count):
-        now = tick + row * stride * step_ticks
+    for row in range(count + 1):
+        now = tick + min(row * stride, steps) * step_ticks
         _reach(constants, inputs, memory, room, y, now)
-        write_row(constants, inputs, memory, room, y, now, int(memory[PHASE]), rows, row)
-    end = tick + steps * step_ticks
-    _reach(constants, inputs, memory, room, y, end)
-    if len(rows) > count:
-        write_row(constants, inputs, memory, room, y, end, int(memory[PHASE]), rows, count)
+        if row < len(rows):
+            write_row(constants, inputs, memory, room, y, now, int(memory[PHASE]), rows, row)
