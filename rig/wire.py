@@ -80,20 +80,23 @@ def schema_of(key: str) -> str | None:
     return SAMPLE_SCHEMA if key.startswith(SENSORS + "/") else None
 
 
-def row_times_s(tick: int, rate_hz: float, tick_rate_hz: float, rows: int) -> np.ndarray:
-    """Times of consecutive rows of which the first is told to the nearest tick [s], shape (rows,).
+def _row(tick: int, rate_hz: float, tick_rate_hz: float) -> float:
+    """Number of the row that is told to the nearest tick, from time zero on.
 
     Rows of an even stream lie at whole numbers over the rate, which need not be whole ticks.
     """
-    first = round(tick * rate_hz / tick_rate_hz)
-    if abs(first * tick_rate_hz / rate_hz - tick) <= 0.5:
-        return (first + np.arange(rows)) / rate_hz
-    return tick / tick_rate_hz + np.arange(rows) / rate_hz
+    row = tick * rate_hz / tick_rate_hz
+    return round(row) if abs(round(row) * tick_rate_hz / rate_hz - tick) <= 0.5 else row
+
+
+def row_times_s(tick: int, rate_hz: float, tick_rate_hz: float, rows: int) -> np.ndarray:
+    """Times of consecutive rows of which the first is told to the nearest tick [s], shape (rows,)."""
+    return (_row(tick, rate_hz, tick_rate_hz) + np.arange(rows)) / rate_hz
 
 
 def row_tick(tick: int, rate_hz: float, tick_rate_hz: float, row: int) -> int:
-    """Tick of a row so many behind one, which is told to the nearest tick: not rounded twice."""
-    return round((float(row_times_s(tick, rate_hz, tick_rate_hz, 1)[0]) + row / rate_hz) * tick_rate_hz)
+    """Tick of a row so many behind one that is told to the nearest tick: not rounded twice."""
+    return round((_row(tick, rate_hz, tick_rate_hz) + row) * tick_rate_hz / rate_hz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +120,7 @@ class Block:
     @property
     def start_s(self) -> float:
         """Simulated time of the first row [s]."""
-        return float(row_times_s(self.tick, self.rate_hz, self.tick_rate_hz, 1)[0])
+        return _row(self.tick, self.rate_hz, self.tick_rate_hz) / self.rate_hz
 
     @property
     def times_s(self) -> np.ndarray:
