@@ -66,6 +66,9 @@ class RigStream:
     def __init__(self, client: Client) -> None:
         self._client = client
         self._lock = threading.Lock()
+        self._order = threading.RLock()
+        """Held from taking rows until they are handed on: blocks and events come on threads of their own, and an end
+        must not overtake the rows before it."""
         self._listeners: dict[str, list[_Listener]] = {}
         self._subscribed: set[str] = set()
         self._intake: Intake | None = None
@@ -147,6 +150,10 @@ class RigStream:
         self.missed += count
 
     def _on_block(self, group: str, payload: bytes) -> None:
+        with self._order:
+            self._take(group, payload)
+
+    def _take(self, group: str, payload: bytes) -> None:
         key = wire.sensor_key(group)
         with self._lock:
             intake = self._intake
@@ -194,14 +201,15 @@ class RigStream:
             return
         for group in list(self._subscribed):
             key = wire.sensor_key(group)
-            with self._lock:
-                assert self._intake is not None
-                # Blocks and events travel apart: the last blocks may be still to come.
-                taken, total = self._intake.rest(rows, key), rows.get(key, 0)
-                done = self._intake.next.get(key, 0) >= total
-                if not done:
-                    self._ends[group] = (total, reason)
-            self._hand_on(group, taken, reason if done else None)
+            with self._order:
+                with self._lock:
+                    assert self._intake is not None
+                    # Blocks and events travel apart: the last blocks may be still to come.
+                    taken, total = self._intake.rest(rows, key), rows.get(key, 0)
+                    done = self._intake.next.get(key, 0) >= total
+                    if not done:
+                        self._ends[group] = (total, reason)
+                self._hand_on(group, taken, reason if done else None)
 
     def _end_in_silence(self, wait_s: float, reason: str) -> None:
         """End all groups once no block has come for so long; look again at the earliest time at which that can be."""
@@ -237,7 +245,8 @@ class RigStream:
 
     def _end(self, reason: str) -> None:
         for group in list(self._subscribed):
-            with self._lock:
-                self._ends.pop(group, None)
-                taken = self._intake.rest(None, wire.sensor_key(group)) if self._intake is not None else []
-            self._hand_on(group, taken, reason)
+            with self._order:
+                with self._lock:
+                    self._ends.pop(group, None)
+                    taken = self._intake.rest(None, wire.sensor_key(group)) if self._intake is not None else []
+                self._hand_on(group, taken, reason)

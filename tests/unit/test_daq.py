@@ -236,6 +236,39 @@ def test_an_end_that_overtakes_blocks_waits_for_them() -> None:
         assert sum(map(len, daq)) == 3 * BLOCK
 
 
+def test_an_end_does_not_overtake_rows_that_are_being_handed_on() -> None:
+    """Blocks and events come on threads of their own: the end, while the last block is on its way to its listeners."""
+    heard, held, on_the_way = [], threading.Event(), threading.Event()
+
+    class Threads(MemoryClient):
+        def subscribe(self, key: str, callback: Any, **_: Any) -> None:
+            takes[key] = callback
+
+    def hold(_: wire.Block) -> None:
+        on_the_way.set()
+        held.wait(5.0)
+
+    takes: dict[str, Any] = {}
+    with MemoryServer(cache=10) as server, Threads(server) as client, MemoryClient(server) as keeper:
+        rig, sent = FakeRig(server), {}
+        for key in (wire.sensor_key("forces"), wire.EVENTS):
+            keeper.subscribe(key, sent.__setitem__)
+        rows = stream.RigStream(client)
+        rows.listen("forces", hold, lambda _: None)
+        rows.listen("forces", lambda block: heard.append(len(block.values)), heard.append)
+        rig.publish("forces")
+        rig.end()
+        threads = [threading.Thread(target=takes[key], args=each) for each in sent.items() for key in each[:1]]
+        threads[0].start()
+        assert on_the_way.wait(5.0)
+        threads[1].start()
+        threads[1].join(0.2)
+        held.set()
+        for thread in threads:
+            thread.join(5.0)
+    assert heard == [BLOCK, "the rig's run has ended: completed"]
+
+
 def test_an_end_that_does_not_tell_its_rows_gives_the_last_blocks_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "GRACE_S", 0.2)
     with on_memory(channels=["P_N"]) as (rig, daq):
