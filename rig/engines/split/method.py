@@ -9,6 +9,7 @@ is the compliant one.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from rig.engines.memory import ONSET, PHASE
@@ -32,26 +33,25 @@ def start(constants, inputs, y, memory, step_ticks, tolerance):
 
 
 @kernel
-def _reach(constants, inputs, plant, memory, room, y, tick):
-    """The series up to a tick, and the state there into y."""
-    while not series.holds(memory, tick, 0.0):
-        bounced = lasts = False
-        ends = memory[SPAN] >= 0.0 and memory[EVENT] == FIRST and memory[PHASE] == FLIGHT
-        if ends and not constants.levels.compliant:
-            series.read_off(memory, room, y, memory[END_TICK], memory[END_FRACTION])
-            bounced = bounce(constants, inputs, plant, memory, room, y)
-            lasts = not bounced
-        if bounced:
-            end = int(memory[END_TICK])
-            series.begin_series(constants, inputs, memory, room, y, end, memory[END_FRACTION], True)
-        elif not series.continue_series(constants, inputs, memory, room, y):
-            return
-        if lasts and memory[HARDEST] > memory[ONSET]:
-            # It has come of that impact: after so slow an onset the law's damping is stiff, and no other matters here.
-            series.read_off(memory, room, y, memory[TICK], memory[FRACTION])
-            memory[ONSET] = memory[HARDEST]
-            series.begin_series(constants, inputs, memory, room, y, int(memory[TICK]), memory[FRACTION], False)
-    series.read_off(memory, room, y, tick, 0.0)
+def _go_on(constants, inputs, plant, memory, room, y):
+    """Over what ends a series to the next one; returns whether the numbers are finite."""
+    bounced = lasts = False
+    ends = memory[SPAN] >= 0.0 and memory[EVENT] == FIRST and memory[PHASE] == FLIGHT
+    if ends and not constants.levels.compliant:
+        series.read_off(memory, room.Y, y, memory[END_TICK], memory[END_FRACTION])
+        bounced = bounce(constants, inputs, plant, memory, room, y)
+        lasts = not bounced
+    if bounced:
+        end = int(memory[END_TICK])
+        series.begin_series(constants, inputs, memory, room, y, end, memory[END_FRACTION], True)
+    elif not series.continue_series(constants, inputs, memory, room, y):
+        return False
+    if lasts and memory[HARDEST] > memory[ONSET]:
+        # It has come of that impact: after so slow an onset the law's damping is stiff, and no other matters here.
+        series.read_off(memory, room.Y, y, memory[TICK], memory[FRACTION])
+        memory[ONSET] = memory[HARDEST]
+        series.begin_series(constants, inputs, memory, room, y, int(memory[TICK]), memory[FRACTION], False)
+    return True
 
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
@@ -61,9 +61,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     plant, room = plant_of(constants, inputs), series.room_in(memory)
     if not series.same_inputs(inputs, memory) or memory[SPAN] < 0.0:
         series.begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
-    count = (steps + stride - 1) // stride
-    for row in range(count + 1):
-        now = tick + min(row * stride, steps) * step_ticks
-        _reach(constants, inputs, plant, memory, room, y, now)
-        if row < len(rows):
-            series.write_row(constants, inputs, memory, room, y, now, int(memory[PHASE]), rows, row)
+    grid, count = (tick, stride * step_ticks, tick + steps * step_ticks), (steps + stride - 1) // stride
+    row = series.write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, 0, rows)
+    while row <= count and _go_on(constants, inputs, plant, memory, room, y):
+        row = series.write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, row, rows)
+    rows[row:].fill(np.nan)

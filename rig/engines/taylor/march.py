@@ -314,9 +314,8 @@ def continue_series(constants, inputs, memory, room, y):
 
 
 @kernel
-def read_off(memory, room, y, tick, fraction):
+def read_off(memory, Y, y, tick, fraction):
     """State at an instant of the series at hand, into y."""
-    Y = room.Y
     time = ((tick - memory[TICK]) + (fraction - memory[FRACTION])) * memory[INPUTS]
     s = time
     if time >= memory[SPAN]:
@@ -324,15 +323,6 @@ def read_off(memory, room, y, tick, fraction):
     elif time > 0.0 and memory[PHASE] != FLIGHT and memory[PHASE] != ROLLING:
         s = refine(Y, TIME, 0, time, 0.0, memory[LENGTH])
     series_at(Y, s, y[: S.N_VECTOR])
-
-
-@kernel
-def _reach(constants, inputs, memory, room, y, tick):
-    """State at a tick, into y: series after series up to there, the last one read off."""
-    while not holds(memory, tick, 0.0):
-        if not continue_series(constants, inputs, memory, room, y):
-            return
-    read_off(memory, room, y, tick, 0.0)
 
 
 @kernel
@@ -378,12 +368,40 @@ def begin_series(constants, inputs, memory, room, y, tick, fraction, leaves):
 
 
 @kernel
-def write_row(constants, inputs, memory, room, y, tick, phase, rows, row):
-    """The row of an instant."""
-    out = room.out
-    rates(constants, inputs, tick, 0.0, memory[ONSET], phase, True, y, room.dy, out)
-    fill(rows[row, : S.N_VECTOR], y)
-    fill(rows[row, S.N_VECTOR :], out)
+def write_rows(constants, inputs, memory, Y, dy, out, y, grid, row, rows):
+    """The rows that lie on the series at hand, and the state at the last of them into y.
+
+    In a loop of its own without `Room`: to hand its arrays on takes as long as to read off a state.
+
+    Args:
+        constants: Numbers of the model.
+        inputs: Hammer, drive, magnets.
+        memory: Of the engine.
+        Y: The series.
+        dy: Room for rates, shape (N_VECTOR,).
+        out: Room for what is observed, shape (N_OBSERVED,).
+        y: State and integrals, out, shape (N_VECTOR,).
+        grid: Tick of the first row, ticks a row, that at the end.
+        row: Number of the next row.
+        rows: Out; instants beyond them are read off and not written.
+
+    Returns:
+        Number of the next row: it does not lie on it, or is behind the end.
+    """
+    first, every, end = grid
+    now = min(first + row * every, end)
+    while holds(memory, now, 0.0):
+        read_off(memory, Y, y, now, 0.0)
+        if row < len(rows):
+            phase = int(memory[PHASE])
+            rates(constants, inputs, now, 0.0, memory[ONSET], phase, True, y, dy, out)
+            fill(rows[row, : S.N_VECTOR], y)
+            fill(rows[row, S.N_VECTOR :], out)
+        row += 1
+        if now == end:
+            break
+        now = min(first + row * every, end)
+    return row
 
 
 @njit(cache=True, error_model="numpy", fastmath=False, nogil=True)
@@ -405,9 +423,8 @@ def advance(constants, inputs, y, memory, tick, step_ticks, steps, stride, rows)
     room = room_in(memory)
     if not same_inputs(inputs, memory) or memory[SPAN] < 0.0:
         begin_series(constants, inputs, memory, room, y, tick, 0.0, False)
-    count = (steps + stride - 1) // stride
-    for row in range(count + 1):
-        now = tick + min(row * stride, steps) * step_ticks
-        _reach(constants, inputs, memory, room, y, now)
-        if row < len(rows):
-            write_row(constants, inputs, memory, room, y, now, int(memory[PHASE]), rows, row)
+    grid, count = (tick, stride * step_ticks, tick + steps * step_ticks), (steps + stride - 1) // stride
+    row = write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, 0, rows)
+    while row <= count and continue_series(constants, inputs, memory, room, y):
+        row = write_rows(constants, inputs, memory, room.Y, room.dy, room.out, y, grid, row, rows)
+    rows[row:].fill(np.nan)
