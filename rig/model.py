@@ -92,13 +92,23 @@ class Model:
     resolved: dict[str, float]
     sag: float
 
-    def state(self, *, ring_x: float | None = None, ring_y: float | None = None, spin: float = 0.0) -> np.ndarray:
-        """A state at rest but for its spin, the houses at their rest.
+    def state(
+        self,
+        *,
+        ring_x: float | None = None,
+        ring_y: float | None = None,
+        velocity: tuple[float, float] = (0.0, 0.0),
+        spin: float = 0.0,
+        angle: float = 0.0,
+    ) -> np.ndarray:
+        """A state of the shaft, the houses at their rest.
 
         Args:
             ring_x: Shaft in the ring, horizontal, from the ring's centre [m]; None for the equilibrium on the magnets.
             ring_y: The same, vertical.
+            velocity: Of its centre in the ring, horizontal and vertical [m/s].
             spin: theta' [rad/s].
+            angle: theta [rad].
 
         Returns:
             Vector of state and integrals, shape (N_VECTOR,).
@@ -116,7 +126,11 @@ class Model:
             beta = math.asin(x / arm)
             gamma = math.asin(-y / (arm * math.cos(beta)))
         vector = np.zeros(N_VECTOR)
-        vector[0], vector[1], vector[9] = gamma, beta, spin
+        vector[:3] = gamma, beta, angle
+        level = self.constants.levels.euler
+        sG, cG, sb, cb = np.sin(gamma), np.cos(gamma), np.sin(beta), np.cos(beta)
+        beta_rate = velocity[0] / arm / (cb if level else 1.0)
+        vector[7:10] = -(velocity[1] / arm - level * sG * sb * beta_rate) / (cG * cb if level else 1.0), beta_rate, spin
         return vector
 
 

@@ -1,17 +1,21 @@
-"""The motion that an engine moves on, and how far it can be trusted: by its energy ledger, and by a companion."""
+"""The motion that an engine moves on: its start, and how far it can be trusted, by energy ledger and companion."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from rig.engines import Engine
 from rig.engines.memory import MEMORY
+from rig.errors import InputError
 from rig.kernels import signals as S
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.signals import COLUMN
+from rig.model import Model
+from rig.scenes import Initial
 
 STORED = ("kinetic_energy", "gravity_energy", "magnet_energy", "house_energy", "contact_energy")
 SUPPLIED = ("drive_work", "hammer_work", "unbalance_work", "gap_work", "release_work")
@@ -25,6 +29,53 @@ DOUBT = 10.0
 _FIRST, _LOST = 1e-9, 0.1
 """Growth is measured from the first distance above rounding, and up to where two runs no longer have to do with each
 other."""
+
+
+class Begin(NamedTuple):
+    """Where a run is taken up that was under way before: the shaft in the ring, its houses at rest."""
+
+    tick: int
+    ring_x: float = 0.0  # [m]
+    ring_y: float = 0.0
+    vx: float = 0.0  # [m/s]
+    vy: float = 0.0
+    angle: float = 0.0  # theta [rad]
+
+
+def initial_state(model: Model, initial: Initial, begin: Begin | None, *, spin: float) -> np.ndarray:
+    """State and integrals at the start of a run, shape (N_VECTOR,).
+
+    Args:
+        model: The model.
+        initial: What the scene says of it.
+        begin: Where it is taken up instead; None: at the scene's start.
+        spin: theta' [rad/s].
+
+    Raises:
+        InputError: The shaft would not be inside the ring.
+    """
+    contact, inside = model.constants.contact, "inside the ring (r0 = {:g} mm)".format
+    if begin is not None:
+        if math.hypot(begin.ring_x, begin.ring_y) >= contact.clearance:
+            place = [begin.ring_x * 1e3, begin.ring_y * 1e3]
+            raise InputError("begin", inside(contact.clearance * 1e3), place)
+        return model.state(
+            ring_x=begin.ring_x, ring_y=begin.ring_y, velocity=(begin.vx, begin.vy), spin=spin, angle=begin.angle
+        )
+    if initial.position == "equilibrium":
+        sag = model.sag
+        if math.hypot(contact.offset_x, sag - contact.offset_y) > contact.clearance:
+            r0 = contact.clearance * 1e3
+            place = f"within {r0:g} mm of the shaft at rest on its magnets, (0, {sag * 1e3:.4g}) mm"
+            raise InputError("ring.offset", place, [contact.offset_x * 1e3, contact.offset_y * 1e3])
+        return model.state(spin=spin)
+    # Just inside the clearance, so that rounding does not make it a contact.
+    within = contact.clearance * (1.0 - 1e-12)
+    places = {"top": (0.0, within), "bottom": (0.0, -within), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}
+    x, y = places[initial.position]
+    if math.hypot(x, y) > contact.clearance:
+        raise InputError("initial.position", inside(contact.clearance * 1e3), [initial.x_mm, initial.y_mm])
+    return model.state(ring_x=x, ring_y=y, spin=spin)
 
 
 @dataclass

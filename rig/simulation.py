@@ -28,7 +28,7 @@ from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
 from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
-from rig.motion import BRANCH_ALARM, FINER, Accuracy, Motion, energy_balance
+from rig.motion import BRANCH_ALARM, FINER, Accuracy, Begin, Motion, energy_balance, initial_state
 from rig.scenes import Scene, load_scene, scene_document
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
@@ -97,6 +97,7 @@ class Simulation:
         block_ticks: An advance must be a whole multiple of this.
         end_tick: Where the scene ends.
         row_ticks: Ticks between observed rows.
+        begin: Where it is taken up; None: at the scene's own start.
         kept_every: Rows from one that samples fall on to the next; 1 where some fall between rows.
 
     Example:
@@ -107,8 +108,9 @@ class Simulation:
         (Simulation(hammer: at 0.05 of 2 s), (1000, 4), (2000, 66))
     """
 
-    def __init__(self, scene: Scene | str | Path) -> None:
+    def __init__(self, scene: Scene | str | Path, *, begin: Begin | None = None) -> None:
         self.scene = scene = load_scene(scene)
+        self.begin = begin
         self.tick_rate_hz = TICK_RATE_HZ
         self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
@@ -147,14 +149,16 @@ class Simulation:
             name: slice(end - len(columns), end) for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
         }
 
-        self.tick = 0
+        self.tick = self._start = 0 if begin is None else begin.tick
+        if self.tick % self.block_ticks:
+            raise InputError("begin.tick", f"a multiple of {self.block_ticks}", self.tick)
         self._segments = segments(scene.drive.profile or ((0.0, scene.drive.speed_hz),), TICK_RATE_HZ)
         self._engaged = scene.initial.magnets
         self._pulse: tuple[HammerCommand, int, int] | None = None
         self._pending = sorted(
             ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
         )
-        choice, initial = scene.engine, self._initial_state(self._segments[0].speed)
+        choice, initial = scene.engine, initial_state(self.model, scene.initial, begin, spin=self._speed())
         self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance)
         self._companion: Motion | None = None
         if choice.companion:
@@ -268,7 +272,7 @@ class Simulation:
     def warm_up(self) -> None:
         """Compile (or load) every kernel that `advance` will call, without moving on."""
         if not self._warm:
-            twin = Simulation(self.scene)
+            twin = Simulation(self.scene, begin=self.begin)
             twin.advance(twin.block_ticks)
             self._warm = True
 
@@ -333,7 +337,7 @@ class Simulation:
         if snapshot.scene != self.scene:
             first_tick = min((tick for tick, _ in self._pending), default=changing["tick"])
             alike = snapshot.scene == self.scene.model_copy(update={"commands": ()})
-            if self.tick > 0 or first_tick < changing["tick"] or not alike:
+            if self.tick > self._start or first_tick < changing["tick"] or not alike:
                 raise InputError("snapshot", f"one of this scene, {self.scene.name}", snapshot.scene.name)
             changing["_pending"] = self._pending
         self.__dict__.update(changing)
@@ -362,28 +366,15 @@ class Simulation:
         """The scene as a JSON document."""
         return {"name": self.scene.name, "seed": self.scene.seed, "scene": scene_document(self.scene)}
 
-    def _initial_state(self, spin: float) -> np.ndarray:
-        initial, clearance = self.scene.initial, self.model.constants.contact.clearance
-        if initial.position == "equilibrium":
-            contact, sag = self.model.constants.contact, self.model.sag
-            if math.hypot(contact.offset_x, sag - contact.offset_y) > clearance:
-                place = f"within {clearance * 1e3:g} mm of the shaft at rest on its magnets, (0, {sag * 1e3:.4g}) mm"
-                raise InputError("ring.offset", place, [contact.offset_x * 1e3, contact.offset_y * 1e3])
-            return self.model.state(spin=spin)
-        # Just inside the clearance, so that rounding does not make it a contact.
-        inside = clearance * (1.0 - 1e-12)
-        places = {"top": (0.0, inside), "bottom": (0.0, -inside), "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3)}
-        x, y = places[initial.position]
-        if math.hypot(x, y) > clearance:
-            raise InputError(
-                "initial.position", f"inside the ring (r0 = {clearance * 1e3:g} mm)", [initial.x_mm, initial.y_mm]
-            )
-        return self.model.state(ring_x=x, ring_y=y, spin=spin)
-
     def _segment(self) -> Segment:
         return max(
             (segment for segment in self._segments if segment.tick <= self.tick), key=lambda segment: segment.tick
         )
+
+    def _speed(self) -> float:
+        """What the drive aims at now [rad/s]."""
+        segment = self._segment()
+        return segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
 
     def _take_effect(self, events: list[dict[str, Any]]) -> None:
         while self._pending and self._pending[0][0] <= self.tick:
@@ -405,8 +396,7 @@ class Simulation:
             events.append(event)
 
     def _ramp_to(self, target: float) -> None:
-        segment = self._segment()
-        now = segment.speed + segment.slope * (self.tick - segment.tick) / TICK_RATE_HZ
+        now = self._speed()
         length = round(abs(target - now) / self.model.parameters["drive.ramp_rate"] * TICK_RATE_HZ)
         hold = Segment(tick=self.tick + length, speed=target, slope=0.0)
         slope = (target - now) / length * TICK_RATE_HZ if length else 0.0

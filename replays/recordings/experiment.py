@@ -10,14 +10,22 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
+import numpy as np
+
 from recorder.reader import Recording
 from rig.commands import COMMANDS
 from rig.errors import InputError, Words
+from rig.motion import Begin
 from rig.offline import Run, SentCommand, frames, simulate
 from rig.parameters import DEFAULT_SET, load_parameters, set_names
 from rig.scenes import Scene, change_scene, parse_scene
 from rig.simulation import TICK_RATE_HZ, Frame, Simulation
 from rig.wire import EDGES, sensor_key, truth_key
+
+BEFORE_S = 0.5
+"""A log from the middle of a run is taken up so long before the hammer pulse [s]: a few turns tell where the shaft is."""
+GRID_S = 0.1
+"""A whole number of samples of every rate [s]."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +35,14 @@ class Experiment:
     Attributes:
         scene: The scene, on the recorded parameters; it ends where the recording does.
         commands: What was sent to the rig beside the scene's own commands.
-        first_s: Simulated time at which the recording begins [s]; the experiment itself always begins at 0.
+        first_s: Simulated time at which the recording begins [s].
+        begin: Where it is taken up, of a log from the middle of a run; None: the experiment begins at 0, with its scene.
     """
 
     scene: Scene
     commands: tuple[SentCommand, ...] = ()
     first_s: float = 0.0
+    begin: Begin | None = None
 
     @classmethod
     def of(cls, recording: Recording) -> Self:
@@ -63,7 +73,9 @@ class Experiment:
             for one in recording.commands
             if one["command"] in COMMANDS
         ]
-        return cls(scene=scene, commands=tuple(sent), first_s=min(float(stream.first_time_s) for stream in streams))
+        first_s = min(float(stream.first_time_s) for stream in streams)
+        begin = _taken_up(recording, scene, first_s) if is_from_the_middle(recording) else None
+        return cls(scene=scene, commands=tuple(sent), first_s=first_s, begin=begin)
 
     def changed(self, changes: dict[str, Any]) -> Experiment:
         """The same with other values of scene or parameters, by dotted key, each in its own unit.
@@ -75,7 +87,7 @@ class Experiment:
 
     def simulation(self) -> Simulation:
         """A simulation of the scene, at its start; `frames` sends it the commands."""
-        return Simulation(self.scene)
+        return Simulation(self.scene, begin=self.begin)
 
     def frames(self, simulation: Simulation, *, chunk_s: float = 0.1) -> Iterator[Frame]:
         """Do it again on a simulation, chunk by chunk."""
@@ -89,6 +101,29 @@ class Experiment:
             progress: Called with the part done, 0 to 1.
         """
         return simulate(self.scene, duration_s=duration_s, commands=self.commands, progress=progress)
+
+
+def is_imported(recording: Recording) -> bool:
+    """Whether a recording is a log of another system."""
+    return "import" in recording.scene
+
+
+def is_from_the_middle(recording: Recording) -> bool:
+    """Whether it is one of a rig that ran before: where its shaft was, only its samples tell."""
+    mapped = recording.scene.get("import", {}).get("mapping", {}).get("experiment", {})
+    return mapped.get("commands") == "detected" and "lead_s" not in mapped
+
+
+def _taken_up(recording: Recording, scene: Scene, first_s: float) -> Begin:
+    """Where such a log is taken up: shortly before the hammer, with the shaft at the angle that the edges tell."""
+    hammer_s = min((timed.at_s for timed in scene.commands), default=first_s)
+    begin_s = math.floor(round(max(first_s, hammer_s - BEFORE_S) / GRID_S, 6)) * GRID_S
+    edges_s = recording.edges()
+    if len(edges_s) < 2:
+        return Begin(round(begin_s * TICK_RATE_HZ))
+    near = max(0, min(int(np.searchsorted(edges_s, begin_s)) - 1, len(edges_s) - 2))
+    turns = (begin_s - edges_s[near]) / (edges_s[near + 1] - edges_s[near])
+    return Begin(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
 
 
 def _end_s(recording: Recording) -> float:

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -255,7 +256,7 @@ class LeadIns:
     """
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[str, float, int], tuple[Snapshot, dict[str, list[np.ndarray]]]] = {}
+        self._kept: dict[tuple[Any, ...], tuple[Snapshot, dict[str, list[np.ndarray]]]] = {}
 
     def take(
         self, experiment: Experiment, simulation: Simulation, *, chunk_s: float, until: int
@@ -268,11 +269,11 @@ class LeadIns:
         ticks = [round(command.at_s * TICK_RATE_HZ) for command in experiment.scene.commands]
         until = min([until, *ticks, *(command.tick for command in experiment.commands)])
         alone = experiment.scene.model_copy(update={"commands": ()})
-        key = (alone.model_dump_json(), chunk_s, until)
+        key = (alone.model_dump_json(), experiment.begin, chunk_s, until)
         if key not in self._kept:
             if len(self._kept) == _LEAD_INS:
                 self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = _lead_in(Simulation(alone), chunk_s=chunk_s, until=until)
+            self._kept[key] = _lead_in(Simulation(alone, begin=experiment.begin), chunk_s=chunk_s, until=until)
         snapshot, truth = self._kept[key]
         simulation.restore(snapshot)
         return {name: list(blocks) for name, blocks in truth.items()}
@@ -280,7 +281,7 @@ class LeadIns:
 
 def _lead_in(simulation: Simulation, *, chunk_s: float, until: int) -> tuple[Snapshot, dict[str, list[np.ndarray]]]:
     truth: dict[str, list[np.ndarray]] = {}
-    if until >= chunk_s * TICK_RATE_HZ:
+    if until >= simulation.tick + chunk_s * TICK_RATE_HZ:
         for frame in frames(simulation, chunk_s=chunk_s):
             for name, block in frame.truth.items():
                 truth.setdefault(name, []).append(block.values)
@@ -316,7 +317,7 @@ def predict(
     row_rate_hz = TICK_RATE_HZ // simulation.row_ticks
     taking = _channels(parts, experiment.scene, row_rate_hz=row_rate_hz)
     chunk_s = min(_CHUNK_S, last_s + 2e-3)  # the row of the last sample must be in it, and some behind it
-    begin_tick = _begin_tick(parts, taking, chunk_s=chunk_s, row_rate_hz=row_rate_hz)
+    begin_tick = max(simulation.tick, _begin_tick(parts, taking, chunk_s=chunk_s, row_rate_hz=row_rate_hz))
     for channels in taking:
         channels.begin(begin_tick * row_rate_hz // TICK_RATE_HZ)
     truth: dict[str, list[np.ndarray]] = {}
@@ -357,11 +358,12 @@ def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chun
 
 
 def bare(experiment: Experiment) -> Experiment:
-    """The same motion with one cheap sensor: rows stay as far apart as they were."""
+    """The same motion with one cheap sensor and no companion: rows stay as far apart as they were."""
     groups = (experiment.scene.channels or rig_table()).groups.values()
     fewest = min(groups, key=lambda group: len(group.channels))
     return experiment.changed(
         {
+            "engine.companion": False,
             "sensors.groups": [fewest.name],
             "sensors.chain": "ideal",
             "sensors.rate_hz": TICK_RATE_HZ // experiment.simulation().row_ticks,

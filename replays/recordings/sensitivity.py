@@ -3,7 +3,7 @@
 A value goes by its dotted key: a parameter (`contact.friction`, in its own unit), a number of the scene
 (`drive.speed_hz`), one of a command (`hammer.1.force_n`: of the first hammer pulse; `at_s`, `duration_ms` and
 `direction` [degrees from x toward y] likewise), or one of the recording (`clock.offset_s` and `clock.rate_ppm` of its
-clock, `shaft.angle_rad` where it begins).
+clock, `shaft.angle_rad` and `state.ring_x` and others where it begins).
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from replays.recordings.experiment import Experiment
-from replays.recordings.prediction import LeadIns, Measured, Prediction, bare, lagrange, predict
+from replays.recordings.prediction import LeadIns, Measured, Prediction, bare, predict
 from rig.commands import check_command
 from rig.errors import InputError, SimulationError
 from rig.model import build_model
+from rig.motion import Begin
 from rig.parameters import load_parameters
 from rig.sampling import ROW_TICKS
 from rig.scenes import Scene, TimedCommand, change_scene, parse_scene
@@ -31,6 +32,11 @@ CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}
 """How late the recording's clock is where its samples begin, and how much faster it goes: unit, change of size 1."""
 ANGLE = "shaft.angle_rad"
 """Angle of the shaft where the samples begin, on what the experiment has [rad]: whatever the speed before was."""
+STATE = {f"state.{name}": (unit, si, scale) for name, unit, si, scale in (
+    ("ring_x", "mm", 1e-3, 0.1), ("ring_y", "mm", 1e-3, 0.1), ("vx", "mm/s", 1e-3, 10.0), ("vy", "mm/s", 1e-3, 10.0),
+)}  # fmt: skip
+"""Where the shaft is in the ring, and how fast, where a log from the middle of a run is taken up: unit, that in SI, change
+of size 1."""
 _STEP = 1e-5
 """Step of a difference quotient, as a part of the value's scale, ..."""
 _LEAST_STEP = 1e-8
@@ -41,8 +47,9 @@ _MARGIN_S = 1e-4
 """The model is followed so far behind the last row, which may lie between two of its own."""
 _ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
 _COMMAND_KEY = re.compile(r"(hammer|speed|release)\.([1-9][0-9]*)\.(\w+)")
-_GRIDS = {"at_s": ROW_TICKS / TICK_RATE_HZ, "duration_ms": ROW_TICKS / TICK_RATE_HZ * 1e3}
-"""A simulation rounds these to its rows, by field of a command, in the field's unit."""
+_TICK_S = 1.0 / TICK_RATE_HZ
+_STEPS = {"at_s": 25.0 * _TICK_S, "duration_ms": 0.025}
+"""Steps of difference quotients of what a simulation rounds to its ticks, by field of a command, in the field's unit."""
 _SCALES = {"at_s": 1e-3, "direction": 10.0}
 """What counts as a change of size 1 where the value itself may be 0 [s], [degrees]."""
 
@@ -70,6 +77,8 @@ def value_of(experiment: Experiment, key: str) -> float:
     """
     if key in CLOCK or key == ANGLE:
         return 0.0
+    if key in STATE:
+        return float(getattr(_begin_of(experiment, key), key.split(".")[1])) / STATE[key][1]
     match = _COMMAND_KEY.fullmatch(key)
     if match is not None:
         command = _commands(experiment)[_place(experiment, key)]
@@ -100,12 +109,16 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
     Raises:
         InputError: An unknown key, or a value that it must not have.
     """
-    values = {key: value for key, value in values.items() if key not in CLOCK}
+    placed = {key.split(".")[1]: value * STATE[key][1] for key, value in values.items() if key in STATE}
+    if placed:
+        begin = _begin_of(experiment, next(key for key in values if key in STATE))
+        experiment = replace(experiment, begin=begin._replace(**placed))
+    values = {key: value for key, value in values.items() if key not in CLOCK and key not in STATE}
     if ANGLE in values:
-        ahead = values.get("drive.speed_hz", experiment.scene.drive.speed_hz) - experiment.scene.drive.speed_hz
-        phase = value_of(experiment, "shaft.unbalance_phase") + values[ANGLE]
-        phase -= 2.0 * math.pi * ahead * experiment.first_s
-        values = {key: value for key, value in values.items() if key != ANGLE}
+        phase = value_of(experiment, "shaft.unbalance_phase") + values.pop(ANGLE)
+        if experiment.begin is None:
+            ahead = values.get("drive.speed_hz", experiment.scene.drive.speed_hz) - experiment.scene.drive.speed_hz
+            phase -= 2.0 * math.pi * ahead * experiment.first_s
         values["shaft.unbalance_phase"] = math.remainder(phase, 2.0 * math.pi)
     changes = {key: value for key, value in values.items() if _COMMAND_KEY.fullmatch(key) is None}
     scene = change_scene(experiment.scene, changes) if changes else experiment.scene
@@ -123,11 +136,22 @@ def with_values(experiment: Experiment, values: Mapping[str, float]) -> Experime
     for place, fields in own.items():
         command = commands[place]
         request = command.request.model_dump(exclude={"command"}) | {k: v for k, v in fields.items() if k != "at_s"}
+        if "duration_ms" in fields:
+            # As many ticks as a simulation takes, with the same impulse: nothing jumps as it goes on by one.
+            ticks = max(1, round(fields["duration_ms"] * 1e-3 * TICK_RATE_HZ))
+            request["force_n"] *= fields["duration_ms"] * 1e-3 * TICK_RATE_HZ / ticks
+            request["duration_ms"] = ticks * _TICK_S * 1e3
         at_s = fields.get("at_s", command.at_s)
         kept.append(TimedCommand(at_s=at_s, request=check_command(command.request.command, request)))
     left = tuple(entry for place, entry in enumerate(sent, start=len(timed)) if place not in own)
     data = scene.model_dump() | {"commands": [entry.model_dump() for entry in kept]}
     return replace(changed, scene=parse_scene(data), commands=left)
+
+
+def _begin_of(experiment: Experiment, key: str) -> Begin:
+    if experiment.begin is None:
+        raise InputError(key, "asked of a log from the middle of a run", key)
+    return experiment.begin
 
 
 def scale_of(experiment: Experiment, key: str) -> float:
@@ -138,6 +162,8 @@ def scale_of(experiment: Experiment, key: str) -> float:
         return 1.0
     if key in CLOCK:
         return CLOCK[key][1]
+    if key in STATE:
+        return STATE[key][2]
     value = abs(value_of(experiment, key))
     return _SCALES.get(key.split(".")[-1], value if value > 0.0 else 1.0)
 
@@ -176,7 +202,7 @@ class Predictor:
     def predict(self, values: Sequence[float] | np.ndarray) -> Prediction:
         """The channels at some values, shape (keys,).
 
-        What a simulation rounds to its rows (times and durations of hammer pulses) is interpolated between simulations.
+        When a command comes is a whole tick to a simulation: between two ticks it is interpolated.
 
         Raises:
             InputError: A value that the model does not take.
@@ -184,11 +210,10 @@ class Predictor:
         """
         values = tuple(float(value) for value in values)
         for place, (key, value) in enumerate(zip(self.keys, values, strict=True)):
-            grid = _grid(key)
-            if grid and not self._later(key):
-                below = math.floor(value / grid + 1e-6)
-                if value - below * grid > 1e-6 * grid:
-                    return self._between(values, place, below, grid)
+            if key.endswith(".at_s") and not self._later(key):
+                below = math.floor(value / _TICK_S + 1e-3)
+                if value - below * _TICK_S > 1e-3 * _TICK_S:
+                    return self._between(values, place, below)
         if values not in self._cache:
             if len(self._cache) > _KEPT:
                 self._cache.pop(next(iter(self._cache)))
@@ -208,7 +233,7 @@ class Predictor:
         found: list[dict[str, np.ndarray]] = []
         smooth = np.zeros(len(self.keys), dtype=bool)
         for place, key in enumerate(self.keys):
-            grid, scale = _grid(key), self.scales[place]
+            grid, scale = _step_of(key), self.scales[place]
             slope: dict[str, np.ndarray] = {}
             for step in _shorter(grid or _STEP * scale, grid or _LEAST_STEP * scale):
                 slope, smooth[place] = self._quotient(values, place, step, base)
@@ -222,22 +247,14 @@ class Predictor:
         kind, number, _ = key.split(".")
         return value_of(self._experiment, f"{kind}.{number}.at_s") > self._last_s + _MARGIN_S
 
-    def _between(self, values: tuple[float, ...], place: int, below: int, grid: float) -> Prediction:
-        """The channels where one value lies between what can be simulated, by the cubic through four neighbours."""
-        for nodes in (np.arange(-1, 3), np.arange(2)):
-            try:
-                # Rounded, so that what was simulated before is found.
-                ends = [round((below + node) * grid, 9) for node in nodes]
-                found = [self.predict((*values[:place], end, *values[place + 1 :])) for end in ends]
-            except InputError:
-                continue  # at the edge of what it may be: a straight line
-            weights = lagrange(np.array([values[place] / grid - below]), nodes)[:, 0]
-            both = {
-                name: sum(weight * one.values[name] for weight, one in zip(weights, found, strict=True))
-                for name in found[0].values
-            }
-            return replace(found[0], values=both)  # pyright: ignore[reportArgumentType]
-        raise InputError(self.keys[place], "a value that can be simulated, with its neighbours", values[place])
+    def _between(self, values: tuple[float, ...], place: int, below: int) -> Prediction:
+        """The channels where a command lies between two ticks."""
+        # Rounded, so that what was simulated before is found.
+        ends = [round((below + node) * _TICK_S, 9) for node in (0, 1)]
+        first, second = (self.predict((*values[:place], end, *values[place + 1 :])) for end in ends)
+        part = values[place] / _TICK_S - below
+        both = {name: (1.0 - part) * found + part * second.values[name] for name, found in first.values.items()}
+        return replace(first, values=both)
 
     def _quotient(
         self, values: np.ndarray, place: int, step: float, base: Prediction
@@ -283,8 +300,8 @@ def on_the_models_clock(
     return {name: part.later(shift, rate, about_s=about_s) for name, part in parts.items()}
 
 
-def _grid(key: str) -> float | None:
-    return _GRIDS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
+def _step_of(key: str) -> float | None:
+    return _STEPS.get(key.split(".")[-1]) if _COMMAND_KEY.fullmatch(key) else None
 
 
 def _shorter(step: float, least: float) -> Iterator[float]:

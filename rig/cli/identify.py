@@ -68,13 +68,8 @@ class Asked:
             InputError: The recording, its scene or the model has no such thing.
         """
         from replays.recordings.identification import ask
-        from replays.recordings.identification.nuisance import (
-            asked_along,
-            check_begin,
-            is_imported,
-            shortly_before,
-            turned,
-        )
+        from replays.recordings.experiment import is_imported
+        from replays.recordings.identification.nuisance import asked_along, shortly_before, turned
 
         keys, from_s = [key for part in self.fit for key in names_of(part)], self.from_s
         experiment = self._experiment(recording)
@@ -82,7 +77,6 @@ class Asked:
         priors = {key: _two("prior", text, "+-") for key, text in known.items()}
         along: dict[str, tuple[float, float] | None] = {}
         if is_imported(recording) and not exact:
-            check_begin(experiment, self.to_s)
             experiment = turned(recording, experiment)
             along = asked_along(experiment, keys)
             keys += list(along)

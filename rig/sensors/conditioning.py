@@ -239,7 +239,6 @@ class Conditioner:
         self._scales[:, _LSB] = 1.0
         steps, self._settling = np.zeros((sets, most, POLE, _LANES)), np.zeros((sets, most, 2, _LANES))
         phases = np.zeros((sets, self._parts, 4 + 2 * most, _LANES))
-        made: dict[tuple[bytes, bytes, float], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         for c, (channel, (poles, residues, direct)) in enumerate(zip(channels, filters, strict=True)):
             of, lane = divmod(c, _LANES)
             self._scales[of, :, lane] = (
@@ -250,13 +249,11 @@ class Conditioner:
                 channel.lsb_v,
                 2.0 ** (channel.adc_bits - 1) - 1.0,
             )
-            alike = (poles.tobytes(), residues.tobytes(), direct)
-            if alike not in made:
-                if digital and len(poles):
-                    made[alike] = digital_coefficients(channel, row_rate_hz)
-                else:
-                    made[alike] = coefficients(poles / row_rate_hz, residues / row_rate_hz, direct, self._parts)
-            step, settling, phase = made[alike]
+            if digital and len(poles):
+                step, settling, phase = digital_coefficients(channel, row_rate_hz)
+            else:
+                inside = (tuple((each / row_rate_hz).tolist()) for each in (poles, residues))
+                step, settling, phase = coefficients(*inside, direct, self._parts)
             steps[of, : len(poles), :, lane], self._settling[of, : len(poles), :, lane] = step, settling
             phases[of, :, : phase.shape[1], lane] = phase
         self._steps, self._phases = steps.reshape(sets, -1), phases.reshape(sets, -1)

@@ -12,6 +12,7 @@ of frequency f at most, rows T apart: 3e-5 at 1 kHz and 25 us.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -72,26 +73,28 @@ def _cubics(t: np.ndarray) -> np.ndarray:
     return np.stack([math.prod((t - b) / (a - b) for b in _NODES if b != a) for a in _NODES], axis=-1)
 
 
+@lru_cache(maxsize=256)
 def coefficients(
-    poles: np.ndarray, residues: np.ndarray, direct: float, parts: int
+    poles: tuple[complex, ...], residues: tuple[complex, ...], direct: float, parts: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of one filter: the steps of its poles, their state in the steady state of 1 V, and samples by their place.
 
     Args:
-        poles: Per row, shape (p,).
-        residues: Per row, shape (p,).
+        poles: Per row.
+        residues: Per row.
         direct: What goes straight through.
         parts: Places of samples in a row.
 
     Returns:
-        Shapes (p, POLE), (p, 2), (parts, 4 + 2 p).
+        Shapes (p, POLE), (p, 2), (parts, 4 + 2 p); not to be written to.
     """
-    factor, settled = np.exp(poles), -residues / poles
-    held = residues[:, None] * _held(poles, np.ones(1))[:, 0]
+    p, r = np.array(poles, complex), np.array(residues, complex)
+    factor, settled = np.exp(p), -r / p
+    held = r[:, None] * _held(p, np.ones(1))[:, 0]
     step = np.hstack([np.real(factor)[:, None], np.imag(factor)[:, None], np.real(held), np.imag(held)])
     places = np.arange(parts) / parts
-    turned = np.exp(poles * places[:, None])
-    rows = direct * _cubics(places) + np.real(residues[:, None, None] * _held(poles, places)).sum(axis=0)
+    turned = np.exp(p * places[:, None])
+    rows = direct * _cubics(places) + np.real(r[:, None, None] * _held(p, places)).sum(axis=0)
     waves = np.stack([np.real(turned), np.imag(turned)], axis=2).reshape(parts, -1)
     return step, np.stack([np.real(settled), np.imag(settled)], axis=1), np.hstack([rows, waves])
 

@@ -94,7 +94,7 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     groups, zero_s = place(taken, mapping, low_s, high_s)
     rotate(groups, mapping, remarks)
     table, counts, present, channels = quantise(groups)
-    lead_s = mapping.experiment.lead if mapping.experiment is not None else 0.0
+    lead_s = (mapping.experiment.lead_s or 0.0) if mapping.experiment is not None else 0.0
     if any(abs(lead_s * group.rate_hz - round(lead_s * group.rate_hz)) > 1e-6 for group in groups.values()):
         raise InputError("experiment.lead_s", "a whole number of samples", lead_s)
     zero_s -= lead_s

@@ -208,15 +208,8 @@ class ExperimentMapping(_Section):
     commands: tuple[dict[str, Any], ...] | Literal["scene", "detected"] = "scene"
     """Commands with at_s in the recording's time; those of the scene; or the hammer pulses that were found."""
     lead_s: Annotated[FiniteFloat, Field(ge=0.0, le=60.0)] | None = None
-    """The recording's time zero lies so long before its first sample [s]: the scene runs from there, and what its own
-    start stirs up has died out. Left out: 5 where hammer pulses were found in a running rig, else 0."""
-
-    @property
-    def lead(self) -> float:
-        """The same, as a number [s]."""
-        if self.lead_s is not None:
-            return self.lead_s
-        return 5.0 if self.commands == "detected" else 0.0
+    """The scene began so long before the first sample [s]. Left out: with the first sample; where hammer pulses were
+    found, the rig was running before, and where its shaft was, the samples tell."""
 
 
 class Mapping(_Section):

@@ -7,45 +7,61 @@ that it neither spoils other values nor passes for a fault of the model.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
+from replays.recordings.experiment import BEFORE_S, Experiment
 from replays.recordings.identification.question import first_command_s, observe
-from replays.recordings.least_squares import Fit, fit
 from replays.recordings.prediction import Measured, Prediction
-from replays.recordings.sensitivity import ANGLE, Predictor, on_the_models_clock, value_of, with_values
-from rig.errors import InputError, Words
+from replays.recordings.sensitivity import ANGLE, STATE, Predictor, on_the_models_clock, value_of, with_values
+from rig.errors import InputError, SimulationError
+from rig.simulation import TICK_RATE_HZ
 
 NUISANCES = (
     "clock.offset_s",
     "clock.rate_ppm",
     ANGLE,
+    *STATE,
     "drive.speed_hz",
     "hammer.1.force_n",
     "hammer.1.duration_ms",
+    "ring.offset_x",
+    "ring.offset_y",
 )
 """In place of the time of the first pulse stand clock and angle: a simulation has pulses only at its own rows."""
 _PULSE = "hammer.1.at_s"
-_DEVIATIONS = {"clock.rate_ppm": 50.0}
-"""What is known before: the standard deviation of a crystal, in ppm; ..."""
+_DEVIATIONS = {"clock.rate_ppm": 50.0, "clock.offset_s": 1e-4, "ring.offset_x": 0.1, "ring.offset_y": 0.1}
+"""What is known before, as standard deviations: of a crystal [ppm]; of a trigger that is found in samples behind a filter
+[s]; of a ring that was put where it is by hand [mm]; ..."""
 _RELATIVE = {"drive.speed_hz": 1e-4}
 """... and of a speed read off the log, as a part of it."""
-_ANGLES = 8
-_ROUNDS = 2
-_LOOK_S = 0.5
-"""So much before the hammer pulse tells angle and speed [s] ..."""
+BEYOND = 5.0
+"""A value that many standard deviations from what is known of it is a finding, and no fit goes further."""
+_ROUNDS = 8
+_EVERY = 8
+"""Of the samples earlier before the hammer pulse so many are one: they tell where the shaft was."""
+_AGREED = 12
+"""Rounds of least squares until the channels' say is settled."""
+_SAME = 1.0
+"""A step that gains less, of a number that noise changes by some, is the last."""
+_PARTS = (1.0, 0.3, 0.1, 0.03)
+"""Parts of a step that are tried in turn, until one gains."""
+_TURNS_S = 3.0
+"""So much of the edges before the hammer pulse tells the speed [s]."""
+_LEAST_LOOK_S = 0.02
+_SETTLED_S = 0.01
+"""Samples so soon behind the begin still show what filters were filled with [s]."""
 _MARGIN_S = 2e-3
-"""... up to here, as the time of the hammer pulse is not known better ..."""
+"""What is before the hammer pulse ends here [s], as its time is not known better ..."""
 _BEFORE_S = 0.03
 """... and so much of it is in the fit of all [s]."""
-_WINDOWS_S = (6e-3, 9e-3, 13e-3, 20e-3, 30e-3)
+_WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """How far behind the begin of the hammer pulse the fits look [s]."""
 _WORSE = 1.5
-"""A longer window is given up where it leaves more by this factor."""
+"""A longer window is given up where it leaves more by this factor, in the middle one of the channels."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +72,13 @@ class Fitted:
     start: float
     value: float
     half_width: float
+    known: tuple[float, float] | None = None
+    """Mean and standard deviation before."""
+
+    @property
+    def beyond(self) -> bool:
+        """Whether it is as far from what is known of it as it may go."""
+        return self.known is not None and abs(self.value - self.known[0]) > 0.99 * BEYOND * self.known[1]
 
     @property
     def line(self) -> str:
@@ -83,7 +106,7 @@ class Tuned:
         perturbed: Values as far off as the fit leaves open, drawn once from what it says.
         about_s: Where the clocks differ by the offset alone [s].
         end_s: End of the samples that it rests on [s].
-        chi2: Sum of squares of what is left over the noise, a sample.
+        scales: RMS of what is left of each channel over its noise, at least 1.
     """
 
     begun: Experiment
@@ -93,7 +116,7 @@ class Tuned:
     perturbed: dict[str, float]
     about_s: float
     end_s: float
-    chi2: float
+    scales: dict[str, float]
 
     def on_time(self, parts: dict[str, Measured]) -> dict[str, Measured]:
         """Channels of the log on the model's clock."""
@@ -111,11 +134,6 @@ class Tuned:
         return predictor.predict(tuple(values.values()))
 
 
-def is_imported(recording: Recording) -> bool:
-    """Whether a recording is a log of another system."""
-    return "import" in recording.scene
-
-
 def nuisances_of(
     experiment: Experiment, keys: Sequence[str] = NUISANCES, *, besides: Sequence[str] = ()
 ) -> dict[str, tuple[float, float] | None]:
@@ -126,7 +144,7 @@ def nuisances_of(
         keys: The nuisances.
         besides: What is asked anyway.
     """
-    if experiment.first_s == 0.0:  # it has run from the scene's own start: the pulse is late, and not the clock
+    if experiment.begin is None:  # it has run from the scene's own start: the pulse is late, and not the clock
         keys = [_PULSE if key == "clock.offset_s" else key for key in keys]
     found: dict[str, tuple[float, float] | None] = {}
     for key in keys:
@@ -142,60 +160,109 @@ def nuisances_of(
 
 
 def turned(recording: Recording, experiment: Experiment) -> Experiment:
-    """With the angle and the speed of the shaft that explain the motion before the first pulse best.
+    """With speed, angle and place of the shaft as the motion before the hammer pulse has them.
 
-    The steady motion is a constant and a vector that turns along with the angle: a sum of squares over the angle is a
-    constant, a cosine and a sine. From its least place on, a fit.
+    Small motions are a sum: of one that begins elsewhere, and of one by the unbalance, a cosine and a sine of its angle.
+    Least squares over a few turns, in which a channel counts by what it leaves: one that is faulty has no say.
     """
     first_s = first_command_s(experiment)
-    try:
-        window = (first_s - _LOOK_S, first_s - _MARGIN_S) if first_s > 0.0 else (None, None)
-        parts = observe(recording, experiment, window=window).parts
-    except InputError:
-        return experiment  # no samples before the hammer pulse
-    predictor = Predictor(experiment, (ANGLE, "drive.speed_hz"), parts)
-    speed_hz = float(predictor.start[1])
-    angles = 2.0 * math.pi * np.arange(_ANGLES) / _ANGLES
-    # What a probe's zero is, the angle does not tell: without each channel's mean.
-    squares = np.array([np.sum(_residuals(predictor, (angle, speed_hz), centred=True) ** 2) for angle in angles])
-    values = np.array([math.atan2(-squares @ np.sin(angles), -squares @ np.cos(angles)), speed_hz])
-    for _ in range(_ROUNDS):
-        z = _residuals(predictor, values, centred=True)
-        # Where the model is wrong, its errors do not outweigh the speed that the log tells.
-        weight = math.sqrt(float(z @ z) / len(z)) / (_RELATIVE["drive.speed_hz"] * max(speed_hz, 1e-3))
-        values = _fit(
-            predictor, values, predictor.start, weights=np.array([0.0, weight]), rounds=1, centred=True
-        ).values
-    return with_values(experiment, dict(zip(predictor.keys, values.tolist(), strict=True)))
+    experiment = _with_speed_of_edges(recording, experiment)
+    start_s, end_s = _looks_from(experiment), first_s - _MARGIN_S if first_s > 0.0 else math.inf
+    if end_s - start_s < _LEAST_LOOK_S:
+        return experiment
+    parts = observe(recording, experiment, window=(start_s, end_s)).parts
+    keys = (*(STATE if experiment.begin is not None else ()), ANGLE)
+    predictor = Predictor(experiment, keys, parts)
+
+    def shown(values: Sequence[float] | np.ndarray) -> list[np.ndarray]:
+        found = predictor.predict(np.asarray(values)).values
+        return [one for one, _ in _channels(parts, found)]
+
+    still = np.zeros(len(keys))
+    still[: len(keys) - 1] = predictor.start[:-1]
+    ahead, behind, beside = (shown([*still[:-1], angle]) for angle in (0.0, math.pi, math.pi / 2.0))
+    moved = [shown(still + step) for step in np.diag(predictor.scales)[:-1]]
+    middle = [(a + b) / 2.0 for a, b in zip(ahead, behind, strict=True)]
+    target, columns = [], []
+    for c, (measured, floor) in enumerate(_channels(parts, {name: part.values for name, part in parts.items()})):
+        slopes = [(ahead[c] - behind[c]) / 2.0, beside[c] - middle[c], *(one[c] - ahead[c] for one in moved)]
+        # What a probe's zero is, this does not tell: without each channel's mean.
+        target.append(_centred(measured - middle[c]) / floor)
+        columns.append(_centred(np.column_stack(slopes)) / floor)
+    found = _by_agreement(target, columns, _signals(parts))
+    moves = np.array([*found[2:], 0.0]) * predictor.scales
+    values = dict(zip(keys, (still + moves).tolist(), strict=True))
+    return with_values(experiment, values | {ANGLE: math.atan2(found[1], found[0])})
+
+
+def _by_agreement(
+    target: list[np.ndarray],
+    columns: list[np.ndarray],
+    scales: list[float],
+    held: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
+    """Least squares over channels that count by what they leave themselves, shape (unknowns,).
+
+    Args:
+        target: Of each channel, over its noise, shape (n,).
+        columns: The same of each unknown, shape (n, unknowns).
+        scales: By what each counts less at first: of all that it shows, so that none is right from the start.
+        held: What is known of the unknowns before: means and standard deviations.
+    """
+    grams = [one.T @ one for one in columns]
+    sides = [one.T @ z for one, z in zip(columns, target, strict=True)]
+    found = np.zeros(columns[0].shape[1])
+    for _ in range(_AGREED):
+        square = sum(gram / scale**2 for gram, scale in zip(grams, scales, strict=True))
+        side = sum(one / scale**2 for one, scale in zip(sides, scales, strict=True))
+        if held is not None:
+            square, side = square + np.diag(held[1] ** -2.0), side + held[0] * held[1] ** -2.0
+        # In units in which each is 1 of its own: sizes differ by a million.
+        size = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+        found = size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
+        scales = [max(1.0, _rms(z - a @ found)) for z, a in zip(target, columns, strict=True)]
+    return found
+
+
+def _signals(parts: Mapping[str, Measured]) -> list[float]:
+    """How much each channel shows, over its noise."""
+    shown = _channels(parts, {name: part.values for name, part in parts.items()})
+    return [max(1.0, float(values.std()) / floor) for values, floor in shown]
+
+
+def _rms(values: np.ndarray) -> float:
+    return math.sqrt(float(values @ values) / len(values))
+
+
+def _channels(parts: Mapping[str, Measured], values: Mapping[str, np.ndarray]) -> list[tuple[np.ndarray, float]]:
+    """Values of each channel, shape (n,), and its noise."""
+    return [
+        (values[name][:, c], float(part.floor[c])) for name, part in parts.items() for c in range(len(part.channels))
+    ]
+
+
+def _centred(values: np.ndarray) -> np.ndarray:
+    return values - values.mean(axis=0)
+
+
+def _with_speed_of_edges(recording: Recording, experiment: Experiment) -> Experiment:
+    """At the speed that the keyphasor's edges tell, which no calibration can spoil; without edges as it was."""
+    first_s = first_command_s(experiment) or math.inf
+    edges_s = recording.edges()
+    edges_s = edges_s[edges_s < first_s]
+    edges_s = edges_s[edges_s > edges_s[-1:].sum() - _TURNS_S] if len(edges_s) else edges_s
+    if len(edges_s) < 3 or experiment.scene.drive.profile:
+        return experiment
+    return with_values(experiment, {"drive.speed_hz": (len(edges_s) - 1) / float(edges_s[-1] - edges_s[0])})
 
 
 def asked_along(experiment: Experiment, keys: Sequence[str]) -> dict[str, tuple[float, float] | None]:
     """Nuisances that are fitted along with what is asked of an imported log: those that a search can take.
 
-    The speed is known before the hammer pulse, and the length of a hammer pulse only in rows of the simulation.
+    The length of a hammer pulse only in rows of the simulation, and the speed is known before.
     """
     few = tuple(key for key in NUISANCES if key not in ("drive.speed_hz", "hammer.1.duration_ms"))
     return nuisances_of(experiment, few, besides=keys)
-
-
-def check_begin(experiment: Experiment, to_s: float | None) -> None:
-    """Refuse a search through the impacts of a log that begins in the middle of a run.
-
-    Every simulation would have to run through the seconds before it, in which small errors of stiffness and unbalance
-    turn the motion away from the recorded one before the first impact: minutes of search that end in a wrong valley.
-
-    Args:
-        experiment: What was done.
-        to_s: Where the samples end [s]; None for the log's end.
-
-    Raises:
-        InputError: It is such a log, and the samples go beyond the first pulse.
-    """
-    hammer_s = first_command_s(experiment)
-    if experiment.first_s > 0.0 and hammer_s > 0.0 and (to_s is None or to_s > hammer_s):
-        must = "a log that begins with the run, at rest (lead_s = 0 in its mapping), to be fitted through impacts; of "
-        must += f"one from the middle of a run, only what is before the hammer pulse: --to {hammer_s - _MARGIN_S:.3f}"
-        raise InputError("file", must, Words(f"{experiment.first_s:g} s of the run are before its first sample"))
 
 
 def shortly_before(experiment: Experiment) -> float | None:
@@ -213,6 +280,9 @@ def tune(
 ) -> Tuned:
     """Fit what a log does not tell exactly, and nothing else, on windows that grow from the pulse.
 
+    A channel counts by what it leaves itself, so that a faulty one does not turn the others; and no value goes further
+    from what is known of it than `BEYOND` standard deviations.
+
     Args:
         recording: The log.
         experiment: What was done, as far as it is known.
@@ -222,87 +292,109 @@ def tune(
     Raises:
         InputError: There are no samples to do it by.
     """
-    progress("angle and speed of the shaft before the hammer pulse")
+    progress("speed, angle and place of the shaft before the hammer pulse")
     begun = turned(recording, experiment) if ANGLE in keys else experiment
     wanted = nuisances_of(begun, keys)
     first_s = first_command_s(begun)
-    whole = observe(recording, begun, window=(max(0.0, first_s - _BEFORE_S), first_s + _WINDOWS_S[-1]))
+    whole = observe(recording, begun, window=(_looks_from(begun), first_s + _WINDOWS_S[-1])).parts
+    whole = {name: _thinned(part, first_s - _BEFORE_S) for name, part in whole.items()}
     values = np.array([value_of(begun, key) for key in wanted])
-    covariance, chi2, end_s = np.eye(len(values)), math.inf, first_s
+    covariance, left, end_s, scales = np.eye(len(values)), math.inf, first_s, [1.0]
     for length in _WINDOWS_S:
-        progress(f"{', '.join(wanted)}: to {first_s + length:.3f} s")
-        predictor = Predictor(begun, tuple(wanted), whole.parts_until(whole.until(first_s + length)))
+        progress(f"{len(wanted)} numbers that the log does not tell exactly: to {first_s + length:.3f} s")
+        parts = {name: part.until(first_s + length) for name, part in whole.items()}
+        predictor = Predictor(begun, tuple(wanted), parts)
         # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
         loose = zip(predictor.start, predictor.scales, strict=True)
-        known = [prior or held for prior, held in zip(wanted.values(), loose, strict=True)]
-        means, deviations = np.array(known).T
-        found = _fit(predictor, values, means, weights=1.0 / deviations, rounds=_ROUNDS)
-        left = found.squares / len(found.residuals)
-        if math.isfinite(chi2) and left > max(_WORSE * chi2, _WORSE):
+        known = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
+        found, here = _approach(predictor, values, known)
+        middle = float(np.median([_rms(z) for z in here.apart]))
+        if math.isfinite(left) and middle > max(_WORSE * left, _WORSE):
             break  # the model no longer explains it: that is to be judged, and not to be fitted away
-        assert found.slopes is not None
-        root = np.linalg.inv(np.linalg.qr(found.slopes, mode="r"))
-        values, covariance, chi2, end_s = found.values, root @ root.T, left, first_s + length
-    half = 1.96 * math.sqrt(max(1.0, chi2)) * np.sqrt(np.diag(covariance))
+        scales = [max(1.0, _rms(z)) for z in here.apart]
+        square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
+        covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
+        left, end_s = middle, first_s + length
+    half = 1.96 * np.sqrt(np.diag(covariance))
     draw = values + np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(len(values))
     told = dict(zip(wanted, values.tolist(), strict=True))
     return Tuned(
         begun=begun,
         experiment=with_values(begun, told),
         fitted=tuple(
-            Fitted(key, value_of(experiment, key), value, float(width))
+            Fitted(key, value_of(experiment, key), value, float(width), wanted[key])
             for (key, value), width in zip(told.items(), half, strict=True)
         ),
         values=told,
         perturbed=dict(zip(wanted, draw.tolist(), strict=True)),
-        about_s=min(float(part.times_s[0]) for part in whole.parts.values()),
+        about_s=min(float(part.times_s[0]) for part in whole.values()),
         end_s=end_s,
-        chi2=chi2,
+        scales=dict(zip((name for part in whole.values() for name in part.names), scales, strict=True)),
     )
 
 
-def _fit(
-    predictor: Predictor,
-    start: np.ndarray,
-    means: np.ndarray,
-    *,
-    weights: np.ndarray,
-    rounds: int,
-    centred: bool = False,
-) -> Fit:
-    """Values near a start that explain the channels best.
+def _looks_from(experiment: Experiment) -> float:
+    """From where on samples before the hammer pulse are looked at [s]."""
+    begin_s = experiment.first_s if experiment.begin is None else experiment.begin.tick / TICK_RATE_HZ + _SETTLED_S
+    return max(begin_s, first_command_s(experiment) - BEFORE_S)
+
+
+def _thinned(part: Measured, until_s: float) -> Measured:
+    """All rows from a time on, and some of those before it."""
+    rows = np.arange(len(part.times_s))
+    return part.chosen(rows[(part.times_s >= until_s) | (rows % _EVERY == 0)])
+
+
+@dataclass(frozen=True)
+class _Here:
+    """Channels at some values: measured less predicted over the noise, each shape (n,); with slopes, (n, unknowns)."""
+
+    apart: list[np.ndarray]
+    slopes: list[np.ndarray]
+
+    def cost(self, off: np.ndarray) -> float:
+        """What values are worth that leave this, and are so many standard deviations off what is known of them."""
+        agreement = sum(len(z) * math.log(1.0 + float(z @ z) / len(z)) for z in self.apart)
+        return agreement + float(off @ off)
+
+
+def _approach(predictor: Predictor, values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, _Here]:
+    """Values near some others at which most channels agree, and how the channels are there.
 
     Args:
         predictor: Of the channels.
-        start: Where the search begins, shape (keys,).
-        means: What is known of the values before, shape (keys,) ...
-        weights: ... and how well: one over the standard deviation, 0 where nothing is, shape (keys,).
-        rounds: Largest number of steps.
-        centred: Without each channel's mean.
+        values: Where the search begins, shape (keys,).
+        known: Means and standard deviations of the values before, shape (2, keys).
     """
+    means, deviations = known
+    low, high = means - BEYOND * deviations, means + BEYOND * deviations
+    here = _look(predictor, values)
+    assert here is not None
+    for _ in range(_ROUNDS):
+        slopes = predictor.derivatives(values).slopes
+        by_key = [[one / floor for one, floor in _channels(predictor.parts, slope)] for slope in slopes]
+        here = _Here(here.apart, [np.column_stack(columns) for columns in zip(*by_key, strict=True)])
+        step = _by_agreement(here.apart, here.slopes, _signals(predictor.parts), (means - values, deviations))
+        cost = here.cost((values - means) / deviations)
+        for part in _PARTS:
+            moved = np.clip(values + part * step, low, high)
+            ahead = _look(predictor, moved)
+            if ahead is not None and ahead.cost((moved - means) / deviations) < cost:
+                break
+        else:
+            break
+        gained = cost - ahead.cost((moved - means) / deviations)
+        values, here = moved, _Here(ahead.apart, here.slopes)
+        if gained < _SAME:
+            break
+    return values, here
 
-    def residuals(values: np.ndarray) -> np.ndarray:
-        return np.concatenate([_residuals(predictor, values, centred=centred), (values - means) * weights])
 
-    def slopes(values: np.ndarray, _z: np.ndarray) -> np.ndarray:
-        found = predictor.derivatives(values).slopes
-        columns = [_over_noise(predictor, slope, centred=centred) for slope in found]
-        return np.vstack([np.column_stack(columns), np.diag(weights)])
-
-    found = fit(residuals, slopes, start, rounds=rounds)
-    assert found is not None
-    return found
-
-
-def _residuals(predictor: Predictor, values: Sequence[float] | np.ndarray, *, centred: bool) -> np.ndarray:
-    """Predicted less measured over the noise, of all channels, shape (n,)."""
-    found = predictor.predict(values).values
-    return _over_noise(
-        predictor, {name: found[name] - part.values for name, part in predictor.parts.items()}, centred=centred
-    )
-
-
-def _over_noise(predictor: Predictor, values: dict[str, np.ndarray], *, centred: bool) -> np.ndarray:
-    """Values of all channels, by group, in units of each one's noise, shape (n,)."""
-    found = [values[name] / part.floor for name, part in predictor.parts.items()]
-    return np.concatenate([(one - one.mean(axis=0) if centred else one).ravel() for one in found])
+def _look(predictor: Predictor, values: np.ndarray) -> _Here | None:
+    """The channels at some values; None where the model does not take them."""
+    try:
+        found = predictor.predict(values).values
+    except (InputError, SimulationError):
+        return None
+    apart = {name: part.values - found[name] for name, part in predictor.parts.items()}
+    return _Here([one / floor for one, floor in _channels(predictor.parts, apart)], [])

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
-from replays.recordings.identification.nuisance import Tuned, is_imported, tune
+from replays.recordings.experiment import Experiment, is_imported
+from replays.recordings.identification.nuisance import Tuned, tune
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
 from replays.recordings.validation.attribution import Explained, attribute
 from replays.recordings.validation.bits import Bits, StreamBits
