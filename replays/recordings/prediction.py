@@ -78,6 +78,15 @@ class Measured:
         """The rows before a time."""
         return self.first(self.rows_until(end_s))
 
+    def from_(self, begin_s: float) -> Measured:
+        """The rows from a time on."""
+        return self.chosen(slice(self.rows_until(begin_s), None))
+
+    def filtered(self, factor: float) -> Measured:
+        """The same behind low-passes of other corners."""
+        corners = ((channel, channel.bandwidth_hz * factor) for channel in self.channels)
+        return replace(self, channels=tuple(one.model_copy(update={"bandwidth_hz": hz}) for one, hz in corners))
+
     def first(self, n: int) -> Measured:
         """The first rows."""
         return self.chosen(slice(n))

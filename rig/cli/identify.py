@@ -67,22 +67,25 @@ class Asked:
         Raises:
             InputError: The recording, its scene or the model has no such thing.
         """
-        from replays.recordings.identification import ask
         from replays.recordings.experiment import is_imported
-        from replays.recordings.identification.nuisance import asked_along, shortly_before, turned
+        from replays.recordings.identification import ask
+        from replays.recordings.identification.nuisance import asked_along, shortly_before, tune
 
         keys, from_s = [key for part in self.fit for key in names_of(part)], self.from_s
         experiment = self._experiment(recording)
         known = pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
         priors = {key: _two("prior", text, "+-") for key, text in known.items()}
         along: dict[str, tuple[float, float] | None] = {}
+        begun: dict[str, str] = {}
         if is_imported(recording) and not exact:
-            experiment = turned(recording, experiment)
+            tuned = tune(recording, experiment, besides=keys)
+            experiment = tuned.begun
             along = asked_along(experiment, keys)
             keys += list(along)
             priors = {key: told for key, told in along.items() if told is not None} | priors
             from_s = shortly_before(experiment) if from_s is None else from_s
-        starts = pairs("--start", self.start, "KEY=VALUE")
+            begun = {key: str(value) for key, value in tuned.values.items() if key in along}
+        starts = begun | pairs("--start", self.start, "KEY=VALUE")
         bounds = pairs("--bounds", self.bounds, "KEY=LOW:HIGH")
         question = ask(
             recording,

@@ -81,6 +81,8 @@ def _show(found: Validation, console: Console) -> None:
     console.print(found.verdict_line)
     if found.explained is not None:
         console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")
+    for fault in found.faults:
+        console.print(shown(f"signal: {fault.line}"))
     console.print(found.bits_line)
     for line in found.fitted:
         console.print(line)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,10 @@ _SAME = 1.0
 """A step that gains less, of a number that noise changes by some, is the last."""
 _PARTS = (1.0, 0.3, 0.1, 0.03)
 """Parts of a step that are tried in turn, until one gains."""
+_ANOTHER = 0.2
+"""Part by which two instruments do not differ that measure one speed."""
+_LOOSER = 100.0
+"""Where a value wants beyond, it is given so many times the room, to see where to."""
 _TURNS_S = 3.0
 """So much of the edges before the hammer pulse tells the speed [s]."""
 _LEAST_LOOK_S = 0.02
@@ -60,8 +65,10 @@ _BEFORE_S = 0.03
 """... and so much of it is in the fit of all [s]."""
 _WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """How far behind the begin of the hammer pulse the fits look [s]."""
-_WORSE = 1.5
-"""A longer window is given up where it leaves more by this factor, in the middle one of the channels."""
+_WORSE = 1.2
+"""A longer window is given up where it leaves more by this factor in a third of the channels; ..."""
+_BROKEN = 10.0
+"""... one that it leaves so much more of is a faulty one."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +85,7 @@ class Fitted:
     @property
     def beyond(self) -> bool:
         """Whether it is as far from what is known of it as it may go."""
-        return self.known is not None and abs(self.value - self.known[0]) > 0.99 * BEYOND * self.known[1]
+        return _is_beyond(self.value, self.known)
 
     @property
     def line(self) -> str:
@@ -94,6 +101,10 @@ class Fitted:
         return f"{self.key}: {self.value:.6g} ±{self.half_width:.2g}, fitted ({change:+.2g} on what the log tells)"
 
 
+def _is_beyond(value: float, known: tuple[float, float] | None) -> bool:
+    return known is not None and abs(value - known[0]) > 0.99 * BEYOND * known[1]
+
+
 @dataclass(frozen=True)
 class Tuned:
     """An imported log and its experiment, brought together.
@@ -103,7 +114,7 @@ class Tuned:
         experiment: With the fitted numbers, those of a hammer pulse as its rows can have them.
         fitted: What was fitted.
         values: The same, by key.
-        perturbed: Values as far off as the fit leaves open, drawn once from what it says.
+        covariance: Of them, shape (values, values).
         about_s: Where the clocks differ by the offset alone [s].
         end_s: End of the samples that it rests on [s].
         scales: RMS of what is left of each channel over its noise, at least 1.
@@ -113,7 +124,7 @@ class Tuned:
     experiment: Experiment
     fitted: tuple[Fitted, ...]
     values: dict[str, float]
-    perturbed: dict[str, float]
+    covariance: np.ndarray
     about_s: float
     end_s: float
     scales: dict[str, float]
@@ -122,16 +133,19 @@ class Tuned:
         """Channels of the log on the model's clock."""
         return on_the_models_clock(parts, self.values, about_s=self.about_s)
 
-    def predict(self, parts: dict[str, Measured], *, perturbed: bool = False) -> Prediction:
-        """What is predicted for channels of the log, on its own clock; a hammer pulse may lie between two rows.
+    def changed(self, changes: dict[str, Any]) -> Tuned:
+        """The same numbers with another model."""
+        return replace(self, begun=self.begun.changed(changes))
 
-        Args:
-            parts: The channels.
-            perturbed: As far off as the fit leaves open.
-        """
-        values = self.perturbed if perturbed else self.values
-        predictor = Predictor(self.begun, tuple(values), parts, about_s=self.about_s)
-        return predictor.predict(tuple(values.values()))
+    def drawn(self, generator: np.random.Generator) -> Tuned:
+        """The same with values as far off as the fit leaves open, drawn from what it says."""
+        off = np.linalg.cholesky(self.covariance) @ generator.standard_normal(len(self.values))
+        return replace(self, values={key: value + d for (key, value), d in zip(self.values.items(), off, strict=True)})
+
+    def predict(self, parts: dict[str, Measured]) -> Prediction:
+        """What is predicted for channels of the log, on its own clock."""
+        predictor = Predictor(self.begun, tuple(self.values), parts, about_s=self.about_s)
+        return predictor.predict(tuple(self.values.values()))
 
 
 def nuisances_of(
@@ -167,7 +181,7 @@ def turned(recording: Recording, experiment: Experiment) -> Experiment:
     """
     first_s = first_command_s(experiment)
     experiment = _with_speed_of_edges(recording, experiment)
-    start_s, end_s = _looks_from(experiment), first_s - _MARGIN_S if first_s > 0.0 else math.inf
+    start_s, end_s = looks_from(experiment), first_s - _MARGIN_S if first_s > 0.0 else math.inf
     if end_s - start_s < _LEAST_LOOK_S:
         return experiment
     parts = observe(recording, experiment, window=(start_s, end_s)).parts
@@ -246,14 +260,32 @@ def _centred(values: np.ndarray) -> np.ndarray:
 
 
 def _with_speed_of_edges(recording: Recording, experiment: Experiment) -> Experiment:
-    """At the speed that the keyphasor's edges tell, which no calibration can spoil; without edges as it was."""
-    first_s = first_command_s(experiment) or math.inf
+    """At the speed that the keyphasor's edges tell, which no calibration can spoil; without edges as it was.
+
+    Where they tell quite another speed than the tachometer, that which the probes turn at is right.
+    """
+    first_s, told_hz = first_command_s(experiment) or math.inf, experiment.scene.drive.speed_hz
     edges_s = recording.edges()
     edges_s = edges_s[edges_s < first_s]
     edges_s = edges_s[edges_s > edges_s[-1:].sum() - _TURNS_S] if len(edges_s) else edges_s
     if len(edges_s) < 3 or experiment.scene.drive.profile:
         return experiment
-    return with_values(experiment, {"drive.speed_hz": (len(edges_s) - 1) / float(edges_s[-1] - edges_s[0])})
+    steps = np.diff(edges_s)
+    turns = np.rint(steps / np.median(steps)).sum()  # one that is missing is two turns
+    speed_hz = float(turns / (edges_s[-1] - edges_s[0]))
+    if abs(speed_hz - told_hz) > _ANOTHER * told_hz > 0.0:
+        parts = observe(recording, experiment, window=(looks_from(experiment), first_s - _MARGIN_S)).parts
+        speed_hz = max(speed_hz, told_hz, key=lambda hz: _turning(parts, hz))
+    return with_values(experiment, {"drive.speed_hz": speed_hz})
+
+
+def _turning(parts: Mapping[str, Measured], speed_hz: float) -> float:
+    """How much of the channels goes round at a speed, over their noise, without what is steady or drifts."""
+    found = 0.0
+    for part in parts.values():
+        turning = np.exp(2j * math.pi * speed_hz * part.times_s) * np.hanning(len(part.times_s))
+        found += float(np.sum(np.abs(turning @ (_centred(part.values) / part.floor)) ** 2)) / len(part.times_s)
+    return found
 
 
 def asked_along(experiment: Experiment, keys: Sequence[str]) -> dict[str, tuple[float, float] | None]:
@@ -276,6 +308,7 @@ def tune(
     experiment: Experiment,
     keys: Sequence[str] = NUISANCES,
     *,
+    besides: Sequence[str] = (),
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Tuned:
     """Fit what a log does not tell exactly, and nothing else, on windows that grow from the pulse.
@@ -287,6 +320,7 @@ def tune(
         recording: The log.
         experiment: What was done, as far as it is known.
         keys: What is fitted of it.
+        besides: What is left out of that, as it is asked anyway.
         progress: Told what is being done.
 
     Raises:
@@ -294,29 +328,21 @@ def tune(
     """
     progress("speed, angle and place of the shaft before the hammer pulse")
     begun = turned(recording, experiment) if ANGLE in keys else experiment
-    wanted = nuisances_of(begun, keys)
+    wanted = nuisances_of(begun, keys, besides=besides)
     first_s = first_command_s(begun)
-    whole = observe(recording, begun, window=(_looks_from(begun), first_s + _WINDOWS_S[-1])).parts
+    whole = observe(recording, begun, window=(looks_from(begun), first_s + _WINDOWS_S[-1])).parts
     whole = {name: _thinned(part, first_s - _BEFORE_S) for name, part in whole.items()}
-    values = np.array([value_of(begun, key) for key in wanted])
-    covariance, left, end_s, scales = np.eye(len(values)), math.inf, first_s, [1.0]
-    for length in _WINDOWS_S:
-        progress(f"{len(wanted)} numbers that the log does not tell exactly: to {first_s + length:.3f} s")
-        parts = {name: part.until(first_s + length) for name, part in whole.items()}
-        predictor = Predictor(begun, tuple(wanted), parts)
-        # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
-        loose = zip(predictor.start, predictor.scales, strict=True)
-        known = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
-        found, here = _approach(predictor, values, known)
-        middle = float(np.median([_rms(z) for z in here.apart]))
-        if math.isfinite(left) and middle > max(_WORSE * left, _WORSE):
-            break  # the model no longer explains it: that is to be judged, and not to be fitted away
-        scales = [max(1.0, _rms(z)) for z in here.apart]
-        square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
-        covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
-        left, end_s = middle, first_s + length
+    found = _grown(begun, wanted, whole, progress, trusting=False)
+    if max(found.scales) > _BROKEN:
+        # Where channels are at odds from the start, it depends on whom one believes first.
+        trusting = _grown(begun, wanted, whole, progress, trusting=True)
+        found = max(found, trusting, key=lambda one: (one.end_s, -sum(map(math.log, one.scales))))
+    far = [key for key, value in zip(wanted, found.values, strict=True) if _is_beyond(float(value), wanted[key])]
+    if far:
+        looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
+        found = _grown(begun, looser, whole, progress, trusting=True)
+    values, covariance = found.values, found.covariance
     half = 1.96 * np.sqrt(np.diag(covariance))
-    draw = values + np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(len(values))
     told = dict(zip(wanted, values.tolist(), strict=True))
     return Tuned(
         begun=begun,
@@ -326,14 +352,54 @@ def tune(
             for (key, value), width in zip(told.items(), half, strict=True)
         ),
         values=told,
-        perturbed=dict(zip(wanted, draw.tolist(), strict=True)),
+        covariance=covariance,
         about_s=min(float(part.times_s[0]) for part in whole.values()),
-        end_s=end_s,
-        scales=dict(zip((name for part in whole.values() for name in part.names), scales, strict=True)),
+        end_s=found.end_s,
+        scales=dict(zip((name for part in whole.values() for name in part.names), found.scales, strict=True)),
     )
 
 
-def _looks_from(experiment: Experiment) -> float:
+@dataclass(frozen=True)
+class _Grown:
+    """Values on the longest window that they explain, their covariance, and what is left of each channel."""
+
+    values: np.ndarray
+    covariance: np.ndarray
+    end_s: float
+    scales: list[float]
+
+
+def _grown(
+    begun: Experiment,
+    wanted: dict[str, tuple[float, float] | None],
+    whole: dict[str, Measured],
+    progress: Callable[[str], None],
+    *,
+    trusting: bool,
+) -> _Grown:
+    """Fit on windows that grow from the pulse; `trusting` believes first what agrees with what the log tells."""
+    first_s = first_command_s(begun)
+    values = np.array([value_of(begun, key) for key in wanted])
+    covariance, end_s, scales = np.eye(len(values)), first_s, list[float]()
+    for length in _WINDOWS_S:
+        progress(f"{len(wanted)} numbers that the log does not tell exactly: to {first_s + length:.3f} s")
+        parts = {name: part.until(first_s + length) for name, part in whole.items()}
+        predictor = Predictor(begun, tuple(wanted), parts)
+        # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
+        loose = zip(predictor.start, predictor.scales, strict=True)
+        known = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
+        found, here = _approach(predictor, values, known, trusting=trusting)
+        now = [max(1.0, _rms(z)) for z in here.apart]
+        if scales and 3 * sum(_WORSE * a < b < _BROKEN * a for a, b in zip(scales, now, strict=True)) > len(now):
+            break  # the model no longer explains it: that is to be judged, and not to be fitted away
+        scales = now
+        square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
+        covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
+        end_s = first_s + length
+    return _Grown(values, covariance, end_s, scales)
+
+
+def looks_from(experiment: Experiment) -> float:
     """From where on samples before the hammer pulse are looked at [s]."""
     begin_s = experiment.first_s if experiment.begin is None else experiment.begin.tick / TICK_RATE_HZ + _SETTLED_S
     return max(begin_s, first_command_s(experiment) - BEFORE_S)
@@ -358,13 +424,16 @@ class _Here:
         return agreement + float(off @ off)
 
 
-def _approach(predictor: Predictor, values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, _Here]:
+def _approach(
+    predictor: Predictor, values: np.ndarray, known: np.ndarray, *, trusting: bool
+) -> tuple[np.ndarray, _Here]:
     """Values near some others at which most channels agree, and how the channels are there.
 
     Args:
         predictor: Of the channels.
         values: Where the search begins, shape (keys,).
         known: Means and standard deviations of the values before, shape (2, keys).
+        trusting: Whether channels count by what they leave from the start on.
     """
     means, deviations = known
     low, high = means - BEYOND * deviations, means + BEYOND * deviations
@@ -374,7 +443,8 @@ def _approach(predictor: Predictor, values: np.ndarray, known: np.ndarray) -> tu
         slopes = predictor.derivatives(values).slopes
         by_key = [[one / floor for one, floor in _channels(predictor.parts, slope)] for slope in slopes]
         here = _Here(here.apart, [np.column_stack(columns) for columns in zip(*by_key, strict=True)])
-        step = _by_agreement(here.apart, here.slopes, _signals(predictor.parts), (means - values, deviations))
+        say = [max(1.0, _rms(z)) for z in here.apart] if trusting else _signals(predictor.parts)
+        step = _by_agreement(here.apart, here.slopes, say, (means - values, deviations))
         cost = here.cost((values - means) / deviations)
         for part in _PARTS:
             moved = np.clip(values + part * step, low, high)

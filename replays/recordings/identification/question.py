@@ -12,7 +12,7 @@ import numpy as np
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
 from replays.recordings.prediction import Measured, measured
-from replays.recordings.sensitivity import ANGLE, CLOCK, scale_of, value_of, with_values
+from replays.recordings.sensitivity import ANGLE, CLOCK, STATE, scale_of, value_of, with_values
 from rig.channels import Channel
 from rig.commands import COMMANDS, HammerCommand
 from rig.errors import InputError
@@ -302,7 +302,7 @@ def _check_key(experiment: Experiment, key: str) -> None:
     """Refuse at once what is no number of the rig or of what was done to it."""
     parameters = load_parameters().entries
     own = [name for name, entry in parameters.items() if entry.unit != "count"]
-    own += [*_SCENE_KEYS, *CLOCK, ANGLE]
+    own += [*_SCENE_KEYS, *CLOCK, ANGLE, *STATE]
     if key in own:
         return
     if len(key.split(".")) == 3 and key.split(".")[0] in COMMANDS:
@@ -330,5 +330,7 @@ def _unit(key: str) -> str:
         return CLOCK[key][0]
     if key == ANGLE:
         return "rad"
+    if key in STATE:
+        return STATE[key][0]
     entries = load_parameters().entries
     return entries[key].unit if key in entries else _COMMAND_UNITS.get(key.split(".")[-1], "")

@@ -7,13 +7,14 @@ of the residual each explains, so that two that explain it alike are seen to do 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from replays.recordings.experiment import Experiment
+from replays.recordings.identification.nuisance import Tuned
 from replays.recordings.least_squares import Fit, fit
 from replays.recordings.prediction import Measured, Prediction, predict
 from replays.recordings.sensitivity import scale_of, value_of, with_values
@@ -35,6 +36,8 @@ _STARTS = (0.0, *(sign * part for part in (0.005, 0.01, 0.02, 0.035, 0.06, 0.1, 
 """Where a fit may start on the first window, as parts of the farthest that it may go ..."""
 _TRIED = 3
 """... and from how many of these it does."""
+_MOST = 0.95
+"""Changes of channels that together explain this part of all are it, though the model leaves something."""
 _WHOLE_S = 5.0
 """How far sensors and time are looked at behind the first difference [s]."""
 
@@ -100,6 +103,34 @@ def attribute(
     found.sort(key=lambda one: (-one.to_s, -one.explained))
     conclusion, best = conclude(found, sensors if cured else [], rules, end_s=until_s)
     return Explained(from_s, until_s, tuple(found), conclusion, best)
+
+
+def explain_log(
+    parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], tuned: Tuned, rules: Attribution,
+    *, from_s: float, end_s: float,
+) -> Explained:  # fmt: skip
+    """What explains that a log of another system differs: sensors, or what was fitted beyond what is known of it.
+
+    Args:
+        parts: What was recorded, on the model's clock.
+        nominal: What was predicted, on the same rows.
+        others: What might be predicted as well.
+        tuned: What was fitted.
+        rules: Limits.
+        from_s: First difference [s].
+        end_s: How far the model has been followed [s].
+    """
+    sensors = sensor_faults(parts, nominal, end_s, others)
+    trigger = any(one.name == "hammer delay" for one in sensors)
+    far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
+    cured = bool(sensors) and sum(one.explained for one in sensors) > _MOST
+    conclusion, best = conclude(sensors, sensors if cured and not far else [], rules, end_s=end_s)
+    if far:
+        best = tuple(one.key for one in far)
+        conclusion = "beyond what is known of it: " + "; ".join(one.line for one in far)
+    elif not best:
+        conclusion = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
+    return Explained(from_s, end_s, tuple(sorted(sensors, key=lambda one: -one.explained)), conclusion, best)
 
 
 class _CandidateFit:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment, is_imported
-from replays.recordings.identification.nuisance import Tuned, tune
+from replays.recordings.identification.nuisance import Tuned, looks_from, tune
+from replays.recordings.identification.question import first_command_s
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
-from replays.recordings.validation.attribution import Explained, attribute
+from replays.recordings.validation.attribution import Explained, attribute, explain_log
 from replays.recordings.validation.bits import Bits, StreamBits
 from replays.recordings.validation.criteria import Criteria, load_criteria
 from replays.recordings.validation.outcome import Validation
+from replays.recordings.validation.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.statistics import perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
 from replays.recordings.validation.truth import judge_truth, recorded_truth
@@ -47,11 +52,11 @@ def validate(
         experiment = experiment.changed(changes)
     again = _done_again(recording, experiment, criteria, step)
     begin, end, reason = _window(again)
-    trajectory = residuals(again.parts, again.nominal, again.perturbed, again.criteria, end_s=end)
+    trajectory = residuals(again.parts, again.nominal, again.others, again.criteria, end_s=end)
     tables = recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
-    truth = judge_truth(tables, again.nominal, again.perturbed, criteria, end_s=end)
+    truth = judge_truth(tables, again.nominal, again.others[0], criteria, end_s=end)
     step("statistics by phase, and their spread")
-    phases, judged = statistics(again.quick, again.parts, again.nominal, tables, criteria)
+    phases, judged = statistics(again.quick, again.parts, again.nominal, tables, criteria, again.members)
     validation = Validation(
         path=recording.path, scene=experiment.scene.name, criteria=criteria.title, changes=dict(changes or {}),
         bits=again.bits, bit_exact=bool(again.bits) and all(one.equal for one in again.bits.values()),
@@ -61,13 +66,13 @@ def validate(
         skipped=sum(stream.lost for stream in recording.streams.values()),
         explained=None, fitted=tuple(one.line for one in again.tuned.fitted) if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
-        doubts=recording.doubts,
+        doubts=recording.doubts, faults=tuple(again.faults),
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     if validation.good or validation.doubts or not firsts:
         return validation
     step("what explains the difference")
-    return replace(validation, explained=_explained(again, from_s=min(firsts), step=step))
+    return replace(validation, explained=_explained(again, from_s=min(firsts), end_s=end, step=step))
 
 
 @dataclass(frozen=True)
@@ -79,18 +84,22 @@ class _DoneAgain:
         criteria: Loosened for an imported log.
         parts: What was recorded, on the model's clock.
         nominal: What was predicted.
-        perturbed: The same, as far off as another build or a fit may be.
+        others: The same, as far off as another build, a fit or a model that is as right may be.
         bits: By key; empty for an imported log.
         tuned: What was fitted before, of an imported log.
+        faults: What its signals show by themselves, of an imported log.
+        members: The ensemble of an imported log: fits as good, by models as right; else it is made of `quick`.
     """
 
     quick: Experiment
     criteria: Criteria
     parts: dict[str, Measured]
     nominal: Prediction
-    perturbed: Prediction
+    others: tuple[Prediction, ...]
     bits: dict[str, StreamBits]
     tuned: Tuned | None
+    members: tuple[Prediction, ...] = ()
+    faults: tuple[SignalFault, ...] = ()
 
 
 def _done_again(
@@ -100,44 +109,64 @@ def _done_again(
     parts = measured(recording, experiment.scene, longest_s=rules.longest_s)
     how_far = "perturbed, to see how far it can be predicted"
     if is_imported(recording):
-        tuned = tune(recording, experiment, criteria.imported.nuisances, progress=lambda text: step(f"log: {text}"))
-        nominal = tuned.predict(parts)
-        step(how_far)
-        return _DoneAgain(
-            quick=bare(tuned.experiment), criteria=criteria.loosened(criteria.imported.noise),
-            parts=tuned.on_time(parts), nominal=nominal, perturbed=tuned.predict(parts, perturbed=True), bits={},
-            tuned=tuned,
-        )  # fmt: skip
+        return _log_done_again(recording, experiment, criteria, step)
     bits = Bits(recording, experiment.simulation().table)
     step("re-simulated, payload by payload")
     nominal = predict(experiment, parts, follow=bits.follow)
     quick = bare(experiment)
     step(how_far)
     moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
-    return _DoneAgain(quick, criteria, parts, nominal, moved, bits.finish(), None)
+    return _DoneAgain(quick, criteria, parts, nominal, (moved,), bits.finish(), None)
+
+
+def _log_done_again(
+    recording: Recording, experiment: Experiment, criteria: Criteria, step: Callable[[str], None]
+) -> _DoneAgain:
+    """A log of another system: what it does not tell is fitted, and what it cannot know counts as floor."""
+    rules = criteria.imported
+    tuned = tune(recording, experiment, rules.nuisances, progress=lambda text: step(f"log: {text}"))
+    parts = measured(recording, tuned.begun.scene, longest_s=criteria.window.longest_s)
+    parts = {name: part.from_(looks_from(tuned.begun)) for name, part in parts.items()}
+    nominal = tuned.predict(parts)
+    step("perturbed, and by models that are as right, to see how far it can be predicted")
+    generator = np.random.default_rng(0)  # the same in every validation
+    others = [tuned.drawn(generator).predict(parts)]
+    models = [tuned, *(tuned.changed(variant.set) for variant in rules.variants)]
+    others += [model.predict(parts) for model in models[1:]]
+    others += [tuned.predict({name: part.filtered(rules.bandwidth) for name, part in parts.items()})]
+    drawn = [models[n % len(models)].drawn(generator) for n in range(criteria.ensemble.members)]
+    faults = signal_faults(measured(recording, tuned.begun.scene))
+    faults += edge_faults(recording.edges(), first_command_s(tuned.begun) or math.inf)
+    return _DoneAgain(
+        faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
+        quick=bare(tuned.experiment), criteria=criteria.loosened(rules.noise), parts=tuned.on_time(parts),
+        nominal=nominal, others=tuple(others), bits={}, tuned=tuned,
+    )  # fmt: skip
 
 
 def _window(again: _DoneAgain) -> tuple[float, float, str]:
     """Begin and end of what is compared sample by sample [s], and how the end was found."""
     rules, parts = again.criteria.window, again.parts
     begin = min(float(part.times_s[0]) for part in parts.values())
-    parted = foreseeable_s(parts, again.nominal, again.perturbed, share=rules.share)
-    change = "what the fit leaves open" if again.tuned is not None else f"a change of {rules.perturbation:g}"
+    if again.tuned is not None:
+        # What the fit leaves open, and what is not known of filters, makes a floor and no end.
+        parted = foreseeable_s(parts, again.nominal, again.others[1:-1], share=1.0)
+        end = min(again.tuned.end_s, math.inf if parted is None else parted)
+        return begin, end, "as far as fit and model go together" if end == again.tuned.end_s else "models part there"
+    parted = foreseeable_s(parts, again.nominal, again.others, share=rules.share)
+    change = f"a change of {rules.perturbation:g}"
     if parted is None:
         end = max(float(part.times_s[-1]) for part in parts.values()) + 1e-9
         return begin, end, f"to the end: {change} stays below {rules.share:g} of every channel's noise"
     return begin, parted, f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
 
 
-def _explained(again: _DoneAgain, *, from_s: float, step: Callable[[str], None]) -> Explained:
+def _explained(again: _DoneAgain, *, from_s: float, end_s: float, step: Callable[[str], None]) -> Explained:
     rules = again.criteria.attribution
-    if again.tuned is not None:  # numbers of the model hang together with what was fitted: `rig identify` fits all
-        rules = rules.model_copy(update={"candidates": ()})
-    explained = attribute(again.quick, again.parts, again.nominal, rules, from_s=from_s, step=step)
-    if again.tuned is not None and not explained.best:
-        told = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
-        explained = replace(explained, conclusion=told)
-    return explained
+    if again.tuned is None:
+        return attribute(again.quick, again.parts, again.nominal, rules, from_s=from_s, step=step)
+    # Numbers of the model hang together with what was fitted: `rig identify` fits all.
+    return explain_log(again.parts, again.nominal, again.others, again.tuned, from_s=from_s, end_s=end_s, rules=rules)
 
 
 def calibration(recording: Recording, experiment: Experiment) -> list[str]:

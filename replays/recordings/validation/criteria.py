@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
@@ -106,6 +106,14 @@ class TruthCriterion(_Section):
     """Largest difference as a part of each column's largest value, beyond that of the perturbed run."""
 
 
+class Variant(_Section):
+    """A model that is as right as ours."""
+
+    reason: Reason
+    set: dict[str, Any]
+    """Scene and parameters that are changed."""
+
+
 class Imported(_Section):
     """What is asked of logs of other systems, which tell less exactly what was done and how loud their sensors are."""
 
@@ -114,6 +122,9 @@ class Imported(_Section):
     """Numbers that are fitted before anything is compared."""
     noise: NotNegative
     """By this part the noise may be off that was read off the log."""
+    bandwidth: Positive
+    """Corner of a real anti-alias filter over the one that is told."""
+    variants: tuple[Variant, ...]
 
 
 class Candidate(_Section):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -16,80 +19,255 @@ from replays.recordings.validation.explanation import (
     smooth_columns,
     vector,
 )
+from replays.recordings.validation.signals import steady_rows
+from replays.recordings.validation.trajectory import floors
 
+_TURNED_OFF = 0.02
+"""By so much may two probes' signals differ from ones that are turned."""
+_LATEST_S = 2e-3
+"""How late a channel is looked for [s]."""
+_ALIKE = 0.05
+"""Changes that differ by less than this part of them are the same one."""
+_SLIGHT = 0.01
+"""A second change of a channel that takes away no more than this part of the first is none."""
+_NEARLY = 0.05
+"""A change that takes away all but this part is it, though the model leaves something."""
+_UNITS = {
+    25.4: "as mm for inch", 1.0 / 25.4: "as inch for mm", 1e3: "a thousand", 1e-3: "a thousandth",
+    9.80665: "as m/s^2 for g", 1.0 / 9.80665: "as g for m/s^2", 4.4482: "as N for lbf", 1.0 / 4.4482: "as lbf for N",
+    60.0: "as 1/min for Hz", 1.0 / 60.0: "as Hz for 1/min", 2.0: "twice", 0.5: "half", 10.0: "ten times", 0.1: "a tenth",
+}  # fmt: skip
+"""Gains that slips with units and ranges make."""
 _SEARCH = 400
 """Samples by which the time may be off in the first search, either way."""
 
 
-def sensor_faults(parts: dict[str, Measured], nominal: Prediction, end_s: float) -> list[Explanation]:
-    """What each channel that differs may have, by itself."""
-    columns = {}
-    total = 0.0
+@dataclass(frozen=True)
+class _Shown:
+    """One channel in the window, over its floor: what it shows, what it should, and that of its neighbours.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit.
+        times_s: Of its rows [s], shape (n,).
+        values: What it shows [its unit], shape (n,).
+        foretold: What it should show [its unit], shape (n,).
+        floor: Noise, and how far an equally right prediction may be off [its unit], shape (n,).
+        noise: Noise alone [its unit].
+    """
+
+    name: str
+    unit: str
+    times_s: np.ndarray
+    values: np.ndarray
+    foretold: np.ndarray
+    floor: np.ndarray
+    noise: float
+
+    @property
+    def apart(self) -> np.ndarray:
+        """Residuals over the floor, shape (n,)."""
+        return (self.values - self.foretold) / self.floor
+
+    @property
+    def moves(self) -> bool:
+        """Whether it should show more than noise."""
+        return float(self.foretold.std()) > self.noise
+
+    def left(self, columns: list[np.ndarray], aim: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Least squares of what it shows by some columns: their factors, and the residuals over the floor, (n,)."""
+        weights = 1.0 / self.floor
+        table = np.column_stack(columns) * weights[:, None]
+        goal = (self.values if aim is None else aim) * weights
+        size = np.sqrt(np.maximum((table**2).sum(axis=0), 1e-300))
+        found = np.linalg.lstsq(table / size, goal, rcond=None)[0] / size
+        return found, goal - table @ found
+
+
+def sensor_faults(
+    parts: dict[str, Measured], nominal: Prediction, end_s: float, others: Sequence[Prediction] = ()
+) -> list[Explanation]:
+    """What each channel that differs may have, by itself, or as one of a pair.
+
+    Args:
+        parts: What was recorded.
+        nominal: What was predicted.
+        end_s: End of the window [s].
+        others: What might be predicted as well.
+    """
+    shown = []
     for name, part in parts.items():
         n = part.rows_until(end_s)
-        for c in smooth_columns(part):
-            floor = float(part.floor[c])
-            r, e = part.values[:n, c] / floor, nominal.values[name][:n, c] / floor
-            columns[part.channels[c].name] = (r, e, part.channels[c].unit, floor)
-            total += excess(r - e)
-    off = {name: entry for name, entry in columns.items() if len(entry[0]) > 2 and not is_noise(entry[0] - entry[1])}
-    found = []
-    swapped = set()
-    for a, b in combinations(off, 2):
-        if off[a][2] == off[b][2] and len(off[a][0]) == len(off[b][0]):
-            (ra, ea, _, fa), (rb, eb, _, fb) = off[a], off[b]
-            crossed = np.concatenate([ra - eb * (fb / fa), rb - ea * (fa / fb)])
-            if is_noise(crossed):
-                share = (excess(ra - ea) + excess(rb - eb) - excess(crossed)) / total
-                found.append(_fault(f"{a} and {b}", "swapped", 0.0, crossed, explained=share, to_s=end_s))
-                swapped |= {a, b}
-    for name, (r, e, unit, floor) in off.items():
-        if name not in swapped:
-            found.append(_one_sensor(name, r, e, unit=unit, floor=floor, total=total, to_s=end_s))
-    return found
+        floor = floors(part, nominal.values[name][:n], [other.values[name][:n] for other in others])
+        shown += [
+            _Shown(
+                part.channels[c].name, part.channels[c].unit, part.times_s[:n], part.values[:n, c],
+                nominal.values[name][:n, c], floor[:, c], float(part.floor[c]),
+            )
+            for c in smooth_columns(part)
+        ]  # fmt: skip
+    total = sum(excess(one.apart) for one in shown)
+    off = {one.name: one for one in shown if len(one.values) > 2 and not is_noise(one.apart)}
+    told = _Telling(total, end_s)
+    found, seen = [], set()
+    for a, b in combinations(off.values(), 2):
+        if a.unit != b.unit or len(a.values) != len(b.values) or {a.name, b.name} & seen:
+            continue
+        pair = _swapped(a, b, told) or _turned(a, b, told)
+        if pair is not None:
+            found.append(pair)
+            seen |= {a.name, b.name}
+    found += [_one_sensor(one, told) for name, one in off.items() if name not in seen]
+    return _together(found)
 
 
-def _one_sensor(
-    name: str, r: np.ndarray, e: np.ndarray, *, unit: str, floor: float, total: float, to_s: float
-) -> Explanation:
+@dataclass(frozen=True)
+class _Telling:
+    """Makes explanations of one window: of which excess in all they explain a part, and to where."""
+
+    total: float
+    to_s: float
+
+    def __call__(
+        self, name: str, change: str, value: float, left: np.ndarray, before: np.ndarray, unit: str = ""
+    ) -> Explanation:
+        explained = (excess(before) - excess(left)) / self.total
+        return Explanation.of(
+            left, kind="sensor", name=name, change=change, value=value, unit=unit, explained=explained, to_s=self.to_s
+        )
+
+
+def _swapped(a: _Shown, b: _Shown, told: _Telling) -> Explanation | None:
+    """Two channels that show each other's signal, each at what it shows at rest."""
+    crossed = np.concatenate([a.left([b.foretold, np.ones(len(b.foretold))])[1],
+                              b.left([a.foretold, np.ones(len(a.foretold))])[1]])  # fmt: skip
+    factors = [x.left([y.foretold, np.ones(len(y.foretold))])[0][0] for x, y in ((a, b), (b, a))]
+    own = min(excess(x.left([x.foretold, np.ones(len(x.foretold))])[1]) for x in (a, b))
+    if not (a.moves and b.moves) or max(abs(factor - 1.0) for factor in factors) > 0.1:
+        return None
+    if not is_noise(crossed) and excess(crossed) > 0.01 * own:
+        return None
+    return told(f"{a.name} and {b.name}", "swapped", 0.0, crossed, np.concatenate([a.apart, b.apart]))
+
+
+def _turned(a: _Shown, b: _Shown, told: _Telling) -> Explanation | None:
+    """Two probes that sit at another angle than is told: both signals are turned by it."""
+    ones = np.ones(len(a.foretold))
+    (aa, ab, _), left_a = a.left([a.foretold, b.foretold, ones])
+    (ba, bb, _), left_b = b.left([a.foretold, b.foretold, ones])
+    angle = math.atan2(ab - ba, aa + bb)
+    off = max(abs(aa - bb), abs(ab + ba), abs(math.hypot(aa, ab) - 1.0))
+    if not (a.moves and b.moves) or off > _TURNED_OFF or abs(math.sin(angle)) < 3.0 * off:
+        return None
+    left = np.concatenate([left_a, left_b])
+    if not is_noise(left) and excess(left) > 0.01 * (excess(a.apart) + excess(b.apart)):
+        return None
+    before = np.concatenate([a.apart, b.apart])
+    return told(f"{a.name} and {b.name} angle", f"{math.degrees(angle):+.3g} degrees", angle, left, before, "rad")
+
+
+def _one_sensor(one: _Shown, told: _Telling) -> Explanation:
     """The simplest change of a channel that leaves noise, else the one that leaves least."""
-    before = excess(r - e)
-
-    def told(what: str, change: str, value: float, left: np.ndarray, of: str = "") -> Explanation:
-        explained = (before - excess(left)) / total
-        return _fault(f"{name} {what}", change, value, left, unit=of, explained=explained, to_s=to_s)
-
-    shift = float((r - e).mean())
-    options = [told("offset", f"{shift * floor:+.4g} {unit}", shift * floor, r - e - shift, unit)]
-    if e @ e > 0.0:
-        gain = float(r @ e) / float(e @ e)
-        what, change = _gain_words(gain)
-        options.append(told(what, change, gain - 1.0, r - gain * e))
-    if e.std() > 1.0:
-        slope, base = (float(number) for number in np.polyfit(e, r, 1))
-        what, change = _gain_words(slope)
-        left = r - slope * e - base
-        options.append(told(f"{what} and offset", f"{change}, {base * floor:+.4g} {unit}", slope - 1.0, left))
-    # Another number must earn its place.
-    best = min(enumerate(options), key=lambda pair: pair[1].squares + DECIDES * (pair[0] == 2))[1]
-    if best.at_floor:
+    before, ones, e = one.apart, np.ones(len(one.values)), one.foretold
+    if excess(before[_steady(one)]) > 0.5 * excess(before):
+        held = "stuck" if _steady(one).any() else ""
+        if held:
+            kept = ~_steady(one)
+            return told(f"{one.name} {held}", _for_how_long(one.times_s[~kept]), 0.0, before[kept], before)
+    (shift,), left = one.left([ones], one.values - e)
+    options = [(told(f"{one.name} offset", f"{shift:+.4g} {one.unit}", float(shift), left, before, one.unit), 1)]
+    if one.moves:
+        late_s, delayed, slope = _delayed(one)
+        for columns, numbers in (([e], 1), ([e, ones], 2)):
+            factors, left = one.left(columns)
+            what, change = _gain_words(float(factors[0]))
+            more = f", {factors[1]:+.4g} {one.unit}" if numbers == 2 and what == "gain" else ""
+            name = f"{one.name} {what}{' and offset' if more else ''}"
+            options.append((told(name, change + more, float(factors[0]) - 1.0, left, before), numbers))
+        (shift,), left = one.left([ones], one.values - delayed)
+        name, change = f"{one.name} delay", f"{late_s * 1e6:+.4g} µs"
+        options.append((told(name, change, late_s, (one.values - delayed) / one.floor, before, "s"), 1))
+        if abs(shift) > one.noise:
+            options.append((told(f"{name} and offset", f"{change}, {shift:+.4g} {one.unit}", late_s, left, before), 2))
+        factors, left = one.left([delayed, ones])
+        what, also = _gain_words(float(factors[0]))
+        options.append(
+            (told(f"{one.name} {what} and delay", f"{also}, {change}", float(factors[0]) - 1.0, left, before), 3)
+        )
+        factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - e)
+        options.append((told(f"{one.name} bandwidth", _smoothing_words(factors), float(factors[1]), left, before), 2))
+    # Another number must earn its place: by more than noise, and by more than what is wrong elsewhere brings along.
+    price = max(DECIDES, _SLIGHT * excess(before))
+    best = min(options, key=lambda pair: pair[0].squares + price * pair[1])[0]
+    if best.at_floor or best.left < _NEARLY * min(1.0, math.sqrt(float(before @ before) / len(before))) + 1.0:
         return best
-    rest = r - e - shift
+    rest = one.left([ones], one.values - e)[1]
     white = abs(float(rest[1:] @ rest[:-1]) / float(rest @ rest)) < 0.1
-    tied = e.std() > 1.0 and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
+    tied = one.moves and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
     if white and not tied:
         ratio = float(rest.std())
-        share = before / total
-        return _fault(f"{name} noise", f"x {ratio:.2f}", ratio, rest / ratio, explained=share, to_s=to_s)
+        return told(f"{one.name} noise", f"x {ratio:.2f}", ratio, rest / ratio, before)
     return best
 
 
-def _fault(
-    name: str, change: str, value: float, left: np.ndarray, *, unit: str = "", explained: float, to_s: float
-) -> Explanation:
-    return Explanation.of(
-        left, kind="sensor", name=name, change=change, value=value, unit=unit, explained=explained, to_s=to_s
-    )
+def _steady(one: _Shown) -> np.ndarray:
+    """Rows of stretches in which a channel with noise shows one and the same number, shape (n,)."""
+    return steady_rows(one.values) if one.noise > 0.0 else np.zeros(len(one.values), dtype=bool)
+
+
+def _for_how_long(times_s: np.ndarray) -> str:
+    return f"from {times_s[0]:.4f} s, {len(times_s)} rows" if len(times_s) else ""
+
+
+def _delayed(one: _Shown) -> tuple[float, np.ndarray, np.ndarray]:
+    """By how much a channel is late [s], what it should show then, and the slope of that [its unit/s]."""
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(one.times_s, one.foretold)
+    slope, period_s = spline.derivative(), float(np.diff(one.times_s).min())
+
+    def cost(late_s: float) -> float:
+        return float(np.sum(one.left([spline(one.times_s - late_s), np.ones(len(one.values))])[1] ** 2))
+
+    rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), np.linspace(-_LATEST_S, _LATEST_S, 41) / period_s])))
+    late_s = float(min(rows * period_s, key=cost))
+    for _ in range(6):
+        at = one.times_s - late_s
+        (_, step, _), _ = one.left([spline(at), -slope(at), np.ones(len(at))])
+        late_s = float(np.clip(late_s + np.clip(step, -period_s, period_s), -2.0 * _LATEST_S, 2.0 * _LATEST_S))
+    at = one.times_s - late_s
+    return late_s, spline(at), slope(at)
+
+
+def _together(found: list[Explanation]) -> list[Explanation]:
+    """Channels that are off by the same, told as one."""
+    kinds = [one.name.partition(" ")[2] for one in found]
+    groups: list[list[Explanation]] = []
+    for one, kind in zip(found, kinds, strict=True):
+        for group in groups:
+            if kind in ("gain", "delay") and group[0].name.endswith(f" {kind}"):
+                apart = abs(one.value - group[0].value)
+                if apart < _ALIKE * max(abs(one.value), abs(group[0].value)):
+                    group.append(one)
+                    break
+        else:
+            groups.append([one])
+    told = []
+    for group in groups:
+        first, *more = group
+        if more:
+            kind, n = first.name.partition(" ")[2], sum(one.n for one in group)
+            squares = sum(one.squares for one in group)
+            first = replace(
+                first, name=f"{', '.join(one.name.partition(' ')[0] for one in group)} {kind}",
+                explained=sum(one.explained for one in group), squares=squares, n=n, left=math.sqrt(squares / n),
+            )  # fmt: skip
+        told.append(first)
+    return told
+
+
+def _smoothing_words(factors: np.ndarray) -> str:
+    return f"{'lower' if factors[1] > 0.0 else 'higher'} than told"
 
 
 def _gain_words(gain: float) -> tuple[str, str]:
@@ -97,7 +275,8 @@ def _gain_words(gain: float) -> tuple[str, str]:
         return "polarity", "turned round"
     if abs(gain) < 0.02:
         return "signal", "missing"
-    return "gain", f"{100.0 * (gain - 1.0):+.3g} %"
+    known = next((text for factor, text in _UNITS.items() if abs(gain / factor - 1.0) < 0.02), "")
+    return "gain", f"{100.0 * (gain - 1.0):+.3g} %" + (f" ({known})" if known else "")
 
 
 class Clock:

@@ -13,6 +13,7 @@ from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.validation.attribution import Explained
 from replays.recordings.validation.bits import StreamBits
 from replays.recordings.validation.phases import SPECTRA, Phase
+from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import ChannelResidual
 from rig.wire import TRUTH as TRUTH_KEY
 
@@ -120,6 +121,7 @@ class Validation:
         parts: What was recorded.
         nominal: What was predicted.
         files: Number of files that the recording was in.
+        faults: What signals of a log show by themselves to be wrong.
         doubts: What in the recording does not fit the rest of it: then nothing that is left of it is good.
     """
 
@@ -143,12 +145,13 @@ class Validation:
     parts: dict[str, Measured] = field(repr=False, default_factory=dict)
     nominal: Prediction | None = field(repr=False, default=None)
     files: int = 1
+    faults: tuple[SignalFault, ...] = ()
     doubts: tuple[str, ...] = ()
 
     @property
     def good(self) -> bool:
         """Bit-exact, or within every criterion, and all of it is there."""
-        return not self.doubts and ((self.bit_exact and not self.declared) or not self.failures)
+        return not (self.doubts or self.faults) and ((self.bit_exact and not self.declared) or not self.failures)
 
     @property
     def failures(self) -> list[Failure]:
@@ -214,6 +217,8 @@ class Validation:
         if self.doubts:
             more = f", and {len(self.doubts) - 1} more" if self.doubts[1:] else ""
             return f"NOT GOOD, the recording does not fit together: {self.doubts[0]}{more}"
+        if self.faults and not self.failures:
+            return f"NOT GOOD, a signal shows a fault: {'; '.join(one.line for one in self.faults)}"
         channels = [one.channel for one in self.residuals if one.good is False]
         tables = [one.table for one in self.truth if not one.good]
         phases = [one.phase for one in self.statistics if one.good is False]
@@ -239,6 +244,7 @@ class Validation:
                 "bits": {key: {**asdict(one), "equal": one.equal} for key, one in self.bits.items()},
                 "rows_lost": self.skipped,
                 "doubts": list(self.doubts),
+                "faults": [one._asdict() for one in self.faults],
                 "fitted": list(self.fitted),
                 "calibration": list(self.calibration),
                 "window": {"from_s": self.window_s[0], "to_s": self.window_s[1], "reason": self.window_reason},

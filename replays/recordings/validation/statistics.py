@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -47,6 +47,7 @@ def statistics(
     nominal: Prediction,
     tables: TruthTables,
     criteria: Criteria,
+    members: Sequence[Prediction] = (),
 ) -> tuple[list[Phase], list[StatisticResult]]:
     """The phases of a recording, and every quantity of each against its spread over perturbed runs.
 
@@ -56,16 +57,17 @@ def statistics(
         nominal: What is predicted.
         tables: The recorded truth.
         criteria: What is asked.
+        members: What might have been predicted as well; none: the experiment perturbed.
     """
     look = _viewer(experiment, parts)
     recorded = {name: part.values for name, part in parts.items()}
     floors = {name: _floor(parts, names) for name, names in SPECTRA.items()}
     phases = find_phases(look(recorded, _whole(parts)), floor_n=_floor(parts, ("P_N", "P_S", "P_E", "P_W")))
-    members = _ensemble(experiment, parts, criteria)
+    shown = _ensemble(experiment, parts, criteria, members)
     results = []
     for number, phase in enumerate(phases):
         seen, there = look(recorded, phase), look(nominal.values, phase)
-        others = [look(loud, phase) for loud, _ in members]
+        others = [look(loud, phase) for loud, _ in shown]
         samples: dict[str, tuple[float, list[float]]] = {}  # recorded, and of every member
         read = [quantities(other, phase.name) for other in others]
         for name, value in quantities(seen, phase.name).items():
@@ -74,7 +76,7 @@ def statistics(
         for name, value in spectra(seen, there, floors).items():
             samples[name] = value, [one.get(name, 1.0) for one in distances]
         for name, columns in _ENERGIES.items() if "energy" in tables else ():
-            ends = [energy_change(tables["energy"], columns, phase, prediction) for _, prediction in members]
+            ends = [energy_change(tables["energy"], columns, phase, prediction) for _, prediction in shown]
             samples[name] = (
                 energy_change(tables["energy"], columns, phase, nominal)[0],
                 [predicted for _, predicted in ends],
@@ -103,14 +105,15 @@ def _viewer(experiment: Experiment, parts: dict[str, Measured]) -> Callable[[dic
 
 
 def _ensemble(
-    experiment: Experiment, parts: dict[str, Measured], criteria: Criteria
+    experiment: Experiment, parts: dict[str, Measured], criteria: Criteria, given: Sequence[Prediction]
 ) -> list[tuple[dict[str, np.ndarray], Prediction]]:
     """Perturbed runs: what the channels show with noise of their own, and what is predicted without."""
     generator = np.random.default_rng(0)  # of the ensemble's noise and perturbations: the same in every validation
     members = []
-    for _ in range(criteria.ensemble.members):
+    for number in range(criteria.ensemble.members):
         part = criteria.ensemble.perturbation * generator.uniform(-1.0, 1.0)
-        prediction = predict(perturbed(experiment, criteria.window.parameters, part), parts)
+        moved = None if given else perturbed(experiment, criteria.window.parameters, part)
+        prediction = given[number] if moved is None else predict(moved, parts)
         loud = {
             name: values + parts[name].floor * parts[name].random * generator.standard_normal(values.shape)
             for name, values in prediction.values.items()

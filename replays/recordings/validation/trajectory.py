@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,42 +70,48 @@ class ChannelResidual:
 
 
 def foreseeable_s(
-    parts: dict[str, Measured], nominal: Prediction, perturbed: Prediction, *, share: float
+    parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], *, share: float
 ) -> float | None:
-    """First time at which two runs that differ as builds may are apart by a part of the noise [s]; None: nowhere."""
+    """First time at which runs that are as right are apart by a part of the noise [s]; None: nowhere."""
     ends = []
     for name, part in parts.items():
-        apart = np.abs(perturbed.values[name] - nominal.values[name]) > share * part.floor
-        apart[:, [channel.name == "keyphasor" for channel in part.channels]] = False  # a pulse: one row late is no sign
-        hit = np.flatnonzero(apart.any(axis=1))
-        if len(hit):
-            ends.append(float(part.times_s[hit[0]]))
+        for other in others:
+            apart = np.abs(other.values[name] - nominal.values[name]) > share * part.floor
+            apart[:, [channel.name == "keyphasor" for channel in part.channels]] = (
+                False  # a pulse: a row late is no sign
+            )
+            hit = np.flatnonzero(apart.any(axis=1))
+            if len(hit):
+                ends.append(float(part.times_s[hit[0]]))
     return min(ends, default=None)
 
 
-def scaled(part: Measured, values: np.ndarray, perturbed: np.ndarray | None = None) -> np.ndarray:
-    """Residuals of recorded against predicted over the floor, shape (n, channels).
+def floors(part: Measured, values: np.ndarray, others: Sequence[np.ndarray] = ()) -> np.ndarray:
+    """Noise, and how far predictions are from each other that are as right, shape (n, channels).
 
     Args:
         part: What was recorded.
-        values: What was predicted for its first rows.
-        perturbed: The same of the perturbed run, which adds its distance to the floor.
+        values: What was predicted for its first rows, shape (n, channels).
+        others: What might have been predicted as well, each shape (n, channels).
     """
-    floor = part.floor[None, :]
-    if perturbed is not None:
-        floor = np.hypot(floor, perturbed - values)
-    return (part.values[: len(values)] - values) / floor
+    squares = sum(((other - values) ** 2 for other in others), np.broadcast_to(part.floor**2, values.shape))
+    return np.sqrt(squares)
+
+
+def scaled(part: Measured, values: np.ndarray, others: Sequence[np.ndarray] = ()) -> np.ndarray:
+    """Residuals of recorded against predicted over the floor, shape (n, channels); arguments as of `floors`."""
+    return (part.values[: len(values)] - values) / floors(part, values, others)
 
 
 def residuals(
-    parts: dict[str, Measured], nominal: Prediction, perturbed: Prediction, criteria: Criteria, *, end_s: float
+    parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], criteria: Criteria, *, end_s: float
 ) -> list[ChannelResidual]:
     """Judge every channel inside the window.
 
     Args:
         parts: What was recorded.
         nominal: What was predicted.
-        perturbed: The same, perturbed.
+        others: What might have been predicted as well.
         criteria: The limits.
         end_s: End of the window [s].
     """
@@ -113,7 +120,7 @@ def residuals(
         n = part.rows_until(end_s)
         if n == 0:
             continue
-        z = scaled(part, nominal.values[name][:n], perturbed.values[name][:n])
+        z = scaled(part, nominal.values[name][:n], [other.values[name][:n] for other in others])
         for c, channel in enumerate(part.channels):
             criterion = criteria.trajectory_of(channel.name)
             found.append(_judge(part, c, z[:, c], criterion))

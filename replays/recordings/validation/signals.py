@@ -1,0 +1,118 @@
+"""Faults that signals show by themselves, wherever in a log: stuck, clipped, loud, pulses that are missing."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from replays.recordings.identification.question import measured_noise
+from replays.recordings.prediction import Measured
+
+_HELD = 8
+"""So many equal numbers in a row are none that noise makes ..."""
+_RARE = 0.02
+"""... where neighbours are equal this seldom elsewhere."""
+_RAIL, _AT_RAIL = 3, 6
+"""Rows in a row at the largest or smallest number, and in all, that make a rail of it."""
+_LOUD = 3.0
+"""Times the noise of its peers."""
+
+
+class SignalFault(NamedTuple):
+    """One fault of one channel."""
+
+    channel: str
+    what: str
+    from_s: float
+    to_s: float
+    text: str
+
+    @property
+    def line(self) -> str:
+        """In words."""
+        return f"{self.channel} {self.what}: {self.text}"
+
+
+def steady_rows(values: np.ndarray, held: int = _HELD) -> np.ndarray:
+    """Rows of stretches of one and the same number, shape (n,)."""
+    found = np.zeros(len(values), dtype=bool)
+    for begin, end in _runs(np.concatenate([[False], np.diff(values) == 0.0])):
+        if end - begin >= held - 1:
+            found[begin - 1 : end] = True
+    return found
+
+
+def signal_faults(parts: dict[str, Measured]) -> list[SignalFault]:
+    """What channels show by themselves.
+
+    Args:
+        parts: The channels, as long as they are.
+    """
+    found = []
+    for part in parts.values():
+        noises = [measured_noise(part.values[:, c]) for c in range(len(part.channels))]
+        for c, channel in enumerate(part.channels):
+            if channel.signal == "keyphasor":
+                continue  # a pulse is steady, and has rails
+            found += _held(channel.name, channel.unit, part.times_s, part.values[:, c])
+            peers = [noises[k] for k, other in enumerate(part.channels) if k != c and other.unit == channel.unit]
+            if peers and noises[c] > _LOUD * max(peers):
+                times = noises[c] / float(np.median(peers))
+                text = f"{times:.2g} times that of its peers"
+                found.append(SignalFault(channel.name, "noise", float(part.times_s[0]), float(part.times_s[-1]), text))
+    return found
+
+
+def edge_faults(edges_s: np.ndarray, until_s: float) -> list[SignalFault]:
+    """Pulses that are missing or too many while the shaft turns evenly.
+
+    Args:
+        edges_s: Keyphasor edges [s].
+        until_s: Up to when it does [s].
+    """
+    steps = np.diff(edges_s[edges_s < until_s])
+    if len(steps) < 3:
+        return []
+    turns = steps / np.median(steps)
+    found = []
+    for what, rows in (("missing", turns > 1.5), ("too many", turns < 0.7)):
+        at = np.flatnonzero(rows)
+        if len(at):
+            begin, end = float(edges_s[at[0]]), float(edges_s[at[-1] + 1])
+            text = f"pulses {what} in {len(at)} of {len(steps)} turns, the first at {begin:.3f} s"
+            found.append(SignalFault("keyphasor", "pulses", begin, end, text))
+    return found
+
+
+def _held(name: str, unit: str, times_s: np.ndarray, values: np.ndarray) -> list[SignalFault]:
+    """Where a channel is stuck, and where it is at a rail."""
+    steady = steady_rows(values)
+    rest = np.diff(values[~steady]) == 0.0
+    if not len(rest) or rest.mean() > _RARE:
+        return []  # its numbers are coarse, or it is all of one
+    found = []
+    rails = np.zeros(len(values), dtype=bool)
+    for side, level in (("largest", values.max()), ("smallest", values.min())):
+        at = steady_rows(np.where(values == level, level, np.arange(len(values)) + level + 1.0), _RAIL)
+        runs = _runs(at)
+        if at.sum() >= _AT_RAIL and len(runs) > 1:
+            rails |= at
+            text = f"{at.sum()} rows at its {side}, {level:.6g} {unit}, the first at {times_s[runs[0][0]]:.4f} s"
+            found.append(SignalFault(name, "clipped", *_span(times_s, runs), text))
+    runs = _runs(steady & ~rails)
+    if runs:
+        begin, end = _span(times_s, runs)
+        text = f"one and the same number in {sum(b - a for a, b in runs)} rows, from {begin:.4f} to {end:.4f} s"
+        found.append(SignalFault(name, "stuck", begin, end, text))
+    return found
+
+
+def _runs(rows: np.ndarray) -> list[tuple[int, int]]:
+    """Beginnings and ends of stretches of rows."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _span(times_s: np.ndarray, runs: list[tuple[int, int]]) -> tuple[float, float]:
+    return float(times_s[runs[0][0]]), float(times_s[runs[-1][1] - 1])
