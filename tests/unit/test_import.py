@@ -757,7 +757,7 @@ def _counts(recording: Recording, group: str) -> np.ndarray:
 def test_a_template_of_an_unknown_file_imports_as_it_is(daq_mdf: Path, tmp_path: Path) -> None:
     text = template([daq_mdf])
     assert text.count("PLEASE CHECK") == 2
-    assert re.search(r"# bandwidth_hz = 5000 +# PLEASE CHECK", text), "filters are what it cannot know"
+    assert re.search(r"# bandwidth_hz = HZ +# PLEASE CHECK", text), "filters are what it cannot know"
     assert re.search(r"pulses_per_turn = 1 +# PLEASE CHECK: 40 pulses a second do not fit the speed", text)
     assert "# daq.mf4: MDF 4.10, 3 signals" in text
     _, recording = imported(tmp_path, [daq_mdf], text)

@@ -25,6 +25,8 @@ _NEAR = 0.01
 """Part of a sample by which untouched samples may lie beside the instants that they are given."""
 _LEAST, _MOST = 1e-30, 1e30
 """Values that a measurement can have, in any unit."""
+_SLOWEST_HZ, _FASTEST_HZ = 0.01, 1e6
+"""Rates that a recording may have, whose clock ticks a million times a second."""
 _DUST = 1e-4
 """Part of a sample by which a rate of few digits may be off from end to end."""
 _CLOCK = 2e-4
@@ -160,11 +162,15 @@ def _group_rate(name: str, entries: Sequence[MappedSignal], mapping: Mapping) ->
         return float(mapping.resample.rate_hz)
     if method == "none" and mapping.resample.rate_hz is not None:
         raise InputError("resample.method", '"polyphase" or "linear" with resample.rate_hz', method)
-    if len({true_rate(entry.axis) for entry in entries}) == 1 or method == "none":
-        return true_rate(entries[0].axis)
-    told = ", ".join(f"{entry.name} {entry.axis.rate_hz:.9g} Hz" for entry in entries[:6])
-    must = f'given with method "{method}", as the rates in {name} are not one (or time.rate_hz'
-    raise InputError("resample.rate_hz", f"{must}, where the file rounds its own)", told)
+    rates = {true_rate(entry.axis) for entry in entries}
+    rate, told = true_rate(entries[0].axis), ", ".join(f"{e.name} {e.axis.rate_hz:.9g} Hz" for e in entries[:6])
+    if len(rates) > 1 and method != "none":
+        must = f'given with method "{method}", as the rates in {name} are not one (or time.rate_hz'
+        raise InputError("resample.rate_hz", f"{must}, where the file rounds its own)", told)
+    if not _SLOWEST_HZ <= rate <= _FASTEST_HZ:
+        must = f'given, with method "polyphase" or "linear", for rates beyond {_SLOWEST_HZ:g} to {_FASTEST_HZ:g} Hz'
+        raise InputError("resample.rate_hz", must, told)
+    return rate
 
 
 def _put(group: PlacedGroup, entry: MappedSignal, mapping: Mapping) -> None:

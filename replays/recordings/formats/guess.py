@@ -383,6 +383,9 @@ def _turns(guesses: Sequence[Guess]) -> None:
         pulse.reasons.append(f"{rate_hz:.4g} pulses a second")
         pulse.asks["pulses_per_turn"] = "no speed to check it by"
         return
+    if speed.volts:
+        pulse.asks["pulses_per_turn"] = "the speed is told in volts"
+        return
     told = speed.entry.unit if units.kind(speed.entry.unit) == "speed of rotation" else None
     pairs = [(unit, size) for unit, size in _TURN_UNITS if told is None or units.canonical(told) == unit]
     pairs = pairs or [(told or "", 6.283185307179586 / units.size_si(told or ""))]
@@ -402,7 +405,7 @@ def _turns(guesses: Sequence[Guess]) -> None:
 def _speed_of(guesses: Sequence[Guess], rate_hz: float) -> Guess | None:
     """A signal without a unit that is as steady and as large as the pulses turn."""
     for each in guesses:
-        steady = not each.channel and not each.kind and each.look.spread < 0.1 * abs(each.look.mean)
+        steady = not (each.channel or each.kind or each.volts) and each.look.spread < 0.1 * abs(each.look.mean)
         if steady and any(abs(each.look.mean / size / rate_hz - 1.0) < _WHOLE for _, size in _TURN_UNITS):
             each.take("speed", LIKELY, "steady, and as the pulses turn")
             return each

@@ -8,11 +8,13 @@ _LENGTH = 256
 """Samples of a stretch."""
 _LOW = 16
 """Lines of its spectrum, from 0 on, in which the signal itself moves: noise is taken to go on there as above them."""
-_MANY = 5
-"""Of more stretches than this, the quietest tenth is below the mean, by so many standard deviations: ..."""
-_TENTH = 1.2816
-_TIED = 1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)
-"""By this a Hann window multiplies the variance of a sum of lines, as it ties each to its neighbours."""
+_QUIET, _HALF_QUIET = 0.1, 0.4
+"""Part of its stretches in which each line is taken for quiet: what a signal does at times drops out, line by line.
+The second one is for the shape, which needs more of them."""
+_TONE = 9
+"""Lines of which the middle one counts, so that a single tone does not."""
+_TONES = 3.0
+"""So many times what its neighbours have, a line may have."""
 _ORDER = 4
 """Of the low-pass, a Butterworth, as the channel table has it."""
 _FALL = 6.0
@@ -36,23 +38,30 @@ def _spectra(values: np.ndarray) -> np.ndarray:
     return lines / (2.0 * np.sin(np.pi * np.arange(_LOW, _LENGTH // 2) / _LENGTH)) ** 4
 
 
+def _floor(values: np.ndarray, quiet: float) -> tuple[np.ndarray, int]:
+    """Power of the noise in each line from _LOW on, shape (lines,), and the number of stretches; none: no lines."""
+    spectra = _spectra(values)
+    rows = len(spectra)
+    if not rows:
+        return np.empty(0), 0
+    # Of a line of noise, powers are distributed exponentially: the k-th least of n is 1/n + ... + 1/(n - k + 1) means.
+    means = np.cumsum(1.0 / np.arange(rows, 0, -1))
+    return np.quantile(spectra, quiet, axis=0) / np.interp(quiet * (rows - 1), np.arange(rows), means), rows
+
+
 def white_or_not(values: np.ndarray) -> float:
-    """Standard deviation of a signal's noise [its unit], in the quietest tenth of its stretches, if there are many.
+    """Standard deviation of a signal's noise [its unit], as it is in the quietest tenth of the time, if there is much.
 
     Of white noise it is that of the noise; of noise behind a filter, or between whose samples straight lines were
     drawn, that of what is left. Where it ends below a sixteenth of the rate it is not seen.
     """
-    spectra = _spectra(values)
-    if not len(spectra):
+    power, _ = _floor(values, _QUIET)
+    if not len(power):
         return 0.0
-    weights = np.ones(spectra.shape[1])
-    weights[: _LOW // 2] += 2.0
-    rms = np.sqrt(spectra @ weights / (_LENGTH / 2))
-    if len(rms) <= _MANY:
-        return float(np.quantile(rms, 0.1))
-    mean = weights * np.median(spectra, axis=0)
-    spread = 0.5 * np.sqrt(_TIED * float(mean @ mean)) / max(float(mean.sum()), 1e-300)
-    return float(np.quantile(rms, 0.1)) / (1.0 - _TENTH * min(float(spread), 0.5))
+    # A tone stands out of its neighbours; what scatters about them has its mean as it is.
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(power, _TONE // 2, mode="reflect"), _TONE)
+    power = np.minimum(power, _TONES * np.median(near, axis=1))
+    return float(np.sqrt((power.sum() + _LOW * power[: _LOW // 2].mean()) / (_LENGTH / 2)))
 
 
 def corner_hz(values: np.ndarray, rate_hz: float) -> float | None:
@@ -61,12 +70,9 @@ def corner_hz(values: np.ndarray, rate_hz: float) -> float | None:
     Of a converter's own noise, which comes behind the filter, nothing is learnt: it is as strong up to half of the
     rate.
     """
-    spectra = _spectra(values)
-    levels = spectra.mean(axis=1) if len(spectra) else np.empty(0)
-    quiet = spectra[levels <= np.quantile(levels, 0.25)] if len(spectra) >= _LEAST else spectra[:0]
-    if not len(quiet):
+    power, stretches = _floor(values, _HALF_QUIET)
+    if stretches < _LEAST:
         return None
-    power = quiet.mean(axis=0)
     part = np.arange(_LOW, _LENGTH // 2) / _LENGTH
     end = float(np.median(power[-_LOW // 2 :]))
     if not end > 0.0 or float(np.median(power[: _LOW // 2])) < _FALL * end:
@@ -75,12 +81,11 @@ def corner_hz(values: np.ndarray, rate_hz: float) -> float | None:
     for corner in np.geomspace(part[0], 0.5, 200):
         shape = 1.0 / (1.0 + (part / corner) ** (2 * _ORDER))
         for floor in end * np.array([0.0, 0.5, 0.8, 0.95]):
-            held = np.log(np.maximum(power - floor, 1e-3 * end)) if floor else np.log(power)
-            level = np.median(held[: _LOW // 2])
-            off = np.log(power) - np.log(np.exp(level) * shape + floor)
+            level = float(np.median((power - floor)[: _LOW // 2]))
+            off = np.log(power) - np.log(np.maximum(level * shape + floor, 1e-3 * end))
             error = float(np.sqrt(np.mean(off**2)))
             if best is None or error < best[0]:
                 best = error, float(corner)
     assert best is not None
-    # Each line is a mean of so many squares: its logarithm varies by one over their number.
-    return best[1] * rate_hz if best[0] < np.hypot(np.log(_FIT), 1.0 / np.sqrt(len(quiet))) else None
+    # Each line is like a mean of so many squares: its logarithm varies by one over their number.
+    return best[1] * rate_hz if best[0] < np.hypot(np.log(_FIT), 1.0 / np.sqrt(_HALF_QUIET * stretches)) else None

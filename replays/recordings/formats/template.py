@@ -98,7 +98,7 @@ def _time(guesses: Sequence[Guess]) -> list[str]:
         return [
             "",
             "[time]",
-            f"# rate_hz = 20000    # {CHECK}: no rate is told of some signals, and no time_column",
+            f"# rate_hz = HZ    # {CHECK}: no rate is told of some signals, and no time_column",
         ]
     uneven = next((each for each in guesses if each.look.axis.times_s is not None), None)
     if uneven is None:
@@ -132,7 +132,7 @@ def _filters(guesses: Sequence[Guess], known: dict[Path, Attached]) -> list[str]
         return [*lines, f"bandwidth_hz = {float(f'{middle:.3g}'):g}    # {CHECK}: {text}"]
     return [
         *lines,
-        f"# bandwidth_hz = 5000    # {CHECK}: the low-pass before the converter; the noise does not show it",
+        f"# bandwidth_hz = HZ    # {CHECK}: the low-pass before the converter; the noise does not show it",
     ]
 
 
