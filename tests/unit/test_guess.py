@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.recordings.formats import clock, noise
+from replays.recordings.formats import clock, noise, overview
 from replays.recordings.formats.conversion import Conversion, block_starts, convert, write_recording
 from replays.recordings.formats.guess import Guess
 from replays.recordings.formats.mapping import parse_mapping
@@ -91,6 +91,35 @@ def test_each_signal_is_taken_for_what_it_is(
         assert (found["speed"].unit, found["speed"].sure) == ("rpm", "likely")
         assert "against CH8; loaded as CH4 rises" in found["P_N"].why
         assert found["P_N"].sure == "ask"
+
+
+@pytest.mark.parametrize(
+    ("names", "channels"),
+    [
+        (("Trigger [V]", "Grid frequency [Hz]"), ("", "speed likely")),
+        (("oil film [mm]", "p [bar]"), ("", "")),
+        (("prox [mm]",), ("disk_x ask",)),
+        (("disk_x [N]", "Wirbelstrom Ring vertikal [mil]"), ("", "ring_y sure")),
+        (("Disk 1 [mm]", "Disk 2 [mm]", "Disk 3 [mm]"), ("disk_x ask", "disk_y ask", "ring_x ask")),
+        (("F_N [N]", "F_N2 [N]"), ("P_N likely", "")),
+        (("F1 [N]", "F2 [N]", "F3 [N]", "F4 [N]", "F5 [N]"), ("",) * 5),
+        (("Effort O [N]", "Effort E [N]"), ("P_W sure", "P_E sure")),
+        (("disk_x [mm]", "disk_x_ [mm]"), ("disk_x sure", "")),
+        (("Drehzahl [V]",), ("speed sure",)),
+    ],
+)
+def test_what_nothing_speaks_for_stays_a_channel_of_its_own(
+    names: tuple[str, ...], channels: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Noise alone: nothing but names and units speaks; each template imports as it is."""
+    path, t = tmp_path / "x.csv", np.arange(600) / 1000
+    noise_of = np.random.default_rng(0).standard_normal((600, len(names)))
+    head = ",".join(["time", *names])
+    np.savetxt(path, np.column_stack([t, 5.0 + noise_of]), delimiter=",", header=head, comments="", fmt="%.9f")
+    text, guesses = guessed([path])
+    assert tuple(f"{one.channel} {one.sure}" if one.channel else "" for one in guesses) == channels
+    conversion, _ = imported(path, text, tmp_path)
+    assert len(conversion.channels) == len(names)
 
 
 def imported(path: Path, text: str, folder: Path) -> tuple[Conversion, Recording]:
@@ -228,10 +257,22 @@ def test_a_log_is_imported_in_one_step(tmp_path: Path, capsys: pytest.CaptureFix
     assert list(tmp_path.iterdir()) == [path], "nothing is written unasked"
     found = json.loads(shown(capsys, "import", path, "--json"))
     assert {one["signal"]: one["channel"] for one in found}["Kraft O"] == "P_E"
-    printed = shown(capsys, "import", path, "-o", tmp_path / "g.mcap", "--picture", tmp_path / "g.png")
+    printed = shown(capsys, "import", path, "-o", tmp_path / "g.mcap")
     assert "imported as guessed" in printed
-    assert (tmp_path / "g.png").read_bytes().startswith(b"\x89PNG")
+    assert "guessed and not told: [defaults] bandwidth_hz" in printed
     assert len(Recording.open(tmp_path / "g.mcap").table.channels) == 13
+
+
+def test_a_picture_shows_short_blows_of_long_signals(tmp_path: Path) -> None:
+    path, t = tmp_path / "x.csv", np.arange(6000) / 3000
+    np.savetxt(path, np.column_stack([t, foreign.hammer(t), np.sin(40 * t)]), delimiter=",", comments="", fmt="%.6f",
+               header="time,hammer [N],disk_x [mm]")  # fmt: skip
+    _, guesses = guessed([path])
+    times, values = overview.course(guesses[0].look.axis.instants(), guesses[0].look.values)
+    assert len(times) == len(values) == 2000
+    assert values.max() == guesses[0].look.extent[1]
+    overview.draw(guesses, tmp_path / "x.png")
+    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(

@@ -174,7 +174,7 @@ def _kind(each: Guess) -> str:
     if by_unit:
         agree = named.kind == by_unit
         each.reasons += [*([word] if agree else []), f"unit {each.entry.unit}"]
-        each.sure = SURE
+        each.sure = SURE if agree or named.place or named.side else LIKELY
         return by_unit
     if units.kind(each.entry.unit) not in ("", "voltage", "number"):
         return ""
@@ -208,9 +208,7 @@ def _place_only(channel: str, found: list[Guess], seen: set[str]) -> None:
 
 def _stem(each: Guess) -> tuple[str, ...]:
     """A name without its axis."""
-    axes = {"x": ("x", "ax", "h"), "y": ("y", "ay", "v")}.get(each.named.axis, ())
-    words = words_of(each.entry.name)
-    return tuple(word for word in words if word not in axes and not read_name(word).axis)
+    return tuple(word for word in words_of(each.entry.name) if not read_name(word).axis)
 
 
 def _place_pairs(kind: str, found: list[Guess], seen: set[str]) -> None:

@@ -26,8 +26,8 @@ _PLACES = {
     "outer": "out outer aussen aussengehaeuse exterieur exterior esterno buiten",
 }
 _AXES = {
-    "x": "x ax fx hor horiz horizontal horizontale waagrecht waagerecht h",
-    "y": "y ay fy ver vert vertical verticale vertikal senkrecht lotrecht v",
+    "x": "x ax fx hor horiz horizontal horizontale waagrecht waagerecht",
+    "y": "y ay fy ver vert vertical verticale vertikal senkrecht lotrecht",
 }
 _SIDES = {
     "N": "n north nord norte noord noorden norden", "S": "s south sued sud sur zuid sueden",

@@ -35,7 +35,7 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
     for (whole, close), guess in zip(axes, shown, strict=True):
         times, values = guess.look.axis.instants(), guess.look.values
         colour = _COLOURS.get(guess.sure, BLACK)
-        whole.plot(*_course(times, values), color=colour, lw=0.9)
+        whole.plot(*course(times, values), color=colour, lw=0.9)
         length = min(len(values), max(_FEW, round(_CLOSE_S * guess.look.axis.rate_hz)))
         starts = np.arange(0, len(values) - length + 1, max(1, length // 2))
         start = max(
@@ -50,7 +50,7 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
     save(figure, path)
 
 
-def _course(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def course(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest of as many stretches as there is room for, in turn: what a line of all samples shows."""
     if len(values) <= 2 * _STRETCHES:
         return times, values
