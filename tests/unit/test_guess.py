@@ -219,6 +219,25 @@ def test_a_corner_that_is_seen_is_proposed_and_asked(tmp_path: Path) -> None:
     assert mapping.channels["inner_y"].bandwidth_hz == pytest.approx(4000.0, rel=0.06)
 
 
+@pytest.mark.parametrize(("taken", "told"), [("evenly", '[time]\nstamps = "line"\n'), ("when stamped", "[resample]\n"),
+                                             ("at rest", 'stamps = "line"    # PLEASE CHECK')])  # fmt: skip
+def test_whether_samples_or_only_their_stamps_are_uneven(taken: str, told: str, tmp_path: Path) -> None:
+    generator, path = np.random.default_rng(3), tmp_path / "x.csv"
+    even = np.arange(3000) / 1000
+    stamps = even + generator.uniform(-2e-4, 2e-4, 3000)
+    noise_of = 1e-3 * generator.standard_normal(3000)
+    values = noise_of + (0.0 if taken == "at rest" else np.sin(60 * (even if taken == "evenly" else stamps)))
+    rows = np.column_stack([stamps, values])
+    np.savetxt(path, rows, delimiter=",", header="time,P_N [N]", comments="", fmt="%.9f")
+    text, _ = guessed([path])
+    assert told in text
+    conversion, recording = imported(path, text, tmp_path)
+    assert ("samples as they were" in conversion.channels[0].time) == (taken != "when stamped")
+    found, at_s = recording.samples("P_N"), conversion.document["zero_s"]
+    if taken != "at rest":
+        np.testing.assert_allclose(found["P_N"], np.sin(60 * (found.times_s + at_s)), rtol=0, atol=6e-3)
+
+
 def test_a_default_gives_way_to_what_a_channel_says() -> None:
     data = {"defaults": {"bandwidth_hz": 4000.0}, "channels": {
         "disk_x": {"source": "a"}, "speed": {"source": "b", "bandwidth_hz": 200.0},

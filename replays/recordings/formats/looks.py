@@ -22,6 +22,8 @@ _EDGES, _REGULAR = 3, 0.3
 """... and has at least so many edges, whose distances have at most this relative spread, or change slowly."""
 _BLOW, _SELDOM = 20.0, 0.02
 """A blow is so many times what is usual, in at most so much of the time."""
+_FEW = 20
+"""Values of which nothing is said."""
 _AROUND = 4
 """Lines of a spectrum on either side of its peak."""
 _BLOCKS = " ▁▂▃▄▅▆▇█"
@@ -90,6 +92,24 @@ class Look:
     def corner_hz(self) -> float | None:
         """Where its noise ends [Hz], if it shows."""
         return noise.corner_hz(self.values, self.axis.rate_hz) if self.timed and self.axis.times_s is None else None
+
+    @cached_property
+    def unevenness(self) -> float:
+        """How far values lie from the line between their neighbours at even times, over the same at their stamps, rms.
+
+        Above 1 they were taken when the stamps say, below it evenly; 1 where the stamps are even.
+        """
+        if self.axis.times_s is None or len(self.values) < _FEW:
+            return 1.0
+
+        def off(times: np.ndarray) -> float:
+            part = (times[1:-1] - times[:-2]) / (times[2:] - times[:-2])
+            between = (1.0 - part) * self.values[:-2] + part * self.values[2:]
+            return float(np.sqrt(np.mean((self.values[1:-1] - between) ** 2)))
+
+        at_stamps = off(self.axis.times_s)
+        evenly = off(np.arange(len(self.values), dtype=float))
+        return evenly / at_stamps if evenly and at_stamps else 1.0
 
     @cached_property
     def slow(self) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from importlib.resources import files as files_of
@@ -20,6 +21,8 @@ CHECK = "PLEASE CHECK"
 _LABEL = 60
 _TABLES = ("[[align]]", "[keyphasor]", "[hammer]", "[experiment]")
 """What stands at the end of a mapping, to be taken up."""
+_FITS = 1.3
+"""By so much better values must fit one kind of times than the other for it to be told."""
 _HEIGHT = 0.3
 """A hammer pulse is told from the rest by this part of the largest one."""
 _COMMON_CORNERS = 0.1
@@ -100,17 +103,23 @@ def _time(guesses: Sequence[Guess]) -> list[str]:
             "[time]",
             f"# rate_hz = HZ    # {CHECK}: no rate is told of some signals, and no time_column",
         ]
-    uneven = next((each for each in guesses if each.look.axis.times_s is not None), None)
-    if uneven is None:
+    uneven = [each for each in guesses if each.look.axis.times_s is not None]
+    if not uneven:
         return []
-    rms, largest = (f"{1e6 * value:.3g} µs" for value in uneven.look.axis.jitter_s)
-    return [
-        "",
-        f"# The time stamps of {uneven.entry.name} lie up to {largest} (rms {rms}) off even ones. If the samples were",
-        '# taken unevenly, not only stamped so: [resample] method = "linear", which colours the noise.',
-        "[time]",
-        f'stamps = "line"    # {CHECK}: samples came evenly, and their stamps jitter',
-    ]
+    most = max(uneven, key=lambda each: abs(math.log(each.look.unevenness)))
+    rms, largest = (f"{1e6 * value:.3g} µs" for value in most.look.axis.jitter_s)
+    factor = most.look.unevenness
+    told = f"# Time stamps lie up to {largest} (rms {rms}) off even ones. The values of {most.entry.name} "
+    if factor > _FITS:
+        told += f"fit their stamps {factor:.2g} times better:"
+        asked = f"{CHECK}: samples were taken unevenly; lines between them colour the noise"
+        return ["", told, "[resample]", f'method = "linear"    # {asked}']
+    if factor < 1.0 / _FITS:
+        told += f"fit even times {1.0 / factor:.2g} times better: only stamps jitter."
+        return ["", told, "[time]", 'stamps = "line"']
+    told += "do not tell which is right:"
+    asked = f'{CHECK}: only stamps jitter; if samples were taken unevenly: [resample] method = "linear"'
+    return ["", told, "[time]", f'stamps = "line"    # {asked}']
 
 
 def _filters(guesses: Sequence[Guess], known: dict[Path, Attached]) -> list[str]:
