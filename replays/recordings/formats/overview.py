@@ -32,8 +32,10 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
     shown = guesses[:_MOST]
     figure = new_figure(0.6 + _HEIGHT * len(shown), "Signals, whole and close up, and what they are taken for")
     axes = figure.subplots(len(shown), 2, squeeze=False, width_ratios=(2, 1))
+    zero_s = min(guess.look.axis.first_s for guess in shown)
+    end_s = max(guess.look.axis.last_s for guess in shown) - zero_s
     for (whole, close), guess in zip(axes, shown, strict=True):
-        times, values = guess.look.axis.instants(), guess.look.values
+        times, values = guess.look.axis.instants() - zero_s, guess.look.values
         colour = _COLOURS.get(guess.sure, BLACK)
         whole.plot(*course(times, values), color=colour, lw=0.9)
         length = min(len(values), max(_FEW, round(_CLOSE_S * guess.look.axis.rate_hz)))
@@ -45,8 +47,10 @@ def draw(guesses: Sequence[Guess], path: Path) -> None:
         close.plot(times[part], values[part], color=colour, lw=0.9)
         taken = f"{guess.channel} ({guess.sure})" if guess.channel else "a channel of its own"
         whole.set_title(f"{label_of(guess.entry.name, guess.entry.unit or 'no unit')} \N{RIGHTWARDS ARROW} {taken}")
+        whole.set_xlim(0.0, end_s)
+        whole.tick_params(labelbottom=whole is axes[-1, 0])
     for ax in axes[-1]:
-        ax.set_xlabel("time [s]")
+        ax.set_xlabel("time from the first sample [s]")
     save(figure, path)
 
 
@@ -54,7 +58,6 @@ def course(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Lowest and highest of as many stretches as there is room for, in turn: what a line of all samples shows."""
     if len(values) <= 2 * _STRETCHES:
         return times, values
-    whole = len(values) // _STRETCHES * _STRETCHES
-    folded = values[:whole].reshape(_STRETCHES, -1)
-    middle = times[:whole].reshape(_STRETCHES, -1).mean(axis=1)
-    return np.repeat(middle, 2), np.stack([folded.min(axis=1), folded.max(axis=1)], axis=1).ravel()
+    starts = np.linspace(0, len(values), _STRETCHES, endpoint=False).astype(int)
+    extremes = np.stack([np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)], axis=1)
+    return np.repeat(times[starts], 2), extremes.ravel()
