@@ -149,7 +149,7 @@ def convert(
 
 def _of_the_axes(groups: dict[str, PlacedGroup]) -> list[str]:
     """What is to be known of groups that came apart, and of rates that are no whole numbers."""
-    told = []
+    told, alike = list[str](), dict[float, list[str]]()
     for name, group in groups.items():
         own = next(iter(group.channels.values())).target.group
         if name != own:
@@ -158,10 +158,12 @@ def _of_the_axes(groups: dict[str, PlacedGroup]) -> list[str]:
                 "is resampled (pictures that need both at once: [resample])"
             )
         if not group.rate_hz.is_integer():
-            set_hz = nominal_hz(group.rate_hz)
-            off = (group.rate_hz / set_hz - 1.0) * 1e6
-            fast = f", {off:+.3g} ppm on {set_hz} Hz" if abs(off) < 1e3 else ""
-            told.append(f"{name}: {group.rate_hz:.9g} Hz{fast}, as its clock says; its samples are as they were")
+            alike.setdefault(group.rate_hz, []).append(name)
+    for rate_hz, names in alike.items():
+        set_hz = nominal_hz(rate_hz)
+        off = (rate_hz / set_hz - 1.0) * 1e6
+        fast = f", {off:+.3g} ppm on {set_hz} Hz" if abs(off) < 1e3 else ""
+        told.append(f"{', '.join(names)}: {rate_hz:.9g} Hz{fast}, as the clock says; samples are as they were")
     return told
 
 

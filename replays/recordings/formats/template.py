@@ -12,6 +12,7 @@ from pathlib import Path
 from replays.recordings.formats.attached import Attached, attached
 from replays.recordings.formats.guess import SURE, Guess, guess
 from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats.noise import white_or_not
 from replays.recordings.formats.source import Entry, Source, open_source
 from rig import units
 from rig.channels import default_table
@@ -23,8 +24,8 @@ _TABLES = ("[[align]]", "[keyphasor]", "[hammer]", "[experiment]")
 """What stands at the end of a mapping, to be taken up."""
 _FITS = 1.3
 """By so much better values must fit one kind of times than the other for it to be told."""
-_HEIGHT = 0.3
-"""A hammer pulse is told from the rest by this part of the largest one."""
+_HEIGHT, _ABOVE = 0.1, 8.0
+"""A hammer pulse is told from the rest by this part of the largest one, and so many times the noise."""
 _COMMON_CORNERS = 0.1
 """Corners that are so near each other are those of one kind of filter."""
 
@@ -157,7 +158,8 @@ def _happened(guesses: Sequence[Guess], *, several: bool) -> list[str]:
         if each.channel == "hammer" and each.look.blows and each.gain:
             peak = max(each.gain * (value - each.zero) for value in each.look.extent)
             lines += ["", f"[hammer]    # its pulses in the channel `hammer`; the largest has {peak:.3g} N"]
-            lines += [f"threshold_n = {_HEIGHT * peak:.2g}"]
+            least = max(_HEIGHT * peak, _ABOVE * abs(each.gain) * white_or_not(each.look.values))
+            lines += [f"threshold_n = {least:.2g}"]
     return lines
 
 
