@@ -106,6 +106,8 @@ class Catalogue(BaseModel):
     table: ChannelTable
     tick_rate_hz: _Rate
     truth: dict[str, _Truth] = {}
+    rates_hz: dict[str, _Rate] = {}
+    """True rates by group, where the table tells them as whole numbers: those of a log of another system."""
 
     @classmethod
     def read(cls, document: Mapping[str, Any]) -> Catalogue:
@@ -126,7 +128,9 @@ class Catalogue(BaseModel):
         ticks = self.tick_rate_hz
         found = {wire.EDGES: Promise(1, 0.0, ticks)}
         for name, group in self.table.groups.items():
-            found[wire.sensor_key(name)] = Promise(len(group.channels), float(group.rate_hz), ticks)
+            found[wire.sensor_key(name)] = Promise(
+                len(group.channels), self.rates_hz.get(name, float(group.rate_hz)), ticks
+            )
         for name, table in self.truth.items():
             found[wire.truth_key(name)] = Promise(len(table.columns), table.rate_hz, ticks)
         return found

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from replays.recordings.formats.conversion import Conversion
+    from replays.recordings.formats.guess import Guess
 
 
 def import_(
@@ -35,44 +37,62 @@ def import_(
             help="Write a starting mapping instead; without logs, an example with every option.",
         ),
     ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw the signals of the logs as well, to a .png or .svg file.")
+    ] = None,
     force: Force = False,
     form: Form,
 ) -> None:
     """Turn logs of a real rig into a recording that `rig info`, `view`, `replay`, `validate` and `identify` read.
 
-    Start with --template, edit the mapping, then import. Everything that was done to the samples is printed, and stands
-    in the recording.
+    Without --mapping, each signal is guessed by its name, unit and numbers, and told with the reason; with -o it is
+    imported so. --template writes the guess as a mapping, to be corrected. What was done to the samples is printed, and
+    stands in the recording.
     """
-    if (template is None) == (mapping is None):
-        raise InputError("import", "given either --mapping or --template", Words("both" if mapping else "neither"))
+    if template is not None and mapping is not None:
+        raise InputError("import", "given either --mapping or --template", Words("both"))
+    if mapping is not None and output is None:
+        raise InputError("--output", "given: a recording to write, such as -o log.mcap", None)
+    if template is not None and output is not None:
+        raise InputError("--output", "left out with --template", str(output))
+    if not files and (template is None or picture is not None):
+        raise InputError("FILE", "given: the logs to import", None)
     from rig.scenes import rig_table
 
     rig_table()
-    if template is not None:
-        if output is not None:
-            raise InputError("--output", "left out with --template", str(output))
-        _write_template(files or [], template, force=force)
+    if mapping is not None:
+        if picture is not None:
+            raise InputError("--picture", "left out with --mapping: `rig view` shows the recording", str(picture))
+        assert output is not None
+        _import(files or [], mapping, output, force=force, form=form)
         return
-    if not files:
-        raise InputError("FILE", "given: the logs to import", None)
-    if output is None or mapping is None:
-        raise InputError("--output", "given: a recording to write, such as -o log.mcap", None)
+    _guess(files or [], template, output, picture, force=force, form=form)
+
+
+def _import(files: list[Path], mapping: Path | str, output: Path, *, force: bool, form: Form) -> None:
+    """Import by a mapping in a file, or by the text of one that was guessed."""
     from recorder.draft import check_destination
     from replays.recordings.formats.conversion import convert, write_recording
-    from replays.recordings.formats.mapping import Mapping, load_mapping
+    from replays.recordings.formats.mapping import Mapping, load_mapping, parse_mapping
     from rig.cli.progress import reporting
 
     check_destination(output, force=force)
-    check_not_among([*files, mapping], output)
-    checked = load_mapping(mapping)
+    check_not_among(files if isinstance(mapping, str) else [*files, mapping], output)
+    name = "the guess (--template writes it)" if isinstance(mapping, str) else mapping.name
+    checked = parse_mapping(tomllib.loads(mapping), name=name) if isinstance(mapping, str) else load_mapping(mapping)
     with reporting() as reporter:
         try:
-            conversion = convert(files, checked, say=reporter.step)
+            doubts = (
+                [f"guessed and not told: {question}" for question in _asked(mapping)]
+                if isinstance(mapping, str)
+                else []
+            )
+            conversion = convert(files, checked, doubts=doubts, say=reporter.step)
         except InputError as error:
             # What is wrong with a file is no fault of the mapping, whose table [file] has other fields.
             if error.field == "file" or error.field.split(".")[0] not in Mapping.model_fields:
                 raise
-            raise InputError(f"{mapping.name}: {error.field}", error.must, error.received) from None
+            raise InputError(f"{name}: {error.field}", error.must, error.received) from None
 
         def tell(part: float) -> None:
             reporter.part(part, "writing")
@@ -82,20 +102,91 @@ def import_(
         echo_json(conversion.document)
     else:
         _tell(conversion, output, form.console())
+        if isinstance(mapping, str):
+            echo("imported as guessed: --template FILE.toml writes the guess, to be corrected and given with --mapping")
 
 
-def _write_template(files: list[Path], path: Path, *, force: bool) -> None:
-    from replays.recordings.formats.template import CHECK, example, template
+def _guess(
+    files: list[Path], path: Path | None, output: Path | None, picture: Path | None, *, force: bool, form: Form
+) -> None:
+    """Guess what is in the logs, tell it, and write it as a mapping, as a picture, or import by it."""
+    from replays.recordings.formats.template import example, guessed
 
-    check_new_file(path, field="--template", suffixes=(".toml",), force=force)
-    check_not_among(files, path, field="--template")
-    text = template(files) if files else example()
-    with whole_file(path) as draft:
-        draft.write_text(text, encoding="utf-8")
-    guesses = text.count(CHECK)
-    told = "a mapping to start from" if files else "an example with every option"
-    told += f"; {guesses} {'line' if guesses == 1 else 'lines'} with {CHECK}" if guesses else ""
-    echo(f"{path}: {told}")
+    for wanted, field, suffixes in ((path, "--template", (".toml",)), (picture, "--picture", (".png", ".svg"))):
+        if wanted is not None:
+            check_new_file(wanted, field=field, suffixes=suffixes, force=force)
+            check_not_among(files, wanted, field=field)
+    text, guesses = guessed(files) if files else (example(), [])
+    if path is not None:
+        with whole_file(path) as draft:
+            draft.write_text(text, encoding="utf-8")
+    if picture is not None:
+        from replays.recordings.formats.overview import draw
+
+        draw(guesses, picture)
+    if form.as_json and output is None:
+        echo_json([_document(guess) for guess in guesses])
+    elif guesses and not form.as_json:
+        _tell_guesses(guesses, text, form.console())
+    if path is not None and not form.as_json:
+        asked = len(_asked(text))
+        told = "a mapping to start from" if files else "an example with every option"
+        told += f"; {asked} {'line' if asked == 1 else 'lines'} to check" if asked else ""
+        echo(f"{path}: {told}")
+    if output is not None:
+        _import(files, text, output, force=force, form=form)
+
+
+def _asked(text: str) -> list[str]:
+    """Lines of a mapping that ask something, each with the table that it stands in."""
+    from replays.recordings.formats.template import CHECK
+
+    found, table = [], ""
+    for line in text.splitlines():
+        if line.startswith("["):
+            table = line.partition("#")[0].strip()
+        if CHECK in line:
+            held, _, question = line.partition(f"# {CHECK}: ")
+            held = held.strip().removeprefix("# ")
+            about = f"{table} {'' if held == table else held}".strip()
+            found.append(f"{about}: {question.partition(' (')[0]}")
+    return found
+
+
+_SPARK = 12
+"""Width of a signal's course in a table."""
+
+
+def _tell_guesses(guesses: list[Guess], text: str, console: Console) -> None:
+    table = new_table("", "signal", "course", "becomes", "sure", "why", wrapped=("signal", "why"), spare=("course",))
+    for guess in guesses:
+        unit = f" [{guess.entry.unit}]" if guess.entry.unit else ""
+        where = f"{guess.entry.group} " if len({each.entry.group for each in guesses}) > 1 else ""
+        why = guess.why if guess.channel else "none of the rig's: a channel of its own"
+        course = guess.look.sparkline(_SPARK)
+        style = "" if guess.channel and guess.sure != "ask" else "yellow"
+        table.add_row(
+            f"{where}{guess.entry.name}{unit}",
+            course,
+            guess.channel or "-",
+            guess.sure if guess.channel else "-",
+            why,
+            style=style,
+        )
+    console.print(table)
+    if questions := _asked(text):
+        echo("What the logs do not tell:")
+        for question in questions:
+            echo(f"  {question}")
+
+
+def _document(guess: Guess) -> dict[str, Any]:
+    return {
+        "file": guess.source.path.name, "group": guess.entry.group, "signal": guess.entry.name,
+        "unit": guess.entry.unit, "channel": guess.channel or None, "sure": guess.sure if guess.channel else None,
+        "why": guess.why, "asks": guess.asks, "mean": guess.look.mean, "low": guess.look.extent[0],
+        "high": guess.look.extent[1], "rate_hz": guess.look.axis.rate_hz if guess.look.timed else None,
+    }  # fmt: skip
 
 
 _JITTER_US, _DRIFT_PPM, _DUST = 1e-3, 1e-2, 1e-6
@@ -149,7 +240,7 @@ def _in_common(conversion: Conversion) -> list[str]:
     for channel in conversion.channels:
         # A count of the source's own differs from channel to channel, and stands in the recording.
         rule = channel.counts.split(",")[0] if "," in channel.counts else "a power of two of the unit"
-        for text in (f"{channel.rate_hz} Hz, {channel.time}", f"one count: {rule}"):
+        for text in (f"{channel.rate_hz:.9g} Hz, {channel.time}", f"one count: {rule}"):
             done.setdefault(text, []).append(channel.name)
     whole = len(conversion.channels)
     return [f"{'all' if len(names) == whole else ', '.join(names)}: {text}" for text, names in done.items()]

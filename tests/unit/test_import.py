@@ -706,10 +706,12 @@ def test_a_delay_moves_a_channel_back(tmp_path: Path) -> None:
     late_s = 370e-6
     path = rows_csv(tmp_path / "x.csv", {"time": t, "a [N]": np.sin(200 * t), "b [N]": np.sin(200 * (t - late_s))})
     mapping = '[channels.P_N]\nsource = "a"\n[channels.P_S]\nsource = "b"\ndelay_us = 370\n'
-    with pytest.raises(
-        InputError, match=r'^resample\.method must be "polyphase" or "linear", as P_S has to move by 0.300'
-    ):
-        imported(tmp_path, [path], mapping)
+    conversion, recording = imported(tmp_path, [path], mapping, name="apart")
+    north, south = recording.samples("P_N"), recording.samples("P_S")
+    assert [len(north), len(south)] == [2000, 2000]
+    np.testing.assert_allclose(south["P_S"], np.sin(200 * (t - late_s)), rtol=0, atol=2e-9)  # the samples as they were
+    np.testing.assert_allclose(north.times_s - south.times_s, late_s, rtol=0, atol=1e-9)  # at instants of their own
+    assert any("P_S" in remark and "forces_2" in remark for remark in conversion.remarks)
     _, recording = imported(tmp_path, [path], f'[resample]\nmethod = "polyphase"\n{mapping}')
     samples = recording.samples("forces")
     np.testing.assert_allclose(samples["P_S"][100:-100], samples["P_N"][100:-100], rtol=0, atol=2e-5)
@@ -754,11 +756,15 @@ def _counts(recording: Recording, group: str) -> np.ndarray:
 
 def test_a_template_of_an_unknown_file_imports_as_it_is(daq_mdf: Path, tmp_path: Path) -> None:
     text = template([daq_mdf])
-    assert "PLEASE CHECK" not in text
+    assert text.count("PLEASE CHECK") == 2
+    assert re.search(r"# bandwidth_hz = HZ +# PLEASE CHECK", text), "filters are what it cannot know"
+    assert re.search(r"pulses_per_turn = 1 +# PLEASE CHECK: 40 pulses a second do not fit the speed", text)
     assert "# daq.mf4: MDF 4.10, 3 signals" in text
     _, recording = imported(tmp_path, [daq_mdf], text)
-    assert list(recording.table.groups) == ["fast", "slow"]
-    assert recording.table.groups["slow"].names == ("Speed",)
+    assert {name: group.names for name, group in recording.table.groups.items()} == {
+        "drive": ("speed",), "drive_2": ("keyphasor",), "fast": ("AI0",),
+    }  # fmt: skip
+    assert len(recording.edges()) == 6
     from recorder.viewer.canvas import Canvas, new_stream
     from recorder.viewer.file import paint
 
@@ -985,11 +991,11 @@ def test_a_template_says_what_else_there_is(daq_mdf: Path, tmp_path: Path, capsy
     target = tmp_path / "t.toml"
     with pytest.raises(SystemExit):
         main(["import", str(daq_mdf), "--template", str(target)])
-    assert "PLEASE CHECK" not in capsys.readouterr().out, "there are none"
+    assert "2 lines to check" in capsys.readouterr().out
     text = target.read_text()
     plain, _, rest = text.partition("# Take away the `# ` of what you need:\n")
     taken_up = "\n".join(line.removeprefix("#").removeprefix(" ") for line in rest.splitlines())
-    tables = tomllib.loads(plain.replace("[channels.Speed]", "[channels.hammer]") + taken_up)
+    tables = tomllib.loads(plain.replace("[channels.AI0]", "[channels.hammer]") + taken_up)
     mapping = mappings.Mapping(**tables)
     assert mapping.align
     assert mapping.keyphasor

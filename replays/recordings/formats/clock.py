@@ -124,6 +124,18 @@ def linear(values: np.ndarray, axis: Axis, instants_s: np.ndarray) -> np.ndarray
     return np.interp(instants_s, axis.instants(), values)
 
 
+def linear_gain(axis: Axis, instants_s: np.ndarray) -> float:
+    """By how much straight lines between samples make white noise smaller, rms: of two samples, both noises a part."""
+    place = np.interp(instants_s, axis.instants(), np.arange(axis.rows, dtype=float))
+    part = place - np.floor(place)
+    return float(np.sqrt(np.mean(part**2 + (1.0 - part) ** 2)))
+
+
+def polyphase_gain(axis: Axis, rate_hz: float) -> float:
+    """By how much `polyphase` makes white noise smaller: what it cuts off [1]."""
+    return math.sqrt(_CUTOFF * min(1.0, rate_hz / axis.rate_hz))
+
+
 def polyphase(values: np.ndarray, axis: Axis, first_s: float, rate_hz: float, rows: int) -> np.ndarray:
     """Even samples at another rate and of another start, band-limited: a filter at each wanted sample's own phase.
 

@@ -7,21 +7,24 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from replays.recordings.formats import clock, events
-from replays.recordings.formats.group import ImportedChannel, PlacedGroup, place, quantise, rotate
+from replays.recordings.formats.group import ImportedChannel, PlacedGroup, nominal_hz, place, quantise, rotate
 from replays.recordings.formats.mapped import Log, MappedSignal, check_rows, engineering
 from replays.recordings.formats.mapping import Mapping
 from rig import wire
-from rig.channels import ChannelTable
+from rig.channels import ChannelTable, default_table
 from rig.errors import InputError
 
 TICK_RATE_HZ = 1_000_000
 _BLOCK_S = 0.05
+_LATE = 2.6131 / (2.0 * math.pi)
+"""Delay of a Butterworth low-pass of order 4 far below its corner, times the corner [1]."""
 NO_SCENE = "none (imported)"
 _EPOCH_S = (946_684_800.0, 4_102_444_800.0)
 """Times from 2000 to 2100 in seconds since 1970: none that a measurement began at 0 would reach."""
@@ -35,7 +38,8 @@ class Conversion:
         table: Its channel table.
         counts: int32 counts by group, shape (rows, channels).
         present: Which rows there are, by group, shape (rows,).
-        first_tick: Tick of the first row, by group.
+        first_s: Time of the first row [s], by group.
+        rates_hz: True rate [Hz], by group; that of the table where it is a whole one.
         edges: Keyphasor edges [ticks], float64, shape (turns,).
         pulses: Hammer pulses that were found.
         channels: What was done, channel by channel.
@@ -48,7 +52,8 @@ class Conversion:
     table: ChannelTable
     counts: dict[str, np.ndarray]
     present: dict[str, np.ndarray]
-    first_tick: dict[str, int]
+    first_s: dict[str, float]
+    rates_hz: dict[str, float]
     edges: np.ndarray
     pulses: tuple[events.HammerPulse, ...]
     channels: tuple[ImportedChannel, ...]
@@ -61,17 +66,24 @@ class Conversion:
     def end_tick(self) -> int:
         """Tick behind the last row."""
         return max(
-            self.first_tick[name] + math.ceil(len(rows) * TICK_RATE_HZ / self.table.groups[name].rate_hz)
+            round(self.first_s[name] * TICK_RATE_HZ) + math.ceil(len(rows) * TICK_RATE_HZ / self.rates_hz[name])
             for name, rows in self.counts.items()
         )
 
 
-def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], None] = lambda text: None) -> Conversion:
+def convert(
+    files: Sequence[Path],
+    mapping: Mapping,
+    *,
+    doubts: Sequence[str] = (),
+    say: Callable[[str], None] = lambda text: None,
+) -> Conversion:
     """Read files and make of them what a mapping says.
 
     Args:
         files: The files; the first one's time is the time of all, unless others are aligned.
         mapping: What becomes what.
+        doubts: What of it is guessed, and stands among the remarks.
         say: Told what is being done.
 
     Raises:
@@ -79,6 +91,7 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     """
     log = Log(files, mapping)
     remarks = log.remarks
+    remarks += doubts
     say("reading")
     taken = [log.take(name, wanted) for name, wanted in mapping.channels.items()]
     say("aligning")
@@ -93,19 +106,24 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
     say("placing samples")
     groups, zero_s = place(taken, mapping, low_s, high_s)
     rotate(groups, mapping, remarks)
+    remarks += [*_of_the_axes(groups), *_of_the_filters(groups)]
     table, counts, present, channels = quantise(groups)
     lead_s = (mapping.experiment.lead_s or 0.0) if mapping.experiment is not None else 0.0
-    if any(abs(lead_s * group.rate_hz - round(lead_s * group.rate_hz)) > 1e-6 for group in groups.values()):
+    rates_hz = {name: group.rate_hz for name, group in groups.items()}
+    whole = [rate for rate in rates_hz.values() if rate.is_integer()]
+    if any(abs(lead_s * rate - round(lead_s * rate)) > 1e-6 for rate in whole):
         raise InputError("experiment.lead_s", "a whole number of samples", lead_s)
+    if not (leading := min(groups.values(), key=lambda group: group.start_s).rate_hz).is_integer():
+        lead_s = math.ceil(lead_s * leading - 1e-6) / leading  # its rows then lie on whole numbers over its rate
     zero_s -= lead_s
     if lead_s:
-        remarks.append(f"time zero lies {lead_s:g} s before the first sample: so long the scene runs, to have settled")
-    first_tick = {name: round((group.start_s - zero_s) * TICK_RATE_HZ) for name, group in groups.items()}
+        remarks.append(f"time zero lies {lead_s:g} s before the first sample: there the scene begins")
+    first_s = {name: group.start_s - zero_s for name, group in groups.items()}
     edges = _edges(log, zero_s, groups)
     since = tuple(replace(pulse, at_s=pulse.at_s - zero_s) for pulse in pulses)
     kept = tuple(pulse for pulse in since if pulse.at_s >= 0.0)
     begin = _began(log, zero_s)
-    end_s = max(first_tick[name] / TICK_RATE_HZ + group.rows / group.rate_hz for name, group in groups.items())
+    end_s = max(first_s[name] + group.rows / group.rate_hz for name, group in groups.items())
     experiment = None
     if mapping.experiment is not None:
         speed = events.speed_before(groups, edges, kept, zero_s=zero_s)
@@ -124,9 +142,47 @@ def convert(files: Sequence[Path], mapping: Mapping, *, say: Callable[[str], Non
         "remarks": remarks,
     }
     return Conversion(
-        table=table, counts=counts, present=present, first_tick=first_tick, edges=edges, pulses=kept,
+        table=table, counts=counts, present=present, first_s=first_s, rates_hz=rates_hz, edges=edges, pulses=kept,
         channels=tuple(channels), remarks=tuple(remarks), document=document, start=begin, experiment=experiment,
     )  # fmt: skip
+
+
+def _of_the_axes(groups: dict[str, PlacedGroup]) -> list[str]:
+    """What is to be known of groups that came apart, and of rates that are no whole numbers."""
+    told, alike = list[str](), dict[float, list[str]]()
+    for name, group in groups.items():
+        own = next(iter(group.channels.values())).target.group
+        if name != own:
+            told.append(
+                f"{', '.join(group.channels)}: in a group {name} with instants of its own, not those of {own}; nothing "
+                "is resampled (pictures that need both at once: [resample])"
+            )
+        if not group.rate_hz.is_integer():
+            alike.setdefault(group.rate_hz, []).append(name)
+    for rate_hz, names in alike.items():
+        set_hz = nominal_hz(rate_hz)
+        off = (rate_hz / set_hz - 1.0) * 1e6
+        fast = f", {off:+.3g} ppm on {set_hz} Hz" if abs(off) < 1e3 else ""
+        told.append(f"{', '.join(names)}: {rate_hz:.9g} Hz{fast}, as the clock says; samples are as they were")
+    return told
+
+
+def _of_the_filters(groups: dict[str, PlacedGroup]) -> list[str]:
+    """What follows from filters that nobody tells."""
+    own = default_table().channels
+    untold = {
+        name: group.rate_hz
+        for group in groups.values()
+        for name, entry in group.channels.items()
+        if name in own and name != "keyphasor" and entry.mapping.bandwidth_hz is None
+    }
+    if not untold:
+        return []
+    late_us = 1e6 * _LATE * (4.0 - 2.0) / max(untold.values())
+    return [
+        f"no bandwidth_hz told of {', '.join(untold)}: taken for half of the rate; were it a quarter, they would be "
+        f"{late_us:.0f} µs late, by which models would see impacts shifted, and fits end at the first contact"
+    ]
 
 
 def _began(log: Log, zero_s: float) -> datetime:
@@ -238,7 +294,7 @@ def _catalogue(conversion: Conversion) -> dict[str, Any]:
     texts |= {f"Remark {n + 1}": remark for n, remark in enumerate(conversion.remarks)}
     return {
         "root": wire.ROOT, "tick_rate_hz": TICK_RATE_HZ, "table": conversion.table.model_dump(mode="json"), "truth": {},
-        "reference": texts,
+        "reference": texts, "rates_hz": conversion.rates_hz,
     }  # fmt: skip
 
 
@@ -278,21 +334,37 @@ def _happenings(conversion: Conversion) -> Iterator[tuple[int, bytes]]:
 
 
 def _blocks(conversion: Conversion, name: str) -> Iterator[tuple[int, str, wire.Block]]:
-    rate = conversion.table.groups[name].rate_hz
+    rate, first = conversion.rates_hz[name], conversion.first_s[name] * TICK_RATE_HZ
     counts, present = conversion.counts[name], conversion.present[name]
-    first = conversion.first_tick[name]
-    # Blocks begin on whole ticks, so that the time of every row is exact at any rate.
-    unit = rate // math.gcd(rate, TICK_RATE_HZ)
-    rows = unit * max(1, round(_BLOCK_S * rate / unit))
     base = round(first * rate / TICK_RATE_HZ)
-    for start in range(0, len(counts), rows):
-        stop = min(start + rows, len(counts))
+    starts = [*block_starts(len(counts), first, rate), len(counts)]
+    for start, stop in pairwise(starts):
         for low, high in _runs(present[start:stop]):
             at = start + low
-            tick = first + at * TICK_RATE_HZ / rate
             values = np.ascontiguousarray(counts[at : start + high])
-            block = wire.Block(round(tick), base + at, float(rate), float(TICK_RATE_HZ), values)
+            block = wire.Block(round(first + at * TICK_RATE_HZ / rate), base + at, rate, float(TICK_RATE_HZ), values)
             yield block.tick, wire.sensor_key(name), block
+
+
+def block_starts(rows: int, first: float, rate: float) -> list[int]:
+    """Rows with which blocks begin: a block tells the whole tick of its first row, so those that are nearest to one.
+
+    Args:
+        rows: Number of rows.
+        first: Time of the first one [ticks].
+        rate: Rows a second [Hz].
+    """
+    if rate.is_integer():
+        # All of them as near as the first one: their times are exact at any rate.
+        unit = int(rate) // math.gcd(int(rate), TICK_RATE_HZ)
+        return list(range(0, rows, unit * max(1, round(_BLOCK_S * rate / unit))))
+    length = max(1, round(_BLOCK_S * rate))
+    found = [0]
+    while found[-1] + length < rows:
+        near = np.arange(found[-1] + (length + 1) // 2, found[-1] + length + 1)
+        ticks = first + near * (TICK_RATE_HZ / rate)
+        found.append(int(near[np.argmin(np.abs(ticks - np.rint(ticks)))]))
+    return found
 
 
 def _runs(present: np.ndarray) -> list[tuple[int, int]]:

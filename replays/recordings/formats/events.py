@@ -86,9 +86,9 @@ def speed_before(
     groups: Mapped[str, PlacedGroup], edges: np.ndarray, pulses: Sequence[HammerPulse], *, zero_s: float
 ) -> float | None:
     """Mean speed before the first hammer pulse, else of the whole [Hz]: of the channel `speed`, else of the edges."""
-    drive = groups.get("drive")
+    drive = next((group for group in groups.values() if "speed" in group.channels), None)
     until_s = pulses[0].at_s if pulses else math.inf
-    if drive is not None and "speed" in drive.channels:
+    if drive is not None:
         values = drive.channels["speed"].values[
             : max(1, round((min(until_s, 1e6) + zero_s - drive.start_s) * drive.rate_hz))
         ]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import count, islice
 from typing import Any
 
 import numpy as np
 
-from replays.recordings.formats import clock
+from replays.recordings.formats import clock, noise
 from replays.recordings.formats.mapped import BITS, MappedSignal
 from replays.recordings.formats.mapping import Mapping
 from replays.recordings.formats.selection import NO_VOLTS
@@ -24,8 +25,12 @@ _NEAR = 0.01
 """Part of a sample by which untouched samples may lie beside the instants that they are given."""
 _LEAST, _MOST = 1e-30, 1e30
 """Values that a measurement can have, in any unit."""
-_MANY = 5
-"""Of more stretches than this, the quietest tenth is below the mean."""
+_SLOWEST_HZ, _FASTEST_HZ = 0.01, 1e6
+"""Rates that a recording may have, whose clock ticks a million times a second."""
+_DUST = 1e-4
+"""Part of a sample by which a rate of few digits may be off from end to end."""
+_CLOCK = 2e-4
+"""Part by which the clock of a converter may be off, at most."""
 
 
 @dataclass
@@ -33,34 +38,41 @@ class PlacedGroup:
     """Channels of one sensor group on one axis.
 
     Attributes:
-        rate_hz: Their rate [Hz].
+        rate_hz: Their rate, as true as it is known, a whole number or not [Hz].
         start_s: Time of the first row, in the time of the source [s].
         rows: Number of rows.
         channels: What they show, by name, on this axis.
     """
 
-    rate_hz: int
+    rate_hz: float
     start_s: float
     rows: int
     channels: dict[str, MappedSignal]
 
 
-def whole_rate(axis: clock.Axis) -> int | None:
-    """The whole rate that an axis has, within a small part of a sample from end to end; None: it has none."""
-    rate = round(axis.rate_hz)
-    if axis.times_s is not None or rate < 1 or abs(rate - axis.rate_hz) / axis.rate_hz * axis.rows > clock.EVEN:
-        return None
-    return rate
+def nominal_hz(rate_hz: float) -> int:
+    """The whole rate that a converter was set to whose clock made it this one: of the fewest digits [Hz]."""
+    if rate_hz >= 1.0 and float(rate_hz).is_integer():
+        return int(rate_hz)
+    told = (float(f"{rate_hz:.{digits}g}") for digits in range(1, 8))
+    return max(1, round(next((each for each in told if abs(each / rate_hz - 1.0) < _CLOCK), rate_hz)))
+
+
+def true_rate(axis: clock.Axis) -> float:
+    """Rate of even samples [Hz]: a whole one if they have it within a part of a sample from end to end."""
+    whole = max(1, round(axis.rate_hz))
+    if abs(whole - axis.rate_hz) / axis.rate_hz * axis.rows <= clock.EVEN:
+        return float(whole)
+    told = (float(f"{axis.rate_hz:.{digits}g}") for digits in range(1, 15))  # without dust
+    return next((each for each in told if abs(each / axis.rate_hz - 1.0) * axis.rows < _DUST), axis.rate_hz)
 
 
 def place(
     taken: Sequence[MappedSignal], mapping: Mapping, low_s: float, high_s: float
 ) -> tuple[dict[str, PlacedGroup], float]:
     """All channels on the axes of their groups, and the time in the source that becomes zero [s]."""
-    names = list(dict.fromkeys(entry.target.group for entry in taken))
-    order = [name for name in default_table().groups if name in names]
-    order += [name for name in names if name not in order]
-    members = {name: [entry for entry in taken if entry.target.group == name] for name in order}
+    members = _members(taken, mapping)
+    order = list(members)
     rates = {name: _group_rate(name, entries, mapping) for name, entries in members.items()}
     first = {name: max(low_s, *(entry.axis.first_s for entry in entries)) for name, entries in members.items()}
     last = {name: min(high_s, *(entry.axis.last_s for entry in entries)) for name, entries in members.items()}
@@ -90,15 +102,43 @@ def place(
     return placed, zero_s
 
 
-def _untouched(entries: Sequence[MappedSignal], rate_hz: int) -> bool:
+def _members(taken: Sequence[MappedSignal], mapping: Mapping) -> dict[str, list[MappedSignal]]:
+    """Signals by sensor group, in the order of the rig's table; without resampling, only those of one axis together.
+
+    The most, and of as many those with the first channel of the rig's, keep the name of its group; others are numbered.
+    """
+    table, moved = default_table(), mapping.resample.method != "none"
+    places = {name: number for number, name in enumerate((*table.groups, *table.channels))}
+    names = sorted(dict.fromkeys(entry.target.group for entry in taken), key=lambda name: places.get(name, len(places)))
+    found: dict[str, list[MappedSignal]] = {}
+    for name in names:
+        alike: list[list[MappedSignal]] = []
+        for entry in (entry for entry in taken if entry.target.group == name):
+            own = next((one for one in alike if moved or _on_one_axis(one[0].axis, entry.axis)), None)
+            if own is None:
+                alike.append([entry])
+            else:
+                own.append(entry)
+        alike.sort(key=lambda one: (-len(one), min(places.get(entry.name, len(places)) for entry in one)))
+        free = (text for number in count(2) if (text := f"{name}_{number}") not in names)
+        found |= dict(zip((name, *islice(free, len(alike) - 1)), alike, strict=True))
+    return found
+
+
+def _on_one_axis(a: clock.Axis, b: clock.Axis) -> bool:
+    """Whether samples of two axes were taken at the same instants, from end to end within a small part of a sample."""
+    if (a.times_s is None) != (b.times_s is None):
+        return False
+    if a.times_s is not None and b.times_s is not None:
+        return np.array_equal(a.times_s, b.times_s)
+    apart = (b.first_s - a.first_s) * a.rate_hz
+    drift = abs(a.rate_hz / b.rate_hz - 1.0) * min(a.rows, b.rows)
+    return abs(apart - round(apart)) < _NEAR and drift < clock.EVEN
+
+
+def _untouched(entries: Sequence[MappedSignal], rate_hz: float) -> bool:
     """Whether all samples already lie on one even axis of the wanted rate."""
-    base = entries[0].axis
-    return all(
-        whole_rate(entry.axis) == rate_hz
-        and abs((entry.axis.first_s - base.first_s) * rate_hz - round((entry.axis.first_s - base.first_s) * rate_hz))
-        < _NEAR
-        for entry in entries
-    )
+    return all(true_rate(entry.axis) == rate_hz and _on_one_axis(entries[0].axis, entry.axis) for entry in entries)
 
 
 def _next_sample(axis: clock.Axis, time_s: float) -> float:
@@ -107,7 +147,7 @@ def _next_sample(axis: clock.Axis, time_s: float) -> float:
     return axis.first_s + number / axis.rate_hz
 
 
-def _group_rate(name: str, entries: Sequence[MappedSignal], mapping: Mapping) -> int:
+def _group_rate(name: str, entries: Sequence[MappedSignal], mapping: Mapping) -> float:
     method = mapping.resample.method
     for entry in entries:
         axis = entry.axis
@@ -119,45 +159,45 @@ def _group_rate(name: str, entries: Sequence[MappedSignal], mapping: Mapping) ->
             )
             raise InputError("resample.method", must, method)
     if method != "none" and mapping.resample.rate_hz is not None:
-        return mapping.resample.rate_hz
+        return float(mapping.resample.rate_hz)
     if method == "none" and mapping.resample.rate_hz is not None:
         raise InputError("resample.method", '"polyphase" or "linear" with resample.rate_hz', method)
-    rates = {whole_rate(entry.axis) for entry in entries}
-    if len(rates) == 1 and None not in rates:
-        return next(rate for rate in rates if rate is not None)
-    told = ", ".join(f"{entry.name} {entry.axis.rate_hz:.9g} Hz" for entry in entries[:6])
-    why = "no whole number" if len(rates) == 1 else "not one rate"
-    must = f'given, with method "polyphase" or "linear", as the rates in {name} are {why} (or time.rate_hz'
-    raise InputError("resample.rate_hz", f"{must}, where the file rounds its own)", told)
+    rates = {true_rate(entry.axis) for entry in entries}
+    rate, told = true_rate(entries[0].axis), ", ".join(f"{e.name} {e.axis.rate_hz:.9g} Hz" for e in entries[:6])
+    if len(rates) > 1 and method != "none":
+        must = f'given with method "{method}", as the rates in {name} are not one (or time.rate_hz'
+        raise InputError("resample.rate_hz", f"{must}, where the file rounds its own)", told)
+    if not _SLOWEST_HZ <= rate <= _FASTEST_HZ:
+        must = f'given, with method "polyphase" or "linear", for rates beyond {_SLOWEST_HZ:g} to {_FASTEST_HZ:g} Hz'
+        raise InputError("resample.rate_hz", must, told)
+    return rate
 
 
 def _put(group: PlacedGroup, entry: MappedSignal, mapping: Mapping) -> None:
     """Put a signal on the axis of its group."""
     axis, rate, method = entry.axis, group.rate_hz, mapping.resample.method
     shift = (group.start_s - axis.first_s) * axis.rate_hz
-    if whole_rate(axis) == rate and abs(shift - round(shift)) < _NEAR:
+    stays = axis.times_s is None and abs(rate / axis.rate_hz - 1.0) * axis.rows <= clock.EVEN
+    if stays and abs(shift - round(shift)) < _NEAR:
         part = slice(round(shift), round(shift) + group.rows)
         entry.values = entry.values[part]
         if entry.signal.values.dtype.kind in "iu" and not entry.missing:
             entry.raw = entry.signal.values[part]
+        entry.noise = noise.white_or_not(entry.values)
         return
-    if method == "none":
-        if whole_rate(axis) != rate:
-            must = f'"polyphase" or "linear", as {entry.name} has {axis.rate_hz:.9g} Hz'
-        else:
-            must = (
-                f'"polyphase" or "linear", as {entry.name} has to move by {abs(shift - round(shift)):.3f} of a sample'
-            )
-        raise InputError("resample.method", must, method)
     if np.isnan(entry.values).any():
         raise InputError(f"channels.{entry.name}.missing", '"hold" where samples are resampled', entry.mapping.missing)
     wanted = group.start_s + np.arange(group.rows) / rate
+    # What is drawn between samples has less noise than they, and of another colour.
+    entry.noise = noise.white_or_not(entry.values)
     if method == "linear":
-        entry.values = clock.linear(entry.values, axis, wanted)
-        entry.touched.append(f"{axis.rate_hz:.9g} Hz to {rate} Hz: straight lines between samples")
+        entry.values, gain = clock.linear(entry.values, axis, wanted), clock.linear_gain(axis, wanted)
+        how = "straight lines between samples"
     else:
         entry.values = clock.polyphase(entry.values, axis, group.start_s, rate, group.rows)
-        entry.touched.append(f"{axis.rate_hz:.9g} Hz to {rate} Hz: {clock.FILTER}")
+        how, gain = clock.FILTER, clock.polyphase_gain(axis, rate)
+    entry.noise *= gain
+    entry.touched.append(f"{axis.rate_hz:.9g} Hz to {rate:.9g} Hz: {how}; noise {gain:.3f} times that of the samples")
 
 
 def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str]) -> None:
@@ -177,9 +217,11 @@ def rotate(groups: dict[str, PlacedGroup], mapping: Mapping, remarks: list[str])
             raise InputError(f"rotate.{number}.angles_deg", "well apart (the sine of their difference 0.1 or more)",
                              list(entry.angles_deg))  # fmt: skip
         told = f"probes at {entry.angles_deg[0]:g} and {entry.angles_deg[1]:g} deg"
-        mixed = np.linalg.inv(seen) @ np.stack([group[a].values, group[b].values])
-        for name, values in zip((a, b), mixed, strict=True):
-            group[name].mix(values)
+        inverse = np.linalg.inv(seen)
+        mixed = inverse @ np.stack([group[a].values, group[b].values])
+        noises = np.hypot(*(inverse * [group[a].noise, group[b].noise]).T)
+        for name, values, level in zip((a, b), mixed, noises.tolist(), strict=True):
+            group[name].mix(values, noise=level)
             group[name].touched.append(f"x and y of {told}")
         remarks.append(f"{a} and {b} worked out of {told}")
 
@@ -194,7 +236,7 @@ class ImportedChannel:
     formula: str
     time: str
     counts: str
-    rate_hz: int
+    rate_hz: float
     jitter_us: float
     drift_ppm: float
     missing: int
@@ -215,19 +257,19 @@ def quantise(
     for name, group in groups.items():
         columns, channels = [], []
         for entry in group.channels.values():
-            channel, column, rule = _counts(entry, group.rate_hz)
+            channel, column, rule = _counts(entry, name, group.rate_hz)
             channels.append(channel)
             columns.append(column)
             told.append(_imported(entry, channel, rule, group.rate_hz))
-        known = default_table().groups.get(name)
+        known = default_table().groups.get(next(iter(group.channels.values())).target.group)
         title = known.title if known is not None else name
-        tables[name] = Group(name=name, title=title, rate_hz=group.rate_hz, channels=tuple(channels))
+        tables[name] = Group(name=name, title=title, rate_hz=channels[0].rate_hz, channels=tuple(channels))
         counts[name] = np.stack(columns, axis=1)
         present[name] = np.all([np.isfinite(entry.values) for entry in group.channels.values()], axis=0)
     return ChannelTable(groups=tables, version=VERSION), counts, present, told
 
 
-def _counts(entry: MappedSignal, rate_hz: int) -> tuple[Channel, np.ndarray, str]:
+def _counts(entry: MappedSignal, group: str, rate_hz: float) -> tuple[Channel, np.ndarray, str]:
     """A channel with its scale, and its int32 counts.
 
     Integers that nobody has touched stay as they are. All else is counted in a power of two that leaves the largest
@@ -270,7 +312,8 @@ def _counts(entry: MappedSignal, rate_hz: int) -> tuple[Channel, np.ndarray, str
             "label": entry.mapping.label or target.label, "sensitivity_v": sensitivity, "bias_v": bias_v,
             "range_v": (low_v, high_v), "bandwidth_hz": entry.mapping.bandwidth_hz or rate_hz / 2.0,
             "highpass_hz": entry.mapping.highpass_hz,
-            "noise_v": abs(sensitivity) * _noise(values), "adc_v": reach_v, "adc_bits": BITS, "rate_hz": rate_hz,
+            "noise_v": abs(sensitivity) * entry.noise, "adc_v": reach_v, "adc_bits": BITS,
+            "rate_hz": nominal_hz(rate_hz), "group": group,
             "kind": NO_VOLTS if volts_per_unit is None else "imported",
         }
     )  # fmt: skip
@@ -283,32 +326,14 @@ def _counts(entry: MappedSignal, rate_hz: int) -> tuple[Channel, np.ndarray, str
     return channel, found.astype(np.int32), f"2^{round(math.log2(abs(scale)))} {channel.unit}"
 
 
-def _noise(values: np.ndarray) -> float:
-    """White noise of a signal [its unit, rms], from its second differences where they are smallest.
-
-    Of white noise, second differences have the variance 6 sigma^2. What the signal does slowly drops out of them; in
-    the quietest tenth of its stretches, so does what it does at times.
-    """
-    length = 256
-    second = np.diff(values, 2)
-    second = second[np.isfinite(second)]
-    stretches = len(second) // length
-    if not stretches:
-        return 0.0
-    rms = np.sqrt(np.mean(second[: stretches * length].reshape(stretches, length) ** 2, axis=1) / 6.0)
-    # Of plain noise, that tenth is too quiet: the mean of n squares has the relative variance 2 (1 + 2 sum rho^2) / n,
-    # with the correlations -2/3 and 1/6 of second differences one and two samples apart.
-    quiet = 1.0 - 1.2816 * math.sqrt(2.0 * (1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0)) / length) / 2.0
-    return float(np.quantile(rms, 0.1)) / (quiet if stretches > _MANY else 1.0)
-
-
-def _imported(entry: MappedSignal, channel: Channel, rule: str, rate_hz: int) -> ImportedChannel:
+def _imported(entry: MappedSignal, channel: Channel, rule: str, rate_hz: float) -> ImportedChannel:
     unit = units.canonical(entry.mapping.unit or entry.entry.unit or "1")
     source = f"(source {'-' if entry.bias > 0.0 else '+'} {abs(entry.bias):.6g})" if entry.bias else "source"
     ratio = "" if unit == channel.unit else f" {channel.unit} per {unit}".replace(" 1 per", " per")
     gain = f"{entry.gain:.9g}{ratio} * " if ratio or entry.gain != 1.0 else ""
     delay = f", {-entry.mapping.delay_us:+g} µs" if entry.mapping.delay_us else ""
-    drift = (entry.axis.rate_hz / rate_hz - 1.0) * 1e6 if entry.axis.rows and whole_rate(entry.axis) == rate_hz else 0.0
+    drift = (entry.axis.rate_hz / channel.rate_hz - 1.0) * 1e6
+    drift = drift if abs(drift) < _CLOCK * 1e6 and not entry.touched else 0.0
     return ImportedChannel(
         name=entry.name, unit=channel.unit,
         source=" ".join(text for text in (entry.source.path.name, entry.entry.group, entry.entry.name) if text),

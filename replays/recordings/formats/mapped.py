@@ -50,10 +50,12 @@ class MappedSignal:
     """What was done that changes samples."""
     missing: int = 0
     overrange: int = 0
+    noise: float = 0.0
+    """Standard deviation of the noise of `values`, by what was done to them."""
 
-    def mix(self, values: np.ndarray) -> None:
-        """Take values that were worked out of two signals."""
-        self.values, self.raw, self.mixed = values, None, True
+    def mix(self, values: np.ndarray, *, noise: float) -> None:
+        """Take values that were worked out of two signals, with their noise."""
+        self.values, self.raw, self.mixed, self.noise = values, None, True, noise
 
 
 class Log:

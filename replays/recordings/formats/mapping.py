@@ -147,6 +147,13 @@ class ChannelMapping(SignalName):
         return factor
 
 
+class Defaults(_Section):
+    """What holds for all channels that do not say it themselves."""
+
+    bandwidth_hz: PositiveFloat | None = None
+    """Corner of the low-pass before the converter [Hz]."""
+
+
 class Rotate(_Section):
     """Two probes at any two angles as horizontal and vertical."""
 
@@ -218,6 +225,7 @@ class Mapping(_Section):
     file: FileOptions = FileOptions()
     time: TimeOptions = TimeOptions()
     resample: Resample = Resample()
+    defaults: Defaults = Defaults()
     channels: dict[str, ChannelMapping] = Field(min_length=1)
     rotate: tuple[Rotate, ...] = ()
     align: tuple[Align, ...] = ()
@@ -236,21 +244,40 @@ def load_mapping(path: Path) -> Mapping:
     Raises:
         InputError: The first thing that is wrong, with file and field.
     """
-    data = read_toml(path)
+    return parse_mapping(read_toml(path), name=path.name)
+
+
+def parse_mapping(data: dict[str, Any], *, name: str) -> Mapping:
+    """Check a mapping, and give its channels what holds for all.
+
+    Args:
+        data: As it stands in TOML.
+        name: What errors call it.
+
+    Raises:
+        InputError: The first thing that is wrong, with its field.
+    """
     try:
         mapping = check(Mapping, data, field="")
     except InputError as first:
-        raise InputError(f"{path.name}: {first.field}", first.must, first.received) from None
+        raise InputError(f"{name}: {first.field}", first.must, first.received) from None
     time = mapping.time
     if time.from_s is not None and time.to_s is not None and time.to_s <= time.from_s:
-        raise InputError(f"{path.name}: time.to_s", f"after time.from_s = {time.from_s:g}", time.to_s)
+        raise InputError(f"{name}: time.to_s", f"after time.from_s = {time.from_s:g}", time.to_s)
     for entry in mapping.rotate:
-        for name in entry.channels:
-            if name not in mapping.channels:
-                raise InputError(f"{path.name}: rotate.channels", "mapped under [channels]", name)
+        for channel in entry.channels:
+            if channel not in mapping.channels:
+                raise InputError(f"{name}: rotate.channels", "mapped under [channels]", channel)
     if mapping.hammer is not None and "hammer" not in mapping.channels:
-        raise InputError(f"{path.name}: hammer", "left out without a channel `hammer` under [channels]", "[hammer]")
+        raise InputError(f"{name}: hammer", "left out without a channel `hammer` under [channels]", "[hammer]")
     experiment = mapping.experiment
     if experiment is not None and experiment.commands == "detected" and mapping.hammer is None:
-        raise InputError(f"{path.name}: experiment.commands", "used with a table [hammer]", "detected")
-    return mapping
+        raise InputError(f"{name}: experiment.commands", "used with a table [hammer]", "detected")
+    if mapping.defaults.bandwidth_hz is None:
+        return mapping
+    corner = {"bandwidth_hz": mapping.defaults.bandwidth_hz}
+    told = {
+        channel: entry if entry.bandwidth_hz is not None else entry.model_copy(update=corner)
+        for channel, entry in mapping.channels.items()
+    }
+    return mapping.model_copy(update={"channels": told})

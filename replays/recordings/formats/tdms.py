@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
     from replays.recordings.formats.selection import ExportChunk, ExportTable, Selection
 
+_ABOUT = re.compile("sens|bias|gain|coupling|range", re.IGNORECASE)
+"""Properties of a channel that tell of its sensor or amplifier."""
 _RAW_INPUT = 0xFFFFFFFF
 """Input of the first scale: the raw values."""
 
@@ -64,7 +67,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
                 continue
             unit = str(channel.properties.get("unit_string", channel.properties.get("NI_UnitDescription", "")))
             step = channel.properties.get("wf_increment")
-            label = str(channel.properties.get("description", ""))
+            label = _label(channel.properties)
             rate = 1.0 / step if step else None
             entries.append(Entry(channel.name, name, unit, len(channel), rate, (name, channel.name), label, number))
 
@@ -79,6 +82,15 @@ def look_into(path: Path, options: FileOptions) -> Source:
         path=path, format="TDMS", entries=tuple(entries), read=read, about=about, remarks=remarks,
         start=None if told is None else told.replace(tzinfo=UTC),
     )  # fmt: skip
+
+
+def _label(properties: dict[str, Any]) -> str:
+    """What the properties of a channel say of it: its description, and what its sensor and amplifier do."""
+    texts = [str(properties.get("description", ""))]
+    for key, value in properties.items():
+        if _ABOUT.search(key) and not key.startswith(("rig_", "NI_")) and not key.endswith("_unit"):
+            texts.append(f"{key} {value} {properties.get(f'{key}_unit', '')}".strip())
+    return "; ".join(filter(None, texts))
 
 
 def _signal(group: Any, name: str, start: Any) -> FileSignal:

@@ -1,0 +1,111 @@
+"""What a signal's name says, in the languages and habits of test benches: what is measured, where, and which way."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+_KINDS = {
+    "hammer": "hammer hammerkraft impulshammer impacthammer schlag marteau martillo martello",
+    "keyphasor": "keyphasor keyph kph kphi key phasor phasenmarke phasenreferenz lichtschranke nullimpuls drehgeber "
+    "onceperrev onceperturn pulse pulses impuls topzero index",
+    "speed": "speed rpm upm drehzahl spin tacho tach tachometer vitesse velocidad velocita giri regime toeren omega",
+    "acceleration": "acc accel accelerometer acceleration beschl beschleunigung accelerometre aceleracion "
+    "accelerazione accelerometro acelerometro versnelling iepe icp vib vibration",
+    "force": "kraft kraftmessdose force forces fuerza forza load loadcell effort kracht transducer kistler f fx fy p",
+    "length": "weg wegsonde wegaufnehmer sonde probe prox proximity proximiter displacement disp position pos "
+    "gap abstand wirbelstrom eddy eddycurrent deplacement desplazamiento spostamento verplaatsing orbit taster d s",
+}  # fmt: skip
+"""What is measured, by words; the first that fits, so that a hammer's force is a hammer's."""
+_PLACES = {
+    "disk": "disk disc scheibe rotorscheibe disque disco schijf rotor",
+    "ring": "ring statorring anneau anillo anello stator fanglager backup",
+    "inner": "in inner innen innenring innengehaeuse interieur interior interno binnen",
+    "outer": "out outer aussen aussengehaeuse exterieur exterior esterno buiten",
+}
+_AXES = {
+    "x": "x ax fx hor horiz horizontal horizontale waagrecht waagerecht",
+    "y": "y ay fy ver vert vertical verticale vertikal senkrecht lotrecht",
+}
+_SIDES = {
+    "N": "n north nord norte noord noorden norden", "S": "s south sued sud sur zuid sueden",
+    "E": "e east ost est este oost osten", "W": "w west ouest oeste ovest westen",
+}  # fmt: skip
+_O = {"E": "W", "W": "E"}
+"""The side that a lone `O` stands for, beside one that is named: Ost beside W, Ouest or Oeste beside E."""
+_LONG = 4
+"""Words of so many letters are found inside others, as German writes them."""
+
+
+def _words(texts: Mapping[str, str]) -> dict[str, str]:
+    return {word: key for key, words in texts.items() for word in words.split()}
+
+
+_KIND_OF, _PLACE_OF, _AXIS_OF, _SIDE_OF = map(_words, (_KINDS, _PLACES, _AXES, _SIDES))
+
+
+@dataclass(frozen=True)
+class Named:
+    """What a name says; empty where it says nothing.
+
+    Attributes:
+        kind: What is measured: `length`, `force`, `acceleration`, `speed`, `keyphasor` or `hammer`.
+        kind_word: The word that says so.
+        place: `disk`, `ring`, `inner` or `outer`.
+        axis: `x` or `y`.
+        side: `N`, `S`, `E`, `W`, or `O`, which is Ost or Ouest.
+        side_letter: The side is told by one letter, which may be the unit's.
+    """
+
+    kind: str = ""
+    kind_word: str = ""
+    place: str = ""
+    axis: str = ""
+    side: str = ""
+    side_letter: bool = False
+
+    def side_among(self, others: set[str]) -> str:
+        """The side, where the sides of all forces tell what `O` is."""
+        if self.side != "O":
+            return self.side
+        return next((_O[other] for other in ("W", "E") if other in others), "E")
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a name in small letters without accents: `Sonde_X2` is sonde, x, 2; umlauts become ae, oe, ue."""
+    text = name.replace("ß", "ss")
+    for umlaut, plain in zip("äöüÄÖÜ", ("ae", "oe", "ue", "Ae", "Oe", "Ue"), strict=True):
+        text = text.replace(umlaut, plain)
+    text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+    text = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text)
+    return re.findall(r"[a-z]+|\d+", text.lower())
+
+
+def read_name(name: str) -> Named:
+    """What a name says."""
+    words = words_of(name)
+    kind, kind_word = "", ""
+    for wanted in _KINDS:
+        kind_word = _found(words, {word: key for word, key in _KIND_OF.items() if key == wanted})[1]
+        if kind_word:
+            kind = wanted
+            break
+    rest = [word for word in words if word != kind_word or len(kind_word) > 1]
+    side_word = next((word for word in reversed(rest) if word in _SIDE_OF or word == "o"), "")
+    side = _SIDE_OF.get(side_word, side_word.upper())
+    axis = _found(words, _AXIS_OF)[0]
+    return Named(kind, kind_word, _found(words, _PLACE_OF)[0], axis, side, len(side_word) == 1)
+
+
+def _found(words: list[str], known: dict[str, str]) -> tuple[str, str]:
+    """Key and word: a word of its own first, else a long one inside another."""
+    for word in words:
+        if word in known:
+            return known[word], word
+    for word in words:
+        for inside, key in known.items():
+            if len(inside) >= _LONG and inside in word:
+                return key, inside
+    return "", ""
