@@ -46,7 +46,7 @@ def record(
             for key, block in blocks.items():
                 if number not in leave_out:
                     writer.write(key, encode_block(block), frame.tick * 1000)
-        writer.finish("completed")
+        writer.finish("closed")
     return Recording.open(path)
 
 

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from recorder.agreement import calibration_off
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment
+from replays.recordings.experiment import Experiment, parameter_doubts
 from replays.recordings.identification.nuisance import Tuned, is_imported, tune
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
 from replays.recordings.validation.attribution import Explained, attribute
@@ -17,7 +18,6 @@ from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.statistics import perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
 from replays.recordings.validation.truth import judge_truth, recorded_truth
-from rig.channels import default_table
 
 
 def validate(
@@ -61,7 +61,7 @@ def validate(
         skipped=sum(stream.lost for stream in recording.streams.values()),
         explained=None, fitted=tuple(one.line for one in again.tuned.fitted) if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
-        doubts=recording.doubts,
+        doubts=(*recording.doubts, *parameter_doubts(recording)),
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     if validation.good or validation.doubts or not firsts:
@@ -142,22 +142,8 @@ def _explained(again: _DoneAgain, *, from_s: float, step: Callable[[str], None])
 
 def calibration(recording: Recording, experiment: Experiment) -> list[str]:
     """How the recording's channels differ from the table of its scene, the rig's own where that has none."""
-    table = experiment.scene.channels or default_table()
-    own, found = table.channels, list[str]()
     if is_imported(recording):
         mapped = recording.scene["import"]["mapping"]["channels"]
         lacking = [name for name, entry in mapped.items() if "bandwidth_hz" not in entry]
         return [f"no bandwidth told of {', '.join(lacking)}: taken for half of the rate"] if lacking else []
-    for name, channel in recording.table.channels.items():
-        if name not in own:
-            found.append(f"{name}: not in the channel table of its scene")
-            continue
-        rate_hz = None if channel.rate_hz == own[name].rate_hz else channel.rate_hz
-        like = table.only((own[name].group,), rate_hz).channels[name]
-        fields = ("signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "filter_order", "highpass_hz",
-                  "noise_v", "adc_v", "adc_bits")  # fmt: skip
-        off = [f"{key} {getattr(channel, key)} instead of {getattr(like, key)}" for key in fields
-               if getattr(channel, key) != getattr(like, key)]  # fmt: skip
-        if off:
-            found.append(f"{name}: {', '.join(off)}")
-    return found
+    return calibration_off(recording.table, experiment.scene.table)
