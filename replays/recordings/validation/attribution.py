@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from replays.recordings.experiment import Experiment
+from replays.recordings.identification.question import unit_of
 from replays.recordings.least_squares import Fit, fit
 from replays.recordings.prediction import Measured, Prediction, predict
 from replays.recordings.sensitivity import scale_of, value_of, with_values
@@ -109,9 +110,10 @@ class _CandidateFit:
         self._experiment, self._parts = experiment, parts
         self.candidate = candidate
         self._start = {key: value_of(experiment, key) for key in candidate.keys}
-        if not candidate.unit and any(value == 0.0 for value in self._start.values()):
-            raise InputError(candidate.name, "a value other than 0", 0.0)
-        self._scale = {} if candidate.unit else self._start
+        # A value of 0 has no parts to change by: it changes in its own unit.
+        self._absolute = bool(candidate.unit) or 0.0 in self._start.values()
+        self._unit = candidate.unit or (unit_of(candidate.keys[0]) if self._absolute else "")
+        self._scale = {} if self._absolute else self._start
         self._step = candidate.step
         if candidate.unit and candidate.step == Candidate.model_fields["step"].default:
             self._step *= scale_of(experiment, candidate.keys[0])
@@ -164,11 +166,12 @@ class _CandidateFit:
 
     def explanation(self, found: Fit, before: float, to_s: float) -> Explanation:
         """What a fit comes to, against the excess of the residuals without it."""
-        p, unit, key = float(found.values[0]), self.candidate.unit, self.candidate.keys[0]
+        p, unit, key = float(found.values[0]), self._unit, self.candidate.keys[0]
+        change = f"{p:+.4g} {unit}".removesuffix(" 1") if self._absolute else f"{100.0 * p:+.3g} %"
         kind: Kind = "time" if key.endswith(".at_s") else "command" if key.startswith("hammer.") else "model"
         return Explanation.of(
             found.residuals, kind=kind, name=self.candidate.name,
-            change=f"{p:+.4g} {unit}" if unit else f"{100.0 * p:+.3g} %", value=p, unit=unit,
+            change=change, value=p, unit=unit,
             explained=1.0 - excess(found.residuals) / before, to_s=to_s,
         )  # fmt: skip
 
