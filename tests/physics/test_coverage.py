@@ -16,7 +16,6 @@ import os
 from pathlib import Path
 
 import pytest
-from scipy.stats import binomtest
 
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
@@ -54,6 +53,8 @@ def held(recording: Recording, keys: tuple[str, ...]) -> tuple[dict[str, bool], 
 @pytest.mark.skipif(not SEEDS, reason="RIG_COVERAGE_SEEDS says how many seeds; half a minute each")
 @pytest.mark.timeout(0)
 def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
+    from scipy.stats import binomtest
+
     counts: dict[str, list[bool | None]] = {}
     for seed in range(100, 100 + SEEDS):
         path = tmp_path / "h.mcap"
