@@ -82,12 +82,38 @@ class Taken(_Document):
     request: dict[str, Any]
 
 
+class _Request(_Document):
+    command: str
+
+
+class _Timed(_Document):
+    at_s: Annotated[float, Field(ge=0.0, le=1e10)]
+    request: _Request
+
+
+class _Engine(_Document):
+    name: str | None = None
+    levels: dict[str, str] = {}
+
+
+class _Sensors(_Document):
+    groups: tuple[str, ...] = ()
+    rate_hz: Annotated[int, Field(ge=0, le=1_000_000_000)] = 0
+    truth_rate_hz: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = None
+
+
 class _Fields(_Document):
     """Of a scene's fields those that are read before the scene itself is checked."""
 
+    name: str = ""
+    seed: int | None = None
+    duration_s: _Finite | None = None
     parameters: str = ""
     set: dict[str, _Finite | str] = {}
-    sensors: dict[str, Any] = {}
+    commands: tuple[_Timed, ...] = ()
+    model: dict[str, str] = {}
+    engine: _Engine = _Engine()
+    sensors: _Sensors = _Sensors()
 
 
 class _Mapping(_Document):
@@ -140,6 +166,8 @@ class _Lateness(_Document):
 class Status(_Document):
     """What the rig said of itself."""
 
+    scene: str | None = None
+    engine: _Engine = _Engine()
     queue: _Queue = _Queue()
     lateness_ms: _Lateness | None = None
     warnings: list[str] = []

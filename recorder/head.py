@@ -121,6 +121,10 @@ class Head:
         for name, document in documents.items():
             yield name, "application/json", json.dumps(document, indent=1, allow_nan=False).encode()
 
+    def explained_by(self, text: str) -> bool:
+        """Whether a README.txt is that of these documents; one in the words of another version is not judged."""
+        return not text.startswith(_README) or text == self._readme()
+
     def about(self, key: str) -> dict[str, str]:
         """The metadata of a key's topic: one JSON list a property, in column order."""
         if key == EDGES:

@@ -268,8 +268,6 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
         for name, group in recording.table.groups.items()
         if recording.messages.get(sensor_key(name))
     }
-    misplaced: dict[str, int] = {}
-    starts: dict[str, tuple[float, int]] = {}
     edges: list[np.ndarray] = []
 
     def watch(key: str, block: Block) -> None:
@@ -279,9 +277,6 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
         if key == EDGES:
             edges.append(row_times_s(key, block))
             return
-        start_s, index = starts.setdefault(key, (block.start_s, block.index))
-        if abs(block.start_s - start_s - (block.index - index) / block.rate_hz) * block.tick_rate_hz > 0.5:
-            misplaced[key] = misplaced.get(key, 0) + 1
         if key in watches:
             watches[key].add(block.index, block.values)
 
@@ -289,10 +284,10 @@ def examine(recording: Recording, progress: Callable[[float], None] = lambda _: 
     times_s = np.unique(np.concatenate(edges)) if edges else np.empty(0)
     spin_hz = 1.0 / float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
     channels = [health for one in watches.values() for health in one.results(spin_hz)]
-    return _with_findings(recording, channels, misplaced)
+    return _with_findings(recording, channels)
 
 
-def _with_findings(recording: Recording, channels: list[ChannelHealth], misplaced: dict[str, int]) -> Health:
+def _with_findings(recording: Recording, channels: list[ChannelHealth]) -> Health:
     clock = recording.clock if _has_clock(recording) else np.empty((0, 2))
     span_s = float(np.ptp(clock[:, 1])) if len(clock) else 0.0
     pace, jitter_ms, jitter_max_ms, strays = pace_of(clock)
@@ -303,9 +298,6 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth], misplace
         + [str(text) for text in last.get("warnings", [])]
     )
     findings = list(recording.doubts)
-    findings += [
-        f"{count} blocks of {key} have a time that does not fit their row number" for key, count in misplaced.items()
-    ]
     dropped = last.get("queue", {}).get("dropped", 0)
     if dropped:
         findings.append(f"the rig dropped {dropped} blocks before they were published")
@@ -317,7 +309,7 @@ def _with_findings(recording: Recording, channels: list[ChannelHealth], misplace
         jitter_ms=jitter_ms,
         jitter_max_ms=jitter_max_ms,
         strays=strays,
-        misplaced=misplaced,
+        misplaced={key: one.misplaced for key, one in recording.streams.items() if one.misplaced},
         status={name: last[name] for name in kept if name in last},
         warnings=list(warnings),
         findings=findings,

@@ -39,6 +39,7 @@ class RecordingFile:
         scene: The rig's scene document.
         metadata: Metadata records by name: `rig` (start), `end` (closing counts, only if complete).
         attachments: All attachments by name; catalogue, parameters and scene are among them.
+        about: What the file says of each topic: names, units and scales of its columns.
         messages: Number of messages by topic.
         chunks: Where its messages are, in file order.
         stated_rows: Rows by key, as the file itself says at its end.
@@ -63,7 +64,7 @@ class RecordingFile:
         self.complete, self.unchecked = found.complete, found.unchecked
         self.damaged += found.damaged
         self.attachments, self.chunks, self._topics = found.attachments, tuple(found.chunks), found.topics
-        self.stated_rows: dict[str, int] = {}
+        self.about, self.stated_rows = found.about, dict[str, int]()
         with contextlib.suppress(InputError):
             stated = found.metadata.get("end", {}) if found.finished else {}  # one that was cut off lacks what it lacks
             self.stated_rows = read_json(documents.read_metadata(documents.End, stated, field="end").rows.encode())

@@ -85,6 +85,7 @@ class Contents:
         metadata: Metadata by name.
         attachments: Attachments by name.
         topics: Topic of each channel.
+        about: What a channel says of its topic, by topic.
         counts: Number of messages by channel.
         chunks: The chunks with messages, in file order.
     """
@@ -96,6 +97,7 @@ class Contents:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     topics: dict[int, str] = field(default_factory=dict)
+    about: dict[str, dict[str, str]] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
     chunks: list[Chunk] = field(default_factory=list)
 
@@ -117,7 +119,8 @@ def read_contents(file: BinaryIO, size: int, *, salvage: bool) -> Contents:
         if footer is not None:
             found.finished = True
             with contextlib.suppress(DamagedError):  # a chunk with channels may be among the damaged ones
-                found.topics = _summary(file, size, footer)[0].topics | found.topics
+                summary = _summary(file, size, footer)[0]
+                found.topics, found.about = summary.topics | found.topics, summary.about | found.about
         return _counted(file, found)
     found, indexed, data_end = _summary(file, size, footer)
     _take_data(file, found, indexed, data_end)
@@ -265,6 +268,7 @@ def _chunk_indexed(body: bytes) -> Chunk:
 def _add_topic(found: Contents, channel: Channel) -> None:
     if found.topics.setdefault(channel.id, channel.topic) != channel.topic:
         raise DamagedError("one number for two channels")
+    found.about[channel.topic] = channel.metadata
 
 
 def _take(found: Contents, opcode: int, body: bytes) -> None:

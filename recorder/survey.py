@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from recorder import documents, schemas
+from recorder.agreement import Agreement
 from recorder.recording_file import RecordingFile
 from recorder.samples import row_times_s
-from rig.wire import EDGES, EVENTS, Block, Continuity, schema_of
+from rig.wire import EDGES, EVENTS, Block, Continuity, Gap, schema_of
 
 _LEAST_SPAN_S = 0.5
 """A stream without rows raises doubt in a recording of this length; in a shorter one it may not have begun."""
@@ -29,11 +30,13 @@ class Stream:
         lost: Number of rows missing between them, counted anew from the row numbers.
         first_time_s: Simulated time of the first row [s].
         last_time_s: Simulated time of the last row [s].
+        start_s: Simulated time of the first tick that a block names, which edges lie behind [s].
         first: Number of the first row.
         due: Number of the row after the last one.
         odd: Number of payloads that are no blocks, or do not fit the catalogue.
         back: Number of blocks that begin before the row that was due.
         off: Number of blocks at another rate than the catalogue says.
+        misplaced: Number of blocks whose time does not fit their row number.
         missing: Rows that the file says it has, or the rig that it made, and that are not there.
     """
 
@@ -42,18 +45,20 @@ class Stream:
     lost: int = 0
     first_time_s: float = 0.0
     last_time_s: float = 0.0
+    start_s: float = 0.0
     first: int = 0
     due: int = 0
     odd: int = 0
     back: int = 0
     off: int = 0
+    misplaced: int = 0
     missing: int = 0
 
     def then(self, later: Stream) -> Stream:
         """The same stream with what it goes on with in another file."""
         sums = {
             name: getattr(self, name) + getattr(later, name)
-            for name in ("messages", "rows", "lost", "odd", "back", "off", "missing")
+            for name in ("messages", "rows", "lost", "odd", "back", "off", "misplaced", "missing")
         }
         if not (self.rows and later.rows):
             return replace(self if self.rows else later, **sums)
@@ -80,18 +85,22 @@ class Survey:
             InputError: The file is damaged.
         """
         self.file = file
-        self._continuity = Continuity()
+        self._continuity, self._steps = Continuity(), dict[str, list[Gap]]()
+        self._agreement = Agreement(file)
         self.streams: dict[str, Stream] = {}
+        self._begun: dict[str, tuple[float, int]] = {}
         self._counted: dict[str, int] = {}
         self._published: dict[str, int] = {}
         self._noted: set[tuple[str, int]] = set()
         self._noted_bytes = 0
-        for key, _, _, payload in file.stamped(None):
+        for key, time_ns, _, payload in file.stamped(None):
             self._counted[key] = self._counted.get(key, 0) + 1
             if schema_of(key) is None:
-                self._take_document(key, payload)
-            elif (block := self._take_block(key, payload)) is not None and on_block is not None:
-                on_block(key, block)
+                self._take_document(key, time_ns, payload)
+            elif (block := self._take_block(key, payload)) is not None:
+                self._agreement.timed(key, time_ns, block.tick)
+                if on_block is not None:
+                    on_block(key, block)
         self._end()
 
     @cached_property
@@ -111,6 +120,8 @@ class Survey:
                 found.append(f"blocks of {key} that repeat row numbers, or go back: {stream.back}")
             if stream.off:
                 found.append(f"blocks of {key} at another rate than the catalogue says: {stream.off}")
+            if stream.misplaced:
+                found.append(f"{stream.misplaced} blocks of {key} have a time that does not fit their row number")
             if stream.rows > (stated := self.file.stated_rows.get(key, stream.rows)):
                 found.append(f"{key} has {stream.rows} rows where the file says {stated}")
             if stream.rows and key not in promises:
@@ -124,6 +135,8 @@ class Survey:
         for key in sorted(set(promises) - {EDGES} - set(filled)):
             if span_s > max(_LEAST_SPAN_S, 2.0 / promises[key].rate_hz):
                 found.append(f"no rows of {key}, which the catalogue promises")
+        sound = {key: self._steps.get(key, []) for key, one in self.streams.items() if not one.odd}
+        found += self._agreement.doubts(self.streams, sound)
         return tuple(found)
 
     def _take_block(self, key: str, payload: bytes) -> Block | None:
@@ -133,26 +146,34 @@ class Survey:
             stream.odd += 1
             return None
         gap = self._continuity.follow(key, block.index, len(block.values))
-        stream.first = stream.first if stream.messages else block.index
+        if not stream.messages:
+            stream.first, stream.start_s = block.index, block.tick / block.tick_rate_hz
+        if gap is not None:
+            self._steps.setdefault(key, []).append(gap)
         stream.messages += 1
         stream.back += gap is not None and gap.size < 0
         if promise is not None and promise.rate_hz:
             stream.off += abs(block.rate_hz / promise.rate_hz - 1.0) > _OFF_RATE
+        if key != EDGES:
+            start_s, index = self._begun.setdefault(key, (block.start_s, block.index))
+            stray_s = block.start_s - start_s - (block.index - index) / block.rate_hz
+            stream.misplaced += abs(stray_s) * block.tick_rate_hz > 0.5
         if len(block.values):
             first_s, stream.last_time_s = row_times_s(key, block)[[0, -1]].tolist()
             stream.first_time_s = stream.first_time_s if stream.rows else first_s
             stream.rows += len(block.values)
         return block
 
-    def _take_document(self, key: str, payload: bytes) -> None:
+    def _take_document(self, key: str, time_ns: int, payload: bytes) -> None:
         """Follow what the rig says of the rows that it published, and the recorder of those that never arrived."""
-        if key not in (EVENTS, schemas.GAPS) or (document := documents.document_in(key, payload)) is None:
+        if key not in documents.KINDS or (document := documents.document_in(key, payload)) is None:
             return
+        self._agreement.follow(key, time_ns, document)
         if key == schemas.GAPS:
             self._noted_bytes = documents.check_kept(self._noted_bytes + len(payload), key, self.file.path)
             if document["index"] >= 0:
                 self._noted.add((document["key"], document["index"] + document["size"]))
-        elif document["event"] in ("start", "end"):
+        elif key == EVENTS and document["event"] in ("start", "end"):
             self._published = (document.get("rows") or {}) if document["event"] == "end" else {}
 
     def _end(self) -> None:

@@ -19,7 +19,7 @@ from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import check, parse_toml
 
 VERSION = 2
-"""Of tables that are made now."""
+"""Of tables that are made now: another one whenever the rig's own changes, as recordings are held against it."""
 TABLE = Path(__file__).with_name("channels.toml")
 
 

@@ -27,7 +27,7 @@ _DOCUMENTS = {
     wire.CATALOGUE: "on request: the channel table with calibration, truth tables with units",
     wire.PARAMETERS: "on request: every parameter with value, unit, source and kind",
     wire.SCENE: "on request: the scene as it runs, with its seed, and as `taken` the commands sent to it so far "
-    "(the newest 500 kB; `forgotten` counts those before)",
+    "(the newest 500 kB; `forgotten` counts those before); `replayed` where a recording is played in part, or changed",
     f"{wire.CLIENTS}/NAME": "sent by clients twice a second, and with `done` when they leave; shown in the status: "
     "how far they have come, null where nothing came yet; `room`: rows that one can hold, which a replay in a burst "
     "does not exceed. The status shows 64, first those that get on; who gets on no more is not waited for",

@@ -208,7 +208,8 @@ class Player(ServedRun):
         for entry in self._track.commands:
             if entry["tick"] * NS < self._position_ns * self._rate and entry["command"] not in _OWN:
                 taken.setdefault(entry["id"], entry)
-        return {**self._scene, **({"taken": list(taken.values())} if taken or "taken" in self._scene else {})}
+        told = {"taken": list(taken.values())} if taken or "taken" in self._scene else {}
+        return {**self._scene, **told, **({} if self._as_recorded else {"replayed": "in part, or changed"})}
 
     def _wake(self) -> None:
         self._woken.set()

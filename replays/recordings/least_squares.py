@@ -45,8 +45,8 @@ def fit(
     *,
     rounds: int,
     gain: float = 0.0,
-    farthest: float = np.inf,
-    longest: float = np.inf,
+    farthest: float | np.ndarray = np.inf,
+    longest: float | np.ndarray = np.inf,
 ) -> Fit | None:
     """Values with the least sum of squares near a start; None where the model does not take the start.
 
@@ -56,8 +56,8 @@ def fit(
         start: Where the search begins, shape (values,).
         rounds: Largest number of steps.
         gain: The search ends with a step that makes the sum of squares smaller by less than this part of it.
-        farthest: Largest amount of a value.
-        longest: Largest amount by which a step changes a value.
+        farthest: Largest amount of a value, or of each.
+        longest: Largest amount by which a step changes a value, or each.
     """
     z = residuals(start)
     if z is None:
@@ -79,7 +79,7 @@ def fit(
     return found
 
 
-def _better(residuals: Residuals, found: Fit, step: np.ndarray, farthest: float) -> Fit | None:
+def _better(residuals: Residuals, found: Fit, step: np.ndarray, farthest: float | np.ndarray) -> Fit | None:
     """Ahead by the first part of a step that makes the sum of squares smaller; None where none does."""
     for part in _PARTS:
         values = np.clip(found.values + part * step, -farthest, farthest)

@@ -142,7 +142,10 @@ def identify(
     form: Form,
     force: Force = False,
 ) -> None:
-    """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell."""
+    """Fit numbers of the rig to a recording: values, 95 % intervals, and what the recording cannot tell.
+
+    Ends with 1, and writes no set, where the model does not explain the recording: then no value is a result.
+    """
     from recorder.reader import join
     from replays.recordings.identification import identify as run
     from replays.recordings.identification.document import check_set, fitted_set, identification_document, write_set
@@ -158,14 +161,23 @@ def identify(
     question, along = asked.question(recording, exact=exact)
     with reporting(compiles=True) as reporter:
         found = run(question, **asdict(search), progress=reporter.step)
-    if output is not None:
+    fits = found.judgement.fits
+    if output is not None and fits:
         write_set(fitted_set(found, recording=name), output)
     if report is not None:
         report_of(found, recording=name, origin=of_recording(name, recording)).write(report)
     if form.as_json:
         echo_json(identification_document(found, recording=name))
-        return
-    _show(found, name, form.console())
+    else:
+        _show(found, name, form.console())
+        _tell(along, output if fits else None, report)
+    if not fits:
+        if output is not None:
+            echo(f"not written  {output}: the model does not explain the recording", err=True)
+        raise typer.Exit(1)
+
+
+def _tell(along: list[str], output: Path | None, report: Path | None) -> None:
     if along:
         echo(f"fitted along, as an imported log does not tell it exactly: {', '.join(along)}")
     if output is not None:

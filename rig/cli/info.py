@@ -49,6 +49,7 @@ def describe(
     from dataclasses import asdict
 
     from recorder.health import examine
+    from replays.recordings.experiment import parameter_doubts
 
     about = recording.metadata["rig"]
     parts = [
@@ -77,6 +78,7 @@ def describe(
     }
     if not quick:
         health = asdict(examine(recording, progress))  # the one pass in which the streams are counted, too
+        health["findings"] += parameter_doubts(recording)
         document["streams"] = {key: asdict(stream) for key, stream in recording.streams.items()}
         document["health"] = health
     return finite(document)

@@ -79,6 +79,8 @@ def _show(found: Validation, console: Console) -> None:
     changed = ", ".join(f"{key} = {value}" for key, value in found.changes.items())
     console.print(shown(f"{found.title}, scene {found.scene}") + (f", validated with {changed}" if changed else ""))
     console.print(found.verdict_line)
+    for line in found.doubts[1:]:
+        console.print(f"nor does this: {line}")
     if found.explained is not None:
         console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")
     for fault in found.faults:

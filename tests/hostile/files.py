@@ -29,7 +29,10 @@ def write(path: Path, *, leave: bool = False, blocks: int = 3, **changes: Any) -
     """A short recording; with `leave` what a kill leaves of it."""
     about = documents()
     session = Recording.open(SESSIONS / "hammer-5.2.mcap")
-    about[PARAMETERS], about[SCENE] = session.parameters, dict(session.scene)
+    scene = session.scene["scene"]
+    scene |= {"seed": 7, "duration_s": 1e-3 * blocks, "commands": []}  # as the stream tells it
+    scene["sensors"] |= {"rate_hz": 0, "truth_rate_hz": 2000}
+    about[PARAMETERS], about[SCENE] = session.parameters, {**session.scene, "seed": 7, "scene": scene}
     about[SCENE]["taken"] = [{"id": 1, "tick": 0, "command": "hammer", "request": {"force_n": 10.0}}]
     file = RecordingWriter(
         path, catalogue=about[CATALOGUE], parameters=about[PARAMETERS], scene=about[SCENE], view_rate_hz=100.0,
@@ -182,6 +185,7 @@ class Layout:
     def __init__(self, recording: Recording) -> None:
         self.metadata = copy.deepcopy(recording.metadata)
         self.attachments = dict(recording.attachments)
+        self.about = dict(recording.parts[0].about)
         self.messages: list[Message] = [
             (topic, payload, time_ns) for topic, time_ns, _, payload in recording.everything() if topic[:4] != "view"
         ]
@@ -257,7 +261,7 @@ class Layout:
             channels: dict[str, int] = {}
             for number, (topic, payload, time_ns) in enumerate(self.messages):
                 if topic not in channels or (0.55 < strange < 0.58 and number == 9):
-                    channels[topic] = mcap.register_channel(topic, "x", schema)
+                    channels[topic] = mcap.register_channel(topic, "x", schema, self.about.get(topic, {}))
                 channel = 999 if 0.6 < strange < 0.65 and number % 7 == 3 else channels[topic]
                 mcap.add_message(channel, time_ns, payload, time_ns)
             if "end" in self.metadata:

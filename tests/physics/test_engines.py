@@ -8,6 +8,8 @@
 | distance of smoothed to exact friction | proportional to v_s              | creep is v_s atanh(needed / mu)     |
 | linearly implicit run at v_s = 1 um/s  | near to exact Coulomb            | L-stable                            |
 | explicit run at v_s = 1 um/s, 25 us    | wrong, and its energy ledger too | stable below 2 m v_s / (mu F_n)     |
+| spin without drive, in the air         | constant, without unbalance      | no moment about the shaft's axis    |
+| spin without drive, in the ring        | less; the energy ledger closes   | friction alone brakes it            |
 """
 
 from __future__ import annotations
@@ -202,6 +204,18 @@ def test_engines_agree_on_exact_friction(engine: str) -> None:
     exact = motion(ready("hammer", "rk8", engine__tolerance=1e-10), 0.05)
     choice, limit = of_engine(engine, CLASS, "CLASS: how it is run, and how far it may be from rk8 after 0.05 s")
     assert distance(motion(ready("hammer", engine, **choice), 0.05), exact) < limit
+
+
+@pytest.mark.parametrize("engine", EXACT)
+def test_without_a_drive_only_contact_brakes_the_shaft(engine: str) -> None:
+    free = {"drive__torque_gain": 0.0, "shaft__unbalance_eccentricity": 0.0}
+    spin = ready("stable-run", engine, **free).advance(100_000).rows[:, S.COLUMN["theta_rate"]]
+    np.testing.assert_allclose(spin, spin[0], rtol=1e-9)  # a shaft that sags turns as evenly, but for its tilt
+    simulation = ready("hammer", engine, **free)
+    spin = simulation.advance(100_000).rows[:, S.COLUMN["theta_rate"]]
+    assert spin[-1] < spin[0] - 1.0
+    energy = simulation.health()["energy"]
+    assert abs(energy["residual_share"]) < energy["alarm_share"]
 
 
 @pytest.mark.parametrize("engine", [name for name in ENGINES if name not in EXACT])

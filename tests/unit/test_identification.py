@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -169,6 +170,36 @@ def test_single_samples_that_are_far_off_count_less(file: Path) -> None:
         finding = identify(question, robust=robust).judgement.findings[0]
         errors.append(abs(finding.value - 1.7))
     assert errors[1] < 0.2 * errors[0]
+
+
+def test_a_wrong_model_gives_no_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Recorded with a restitution of 0.88 and fitted with 0.9: friction and magnets would make up for it."""
+    wrong, fitted = tmp_path / "w.mcap", tmp_path / "w.toml"
+    write_run(Simulation(load_scene("hammer", {"duration_s": 0.035, "contact.restitution": 0.88})), wrong)
+    arguments = ("--fit", "contact.friction,magnet.stiffness", "--parameters", "corrected", "-o", fitted)
+    assert run(wrong, *arguments, "--json") == 1
+    told = capsys.readouterr()
+    document = json.loads(told.out)
+    assert document["fits"] is False
+    for key, truth in (("contact.friction", 0.25), ("magnet.stiffness", 1.7)):
+        value = document["values"][key]
+        assert (value["standing"], value["value"], value["half_width_95"]) == ("not explained", None, None)
+        found = re.search(r"the fit ended at ([0-9.]+).* may have moved it by (\S+)", value["words"])
+        assert found is not None
+        assert abs(float(found[1]) - truth) < float(found[2]) < 0.2 * truth
+    assert not fitted.exists()
+    assert "not written" in told.err
+
+
+@pytest.mark.parametrize(("lacking", "widened"), [(0.0, False), (0.8, True)])
+def test_a_small_misfit_widens_the_intervals_by_its_size(lacking: float, widened: bool, file: Path) -> None:
+    recording = Recording.open(file)
+    question = ask(recording, Experiment.of(recording), ["magnet.stiffness"], window=(0.0, 0.025))
+    times_s, noise = question.observation.times_s, question.observation.noise
+    question.observation.values[:, :4] += np.sin(2e3 * times_s)[:, None] * lacking * noise[:4]
+    judged = identify(question).judgement
+    assert judged.fits
+    assert (judged.inflation > 3.0) is widened
 
 
 def test_a_log_without_a_scene_takes_one_from_elsewhere(file: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def record(
             for key, block in blocks.items():
                 if number not in leave_out:
                     writer.write(key, encode_block(block), frame.tick * 1000)
-        writer.finish("completed")
+        writer.finish("closed")
     return Recording.open(path)
 
 
@@ -303,6 +304,25 @@ def test_two_that_explain_it_alike_are_both_named(tmp_path: Path) -> None:
     assert found.explained is not None
     assert "house.preload" in found.explained.best
     assert any(name.startswith("P_") for name in [one.name for one in found.explained.ranked])
+
+
+def test_a_second_cause_behind_the_first_is_named_with_it(tmp_path: Path) -> None:
+    """Damping is seen before the impacts, friction only in them."""
+    both = {"shaft__damping_ratio_x": 0.03, "contact__friction": 0.24}
+    recording = record(tmp_path / "two.mcap", sensors__rate_hz=20_000, duration_s=0.045, **both)
+    criteria = load_criteria()
+    few = [one for one in criteria.attribution.candidates if one.name in ("contact.friction", "shaft.damping_ratio_x")]
+    rules = criteria.attribution.model_copy(update={"candidates": tuple(few)})
+    right = {"shaft.damping_ratio_x": 0.016, "contact.friction": 0.25}
+    found = validate(recording, criteria=criteria.model_copy(update={"attribution": rules}), changes=right).explained
+    assert found is not None
+    assert found.best[0] == "shaft.damping_ratio_x"
+    assert re.search(r"of the difference to 0\.02\d s", found.conclusion)
+    told = re.search(r"second cause, contact.friction (\S+) % with shaft.damping_ratio_x (\S+) %", found.conclusion)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(-4.0, abs=0.1)
+    assert float(told[2]) == pytest.approx(87.5, abs=1.0)
+    assert found.to_s == pytest.approx(0.05, abs=2e-3)
 
 
 @pytest.mark.parametrize(("left", "nearest"), [(1.0, False), (31.0, True)])

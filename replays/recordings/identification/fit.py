@@ -36,6 +36,10 @@ _FARTHEST = 6.0
 _BENDS = "beyond, the response to what is not known yet, above all {}, is no longer linear"
 _CHANCE = 4.0
 """Samples that come new are not explained where chi2 is above that before by more of its standard deviations."""
+_FAR = 6.0
+"""Where single samples are to count less, those off by so many times their noise tell nothing of the model, ..."""
+_FEW = 0.01
+"""... if they are no more than this part."""
 _PASSES = 3
 """So often the slopes are taken anew along the principal directions that they have given."""
 
@@ -273,9 +277,10 @@ class _Search:
         blind = blind_directions(window.slopes(self.state.z, self.state.covariance), reach)
         # Along what is not seen the values stay where they are.
         self._solve(window, blind.T / reach, self.state.z, robust=robust)
-        judgement = judge(
-            window, self.state.z, window.slopes(self.state.z, self.state.covariance), window.residuals(self.state.z)
-        )
+        slopes, residuals = window.slopes(self.state.z, self.state.covariance), window.residuals(self.state.z)
+        far = np.abs(residuals) > _FAR
+        known = window.known & ~far if robust and far.sum() <= _FEW * window.known.sum() else window.known
+        judgement = judge(window, self.state.z, slopes * known[..., None], residuals * known, known)
         return Identification(
             question=self.question,
             judgement=judgement,

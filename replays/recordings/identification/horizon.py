@@ -19,6 +19,7 @@ NOTICEABLE = 3.0
 """... and above this many times the noise, summed in squares over a bin."""
 SIGMAS = 2.0
 """The response to an error of so many standard deviations."""
+_PARTS = (1.0, 0.5, 0.25, 0.1)
 _BIN_S = 5e-4
 
 
@@ -55,11 +56,15 @@ def horizon(window: Window, z: np.ndarray, covariance: np.ndarray) -> Horizon:
     for size, direction in zip(sizes, directions.T, strict=True):
         change = SIGMAS * np.sqrt(max(size, 0.0)) * direction
         name = question.keys[int(np.argmax(np.abs(direction)))]
-        try:
-            up, down = window.predicted(z + change), window.predicted(z - change)
-        except (InputError, SimulationError):
-            continue  # at the edge of what the model takes, where there is only one side
-        slope, bend = (up - down) / 2.0, (up + down) / 2.0 - base
+        for part in _PARTS:  # near the edge of what the model takes, a smaller change tells of the whole one
+            try:
+                up, down = window.predicted(z + part * change), window.predicted(z - part * change)
+            except (InputError, SimulationError):
+                continue
+            break
+        else:
+            continue  # at the edge there is only one side
+        slope, bend = (up - down) / (2.0 * part), ((up + down) / 2.0 - base) / part**2
         slope, bend = (
             np.sqrt(np.add.reduceat((np.where(window.known, part, 0.0) ** 2).sum(axis=1), starts))
             for part in (slope, bend)

@@ -11,12 +11,19 @@ import numpy as np
 from replays.recordings.identification.question import Unknown
 from replays.recordings.identification.window import Window
 
-Standing = Literal["identified", "not seen", "only together", "at its bound"]
+Standing = Literal["identified", "not seen", "only together", "at its bound", "not explained"]
 
 _FITS = 0.03
 """By so much may the sum of squares a degree of freedom be above 1 beside chance: noise is not known better, ..."""
 _CHANCE = 5.0
 """... and by so many of its standard deviations is chance."""
+_ALONG = 2.0
+"""What the model lacks may act along the unknowns by so many times what it does across them, which is seen: with a
+correlation of up to 0.9 between the two."""
+_NOTED = 3.0
+"""What is missing is noted from so many standard deviations of the sum of squares on."""
+_LEAST_ROWS = 100
+"""Samples at least over which it is looked for."""
 _NAMED = 0.1
 """Least part in a direction for an unknown to be named."""
 _ALIKE = 0.99
@@ -101,13 +108,10 @@ class Judgement:
         if self.fits:
             coloured = ", ".join(channel.name for channel in self.channels if not channel.white)
             return f"the residuals are as small as the noise but not white ({coloured}): something small is left out"
-        return (
-            f"lack of fit: the residuals are {math.sqrt(self.chi2):.3g} times the noise; the intervals are widened for "
-            "it, but hold only if what is missing acts like noise"
-        )
+        return f"lack of fit: the residuals are {math.sqrt(self.chi2):.3g} times the noise; no value is a result"
 
 
-def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarray) -> Judgement:
+def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarray, known: np.ndarray) -> Judgement:
     """Judge a fit by what it rests on.
 
     Args:
@@ -115,17 +119,19 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
         z: Where the fit ended, in scales, shape (unknowns,).
         slopes: d predicted / d z over the noise, shape (rows, channels, unknowns).
         residuals: Measured less predicted over the noise, shape (rows, channels).
+        known: Which samples count, shape (rows, channels); slopes and residuals are 0 for the others.
     """
     from scipy.stats import t
 
     unknowns, observation, values = window.question.unknowns, window.question.observation, window.values(z)
     reach = np.array([unknown.reach / unknown.scale for unknown in unknowns])
-    count = int(np.isfinite(observation.values[: len(residuals)]).sum())
+    count = int(known.sum())
     _, singular, directions = np.linalg.svd(triangle_of(slopes * reach))
     freedom = max(1, count - len(unknowns))
     chi2 = float((residuals**2).sum()) / freedom
-    spread = math.sqrt(max(1.0, chi2))
     quantile = float(t.ppf(0.975, freedom))
+    unsure = _FITS if "measured" in observation.noise_from else 0.0
+    spread = 1.0 + _ALONG * _misfit(residuals, known, unsure) / quantile
     seen = quantile * spread < singular  # a direction's 95 % interval is within the reach
     blind = directions[~seen].T
     part = np.linalg.norm(blind, axis=1) if blind.size else np.zeros(len(unknowns))
@@ -136,12 +142,11 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     noise_only = np.sqrt(np.diag(plain))
     covariance = plain * spread**2
     channels = tuple(
-        _channel(name, residuals[:, column], np.isfinite(observation.values[: len(residuals), column]))
-        for column, name in enumerate(observation.names)
+        _channel(name, residuals[:, column], known[:, column]) for column, name in enumerate(observation.names)
     )
     if not _explained(chi2, freedom) or sum(not channel.white for channel in channels) > len(channels) // 10:
         covariance = _wider(covariance, plain @ _scores(slopes * reach, residuals) @ plain)
-    stretch = _bends(window, z, covariance * np.outer(reach, reach), residuals, far=quantile, spread=spread)
+    stretch = _bends(window, z, covariance * np.outer(reach, reach), residuals, known, far=quantile, spread=spread)
     covariance = _with_priors(covariance * np.outer(stretch, stretch), unknowns, reach)
     deviation, inflation = np.sqrt(np.diag(covariance)), 1.0
     clear = (part < _NAMED) & ~alone & (noise_only > 0.0)
@@ -151,7 +156,8 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
     findings = []
     for place, unknown in enumerate(unknowns):
         half = quantile * deviation[place] * unknown.reach
-        findings.append(_finding(place, unknowns, float(values[place]), half, alone=alone, blind=blind, part=part))
+        finding = _finding(place, unknowns, float(values[place]), half, alone=alone, blind=blind, part=part)
+        findings.append(finding if _explained(chi2, freedom) else _unexplained(finding))
     correlation = np.full(covariance.shape, np.nan)
     told = np.array([finding.standing == "identified" for finding in findings])
     both = np.outer(told, told) & (np.outer(deviation, deviation) > 0.0)
@@ -166,6 +172,33 @@ def judge(window: Window, z: np.ndarray, slopes: np.ndarray, residuals: np.ndarr
         inflation=inflation,
         channels=channels,
     )
+
+
+def _misfit(residuals: np.ndarray, known: np.ndarray, unsure: float) -> float:
+    """Size of what the model lacks, over the noise: root of what the squares have beyond chance from some row on.
+
+    Added to the intervals as the most that the values may be off by it: bias-aware intervals, after Armstrong and
+    Kolesár (Econometrica 86, 2018). What is missing acts behind an impact, so that all rows together would hide it.
+
+    Args:
+        residuals: Over the noise, shape (rows, channels).
+        known: Which of them count, shape (rows, channels).
+        unsure: Part by which the square of the noise is not known.
+    """
+    squares, counts = (part.sum(axis=1)[::-1].cumsum() for part in (residuals**2, known))
+    beyond = squares - (1.0 + unsure) * counts - _NOTED * np.sqrt(2.0 * counts)
+    return math.sqrt(max(0.0, float(beyond[counts >= min(_LEAST_ROWS, counts[-1])].max())))
+
+
+def _unexplained(finding: Finding) -> Finding:
+    """A finding where the model does not explain the samples: what would be a result is none."""
+    if finding.standing in ("not seen", "only together"):
+        return finding
+    half = finding.half_width
+    moved = f", and what is missing may have moved it by {half:.2g}" if half < math.inf else ""
+    ended = _with_unit(finding.value, finding.unknown, ".6g")
+    words = f"no result, as the model does not explain the samples: the fit ended at {ended}{moved}"
+    return Finding(finding.unknown, finding.value, math.inf, "not explained", words)
 
 
 def _explained(chi2: float, freedom: int) -> bool:
@@ -233,8 +266,8 @@ def _together(place: int, unknowns: tuple[Unknown, ...], blind: np.ndarray, know
     return f"only together with {names}: a change by {_with_unit(change, unknowns[place])} is made up for by {made_up}"
 
 
-def _with_unit(change: float, unknown: Unknown) -> str:
-    return f"{change:+.3g}" + ("" if unknown.unit in ("", "1") else f" {unknown.unit}")
+def _with_unit(change: float, unknown: Unknown, form: str = "+.3g") -> str:
+    return f"{change:{form}}" + ("" if unknown.unit in ("", "1") else f" {unknown.unit}")
 
 
 def _with_likeness(finding: Finding, place: int, findings: list[Finding], correlation: np.ndarray) -> Finding:
@@ -264,7 +297,14 @@ def _with_priors(covariance: np.ndarray, unknowns: tuple[Unknown, ...], reach: n
 
 
 def _bends(
-    window: Window, z: np.ndarray, covariance: np.ndarray, residuals: np.ndarray, *, far: float, spread: float
+    window: Window,
+    z: np.ndarray,
+    covariance: np.ndarray,
+    residuals: np.ndarray,
+    known: np.ndarray,
+    *,
+    far: float,
+    spread: float,
 ) -> np.ndarray:
     """By how much each interval has to be wider than a linear response makes it, shape (unknowns,).
 
@@ -281,7 +321,7 @@ def _bends(
         for sign in (-1.0, 1.0):
             for factor in _STRETCHES:
                 found = window.residuals_or_none(z + sign * factor * far * along)
-                if found is None or float((found**2).sum()) - base > wanted:
+                if found is None or float((found[known] ** 2).sum()) - base > wanted:
                     break
                 stretch[place] = max(stretch[place], _STRETCHES[min(_STRETCHES.index(factor) + 1, len(_STRETCHES) - 1)])
     return stretch

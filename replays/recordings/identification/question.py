@@ -189,7 +189,7 @@ def ask(
         unknowns.append(
             Unknown(
                 key=key,
-                unit=_unit(key),
+                unit=unit_of(key),
                 start=values[key],
                 scale=scale_of(begun, key),
                 low=low,
@@ -325,7 +325,8 @@ def _accepted(key: str) -> tuple[float, float]:
     return _COMMAND_BOUNDS.get(key.split(".")[-1], (-math.inf, math.inf))
 
 
-def _unit(key: str) -> str:
+def unit_of(key: str) -> str:
+    """Unit of a value that can be fitted; empty where it has none that is told."""
     if key in CLOCK:
         return CLOCK[key][0]
     if key == ANGLE:

@@ -29,7 +29,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HEADINGS = ("key", "start", "result", "95 % interval", "unit", "what the recording tells")
-_MARKS: dict[str, Mark] = {"identified": "good", "not seen": "open", "only together": "open", "at its bound": "bad"}
+_MARKS: dict[str, Mark] = {
+    "identified": "good", "not seen": "open", "only together": "open", "at its bound": "bad",
+    "not explained": "bad",
+}  # fmt: skip
 _MOST_PANELS = 16
 _WRITTEN = 6
 """Values up to which each correlation is written into its square."""
@@ -78,7 +81,7 @@ def fit_line(found: Identification) -> str:
     """Goodness of the fit."""
     judgement = found.judgement
     line = f"chi2 {judgement.chi2:.4g} a degree of freedom ({judgement.freedom}); {judgement.verdict}"
-    if judgement.inflation > 1.1:
+    if judgement.fits and judgement.inflation > 1.1:
         line += f"; intervals up to {judgement.inflation:.2g} times as wide as by noise alone"
     if judgement.together > 1.0:
         line += f"; each interval holds by itself, all hold at once if {judgement.together:.2f} times as wide"

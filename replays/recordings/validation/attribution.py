@@ -8,19 +8,29 @@ of the residual each explains, so that two that explain it alike are seen to do 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from replays.recordings.experiment import Experiment
 from replays.recordings.identification.nuisance import Tuned
+from replays.recordings.identification.question import unit_of
 from replays.recordings.least_squares import Fit, fit
 from replays.recordings.prediction import Measured, Prediction, predict
 from replays.recordings.sensitivity import scale_of, value_of, with_values
 from replays.recordings.validation.criteria import Attribution, Candidate
-from replays.recordings.validation.explanation import DECIDES, Explanation, Kind, excess, is_noise, vector
+from replays.recordings.validation.explanation import (
+    DECIDES,
+    Explanation,
+    Kind,
+    excess,
+    is_noise,
+    smooth_columns,
+    vector,
+)
 from replays.recordings.validation.faults import Clock, sensor_faults
+from replays.recordings.validation.trajectory import scaled
 from rig.errors import InputError, SimulationError
 
 _GROWTH_S = (5e-3, 10e-3, 20e-3, 40e-3, 80e-3, 160e-3)
@@ -38,6 +48,10 @@ _TRIED = 3
 """... and from how many of these it does."""
 _MOST = 0.95
 """Changes of channels that together explain this part of all are it, though the model leaves something."""
+_MOST_TIED = 3
+"""Of causes that explain the beginning equally, so many are tried with a second one behind it."""
+_OFF = 7.0
+"""A sample so many times its noise off is the first that a cause does not explain."""
 _WHOLE_S = 5.0
 """How far sensors and time are looked at behind the first difference [s]."""
 
@@ -102,7 +116,47 @@ def attribute(
     # Those that were given up on a shorter window come behind all others.
     found.sort(key=lambda one: (-one.to_s, -one.explained))
     conclusion, best = conclude(found, sensors if cured else [], rules, end_s=until_s)
-    return Explained(from_s, until_s, tuple(found), conclusion, best)
+    explained = Explained(from_s, until_s, tuple(found), conclusion, best)
+    floor = {one.name: one for one in found if one.at_floor and one.to_s == until_s}
+    if until_s >= ends[-1] or not set(best) <= set(floor) & set(candidates):
+        return explained
+    tied = sorted((floor[name] for name in best), key=lambda one: one.squares)[:_MOST_TIED]
+    return _behind(explained, [candidates[one.name] for one in tied], candidates, ends[-1], step)
+
+
+def _behind(
+    first: Explained,
+    causes: list[_CandidateFit],
+    candidates: dict[str, _CandidateFit],
+    last_s: float,
+    step: Callable[[str], None],
+) -> Explained:
+    """With a second cause where the first explains the difference to some time only; each is fitted with the other."""
+    found: list[tuple[Explanation, str]] = []
+    for cause in causes:
+        from_s = cause.first_off(last_s)
+        ends = sorted({min(from_s + length, last_s) for length in _GROWTH_S})
+        others = {name: one.along(cause) for name, one in candidates.items() if not one.shares(cause)}
+        fitted, end_s = _model(others, ends, lambda text, told=cause.candidate.name: step(f"with {told}: {text}"))
+        alone = cause.fit(cause.ended, end_s)
+        least = np.inf if alone is None else alone.squares - DECIDES
+        for one in fitted:
+            if one.at_floor and one.to_s == end_s and one.squares < least:
+                found.append((one, f"{cause.candidate.name} {cause.told(float(others[one.name].ended[1]))}"))
+        if found and end_s >= ends[-1]:
+            break
+    if not found:
+        return replace(first, conclusion=f"{first.conclusion}; what comes behind that is not explained")
+    end_s = max(one.to_s for one, _ in found)
+    fewest = min(one.squares for one, _ in found if one.to_s == end_s)
+    pairs = [(one, cause) for one, cause in found if one.to_s == end_s and one.squares < fewest + DECIDES]
+    named = [replace(one, name=f"{one.name}, with {cause}") for one, cause in pairs]
+    told = " or ".join(f"{one.name} {one.change} with {cause}" for one, cause in pairs)
+    return replace(
+        first, to_s=end_s, ranked=(*named, *first.ranked), best=(*first.best, *(one.name for one in named)),
+        conclusion=f"{first.conclusion}; behind that a second cause, {told}: together they explain it to {end_s:.3f} s "
+        f"({named[0].left:.2f} of the noise left)",
+    )  # fmt: skip
 
 
 def explain_log(
@@ -134,44 +188,94 @@ def explain_log(
 
 
 class _CandidateFit:
-    """The residual as a function of one candidate's number."""
+    """The residual as a function of one candidate's number, and of that of a cause found before, which is fitted along.
 
-    def __init__(self, experiment: Experiment, candidate: Candidate, parts: dict[str, Measured]) -> None:
-        self._experiment, self._parts = experiment, parts
+    Attributes:
+        candidate: The candidate.
+        ended: Where the fit ended that counts, its own number first, shape (1,) or (2,).
+        step: Of a difference quotient.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        candidate: Candidate,
+        parts: dict[str, Measured],
+        cause: _CandidateFit | None = None,
+    ) -> None:
+        self._experiment, self._parts, self._cause = experiment, parts, cause
         self.candidate = candidate
+        self.ended = np.zeros(1) if cause is None else np.append(0.0, cause.ended[0])
+        self._begin = self.ended
         self._start = {key: value_of(experiment, key) for key in candidate.keys}
-        if not candidate.unit and any(value == 0.0 for value in self._start.values()):
-            raise InputError(candidate.name, "a value other than 0", 0.0)
-        self._scale = {} if candidate.unit else self._start
-        self._step = candidate.step
+        # A value of 0 has no parts to change by: it changes in its own unit.
+        self._absolute = bool(candidate.unit) or 0.0 in self._start.values()
+        self._unit = candidate.unit or (unit_of(candidate.keys[0]) if self._absolute else "")
+        self._scale = {} if self._absolute else self._start
+        self.step = candidate.step
         if candidate.unit and candidate.step == Candidate.model_fields["step"].default:
-            self._step *= scale_of(experiment, candidate.keys[0])
+            self.step *= scale_of(experiment, candidate.keys[0])
 
-    def residuals(self, p: float, end_s: float) -> np.ndarray | None:
-        """Residuals over floors, shape (n,); None where the model does not take the number.
+    def told(self, p: float) -> str:
+        """A number of it in words."""
+        return f"{p:+.4g} {self._unit}".removesuffix(" 1") if self._absolute else f"{100.0 * p:+.3g} %"
 
-        Args:
-            p: The number.
-            end_s: End of the window [s].
-        """
-        changed = {key: value + p * self._scale.get(key, 1.0) for key, value in self._start.items()}
+    def along(self, cause: _CandidateFit) -> _CandidateFit:
+        """The same with a cause that is fitted along, from where its own fit ended."""
+        return _CandidateFit(self._experiment, self.candidate, self._parts, cause)
+
+    def shares(self, other: _CandidateFit) -> bool:
+        """Whether both change the same value."""
+        return not self._start.keys().isdisjoint(other._start)
+
+    def first_off(self, end_s: float) -> float:
+        """Time of the first sample that is far off with the number where the last fit ended, up to an end [s]."""
+        found = self._predicted(self.ended, end_s)
+        off = {} if found is None else {name: np.abs(scaled(self._parts[name], v)) for name, v in found.values.items()}
+        rows = {
+            name: np.flatnonzero(each[:, smooth_columns(self._parts[name])].max(axis=1, initial=0.0) > _OFF)
+            for name, each in off.items()
+        }
+        return min(
+            (float(self._parts[name].times_s[each[0]]) for name, each in rows.items() if len(each)), default=end_s
+        )
+
+    def changed(self, p: float) -> dict[str, float]:
+        """The values that it changes, with its number."""
+        return {key: value + p * self._scale.get(key, 1.0) for key, value in self._start.items()}
+
+    def _predicted(self, values: np.ndarray, end_s: float) -> Prediction | None:
+        changed = self.changed(float(values[0]))
+        if self._cause is not None:
+            changed |= self._cause.changed(float(values[1]))
         try:
-            prediction = predict(with_values(self._experiment, changed), self._parts, end_s=end_s)
+            return predict(with_values(self._experiment, changed), self._parts, end_s=end_s)
         except (InputError, SimulationError):
             return None
-        return vector(self._parts, prediction.values)
+
+    def residuals(self, values: np.ndarray, end_s: float) -> np.ndarray | None:
+        """Residuals over floors, shape (n,); None where the model does not take the numbers.
+
+        Args:
+            values: The numbers.
+            end_s: End of the window [s].
+        """
+        prediction = self._predicted(values, end_s)
+        return None if prediction is None else vector(self._parts, prediction.values)
 
     def search(self, end_s: float) -> Fit | None:
         """The best of the fits from a few places: those with the smallest flattened residuals."""
         places = []
         for part in _STARTS:
-            z = self.residuals(part * self.candidate.largest, end_s)
+            start = self._begin.copy()
+            start[0] = part * self.candidate.largest
+            z = self.residuals(start, end_s)
             if z is not None:
                 # Impacts that do not overlap outweigh everything and give no slope to follow, while the smooth motion
                 # between them does.
-                places.append((float(np.sum(np.arcsinh(z) ** 2)), abs(part), part * self.candidate.largest))
+                places.append((float(np.sum(np.arcsinh(z) ** 2)), abs(part), part, start))
         best: Fit | None = None
-        for _, _, start in sorted(places)[:_TRIED]:
+        for *_, start in sorted(places, key=lambda place: place[:3])[:_TRIED]:
             found = self.fit(start, end_s)
             if found is not None and (best is None or found.squares < best.squares):
                 best = found
@@ -179,38 +283,46 @@ class _CandidateFit:
                 break
         return best
 
-    def fit(self, p: float, end_s: float) -> Fit | None:
-        """The number that leaves least on a window, near a start."""
+    def fit(self, start: np.ndarray, end_s: float) -> Fit | None:
+        """The numbers that leave least on a window, near a start."""
+        both = [self] if self._cause is None else [self, self._cause]
 
         def residuals(values: np.ndarray) -> np.ndarray | None:
-            return self.residuals(float(values[0]), end_s)
+            return self.residuals(values, end_s)
 
         def slopes(values: np.ndarray, z: np.ndarray) -> np.ndarray | None:
-            moved = self.residuals(float(values[0]) + self._step, end_s)
-            return None if moved is None else (moved - z)[:, None] / self._step
+            columns = []
+            for place, one in enumerate(both):
+                moved = values.copy()
+                moved[place] += one.step
+                ahead = self.residuals(moved, end_s)
+                if ahead is None:
+                    return None
+                columns.append((ahead - z) / one.step)
+            return np.stack(columns, axis=1)
 
-        largest = self.candidate.largest
-        start = np.array([p])
+        largest = np.array([one.candidate.largest for one in both])
         return fit(residuals, slopes, start, rounds=_ROUNDS, gain=_GAIN, farthest=largest, longest=largest / 4.0)
 
     def explanation(self, found: Fit, before: float, to_s: float) -> Explanation:
         """What a fit comes to, against the excess of the residuals without it."""
-        p, unit, key = float(found.values[0]), self.candidate.unit, self.candidate.keys[0]
+        p, unit, key = float(found.values[0]), self._unit, self.candidate.keys[0]
         kind: Kind = "time" if key.endswith(".at_s") else "command" if key.startswith("hammer.") else "model"
         return Explanation.of(
             found.residuals, kind=kind, name=self.candidate.name,
-            change=f"{p:+.4g} {unit}" if unit else f"{100.0 * p:+.3g} %", value=p, unit=unit,
+            change=self.told(p), value=p, unit=unit,
             explained=1.0 - excess(found.residuals) / before, to_s=to_s,
         )  # fmt: skip
 
     def before(self, end_s: float) -> float:
-        """Excess of the residuals of the experiment as it is."""
-        return excess(vector(self._parts, predict(self._experiment, self._parts, end_s=end_s).values))
+        """Excess of the residuals of the experiment as it is, or with the cause found before."""
+        z = self.residuals(self._begin, end_s)
+        return 0.0 if z is None else excess(z)
 
     def again(self, one: Explanation, end_s: float) -> Explanation:
         """The same on a longer window, from where its fit ended."""
         before = self.before(end_s)
-        found = self.fit(one.value, end_s)
+        found = self.fit(self.ended, end_s)
         return one if found is None or before == 0.0 else self.explanation(found, before, end_s)
 
 
@@ -230,6 +342,7 @@ class _WindowStage(NamedTuple):
 
     end_s: float
     fitted: list[Explanation]
+    fits: dict[str, Fit]
 
     @property
     def worth(self) -> float:
@@ -244,7 +357,9 @@ def _model(
     candidates: dict[str, _CandidateFit], ends: list[float], step: Callable[[str], None]
 ) -> tuple[list[Explanation], float]:
     """What each candidate explains, and the end of the window that this is said of [s]."""
-    places = dict.fromkeys(candidates, 0.0)  # where the fits begin, of those that are not given up
+    places = {
+        name: one.ended for name, one in candidates.items()
+    }  # where the fits begin, of those that are not given up
     stages: list[_WindowStage] = []
     for end_s in ends:
         fits: dict[str, Fit] = {}
@@ -263,11 +378,11 @@ def _model(
         told = {
             name: candidates[name].explanation(found, before, end_s) for name, found in fits.items() if before > 0.0
         }
-        stages.append(_WindowStage(end_s, [one for one in told.values() if one.explained > 0.0]))
+        stages.append(_WindowStage(end_s, [one for one in told.values() if one.explained > 0.0], fits))
         best = max((one.explained for one in told.values()), default=0.0)
         fewest = min((one.squares for one in told.values()), default=0.0)
         places = {
-            name: one.value
+            name: fits[name].values
             for name, one in told.items()
             if one.explained > max(0.0, best - _KEEP) or one.squares < fewest + 4.0 * DECIDES
         }
@@ -275,6 +390,8 @@ def _model(
     # too sensitive for a fit says nothing.
     chosen = max(range(len(stages)), key=lambda k: (stages[k].worth, k))
     kept = {one.name: one for stage in stages[: chosen + 1] for one in stage.fitted}
+    for name, found in stages[chosen].fits.items():
+        candidates[name].ended = found.values
     return list(kept.values()), stages[chosen].end_s
 
 
@@ -307,7 +424,7 @@ def conclude(
     else:
         equal = [one for one in alone if one.explained > single.explained - rules.equal]
     names = tuple(one.name for one in equal)
-    part = f"{single.explained:.2%} of the difference, {single.left:.2f} of the noise left"
+    part = f"{single.explained:.2%} of the difference to {end_s:.3f} s, {single.left:.2f} of the noise left"
     short = "" if single.left < _NEAR else "nothing alone explains it down to the noise; nearest is "
     if len(equal) == 1:
         return f"{short}{single.kind}: {single.name} {single.change} ({part})", names

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from recorder.agreement import calibration_off
 from recorder.reader import Recording
-from replays.recordings.experiment import Experiment, is_imported
+from replays.recordings.experiment import Experiment, is_imported, parameter_doubts
 from replays.recordings.identification.nuisance import Tuned, looks_from, tune
 from replays.recordings.identification.question import first_command_s
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
@@ -22,7 +23,6 @@ from replays.recordings.validation.signals import SignalFault, edge_faults, sign
 from replays.recordings.validation.statistics import perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
 from replays.recordings.validation.truth import judge_truth, recorded_truth
-from rig.channels import default_table
 
 
 def validate(
@@ -66,7 +66,7 @@ def validate(
         skipped=sum(stream.lost for stream in recording.streams.values()),
         explained=None, fitted=tuple(one.line for one in again.tuned.fitted) if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
-        doubts=recording.doubts, faults=tuple(again.faults),
+        doubts=(*recording.doubts, *parameter_doubts(recording)), faults=again.faults,
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     if validation.good or validation.doubts or not firsts:
@@ -171,22 +171,8 @@ def _explained(again: _DoneAgain, *, from_s: float, end_s: float, step: Callable
 
 def calibration(recording: Recording, experiment: Experiment) -> list[str]:
     """How the recording's channels differ from the table of its scene, the rig's own where that has none."""
-    table = experiment.scene.channels or default_table()
-    own, found = table.channels, list[str]()
     if is_imported(recording):
         mapped = recording.scene["import"]["mapping"]["channels"]
         lacking = [name for name, entry in mapped.items() if "bandwidth_hz" not in entry]
         return [f"no bandwidth told of {', '.join(lacking)}: taken for half of the rate"] if lacking else []
-    for name, channel in recording.table.channels.items():
-        if name not in own:
-            found.append(f"{name}: not in the channel table of its scene")
-            continue
-        rate_hz = None if channel.rate_hz == own[name].rate_hz else channel.rate_hz
-        like = table.only((own[name].group,), rate_hz).channels[name]
-        fields = ("signal", "unit", "sensitivity_v", "bias_v", "range_v", "bandwidth_hz", "filter_order", "highpass_hz",
-                  "noise_v", "adc_v", "adc_bits")  # fmt: skip
-        off = [f"{key} {getattr(channel, key)} instead of {getattr(like, key)}" for key in fields
-               if getattr(channel, key) != getattr(like, key)]  # fmt: skip
-        if off:
-            found.append(f"{name}: {', '.join(off)}")
-    return found
+    return calibration_off(recording.table, experiment.scene.table)

@@ -1,0 +1,80 @@
+"""Intervals hold the truth as often as they say: each value alone, and five together with the factor for all at once.
+
+Many fits, half a minute a seed: it runs where `RIG_COVERAGE_SEEDS` says how many seeds, and then
+prints a table (`pytest -s`).
+
+| what | must agree with | why |
+|---|---|---|
+| share of recordings in which an interval holds the value that they were made with | 95 % | what an interval says |
+| the same of all five at once, by the wider intervals | 95 % | what `together` says |
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from recorder.reader import Recording
+from replays.recordings.experiment import Experiment
+from replays.recordings.export import write_run
+from replays.recordings.identification import ask, identify
+from replays.recordings.sensitivity import value_of
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+
+SEEDS = int(os.environ.get("RIG_COVERAGE_SEEDS", "0"))
+KEYS = (
+    "contact.friction", "contact.restitution", "magnet.stiffness", "house.pair_stiffness_vertical",
+    "shaft.unbalance_eccentricity",
+)  # fmt: skip
+_OFF = 1.02
+"""The search begins so far off."""
+_BY_CHANCE = 0.999
+"""An interval is too narrow where a share so low comes by chance less often than this leaves."""
+
+
+def held(recording: Recording, keys: tuple[str, ...]) -> tuple[dict[str, bool], bool | None]:
+    """Which intervals hold the value that the recording was made with, and whether all wider ones do at once.
+
+    Without an interval there is no entry, and None.
+    """
+    experiment = Experiment.of(recording)
+    truth = {key: value_of(experiment, key) for key in keys}
+    found = identify(ask(recording, experiment, keys, start={key: _OFF * value for key, value in truth.items()}))
+    given = [one for one in found.judgement.findings if one.standing == "identified"]
+    off = {one.unknown.key: abs(one.value - truth[one.unknown.key]) / one.half_width for one in given}
+    together = bool(max(off.values()) < found.judgement.together) if len(off) == len(keys) else None
+    return {key: bool(each < 1.0) for key, each in off.items()}, together
+
+
+@pytest.mark.skipif(not SEEDS, reason="RIG_COVERAGE_SEEDS says how many seeds; half a minute each")
+@pytest.mark.timeout(0)
+def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
+    from scipy.stats import binomtest
+
+    counts: dict[str, list[bool | None]] = {}
+    for seed in range(100, 100 + SEEDS):
+        path = tmp_path / "h.mcap"
+        scene = load_scene("hammer", {"duration_s": 0.08, "sensors.rate_hz": 5000, "seed": seed})
+        write_run(Simulation(scene), path, force=True)
+        recording = Recording.open(path)
+        for key in KEYS:
+            counts.setdefault(f"{key}, alone", []).append(held(recording, (key,))[0].get(key))
+        each, together = held(recording, KEYS)
+        for key in KEYS:
+            counts.setdefault(f"{key}, of five", []).append(each.get(key))
+        counts.setdefault("all five at once", []).append(together)
+        print(json.dumps({"seed": seed, **{name: found[-1] for name, found in counts.items()}}), flush=True)
+    low = []
+    for name, every in counts.items():
+        found = [inside for inside in every if inside is not None]
+        assert len(found) > 0.9 * SEEDS, name
+        shares = binomtest(sum(found), len(found), 0.95, alternative="less")
+        ci = binomtest(sum(found), len(found)).proportion_ci(method="wilson")
+        print(f"{name}: {sum(found)} of {len(found)}, Wilson {ci.low:.3f} to {ci.high:.3f}")
+        if shares.pvalue < 1.0 - _BY_CHANCE:
+            low.append(name)
+    assert not low
