@@ -25,6 +25,7 @@ HOUSE_KEYS = (
 SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Factors on the stiffness and damping of the houses' supports: more is less mobile."""
 BANDWIDTHS_HZ = (50.0, 100.0, 200.0, 500.0, 1000.0, 4900.0)
+ENDS = ("low", "high")
 LAWS = ("exact", "lankarani-nikravesh", "none", "hunt-crossley", "flores", "kelvin-voigt")
 
 Groups = dict[str, list[Pulse]]
@@ -125,7 +126,7 @@ def bars(results: Results, quantity: str) -> list[Bar]:
     ]
     found += [Bar(f"{key} put right", "correction", (printed, of(f"correction {key}"))) for key in correction_keys()]
     found.append(Bar("all put right", "correction", (printed, base)))
-    found.append(Bar("house, 1/10 to 10 x as stiff", "house", (of("mobility 0.1"), base, of("mobility 10"))))
+    found.append(Bar("house, 1/10 to 10 times as stiff", "house", (of("mobility 0.1"), base, of("mobility 10"))))
     found += [Bar(name, "other reading", (base, of(f"alternative {name}"))) for name in alternatives()]
     found.append(Bar("contact law", "other reading", tuple(of(f"law {law}") for law in LAWS)))
     return sorted(found, key=lambda bar: -bar.width)
