@@ -97,7 +97,7 @@ def draw_verdicts(lines: list[Line]) -> Figure:
     for verdict, colour in _VERDICTS.items():
         where.plot([], [], color=colour, lw=5, label=verdict)
     inside.set_yticks(range(len(judged)), [_label(line) for line in judged])
-    inside.set(xlim=(-3, 103), ylim=(len(judged) - 0.4, -0.6), xlabel="of ours inside what the paper states [%]")
+    inside.set(xlim=(-3, 103), ylim=(len(judged) - 0.4, -0.6), xlabel="inside what the paper states [%]")
     where.set(
         xlim=(-1.1 * _FAR, 1.0 + 1.1 * _FAR),
         xlabel="5 to 95 % of ours between the paper's\nleast (0) and largest (1) [1]",

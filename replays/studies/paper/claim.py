@@ -206,11 +206,15 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
             axes.set_title(f"dashed: {text}, {paper:g}".replace("-", "−"), color=RED, fontweight="normal")
         axes.set(xlabel=label, ylabel="runs [1]")
     entries = free_values()
-    force = rank_correlation(parts, column(spread, "reaction_x_n"))
-    peak = rank_correlation(parts, column(spread, "peak_x_n"))
     rows = np.arange(len(entries))
-    panels[3].barh(rows - 0.2, np.nan_to_num(force), height=0.38, color=BLUE, label="force in whirl")
-    panels[3].barh(rows + 0.2, np.nan_to_num(peak), height=0.38, color=ORANGE, label="highest force")
+    ranked = (
+        ("reaction_x_n", BLUE, "force in whirl"),
+        ("peak_x_n", ORANGE, "highest force"),
+        ("whirl_hz", GREEN, "|whirl|"),
+    )
+    for place, (name, colour, label) in enumerate(ranked):
+        ranks = np.nan_to_num(rank_correlation(parts, np.abs(column(spread, name))))
+        panels[3].barh(rows + 0.27 * (place - 1), ranks, height=0.26, color=colour, label=label)
     panels[3].set_yticks(rows, [entry.key for entry in entries])
     panels[3].invert_yaxis()
     panels[3].set(xlabel="rank correlation [1]", xlim=(-1.05, 1.05))

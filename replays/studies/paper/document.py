@@ -88,7 +88,7 @@ def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | Non
 
 def in_print(text: str) -> str:
     """Lines as one, with symbols, powers of ten and signs as they are set in print."""
-    words = " ".join(text.split())
+    words = re.sub(r"[ \n]+", " ", text).strip()
     for written, printed in _PRINT:
         words = written.sub(printed, words)
     return words
@@ -190,7 +190,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
     reached = toward_measured(bars(results, "reaction_x_n"))
     whirling = [result for result in findings.spread if result.whirls]
     ranks = np.nan_to_num(rank_correlation(findings.parts, column(findings.spread, "reaction_x_n")))
-    first, second = ({"key": free_values()[k].key, "rank": ranks[k]} for k in np.argsort(-np.abs(ranks))[:2])
+    first = int(np.argmax(np.abs(ranks)))
     low_passes = zip(BANDWIDTHS_HZ, results["bandwidth"], strict=True)
     return {
         "printed": of("base as-printed"),
@@ -205,8 +205,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
         "corners_hz": [hz for hz, result in low_passes if result.reaction_x_n <= MEASURED_N],
         "whirling": len(whirling),
         "share": float(np.mean([result.reaction_x_n <= MEASURED_N for result in whirling])) if whirling else math.nan,
-        "first": first,
-        "second": second,
+        "first": {"key": free_values()[first].key, "rank": ranks[first]},
     }
 
 
@@ -234,14 +233,11 @@ def _spread(findings: Findings) -> dict[str, Any]:
     }
     spread = findings.spread
     kinds = [result.outcome for result in spread]
-    ranked = [np.abs(column(spread, name)) for name in ("reaction_x_n", "peak_x_n", "whirl_hz")]
-    ranks = np.transpose([rank_correlation(findings.parts, values) for values in ranked])
     return {
         "runs": len(kinds),
         "outcomes": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
         "chance": 2 / math.sqrt(max(1, len(kinds))),
         "quantities": {label: percentiles(column(spread, name)) for label, name in shown.items()},
-        "ranks": {entry.key: each.tolist() for entry, each in zip(free_values(), ranks, strict=True)},
     }
 
 

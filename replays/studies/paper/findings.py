@@ -57,7 +57,8 @@ class Line:
         ours = [distribution(self.values[name]) if name in self.values else "–" for name in SETS]
         cells = (said.says, said.place, said.paper, "" if said.unit == "1" else said.unit, *ours)
         inside = f"{share:.0%}" if math.isfinite(share) else "–"
-        return Row((*cells, inside, self.verdicts[best]), MARKS[self.verdicts[best]])
+        verdict = self.verdicts[best]
+        return Row((*cells, inside, f"{verdict}: {said.why}" if said.why else verdict), MARKS[verdict])
 
 
 @dataclass
@@ -110,8 +111,8 @@ def planned_groups(*, quick: bool) -> Groups:
         for length_ms in LENGTHS_MS:
             pulse = Pulse(label=f"{length_ms:g} ms, {name}", parameters=name, changes={HAMMER_MS: length_ms})
             groups[f"length {length_ms:g} {name}"] = phases(pulse, 2 if quick else 12)
-        _, groups[f"spread {name}"] = hypercube(16 if quick else 224, parameters=name)
-        slow = groups[f"spread {name}"][: 4 if quick else 48]
+        _, groups[f"spread {name}"] = hypercube(16 if quick else 192, parameters=name)
+        slow = groups[f"spread {name}"][: 4 if quick else 40]
         groups[f"slow {name}"] = [replace(pulse, speed_hz=SPEEDS_HZ[0]) for pulse in slow]
     return {**groups, "sweep": condition.sweep_pulses(SWEEP_HZ[1:6:2] if quick else SWEEP_HZ)}
 
@@ -154,7 +155,7 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
     tell("from slipping to rolling")
     drops = {}
     for name in SETS:
-        drops[name] = drop_spread(name, 4 if quick else 48)
+        drops[name] = drop_spread(name, 4 if quick else 40)
         tell(f"drops, {name}")
     findings = Findings(
         found=found,

@@ -10,7 +10,7 @@ from replays.studies.closed_forms import Impact, impact, stiffest_mode
 from replays.studies.paper.claim import Groups, Results, median
 from replays.studies.paper.condition import oscillator
 from replays.studies.paper.pulse import Pulse
-from replays.studies.paper.reproduction import Reproduction, bare_drop, drop_impact, drop_impulse
+from replays.studies.paper.reproduction import G, Reproduction, bare_drop, drop_impact, drop_impulse
 from replays.studies.paper.spread import free_values, phases
 from rig.kernels.constants import Constants
 from rig.magnets import cylinder_stiffness, field_sum_stiffness
@@ -94,7 +94,8 @@ def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
         "clearance_mm": contact.clearance * 1e3,
         "height_um": 1e6 * 2.0 * contact.clearance * (slow / speed) ** 2,
         "weight": weight_at_ring(model.constants),
-        "house_n": PAPER_DROP_N * model.constants.house.inner_mass,
+        "house_n": 100.0 * model.constants.house.inner_mass,
+        "house_g_n": 100.0 * G * model.constants.house.inner_mass,
     }
 
 

@@ -102,9 +102,9 @@ def number(value: float) -> str:
 def distribution(values: np.ndarray) -> str:
     """Median, and 5 to 95 % where they differ, as the tables show them: to three figures, four where it is narrow."""
     low, middle, high = percentiles(values)
-    if low == high or not math.isfinite(middle):
+    if not high - low > 1e-3 * abs(middle):
         return number(middle)
     figures = 3 if high - low < 0.03 * abs(middle) else 2
     places = figures - math.floor(math.log10(abs(middle) or 1.0))
     low, middle, high = (f"{round(each, places):.{max(0, places)}f}" for each in (low, middle, high))
-    return f"{middle} ({low}–{high})"
+    return f"{middle}\u00a0({low}–{high})"
