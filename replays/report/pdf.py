@@ -128,15 +128,17 @@ def _cells(table: Table) -> list[list[str]]:
 
 
 def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:
-    """Widths of the columns [mm]: their texts in one line as far as there is room, else no narrower than any word."""
+    """Widths of the columns [mm]: texts in one line as far as there is room, else no narrower than a word or number."""
     natural, least, rows = [], [], _cells(table)
     for column, heading in enumerate(table.headings):
         lines, words = 0.0, 0.0
         # Bold is wider: measured by its own letters.
         for style, texts in (("B", [unset(heading)]), ("", [row[column] for row in rows])):
             pdf.set_font(_FONT, style=style, size=_CELL_SIZE)
+            whole = table.numeric[column] and not style  # a number and its spread are not broken
             lines = max([lines, *map(pdf.get_string_width, texts)])
-            words = max([words, *(pdf.get_string_width(word) for text in texts for word in text.split(" "))])
+            pieces = texts if whole else [word for text in texts for word in text.split()]
+            words = max([words, *map(pdf.get_string_width, pieces)])
         natural.append(lines + 2.4 + _APART)
         least.append(words + 2.4 + _APART)
     pdf.set_font(_FONT, size=_CELL_SIZE)

@@ -88,7 +88,7 @@ def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | Non
 
 def in_print(text: str) -> str:
     """Lines as one, with symbols, powers of ten and signs as they are set in print."""
-    words = re.sub(r"[ \n]+", " ", text).strip()
+    words = " ".join(text.split())
     for written, printed in _PRINT:
         words = written.sub(printed, words)
     return words

@@ -162,7 +162,7 @@ def drop_numbers(run: Run, *, bandwidth_hz: float = 4900.0) -> dict[str, float]:
     return {
         "drop_span": float(np.abs(run["ring_y"]).max() * 1e3),
         "drop_span_disk": float(np.abs(run["disk_y"]).max() * 1e3),
-        "drop_settled": settled,
+        "drop_settled": settled * 1e3,
         "drop_reaction": float(south.max()),
         "drop_acceleration": float(np.abs(run["inner_ay"]).max()),
         "drop_sensed": float(low_passed(run, south, bandwidth_hz).max()),
@@ -185,7 +185,7 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.nda
 
     return {
         "backward": np.array([float(one.whirls and one.whirl_hz < 0.0) for one in spread]),
-        "roll": of("roll_s"),
+        "roll": of("roll_s", 1e3),
         "orbit_ring": of("ring_m", 1e3),
         "orbit_disk": of("disk_m", 1e3),
         "spin_lowest": column(spread, "slowest_hz"),
@@ -194,7 +194,7 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.nda
         "peak_x": column(spread, "true_peak_x_n"),
         "peak_y": column(spread, "true_peak_y_n"),
         "peak_sensed": np.maximum(column(spread, "peak_x_n"), column(spread, "peak_y_n")),
-        "steady": of("ripple_n") / of("normal_n"),
+        "steady": of("ripple_n", 100.0) / of("normal_n"),
         "east": of("reaction_x_n"),
         "slowest_whirls": np.array([float(one.whirls) for one in slow]),
         "period_ratio": np.array([low.whirl_hz / high.whirl_hz for low, high in pairs]),
@@ -213,7 +213,7 @@ def _whirl_numbers(run: Run) -> dict[str, float]:
         "orbit_ring": truth.ring_m * 1e3,
         "orbit_disk": truth.disk_m * 1e3,
         "whirl_hz": abs(truth.whirl_hz),
-        "imbalance": float(spin / whirl),
+        "imbalance": 100.0 * float(spin / whirl),
         "sensed_x": float(np.ptp(run.samples["P_E"][last] - run.samples["P_W"][last]) / 2),
         "east": truth.reaction_x_n,
     }

@@ -107,4 +107,4 @@ def distribution(values: np.ndarray) -> str:
     figures = 3 if high - low < 0.03 * abs(middle) else 2
     places = figures - math.floor(math.log10(abs(middle) or 1.0))
     low, middle, high = (f"{round(each, places):.{max(0, places)}f}" for each in (low, middle, high))
-    return f"{middle}\u00a0({low}–{high})"
+    return f"{middle} ({low}–{high})"
