@@ -21,13 +21,26 @@ Mark = Literal["good", "bad", "open", "plain"]
 """What a row of a table says: as it must be, not so, undecided, or nothing to be judged."""
 _NUMBER = re.compile(r"[<>≤≥~±+− -]*\d")
 _WORD = re.compile(r"[^\W\d_]{4}")
-_CODE = re.compile(r"`([^`]+)`")
+_SET = re.compile(r"`([^`]+)`|_\{([^}]+)\}|\^\{([^}]+)\}")
+_PLAIN = re.compile(r"[−+-]?\d+(\.\d+)?")
+
+Style = Literal["", "code", "sub", "sup"]
 
 
-def fragments(text: str) -> list[tuple[str, bool]]:
-    """Pieces of a text as they are set, each with whether it is code, which stands between backticks."""
-    pieces = enumerate(_CODE.split(text))
-    return [(piece if n % 2 else piece.replace("m/s^2", "m/s²"), bool(n % 2)) for n, piece in pieces if piece]
+def fragments(text: str) -> list[tuple[str, Style]]:
+    """Pieces of a text as they are set: code between backticks, what is lowered in _{}, what is raised in ^{}."""
+    styles: tuple[Style, ...] = ("", "code", "sub", "sup")
+    found: list[tuple[str, Style]] = []
+    for n, piece in enumerate(_SET.split(text)):
+        style = styles[n % len(styles)]
+        if piece:
+            found.append((piece if style else piece.replace("m/s^2", "m/s²"), style))
+    return found
+
+
+def unset(text: str) -> str:
+    """A text where nothing can be set: without backticks, what is lowered after an underscore."""
+    return "".join({"sub": "_", "sup": "^"}.get(style, "") + piece for piece, style in fragments(text))
 
 
 @dataclass(frozen=True)
@@ -70,6 +83,18 @@ class Table:
             and all(len(cell) < 5 or (_NUMBER.match(cell) and not _WORD.search(cell)) for cell in cells)
             for cells in columns
         )
+
+    @property
+    def tails(self) -> tuple[tuple[str, ...], ...]:
+        """What a plain number lacks to be as long behind its point as the longest of a column of numbers, by row."""
+        columns = [[_PLAIN.fullmatch(row.cells[n]) for row in self.rows] for n in range(len(self.headings))]
+        decimals = [[match[1] or "" if match else None for match in found] for found in columns]
+        longest = [max((each for each in found if each is not None), key=len, default="") for found in decimals]
+        tails = [
+            ["" if each is None or not numeric else ("." + "0" * len(most))[len(each) : len(most)] for each in found]
+            for found, most, numeric in zip(decimals, longest, self.numeric, strict=True)
+        ]
+        return tuple(zip(*tails, strict=True))
 
 
 @dataclass(frozen=True)

@@ -28,13 +28,13 @@ def render(report: Report) -> bytes:
 
 
 def _marked(text: str) -> Markup:
-    """A text as markup: what stands between backticks is code, all else is said as it is."""
+    """A text as markup: code, what is lowered and what is raised, all else as it is."""
     from markupsafe import Markup, escape
 
     from replays.report.document import fragments
 
     return Markup("").join(
-        Markup("<code>{}</code>").format(piece) if code else escape(piece) for piece, code in fragments(text)
+        Markup("<{0}>{1}</{0}>").format(style, piece) if style else escape(piece) for piece, style in fragments(text)
     )
 
 

@@ -8,7 +8,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from replays.report.document import Heading, Paragraph, Picture, Report, ReportPart, Table, fragments
+from replays.report.document import Heading, Paragraph, Picture, Report, ReportPart, Table, fragments, unset
 
 if TYPE_CHECKING:
     from fpdf import FPDF
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 _INK, _SOFT = (26, 26, 26), (102, 102, 102)
 _MARKS = {"good": (0, 121, 79), "bad": (179, 38, 30), "open": (154, 103, 0), "plain": _INK}
 _FONT, _CODE = "DejaVu", "DejaVuMono"
+_PLACES = {"sub": "SUB", "sup": "SUP"}
+_BLANKS = str.maketrans({".": "\u2008", "0": "\u2007"})
+"""As wide as a point and a digit."""
 _CELL_SIZE, _APART = 7.5, 2.5
 """Size of a cell's letters [pt], and room behind them [mm]."""
 
@@ -49,9 +52,12 @@ def render(report: Report) -> bytes:
         text: str, *, size: float, bold: bool = False, colour: tuple[int, int, int] = _INK, below: float = 1.5
     ) -> None:
         pdf.set_text_color(*colour)
-        for piece, code in fragments(text):
+        for piece, style in fragments(text):
+            code = style == "code"
             pdf.set_font(_CODE if code else _FONT, style="B" if bold else "", size=0.93 * size if code else size)
+            pdf.char_vpos = _PLACES.get(style, "LINE")
             pdf.write(size * 0.5, piece)
+        pdf.char_vpos = "LINE"
         pdf.ln(size * 0.5 + below)
 
     write(report.title, size=16, bold=True)
@@ -69,6 +75,8 @@ def render(report: Report) -> bytes:
         elif isinstance(part, Paragraph):
             write(part.text, size=9)
         elif isinstance(part, Table):
+            if pdf.will_page_break(20.0):  # no caption and no headings alone at the foot of a page
+                pdf.add_page()
             if part.caption:
                 write(part.caption, size=8, colour=_SOFT)
             _table(pdf, part)
@@ -103,27 +111,34 @@ def _table(pdf: FPDF, table: Table) -> None:
         headings_style=FontFace(emphasis="BOLD"),
         padding=(0.6, _APART, 0.6, 0.6),
     ) as grid:
-        grid.row(table.headings)
-        for row in table.rows:
+        grid.row([unset(heading) for heading in table.headings])
+        for row, cells in zip(table.rows, _cells(table), strict=True):
             line = grid.row()
-            for n, cell in enumerate(row.cells):
-                last = n == len(row.cells) - 1
-                line.cell(
-                    "".join(piece for piece, _ in fragments(cell)),
-                    style=FontFace(color=_MARKS[row.mark] if last else _INK),
-                )
+            for n, cell in enumerate(cells):
+                line.cell(cell, style=FontFace(color=_MARKS[row.mark] if n == len(cells) - 1 else _INK))
+
+
+def _cells(table: Table) -> list[list[str]]:
+    """The rows' cells as they are set: plain numbers with their points in line."""
+    rows = zip(table.rows, table.tails, strict=True)
+    return [
+        [unset(cell) + tail.translate(_BLANKS) for cell, tail in zip(row.cells, tails, strict=True)]
+        for row, tails in rows
+    ]
 
 
 def _widths(pdf: FPDF, table: Table) -> tuple[float, ...]:
-    """Widths of the columns [mm]: their texts in one line as far as there is room, else no narrower than any word."""
-    natural, least = [], []
+    """Widths of the columns [mm]: texts in one line as far as there is room, else no narrower than a word or number."""
+    natural, least, rows = [], [], _cells(table)
     for column, heading in enumerate(table.headings):
         lines, words = 0.0, 0.0
         # Bold is wider: measured by its own letters.
-        for style, texts in (("B", [heading]), ("", [row.cells[column] for row in table.rows])):
+        for style, texts in (("B", [unset(heading)]), ("", [row[column] for row in rows])):
             pdf.set_font(_FONT, style=style, size=_CELL_SIZE)
+            whole = table.numeric[column] and not style  # a number and its spread are not broken
             lines = max([lines, *map(pdf.get_string_width, texts)])
-            words = max([words, *(pdf.get_string_width(word) for text in texts for word in text.split())])
+            pieces = texts if whole else [word for text in texts for word in text.split()]
+            words = max([words, *map(pdf.get_string_width, pieces)])
         natural.append(lines + 2.4 + _APART)
         least.append(words + 2.4 + _APART)
     pdf.set_font(_FONT, size=_CELL_SIZE)

@@ -67,12 +67,15 @@ def paper(
 
 
 def summary(findings: Findings) -> dict[str, object]:
-    """The summary as a JSON document; nan where a number does not exist."""
+    """The summary as a JSON document: of ours 5, 50 and 95 %, nan where a number does not exist."""
+    from replays.studies.paper.spread import percentiles
+
     return {
         "statements": [
             {
                 **line.statement.model_dump(exclude={"low", "high"}),
-                "values": line.values,
+                "values": {name: percentiles(values) for name, values in line.values.items()},
+                "inside": {name: line.statement.inside(values) for name, values in line.values.items()},
                 "verdicts": line.verdicts,
             }
             for line in [*findings.lines, *findings.claims]
@@ -83,18 +86,14 @@ def summary(findings: Findings) -> dict[str, object]:
 def _show(findings: Findings, console: Console) -> None:
     from rich.text import Text
 
-    from replays.studies.paper.findings import JUDGED_BY, count
+    from replays.studies.paper.findings import JUDGED_BY
 
-    headings = ("statement", "the paper", ">as-printed", ">corrected", "verdict")
+    headings = ("statement", "the paper", ">unit", ">as-printed", ">corrected", ">inside", "verdict")
     table = new_table("the paper's statements, and ours", *headings, wrapped=("statement", "verdict"))
     colours = {"good": "green", "bad": "bold red", "open": "yellow", "plain": ""}
-    lines = [*findings.lines, *findings.claims]
-    for line in lines:
+    for line in [*findings.lines, *findings.claims]:
         row = line.row()
-        says, _, paper_says, printed, corrected, _ = row.cells
-        verdict = " / ".join(dict.fromkeys(line.verdicts.values()))  # in the order of the columns, one if they agree
-        table.add_row(says, paper_says, printed, corrected, Text(verdict, colours[row.mark]))
+        says, _, *cells, verdict = row.cells
+        table.add_row(says, *cells, Text(verdict, colours[row.mark]))
     console.print(table)
-    counts = count(lines)
-    console.print(f"corrected: {counts['agrees']} agree, {counts['differs']} differ, {counts['cannot be judged']} "
-                  f"cannot be judged ({JUDGED_BY})")  # fmt: skip
+    console.print(f"median (5–95 %) over phases, assumed values and readings; {JUDGED_BY}")

@@ -11,6 +11,10 @@
 | least friction that keeps up whirl    | the same, solved for mu; with the houses' loss in the full rig     |
 | what whirl costs the houses           | forced vibration of two masses on a line                           |
 | swing of the friction in rolling      | m w^2 |X - Y|/2 of the ring's ellipse                              |
+| spin kept from slipping to rolling    | I_zz spin + m R_S v is kept; of a slip from rest I_zz/(I_zz+m R_S^2) |
+| time from slipping to rolling         | mu (w^2 - w_n^2) = w', integrated by quadrature                    |
+| decay of a free shaft                 | zeta of eq. 10's D on I_xx/l_0B^2, not on M                        |
+| line of the unbalance in whirl        | M eps spin^2 l_0I/l_0A over m r w^2, rigid ring and held drive      |
 """
 
 from __future__ import annotations
@@ -23,10 +27,10 @@ import numpy as np
 import pytest
 
 from replays.studies.paper import condition
-from replays.studies.paper.pulse import Outcome, Pulse, outcome
+from replays.studies.paper.pulse import Outcome, Pulse, outcome, pulse_scene
 from replays.studies.paper.question import fall, weight_at_ring
 from replays.studies.paper.reproduction import drop_impact, drop_impulse
-from replays.studies.stability.motion import base_model, move, quiet_inputs
+from replays.studies.stability.motion import base_model, move, quiet_inputs, state
 from rig.levels import ModelLevels
 from rig.offline import Run, simulate
 from rig.parameters import load_parameters
@@ -181,3 +185,46 @@ def test_friction_swings_as_the_ring_goes_on_an_ellipse(stator, share):
     force = condition.normal_force(condition.oscillator(constants), whirl, constants.contact.clearance + depth)
     # The closed form takes the force on a rigid ring.
     assert swing == pytest.approx(share * expected * float(normal.mean()) / force, abs=0.12 * expected)
+
+
+def test_slip_to_rolling():
+    """Whole time by quadrature, spin by the momentum that friction hands over."""
+    from scipy.integrate import quad
+
+    polar, spin = P["shaft.polar_inertia"], 2 * math.pi * 6.2
+    natural = math.sqrt(STIFFNESS / MASS)
+    for slip in condition.slips_to_rolling():
+        begin = 2 * math.pi * slip.whirl_hz
+        after = (polar * spin + MASS * RS * R0 * begin) / (polar + MASS * RS**2)
+        time_s: Any = quad(lambda w: 1 / (P["contact.friction"] * (w * w - natural**2)), begin, after * RS / R0)
+        assert slip.kept == pytest.approx(after / spin, rel=2e-3)
+        assert slip.time_s == pytest.approx(float(time_s[0]), rel=5e-3)
+        assert (slip.kept_closed, slip.time_closed_s) == pytest.approx((after / spin, float(time_s[0])), rel=1e-9)
+    kept = condition.spin_kept(base_model(ModelLevels()).constants)
+    assert kept == pytest.approx(polar / (polar + MASS * RS**2), rel=1e-12)
+
+
+def test_free_decay_is_faster_than_the_ratio_that_damping_is_made_of():
+    constants = condition.bare_rig(0.25)._replace(magnet=base_model(ModelLevels(magnet="linear")).constants.magnet)
+    begun = state(beta=0.5 * R0 / P["shaft.arm_ring"])
+    run = move("split", constants, quiet_inputs(magnets=True, ideal=True), begun, ticks=1_000_000, every=100)
+    beta = run.column("beta")
+    tops = np.flatnonzero((beta[1:-1] > beta[:-2]) & (beta[1:-1] >= beta[2:])) + 1
+    decrement = math.log(beta[tops[0]] / beta[tops[-1]]) / (len(tops) - 1)
+    ratio = decrement / math.hypot(2 * math.pi, decrement)
+    modal = P["shaft.transverse_inertia"] / P["shaft.arm_magnet"] ** 2
+    assert ratio == pytest.approx(P["shaft.damping_ratio_x"] * math.sqrt(P["shaft.mass"] / modal), rel=5e-3)
+
+
+def test_unbalance_in_whirl_is_a_line_of_its_force():
+    run = simulate(pulse_scene(Pulse(changes={"drive.mode": "ideal", "model.stator": "rigid"}, duration_s=2.0)))
+    last = run.times_s > 1.0
+    times, spin = run.times_s[last], 2 * math.pi * 6.2
+    forces = run["P_E"][last] - run["P_W"][last] + 1j * (run["P_N"][last] - run["P_S"][last])
+    weighted = (forces - forces.mean()) * np.hanning(len(times))
+    whirl = -rolling(6.2)[0]
+    line, highest = (abs(np.sum(weighted * np.exp(-1j * w * times))) for w in (spin, whirl))
+    unbalance = (
+        P["shaft.mass"] * P["shaft.unbalance_eccentricity"] * spin**2 * P["shaft.arm_disk"] / P["shaft.arm_ring"]
+    )
+    assert line / highest == pytest.approx(unbalance / (MASS * R0 * whirl**2), rel=0.02)

@@ -16,7 +16,7 @@ import pytest
 
 from replays.report.document import Heading, Paragraph, Picture, Report, Table
 from replays.studies.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
-from replays.studies.paper.document import write_up
+from replays.studies.paper.document import in_print, write_up
 from replays.studies.paper.figure import first_impacts
 from replays.studies.paper.findings import Findings, find, planned_groups, steps
 from replays.studies.paper.pulse import PULSE_AT, Outcome, Pulse, outcome, outcomes
@@ -29,7 +29,7 @@ from replays.studies.paper.spread import (
     phases,
     rank_correlation,
 )
-from replays.studies.paper.statement import SETS, Statement, claims, number, printed_values, statements
+from replays.studies.paper.statement import SETS, Statement, claims, distribution, number, printed_values, statements
 from rig.cli.main import main
 from rig.parameters import load_parameters
 from tests.commands import shown
@@ -104,11 +104,29 @@ def test_statements_say_where_and_what_agrees():
     ("value", "verdict"), [(1.0, "agrees"), (2.0, "agrees"), (2.1, "differs"), (0.9, "differs"), (math.nan, "differs")]
 )
 def test_verdict_comes_of_the_number(value, verdict):
-    assert statement(low=1.0, high=2.0).verdict(value) == verdict
+    assert statement(low=1.0, high=2.0).verdict(np.array([value])) == verdict
+
+
+@pytest.mark.parametrize(
+    ("inside", "verdict"),
+    [(0, "differs"), (1, "differs"), (2, "cannot be judged"), (18, "cannot be judged"), (19, "agrees"), (20, "agrees")],
+)
+def test_verdict_comes_of_how_many_are_inside(inside, verdict):
+    values = np.repeat([1.5, math.nan], [inside, 20 - inside])
+    assert statement(low=1.0, high=2.0).verdict(values) == verdict
 
 
 def test_nothing_to_judge_by():
-    assert statement(why="no axis").verdict(1.0) == "cannot be judged"
+    assert statement(why="no axis").verdict(np.array([1.0])) == "cannot be judged"
+
+
+@pytest.mark.parametrize(
+    ("values", "shown"),
+    [([1.0, 1.0], "1"), ([1.1111, 1.1112], "1.111"), ([538.6], "538.6"), ([1000.0, 2084.0, 3000.0], "2080 (1110–2910)"),
+     ([1.049, 1.6, 2.38], "1.60 (1.10–2.30)"), ([13.19, 13.4, 13.47], "13.40 (13.21–13.46)"), ([math.nan], "none")],
+)  # fmt: skip
+def test_distribution_is_told_to_as_many_figures_as_it_has(values, shown):
+    assert distribution(np.array(values)) == shown
 
 
 def test_printed_values_against_the_sets():
@@ -172,9 +190,14 @@ def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list
     for line in findings.lines:
         assert set(line.values) == set(SETS)
     for line in [*findings.lines, *findings.claims]:
-        assert all(math.isfinite(value) for value in line.values.values()), line.statement.quantity
-        assert re.search(r"\d", line.row().cells[4])
-        assert line.row().cells[5]
+        assert all(np.isfinite(values).all() for values in line.values.values()), line.statement.quantity
+        *_, corrected, inside, verdict = line.row().cells
+        assert re.search(r"\d", corrected)
+        assert (inside == "–") == bool(line.statement.why)
+        assert verdict
+    spread = {line.statement.quantity: len(line.values["corrected"]) for line in findings.lines}
+    assert spread["peak_x"] == len(findings.spread), "all assumed values at once"
+    assert spread["drop_amplified"] == 2 * spread["drop_reaction"] > 2, "two readings of each sample"
     assert all(len(findings.results[name]) == len(group) for name, group in planned_groups(quick=True).items())
 
 
@@ -207,6 +230,9 @@ def test_report_backs_every_section_with_a_table(findings: Findings, tmp_path: P
     for before, after in zip(report.parts[1:], report.parts[2:], strict=False):
         if isinstance(before, Picture):
             assert isinstance(after, Table), before.caption
+    judged = [part for part in report.parts if isinstance(part, Table) and part.headings[0] == "statement"]
+    stated = [row.cells[0] for table in judged for row in table.rows]
+    assert len(stated) == len(set(stated)) == len(statements()) + len(claims()), "each once"
     for table in (part for part in report.parts if isinstance(part, Table)):
         assert table.rows, table.caption
         assert any(re.search(r"\d", cell) for row in table.rows for cell in row.cells[1:])
@@ -277,14 +303,19 @@ def test_number():
     ]  # fmt: skip
 
 
-def test_terminal_tells_the_total_and_the_rule(findings: Findings, capsys, monkeypatch):
+def test_symbols_powers_and_signs_are_set_as_in_print():
+    words = "R_S/r_0 of house.k_T with  ω_n² and l_0B², -1.5e-05 to 2e+07 in eqs. 24-25, a-b"
+    printed = "R_{S}/r_{0} of house.k_T with ω_{n}² and l_{0B}², −1.5·10^{−5} to 2·10^{7} in eqs. 24-25, a-b"
+    assert in_print(words) == printed
+
+
+def test_terminal_tells_every_statement_and_the_rule(findings: Findings, capsys, monkeypatch):
     monkeypatch.setattr("replays.studies.paper.findings.find", lambda **_: findings)
     printed = shown(capsys, "paper", "--quick")
-    lines = [*findings.lines, *findings.claims]
-    kinds = [line.verdicts["corrected"] for line in lines]
-    agree, differ, neither = (kinds.count(kind) for kind in ("agrees", "differs", "cannot be judged"))
     said = " ".join(printed.split())
-    assert f"corrected: {agree} agree, {differ} differ, {neither} cannot be judged (" in said
+    for line in [*findings.lines, *findings.claims]:
+        assert " ".join(line.row().cells[-2:]) in said
+    assert not re.search(r"\d+ (agree|differ)", said), "no headline of counts"
     assert "more than 2/5" in said
     assert "nothing is written" in said
 
@@ -311,7 +342,7 @@ def test_what_is_corrected_on_purpose_does_not_differ(findings: Findings):
         agrees = abs(kept[printed.key] / printed.value - 1.0) < 5e-3
         assert (row.cells[-1], row.mark) == (("agrees", "good") if agrees else ("corrected", "open"))
     assert {row.cells[0] for row in table.rows if row.mark == "open"} == {
-        "M_oh (as-printed holds M_ih + M_oh)", "K_ft, printed of one; both sets hold a pair's k_T"
+        "M_{oh} (as-printed holds M_{ih} + M_{oh})", "K_{ft}, printed of one; both sets hold a pair's k_{T}"
     }  # fmt: skip
 
 

@@ -82,6 +82,21 @@ def test_numbers_stand_right_code_as_code_and_the_origin_in_the_head(tmp_path: P
     assert "`" not in page
 
 
+def test_symbols_are_set_and_points_stand_in_line(tmp_path: Path) -> None:
+    report = Report("Fit")
+    rows = [("R_{S}", "1.5", "1"), ("shaft.arm_ring", "12", "a word"), ("K", "7·10^{5}", "2.50"), ("e", "−", "3")]
+    report.table(("name", "value [N^{2}]", "mixed"), rows)
+    report.write(tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for cell in (
+        "<td>R<sub>S</sub></td>", "<td>shaft.arm_ring</td>", "value [N<sup>2</sup>]", '<td class="number">1.5</td>',
+        '<td class="number" data-tail=".0">12</td>', '<td class="number">7·10<sup>5</sup></td>',
+        '<td class="number">−</td>', '<td class="verdict">1</td>',
+    ):  # fmt: skip
+        assert cell in page
+    report.write(tmp_path / "report.pdf")
+
+
 @pytest.mark.parametrize("name", ["report.html", "report.pdf"])
 def test_the_same_report_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
     written = []

@@ -19,6 +19,7 @@ from replays.studies.paper.condition import (
     rolling_whirl,
 )
 from replays.studies.paper.pulse import Outcome
+from replays.studies.paper.spread import percentiles
 from replays.studies.stability.boundary import NAMES, STYLES
 from rig.kernels.constants import Constants
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 _FAR = 0.6
 """How far outside what is allowed a value is still drawn at its place, in parts of the allowed range."""
+_VERDICTS = {"agrees": GREEN, "differs": RED, "cannot be judged": ORANGE}
 
 
 @house_style()
@@ -70,33 +72,44 @@ def draw_conditions(
 
 @house_style()
 def draw_verdicts(lines: list[Line]) -> Figure:
-    """Where ours lies within what the paper allows, for every statement on how large something is."""
-    judged = [line for line in lines if 0.0 < line.statement.low < line.statement.high < 20.0 * line.statement.low]
-    figure = new_figure(0.27 * len(judged) + 1.5, "How large the paper has it, and ours")
-    axes = figure.subplots()
-    axes.axvspan(0.0, 1.0, color="0.92", lw=0)
-    looks = {"as-printed": ("s", "white"), "corrected": ("o", None)}
+    """How much of ours lies in what the paper states, and where, for every statement that can be held against it."""
+    judged = [line for line in lines if math.isfinite(line.statement.low)]
+    figure = new_figure(0.27 * len(judged) + 1.9, "What the paper states, and how ours spreads")
+    inside, where = figure.subplots(1, 2, sharey=True, width_ratios=(0.7, 1.0))
+    where.axvspan(0.0, 1.0, color="0.92", lw=0)
+    looks = {"as-printed": (0.2, "s", "white"), "corrected": (-0.2, "o", None)}
     for row, line in enumerate(judged):
-        low, high = line.statement.low, line.statement.high
-        for name, value in line.values.items():
-            marker, fill = looks[name]
-            colour = GREEN if line.verdicts[name] == "agrees" else RED
-            place = (value - low) / (high - low) if math.isfinite(value) else math.inf
-            # What is farther off stands at the edge.
-            shown = min(max(place, -_FAR), 1.0 + _FAR)
-            axes.plot(shown, row, marker if shown == place else "<" if place < 0.0 else ">", color=colour,
-                      mfc=fill or colour, ms=7, mew=1.6)  # fmt: skip
-    for name, (marker, fill) in looks.items():
-        axes.plot([], [], marker, color=BLACK, mfc=fill or BLACK, ms=7, mew=1.6, ls="none", label=name)
-    for colour, label in ((GREEN, "agrees"), (RED, "differs (triangle: farther off)")):
-        axes.plot([], [], color=colour, lw=5, label=label)
-    axes.set_yticks(range(len(judged)), [shorten(line.statement.says, 60, placeholder=" …") for line in judged])
-    axes.set(
-        xlim=(-1.15 * _FAR, 1.0 + 1.15 * _FAR), ylim=(len(judged) - 0.4, -0.6),
-        xlabel="place between the least (0) and the largest (1)\nthat the paper allows [1]",
-    )  # fmt: skip
-    legend_below(figure)
+        said = line.statement
+        for name, values in line.values.items():
+            up, marker, fill = looks[name]
+            colour = _VERDICTS[line.verdicts[name]]
+            inside.plot(100.0 * said.inside(values), row - up, marker, color=colour, mfc=fill or colour, ms=6.5,
+                        mew=1.5, clip_on=False)  # fmt: skip
+            if 0.0 < said.low < said.high < 20.0 * said.low:
+                places = (np.array(percentiles(values)) - said.low) / (said.high - said.low)
+                # What is farther off stands at the edge.
+                low, middle, high = np.clip(places, -_FAR, 1.0 + _FAR)
+                ends = "<" if places[1] < -_FAR else ">" if places[1] > 1.0 + _FAR else marker
+                where.plot((low, high), (row - up, row - up), color=colour, lw=2.2, alpha=0.55)
+                where.plot(middle, row - up, ends, color=colour, mfc=fill or colour, ms=6.5, mew=1.5)
+    for name, (_, marker, fill) in looks.items():
+        where.plot([], [], marker, color=BLACK, mfc=fill or BLACK, ms=7, mew=1.6, ls="none", label=name)
+    for verdict, colour in _VERDICTS.items():
+        where.plot([], [], color=colour, lw=5, label=verdict)
+    inside.set_yticks(range(len(judged)), [_label(line) for line in judged])
+    inside.set(xlim=(-3, 103), ylim=(len(judged) - 0.4, -0.6), xlabel="inside what the paper states [%]")
+    where.set(
+        xlim=(-1.1 * _FAR, 1.0 + 1.1 * _FAR),
+        xlabel="5 to 95 % of ours between the paper's\nleast (0) and largest (1) [1]",
+    )
+    legend_below(figure, columns=5)
     return figure
+
+
+def _label(line: Line) -> str:
+    """Where it stands and what it is, short."""
+    place = line.statement.place.replace("sections ", "§").replace("section ", "§").removesuffix(", measured")
+    return shorten(f"{place}: {line.statement.says}".replace("_", ""), 66, placeholder=" …")
 
 
 @house_style()

@@ -25,6 +25,7 @@ HOUSE_KEYS = (
 SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Factors on the stiffness and damping of the houses' supports: more is less mobile."""
 BANDWIDTHS_HZ = (50.0, 100.0, 200.0, 500.0, 1000.0, 4900.0)
+ENDS = ("low", "high")
 LAWS = ("exact", "lankarani-nikravesh", "none", "hunt-crossley", "flores", "kelvin-voigt")
 
 Groups = dict[str, list[Pulse]]
@@ -125,7 +126,7 @@ def bars(results: Results, quantity: str) -> list[Bar]:
     ]
     found += [Bar(f"{key} put right", "correction", (printed, of(f"correction {key}"))) for key in correction_keys()]
     found.append(Bar("all put right", "correction", (printed, base)))
-    found.append(Bar("house, 1/10 to 10 x as stiff", "house", (of("mobility 0.1"), base, of("mobility 10"))))
+    found.append(Bar("house, 1/10 to 10 times as stiff", "house", (of("mobility 0.1"), base, of("mobility 10"))))
     found += [Bar(name, "other reading", (base, of(f"alternative {name}"))) for name in alternatives()]
     found.append(Bar("contact law", "other reading", tuple(of(f"law {law}") for law in LAWS)))
     return sorted(found, key=lambda bar: -bar.width)
@@ -205,11 +206,15 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
             axes.set_title(f"dashed: {text}, {paper:g}".replace("-", "−"), color=RED, fontweight="normal")
         axes.set(xlabel=label, ylabel="runs [1]")
     entries = free_values()
-    force = rank_correlation(parts, column(spread, "reaction_x_n"))
-    peak = rank_correlation(parts, column(spread, "peak_x_n"))
     rows = np.arange(len(entries))
-    panels[3].barh(rows - 0.2, np.nan_to_num(force), height=0.38, color=BLUE, label="force in whirl")
-    panels[3].barh(rows + 0.2, np.nan_to_num(peak), height=0.38, color=ORANGE, label="highest force")
+    ranked = (
+        ("reaction_x_n", BLUE, "force in whirl"),
+        ("peak_x_n", ORANGE, "highest force"),
+        ("whirl_hz", GREEN, "|whirl|"),
+    )
+    for place, (name, colour, label) in enumerate(ranked):
+        ranks = np.nan_to_num(rank_correlation(parts, np.abs(column(spread, name))))
+        panels[3].barh(rows + 0.27 * (place - 1), ranks, height=0.26, color=colour, label=label)
     panels[3].set_yticks(rows, [entry.key for entry in entries])
     panels[3].invert_yaxis()
     panels[3].set(xlabel="rank correlation [1]", xlim=(-1.05, 1.05))

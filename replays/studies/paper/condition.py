@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from replays.studies.ladder.quantity import rolls_from
 from replays.studies.paper.pulse import Outcome, Pulse
 from replays.studies.stability.boundary import NAMES, ROLLING, whirl_class
 from replays.studies.stability.motion import base_model, move, pivoted_mass, quiet_inputs, state
@@ -261,6 +262,54 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ, *, steps: int = 1
         bare_mu, full_mu = values
         with_houses, used = friction_with_houses(full, spin), friction_used(full, spin)
         found.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
+    return found
+
+
+class Slip(NamedTuple):
+    """A sliding whirl that friction turns into rolling, on the bare rig without damping or drive."""
+
+    whirl_hz: float
+    """With what it begins [Hz]."""
+    kept: float
+    """Spin after over spin before [1]."""
+    kept_closed: float
+    time_s: float
+    time_closed_s: float
+
+
+def spin_kept(constants: Constants) -> float:
+    """Part of its spin that a shaft keeps which slips from rest on the ring until it rolls [1], on a rigid ring.
+
+    Friction's impulse J gives m v = J along the ring and takes R_S J = I_zz (spin before - after); it rolls when
+    v = R_S spin.
+    """
+    shaft = constants.shaft
+    return shaft.polar_inertia / (shaft.polar_inertia + pivoted_mass(constants) * shaft.radius**2)
+
+
+def slips_to_rolling(whirls_hz: tuple[float, ...] = (12.0, 20.0, 40.0), *, spin_hz: float = 6.2) -> list[Slip]:
+    """From a sliding whirl to rolling: simulated, and by closed form.
+
+    m r w' = mu N with N = m r (w^2 - w_n^2), so the time is an integral of dw / (mu (w^2 - w_n^2)), elementary; the
+    ring is taken as rigid in the contact too, so that r = r0.
+    """
+    constants = bare_rig(0.25)
+    constants = constants._replace(magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0), torque_gain=0.0)
+    own, r0, radius = oscillator(constants), constants.contact.clearance, constants.shaft.radius
+    spin, kept, mu = 2.0 * math.pi * spin_hz, spin_kept(constants), constants.contact.friction
+    found = []
+    for whirl_hz in whirls_hz:
+        begin = 2.0 * math.pi * whirl_hz
+        # Its whirl adds to what friction gives: I_zz spin + m R_S v is kept.
+        after = kept + (1.0 - kept) * r0 * begin / (radius * spin)
+        high, low = (math.log((w - own.natural) / (w + own.natural)) for w in (after * spin * radius / r0, begin))
+        inputs = quiet_inputs(spin=spin, magnets=True)
+        motion = move(
+            ENGINE, constants, inputs, _whirling(constants, begin, spin), ticks=round(0.5 * _TICKS_S), every=50
+        )
+        rolls_s = rolls_from(motion.times, motion.rows, radius)
+        spin_end = float(motion.column("theta_rate")[motion.times >= rolls_s].mean())
+        found.append(Slip(whirl_hz, spin_end / spin, after, rolls_s, (high - low) / (2.0 * mu * own.natural)))
     return found
 
 

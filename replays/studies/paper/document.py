@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from replays.report import Report
+from replays.report import Report, Row
 from replays.report.canvas import save
 from replays.studies.paper import condition, figure, question
 from replays.studies.paper.chart import draw_conditions, draw_law, draw_verdicts
@@ -31,16 +31,22 @@ from replays.studies.paper.claim import (
     median,
     toward_measured,
 )
-from replays.studies.paper.findings import Findings, count
+from replays.studies.paper.findings import JUDGED_BY, Findings
 from replays.studies.paper.spread import assumed_values, column, free_values, percentiles, present, rank_correlation
 from replays.studies.paper.statement import number
-from replays.studies.paper.table import IDLE_N, TABLES, idle_changes, summary
+from replays.studies.paper.table import IDLE_N, TABLES, Content, idle_changes, summary
 from rig.parameters import load_parameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PLACED = re.compile(r"\[(?P<kind>table|picture|verdicts) (?P<name>[^],]+)\] ?(?P<caption>.*)")
+_PRINT = (
+    (re.compile(r"(?<![\w.])([A-Za-zωζνµ])_([A-Za-z0-9]{1,3})(?![A-Za-z0-9_])"), r"\1_{\2}"),
+    (re.compile(r"(?<=\d)e([+-])0*(\d+)"), lambda power: f"·10^{{{power[1].strip('+')}{power[2]}}}"),
+    (re.compile(r"(?<![\w.)])-(?=\d)|(?<=\{)-"), "−"),
+)
+"""As in print: R_S with its letter lowered, but no parameter's name; powers of ten; minus signs."""
 _CELLS = " | "
 """Between the cells of a table in the text."""
 
@@ -64,9 +70,9 @@ def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | Non
     )
     text = template.render(quick=quick, **_numbers(findings))
     title, lead, *blocks = re.split(r"\n\s*\n", text.strip())
-    report = Report(_joined(title), _joined(lead), origin=origin)
+    report = Report(in_print(title), in_print(lead), origin=origin)
     for block in blocks:
-        words = _joined(block)
+        words = in_print(block)
         placed = _PLACED.fullmatch(words)
         if placed:
             _place(report, findings, placed)
@@ -80,29 +86,39 @@ def write_up(findings: Findings, *, quick: bool, origin: Mapping[str, str] | Non
     return report
 
 
-def _joined(text: str) -> str:
-    """Lines as one."""
-    return " ".join(text.split())
+def in_print(text: str) -> str:
+    """Lines as one, with symbols, powers of ten and signs as they are set in print."""
+    words = " ".join(text.split())
+    for written, printed in _PRINT:
+        words = written.sub(printed, words)
+    return words
+
+
+def _printed(content: Content) -> Content:
+    """The same of a table's cells."""
+    rows = [Row(tuple(map(in_print, row.cells)), row.mark) for row in content.rows]
+    return Content(tuple(map(in_print, content.headings)), rows)
 
 
 def _add_table(report: Report, block: str) -> None:
     """A table that stands in the text: caption, headings, rows; an indented line goes on with the one before."""
     lines = re.sub(r"\n\s+", " ", block).split("\n")
     first = next(n for n, line in enumerate(lines) if _CELLS in line)
-    headings, *rows = ([_joined(cell) for cell in line.split(_CELLS)] for line in lines[first:])
-    report.table(headings, rows, caption=_joined(" ".join(lines[:first])))
+    headings, *rows = ([in_print(cell) for cell in line.split(_CELLS)] for line in lines[first:])
+    report.table(headings, rows, caption=in_print(" ".join(lines[:first])))
 
 
 def _place(report: Report, findings: Findings, placed: re.Match[str]) -> None:
-    """Put a picture, a table, or the summary's lines on some quantities once more, where the text names it."""
+    """Put a picture, a table, or the statements on some quantities, where the text names it."""
     name, caption = placed["name"], placed["caption"]
     if placed["kind"] == "picture":
         report.picture(_PICTURES[name](findings), caption)
     elif placed["kind"] == "verdicts":
         lines = [*findings.lines, *findings.claims]
-        report.table(*summary([line for line in lines if line.statement.quantity.startswith(tuple(name.split()))]))
+        kept = [line for line in lines if line.statement.quantity.startswith(tuple(name.split()))]
+        report.table(*_printed(summary(kept)))
     else:
-        report.table(*TABLES[name](findings), caption=caption)
+        report.table(*_printed(TABLES[name](findings)), caption=caption)
 
 
 _PICTURES: dict[str, Callable[[Findings], Figure]] = {
@@ -130,20 +146,20 @@ def draw_pictures(findings: Findings, folder: Path) -> list[Path]:
     Raises:
         OSError: The disk refused.
     """
-    drawn = {name: _PICTURES[name](findings) for name in ("tornado", "conditions", "drop")}
+    drawn = {name: _PICTURES[name](findings) for name in ("verdicts", "tornado", "conditions", "drop")}
     return [path for name, each in drawn.items() for path in save(each, folder / f"paper-{name}.png")]
 
 
 def _numbers(findings: Findings) -> dict[str, Any]:
     """What the text is filled with."""
-    lines = [*findings.lines, *findings.claims]
     results, found = findings.results, findings.found
     return {
-        "lines": len(lines),
-        "counts": count(lines),
+        "judged_by": JUDGED_BY,
         "found": found,
         "median": lambda group, quantity: median(results[group], quantity),
         "measured_n": MEASURED_N,
+        "resolution_hz": 2.0 / (0.5 * found["corrected"].whirl.times_s[-1]),
+        "unbalance_n": findings.constants.shaft.unbalance * (2.0 * math.pi * 6.2) ** 2,
         "drop": question.drop_numbers(found),
         **question.house_numbers(results),
         "magnet": question.magnet_numbers(),
@@ -151,7 +167,7 @@ def _numbers(findings: Findings) -> dict[str, Any]:
         "clearance": question.clearance_numbers(found),
         "tornado": {"idle_n": IDLE_N, "idle": idle_changes(findings)},
         "moves": _moves(findings),
-        "mobility": {f"x {scale:g}": f"mobility {scale:g}" for scale in SCALES} | {"rigid": "alternative house rigid"},
+        "mobility": {f"× {scale:g}": f"mobility {scale:g}" for scale in SCALES} | {"rigid": "alternative house rigid"},
         "low_passes": dict(zip(BANDWIDTHS_HZ, results["bandwidth"], strict=True)),
         "laws": LAWS,
         "ring": _ring_forces(findings),
@@ -174,7 +190,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
     reached = toward_measured(bars(results, "reaction_x_n"))
     whirling = [result for result in findings.spread if result.whirls]
     ranks = np.nan_to_num(rank_correlation(findings.parts, column(findings.spread, "reaction_x_n")))
-    first, second = ({"key": free_values()[k].key, "rank": ranks[k]} for k in np.argsort(-np.abs(ranks))[:2])
+    first = int(np.argmax(np.abs(ranks)))
     low_passes = zip(BANDWIDTHS_HZ, results["bandwidth"], strict=True)
     return {
         "printed": of("base as-printed"),
@@ -189,8 +205,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
         "corners_hz": [hz for hz, result in low_passes if result.reaction_x_n <= MEASURED_N],
         "whirling": len(whirling),
         "share": float(np.mean([result.reaction_x_n <= MEASURED_N for result in whirling])) if whirling else math.nan,
-        "first": first,
-        "second": second,
+        "first": {"key": free_values()[first].key, "rank": ranks[first]},
     }
 
 
@@ -208,24 +223,21 @@ def _ring_forces(findings: Findings) -> dict[str, Any]:
 def _spread(findings: Findings) -> dict[str, Any]:
     """What comes of all assumed values at once."""
     shown = {
-        "E - W in whirl [N]": "reaction_x_n",
-        "N - S in whirl [N]": "reaction_y_n",
+        "E − W in whirl [N]": "reaction_x_n",
+        "N − S in whirl [N]": "reaction_y_n",
         "mean normal force in whirl [N]": "normal_n",
         "highest normal force [N]": "peak_normal_n",
-        "highest E - W [N]": "peak_x_n",
+        "highest E − W [N]": "peak_x_n",
         "whirl frequency [Hz]": "whirl_hz",
         "spin in whirl [Hz]": "spin_hz",
     }
     spread = findings.spread
     kinds = [result.outcome for result in spread]
-    ranked = [np.abs(column(spread, name)) for name in ("reaction_x_n", "peak_x_n", "whirl_hz")]
-    ranks = np.transpose([rank_correlation(findings.parts, values) for values in ranked])
     return {
         "runs": len(kinds),
         "outcomes": ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds)),
         "chance": 2 / math.sqrt(max(1, len(kinds))),
         "quantities": {label: percentiles(column(spread, name)) for label, name in shown.items()},
-        "ranks": {entry.key: each.tolist() for entry, each in zip(free_values(), ranks, strict=True)},
     }
 
 
@@ -233,6 +245,7 @@ def _whirl(findings: Findings) -> dict[str, Any]:
     """When it whirls, and how fast."""
     constants, fastest = findings.constants, findings.least[-1]
     own = condition.oscillator(constants)
+    modal = constants.shaft.transverse_inertia / constants.shaft.arm_magnet**2
     spin = 2.0 * math.pi * fastest.spin_hz
     force = condition.normal_force(own, *condition.rolling_circle(constants, spin))
     turned = condition.pulse_whirl(constants, force_n=100.0, duration_s=5e-3)
@@ -243,7 +256,13 @@ def _whirl(findings: Findings) -> dict[str, Any]:
         error = condition.law_error(result, speed)
         sweep.append({"speed_hz": speed, "law_hz": law, "rigid_hz": rigid, "error": error, **vars(result)})
     return {
-        "own": {"mass": own.mass, "natural_hz": own.natural / (2 * math.pi), "ratio": own.ratio},
+        "own": {
+            "modal": modal,
+            "decays": math.sqrt(constants.shaft.mass / modal),
+            "mass": own.mass,
+            "natural_hz": own.natural / (2 * math.pi),
+            "ratio": own.ratio,
+        },
         "slowest": findings.slowest,
         "least": findings.least,
         "fastest": {
@@ -252,6 +271,9 @@ def _whirl(findings: Findings) -> dict[str, Any]:
             "asked_n": fastest.with_houses * force,
         },
         "starts": findings.starts,
+        "slips": findings.slips,
+        "kept": {"share": condition.spin_kept(constants), "spin_hz": 6.2 * condition.spin_kept(constants)},
+        "lowest_hz": percentiles(column(findings.spread, "slowest_hz")),
         "turned": {"whirl_hz": turned / (2 * math.pi), "friction": own.ratio / share},
         "sweep": sweep,
     }

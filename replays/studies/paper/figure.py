@@ -20,7 +20,7 @@ from replays.report.canvas import (
     legend_below,
     new_figure,
 )
-from replays.studies.paper.reproduction import FIG_7_M, PULSE_S, SPEEDS_HZ, Reproduction, spectra
+from replays.studies.paper.reproduction import FIG_7_M, PULSE_S, SPEEDS_HZ, Reproduction, fine_spectrum, spectra
 from rig.magnets import map_force
 
 if TYPE_CHECKING:
@@ -31,11 +31,12 @@ _IMPACTS_MS = 14.0
 _BEFORE, _IMPACTS, _SETTLED = GREEN, RED, BLUE
 
 
-def _axis_lines(axes: Any, *levels: float, text: str = "the paper's axis", along: str = "y") -> None:
+def _axis_lines(axes: Any, *levels: float, text: str = "the paper's axis", measured: bool = False) -> None:
     """Dashed lines where the paper's axis ends."""
+    look = {**_PAPER, "color": PINK, "lw": 1.5, "ls": (0, (1, 1.5))} if measured else _PAPER
     for level in levels:
-        (axes.axhline if along == "y" else axes.axvline)(level, **_PAPER)
-    axes.plot([], [], label=text, **_PAPER)
+        axes.axhline(level, **look)
+    axes.plot([], [], label=text, **look)
 
 
 def _since_rise_ms(times_s: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -106,7 +107,7 @@ def first_impacts(penetration: np.ndarray, times_ms: np.ndarray) -> tuple[float,
 
 @house_style()
 def draw_drop(found: dict[str, Reproduction]) -> Figure:
-    """Figure 10 (and 11): trajectory, y(t), SOUTH reaction, inner house."""
+    """Figures 10 and 11: trajectory, y(t), SOUTH reaction, inner house."""
     figure, columns = _columns(
         found, "Figs. 10, 11: drop at standstill from the top of the ring, magnets out", 11.4, heights=(1.25, 1, 1, 1)
     )
@@ -125,8 +126,10 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         force.plot(t, run["P_S"] - run["P_N"], color=BLUE, lw=1.6)
         force.plot(t, run.samples["P_S"] - run.samples["P_N"], color=RED, lw=0.8, label="transducers")
         _axis_lines(force, 0.0, 100.0)
+        _axis_lines(force, 80.0, text="the paper's axis, measured", measured=True)
         house.plot(t, run["inner_ay"], color=BLUE, lw=1.2)
         _axis_lines(house, -100.0, 100.0)
+        _axis_lines(house, -40.0, 40.0, text="the paper's axis, measured", measured=True)
         for axes in (force, house):
             axes.set(xlabel="time, first impacts [ms]", xlim=first_impacts(run["penetration"], t))
     _name_first(
@@ -148,9 +151,9 @@ def _phases(one: Reproduction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @house_style()
 def draw_hammer(found: dict[str, Reproduction]) -> Figure:
-    """Figure 12: orbit, spin, x(t), y(t)."""
+    """Figures 12 and 13: orbit, spin, x(t), y(t)."""
     figure, columns = _columns(
-        found, "Fig. 12: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", 11.4, heights=(1.5, 0.9, 1, 1)
+        found, "Figs. 12, 13: hammer pulse of 100 N, 5 ms (shape assumed) at 6.2 Hz", 11.4, heights=(1.5, 0.9, 1, 1)
     )
     for one, (orbit, spin, across, up) in columns:
         run, t = one.whirl, one.whirl.times_s
@@ -175,10 +178,10 @@ def draw_hammer(found: dict[str, Reproduction]) -> Figure:
 
 @house_style()
 def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
-    """Figure 14: full spectrum over time."""
-    figure, columns = _columns(found, "Fig. 14: full spectrum of the disk's probes over time", 4.6)
+    """Figure 14: full spectrum over time, and of the settled whirl in lines that tell 81.7 from 83.7 Hz."""
+    figure, columns = _columns(found, "Fig. 14: full spectrum at the disk", 7.4, heights=(1.2, 1.0))
     mesh: Any = None
-    for one, (axes,) in columns:
+    for one, (axes, lines) in columns:
         times, frequencies, amplitude = spectra(one.whirl)
         level = 20.0 * np.log10(np.maximum(amplitude, 1e-5))
         mesh = axes.pcolormesh(times, frequencies, level.T, cmap="magma", vmin=-80, vmax=5, shading="nearest",
@@ -187,8 +190,13 @@ def draw_waterfall(found: dict[str, Reproduction]) -> Figure:
         axes.annotate("the paper: 83.7 Hz, backward", (times[0], -83.7), xytext=(4, -13), textcoords="offset points",
                       color="white")  # fmt: skip
         axes.set(xlabel="time [s]", ylim=(-150, 150))
-    _name_first(columns, "frequency [Hz]\n← backward      forward →")
+        for run, colour, label in ((one.whirl, BLUE, "as run"), (one.held, GREEN, "drive held at 6.2 Hz")):
+            lines.plot(*fine_spectrum(run), color=colour, lw=1.6, label=label)
+        lines.axvline(-83.7, color=RED, lw=1.4, ls=(0, (4, 3)), label="the paper, 83.7 Hz")
+        lines.set(xlim=(-88.0, -78.0), xlabel="frequency [Hz]")
+    _name_first(columns, "frequency [Hz]\n← backward      forward →", "amplitude [mm]")
     figure.colorbar(mesh, ax=[column[0] for _, column in columns], label="amplitude [dB re 1 mm]", pad=0.02)
+    legend_below(figure)
     return figure
 
 

@@ -61,13 +61,19 @@ class Outcome:
         spin_hz: Of the shaft while it whirls [Hz].
         normal_n: Mean normal force while it whirls [N].
         ripple_n: RMS of the normal force about that [N].
-        reaction_x_n: Amplitude of P_E - P_W while it whirls [N].
-        reaction_y_n: Amplitude of P_N - P_S while it whirls [N].
+        reaction_x_n: Amplitude of P_E - P_W while it whirls [N], through the low-pass if there is one.
+        reaction_y_n: Amplitude of P_N - P_S while it whirls [N], likewise.
         depth_m: Mean penetration while it whirls [m].
+        ring_m: Mean radius of the orbit in the ring while it whirls [m].
+        disk_m: Largest |x| at the disk while it whirls [m].
         peak_normal_n: Largest normal force of the whole run, by the engine's own steps [N].
-        peak_x_n: Largest |P_E - P_W| of the whole run [N].
-        peak_y_n: Largest |P_N - P_S| of the whole run [N].
+        peak_x_n: Largest |P_E - P_W| of the whole run [N], through the low-pass if there is one.
+        peak_y_n: Largest |P_N - P_S| of the whole run [N], likewise.
+        true_peak_x_n: Largest |P_E - P_W| without it [N].
+        true_peak_y_n: Largest |P_N - P_S| without it [N].
         contacts: Contacts begun.
+        rebound_m_s: Fastest that the shaft flies off the ring, seen from the ring [m/s].
+        slowest_hz: Lowest spin of the whole run [Hz].
         roll_s: From the pulse until it rolls for good [s].
         slope_n_s: Largest rate of P_E - P_W while it whirls [N/s].
     """
@@ -80,10 +86,16 @@ class Outcome:
     reaction_x_n: float = math.nan
     reaction_y_n: float = math.nan
     depth_m: float = math.nan
+    ring_m: float = math.nan
+    disk_m: float = math.nan
     peak_normal_n: float = math.nan
     peak_x_n: float = math.nan
     peak_y_n: float = math.nan
+    true_peak_x_n: float = math.nan
+    true_peak_y_n: float = math.nan
     contacts: int = 0
+    rebound_m_s: float = math.nan
+    slowest_hz: float = math.nan
     roll_s: float = math.nan
     slope_n_s: float = math.nan
 
@@ -168,6 +180,10 @@ def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome
         "peak_normal_n": trace.peak_force,
         "peak_x_n": float(np.abs(pair_x).max()),
         "peak_y_n": float(np.abs(pair_y).max()),
+        "true_peak_x_n": float(np.abs(run["P_E"] - run["P_W"]).max()),
+        "true_peak_y_n": float(np.abs(run["P_N"] - run["P_S"]).max()),
+        "rebound_m_s": rebound(run),
+        "slowest_hz": float(run["spin_rate"].min() / (2.0 * math.pi)),
         "contacts": int(run.simulation.health()["contacts"]),
     }
     if kind != "backward whirl":
@@ -182,10 +198,20 @@ def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome
         reaction_x_n=float(np.ptp(pair_x[settled]) / 2),
         reaction_y_n=float(np.ptp(pair_y[settled]) / 2),
         depth_m=float(trace.settled("penetration").mean()),
+        ring_m=float(np.hypot(run["ring_x"], run["ring_y"])[settled].mean()),
+        disk_m=float(np.abs(run["disk_x"][settled]).max()),
         roll_s=number("time_to_roll") - at_s,
         slope_n_s=float(np.abs(np.diff(pair_x[settled])).max() * RATE_HZ),
         **whole,
     )
+
+
+def rebound(run: Run) -> float:
+    """Fastest that the shaft flies off the ring, seen from the ring [m/s]; nan where it never touched."""
+    touched = np.logical_or.accumulate(run["penetration"] > 0.0)
+    flies = touched & (run["penetration"] <= 0.0)
+    inward = -np.diff(np.hypot(run["ring_x"], run["ring_y"])) / np.diff(run.times_s)
+    return float(inward[flies[1:] & flies[:-1]].max(initial=0.0)) if touched.any() else math.nan
 
 
 def reaction(run: Run, plus: str, minus: str, *, bandwidth_hz: float | None = None) -> np.ndarray:
@@ -198,13 +224,16 @@ def reaction(run: Run, plus: str, minus: str, *, bandwidth_hz: float | None = No
         bandwidth_hz: Corner of a Butterworth low-pass of order 2 [Hz], or None.
     """
     pair = run[plus] - run[minus]
-    if bandwidth_hz is None:
-        return pair
+    return pair if bandwidth_hz is None else low_passed(run, pair, bandwidth_hz)
+
+
+def low_passed(run: Run, signal: np.ndarray, bandwidth_hz: float) -> np.ndarray:
+    """A signal of a run through a Butterworth low-pass of order 2, shape (n,)."""
     from scipy.signal import butter, sosfilt
 
     rate_hz = 1.0 / (run.times_s[1] - run.times_s[0])
     sections: Any = butter(2, bandwidth_hz, fs=rate_hz, output="sos")
-    return np.asarray(sosfilt(sections, pair))
+    return np.asarray(sosfilt(sections, signal))
 
 
 def outcomes(

@@ -10,12 +10,12 @@ from replays.studies.closed_forms import Impact, impact, stiffest_mode
 from replays.studies.paper.claim import Groups, Results, median
 from replays.studies.paper.condition import oscillator
 from replays.studies.paper.pulse import Pulse
-from replays.studies.paper.reproduction import Reproduction, drop_impact, drop_impulse
-from replays.studies.paper.spread import phases
+from replays.studies.paper.reproduction import G, Reproduction, bare_drop, drop_impact, drop_impulse
+from replays.studies.paper.spread import free_values, phases
 from rig.kernels.constants import Constants
 from rig.magnets import cylinder_stiffness, field_sum_stiffness
 from rig.model import magnet_geometry, reference_impact
-from rig.offline import simulate
+from rig.offline import Run, simulate
 from rig.parameters import load_parameters
 from rig.scenes import load_scene
 
@@ -83,6 +83,7 @@ def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
         "free": free,
         "fixed": hit(masses.shaft_mass),
         "runs": {name: _drop_run(one) for name, one in found.items()},
+        "amplified": _amplified(found["corrected"].drop),
         "half_sine_ms": half_sine_ms,
         "ratio": half_sine_ms / (free.duration * 1e3),
         "soft": {
@@ -93,7 +94,8 @@ def drop_numbers(found: dict[str, Reproduction]) -> Numbers:
         "clearance_mm": contact.clearance * 1e3,
         "height_um": 1e6 * 2.0 * contact.clearance * (slow / speed) ** 2,
         "weight": weight_at_ring(model.constants),
-        "house_n": PAPER_DROP_N * model.constants.house.inner_mass,
+        "house_n": 100.0 * model.constants.house.inner_mass,
+        "house_g_n": 100.0 * G * model.constants.house.inner_mass,
     }
 
 
@@ -107,6 +109,16 @@ def _drop_run(one: Reproduction) -> Numbers:
         "force": run["normal_force"].max(),
         "reaction": one.numbers["drop_reaction"],
         "mean_force": run["contact_impulse"][-1] / run.times_s[-1],
+    }
+
+
+def _amplified(run: Run) -> Numbers:
+    """The largest reaction over its own contact force, and over that of a rigid house."""
+    reaction = float((run["P_S"] - run["P_N"]).max())
+    rigid = bare_drop({"model.stator": "rigid"})
+    return {
+        "contact": reaction / float(run["normal_force"].max()),
+        "rigid": reaction / float(rigid["normal_force"].max()),
     }
 
 
@@ -216,8 +228,10 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
     drop = axis("drop ±1 mm, in the ring, Fig. 10", r0, 0.4, 1.0)
     probes = axis("the same, at the probes", r0 * lever, 0.4, 1.0)
     disk = axis("x(t) ±2 mm at the probes, Fig. 12(c)", n["orbit_disk"], 0.8, 2.0)
-    measured = axis("E - W ±500 N, measured, Fig. 15(c)", n["sensed_x"], 200.0, 500.0)
+    measured = axis("E − W ±500 N, measured, Fig. 15(c)", n["sensed_x"], 200.0, 500.0)
     east = axis("EAST 0 to 900 N, Fig. 16", n["east"], 360.0, 900.0)
+
+    radius = next(entry for entry in free_values() if entry.key == "shaft.radius")
 
     def together(*axes: Axis) -> tuple[float, float]:
         ends = [[round(end, 2) for end in each.allowed_mm] for each in axes]
@@ -225,6 +239,7 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
 
     return {
         "r0_mm": r0,
+        "spread_mm": [radius.at(part) / _PRINTED_RATIO for part in (0.0, 1.0)],
         "ratio": _PRINTED_RATIO,
         "axes": (orbit, drop, probes, disk, measured, east),
         "simulated": together(orbit, drop, disk, east),

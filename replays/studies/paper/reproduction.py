@@ -5,15 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from replays.studies.paper.pulse import FORCE_N, SPEED_HZ, Outcome, Pulse, outcomes, pulse_scene, read
-from replays.studies.paper.spread import column, phases
-from replays.studies.paper.statement import statements
+from replays.studies.paper.pulse import (
+    BANDWIDTH,
+    FORCE_N,
+    SPEED_HZ,
+    Outcome,
+    Pulse,
+    low_passed,
+    outcome,
+    pulse_scene,
+    read,
+)
+from replays.studies.paper.spread import column, hypercube
 from rig.magnets import map_force
 from rig.offline import Run, simulate
-from rig.orbit import full_spectrum, waterfall, whirl_frequency
+from rig.orbit import full_spectrum, waterfall
+from rig.parameters import load_parameters
 from rig.scenes import load_scene
 
 SPEEDS_HZ = (3.2, 4.2, 5.2, 6.2)
@@ -22,6 +33,8 @@ FIG_7_M = 0.010
 PULSE_S = 0.5
 """When the pulse comes in the long run [s]."""
 _RATE_HZ = 20_000
+G = 9.80665
+"""Standard gravity [m/s^2]."""
 _RESTS = 0.01
 """A drop has settled when it leaves the ring by less than this part of the clearance."""
 
@@ -34,16 +47,18 @@ class Reproduction:
         parameters: The set.
         drop: Section 6.1, all sensors on.
         whirl: Sections 6.2 and 6.3, all sensors on; the pulse comes at `PULSE_S`.
+        held: The same on a drive that holds its speed, truth alone.
         speeds: Section 6.4 by speed of the drive [Hz], truth alone.
-        ensemble: The pulse at several places of the shaft's turn.
-        numbers: What each statement asks for, in its unit.
+        lasting: A pulse and 20 s, as long as Fig. 13 shows; quick, 5 s.
+        numbers: Of these runs, each in its statement's unit.
     """
 
     parameters: str
     drop: Run
     whirl: Run
+    held: Run
     speeds: dict[float, Run]
-    ensemble: list[Outcome]
+    lasting: Outcome
     numbers: dict[str, float]
 
 
@@ -52,7 +67,7 @@ def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str],
 
     Args:
         parameters: The set.
-        quick: Shorter runs, fewer of them.
+        quick: Shorter runs.
         progress: Told what is done.
     """
     tell = progress or (lambda _: None)
@@ -60,39 +75,61 @@ def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str],
     drop = simulate(load_scene("drop", {**sensed, "duration_s": 1.5}))
     tell(f"drop, {parameters}")
     command = {"at_s": PULSE_S, "command": "hammer", "force_n": FORCE_N, "duration_ms": 5.0, "direction": "x"}
-    whirl = simulate(
-        load_scene(
-            "hammer",
-            {**sensed, "duration_s": 2.0 if quick else 4.0, "drive.speed_hz": SPEED_HZ, "commands": [command]},
-        )
-    )
+    long = {**sensed, "duration_s": 2.0 if quick else 4.0, "drive.speed_hz": SPEED_HZ, "commands": [command]}
+    whirl = simulate(load_scene("hammer", long))
     tell(f"hammer run, {parameters}")
+    ideal = {"drive.mode": "ideal", "sensors.chain": "ideal", "sensors.groups": ["hammer"]}
+    held = simulate(load_scene("hammer", {**long, **ideal}))
+    tell(f"hammer run, drive held, {parameters}")
     speeds = {}
     for speed in SPEEDS_HZ:
         speeds[speed] = simulate(pulse_scene(Pulse(parameters=parameters, speed_hz=speed)))
         tell(f"{speed:g} Hz, {parameters}")
-    held = next(iter(outcomes([Pulse(parameters=parameters, changes={"drive.mode": "ideal"})], processes=1)))
-    ensemble = list(outcomes(phases(Pulse(parameters=parameters), 3 if quick else 15), processes=1))
-    tell(f"pulses, {parameters}")
+    lasting = outcome(Pulse(parameters=parameters, duration_s=5.0 if quick else 20.0))
+    tell(f"lasting whirl, {parameters}")
     numbers = {
-        **_magnet_numbers(whirl),
-        **drop_numbers(drop),
+        "magnet_force": magnet_force(whirl),
+        "lasts": float(lasting.whirls),
+        "drop_reaction": drop_numbers(drop)["drop_reaction"],
         **_whirl_numbers(whirl),
-        "whirl_held_hz": abs(held.whirl_hz),
-        "peak_x": float(np.median(column(ensemble, "peak_x_n"))),
-        "peak_y": float(np.median(column(ensemble, "peak_y_n"))),
-        **_speed_numbers({speed: read(run, at_s=0.02) for speed, run in speeds.items()}),
+        **{f"force_{speed:g}": read(run, at_s=0.02).reaction_x_n for speed, run in speeds.items()},
     }
-    missing = [entry.quantity for entry in statements() if entry.quantity not in numbers]
-    if missing:
-        raise KeyError(f"no measure for the statements {', '.join(missing)}")
-    return Reproduction(parameters, drop, whirl, speeds, ensemble, numbers)
+    return Reproduction(parameters, drop, whirl, held, speeds, lasting, numbers)
 
 
-def _magnet_numbers(run: Run) -> dict[str, float]:
+def magnet_force(run: Run) -> float:
+    """Largest force of the magnets over Fig. 7's axis [N]."""
     line = np.linspace(0.0, FIG_7_M, 101)
-    force = map_force(line, np.zeros_like(line), run.simulation.model.constants.magnet)[:, 0]
-    return {"magnet_force_10mm": float(np.abs(force).max())}
+    return float(np.abs(map_force(line, np.zeros_like(line), run.simulation.model.constants.magnet)[:, 0]).max())
+
+
+def drop_spread(parameters: str, samples: int) -> dict[str, np.ndarray]:
+    """Numbers of the drop with all assumed values spread at once, by statement, each shape (n,).
+
+    Where the paper can be read in two ways, both are in: the path in the ring or at the probes; the acceleration in
+    m/s² or in g; the reaction over its own contact force or over that of a rigid house.
+    """
+    found: dict[str, list[float]] = {}
+    own = load_parameters(parameters).entries
+    for pulse in hypercube(samples, parameters=parameters)[1]:
+        changes = {key: value for key, value in pulse.changes.items() if key in own}
+        run, rigid = (
+            bare_drop({**changes, "parameters": parameters, **more}) for more in ({}, {"model.stator": "rigid"})
+        )
+        numbers = drop_numbers(run, bandwidth_hz=pulse.changes[BANDWIDTH])
+        for name, value in numbers.items():
+            readings = (value, value / G) if name.endswith("acceleration") else (value,)
+            found.setdefault(name.removesuffix("_disk"), []).extend(readings)
+        south = numbers["drop_reaction"]
+        contact, still = (float(each["normal_force"].max()) for each in (run, rigid))
+        found.setdefault("drop_amplified", []).extend((south / contact, south / still))
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def bare_drop(changes: dict[str, Any]) -> Run:
+    """A drop seen by ideal sensors."""
+    ideal = {"sensors.chain": "ideal", "sensors.groups": ["hammer"], "sensors.rate_hz": _RATE_HZ}
+    return simulate(load_scene("drop", {**changes, **ideal, "duration_s": 0.4}))
 
 
 def drop_impact(run: Run) -> tuple[float, float]:
@@ -116,59 +153,79 @@ def drop_impulse(run: Run) -> float:
     return float(impulse[first + int(still[0])]) if len(still) else math.nan
 
 
-def drop_numbers(run: Run) -> dict[str, float]:
-    """Numbers of a drop, after its start at the top."""
+def drop_numbers(run: Run, *, bandwidth_hz: float = 4900.0) -> dict[str, float]:
+    """Numbers of a drop, after its start at the top; what is measured comes through a low-pass."""
     contact = run.simulation.model.constants.contact
     leaves = np.flatnonzero(run["penetration"] < -_RESTS * contact.clearance)
     south = run["P_S"] - run["P_N"]
-    sensed = run.samples["P_S"] - run.samples["P_N"]
     settled = float(run.times_s[leaves[-1] + 1]) if leaves[-1] + 1 < len(run.times_s) else math.inf
     return {
         "drop_span": float(np.abs(run["ring_y"]).max() * 1e3),
         "drop_span_disk": float(np.abs(run["disk_y"]).max() * 1e3),
-        "drop_impact_ms": drop_impact(run)[0] * 1e3,
-        "drop_settled_s": settled,
+        "drop_settled": settled * 1e3,
         "drop_reaction": float(south.max()),
         "drop_acceleration": float(np.abs(run["inner_ay"]).max()),
-        "drop_sensed": float(sensed.max() - np.median(sensed[:200])),
+        "drop_sensed": float(low_passed(run, south, bandwidth_hz).max()),
+        "drop_sensed_acceleration": float(np.abs(low_passed(run, run["inner_ay"], bandwidth_hz)).max()),
+    }
+
+
+def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.ndarray]:
+    """Numbers of the pulse with all assumed values spread at once, by statement, each shape (n,).
+
+    Args:
+        spread: At 6.2 Hz. Numbers of the whirl are of those that whirl.
+        slow: The first of these at 3.2 Hz.
+    """
+    whirling = [one for one in spread if one.whirls]
+    pairs = [(low, high) for low, high in zip(slow, spread, strict=False) if low.whirls and high.whirls]
+
+    def of(name: str, scale: float = 1.0) -> np.ndarray:
+        return scale * column(whirling, name)
+
+    return {
+        "backward": np.array([float(one.whirls and one.whirl_hz < 0.0) for one in spread]),
+        "roll": of("roll_s", 1e3),
+        "orbit_ring": of("ring_m", 1e3),
+        "orbit_disk": of("disk_m", 1e3),
+        "spin_lowest": column(spread, "slowest_hz"),
+        "whirl_hz": of("whirl_hz", -1.0),
+        "whirl_per_spin": np.abs(of("whirl_hz") / of("spin_hz")),
+        "peak_x": column(spread, "true_peak_x_n"),
+        "peak_y": column(spread, "true_peak_y_n"),
+        "peak_sensed": np.maximum(column(spread, "peak_x_n"), column(spread, "peak_y_n")),
+        "steady": of("ripple_n", 100.0) / of("normal_n"),
+        "east": of("reaction_x_n"),
+        "slowest_whirls": np.array([float(one.whirls) for one in slow]),
+        "period_ratio": np.array([low.whirl_hz / high.whirl_hz for low, high in pairs]),
+        "impulsive_ratio": np.array([high.slope_n_s / low.slope_n_s for low, high in pairs]),
     }
 
 
 def _whirl_numbers(run: Run) -> dict[str, float]:
     truth = read(run, at_s=PULSE_S)
-    last = run.times_s > run.times_s[-1] - 0.5
-    sensed = [run.samples[a][last] - run.samples[b][last] for a, b in (("P_E", "P_W"), ("P_N", "P_S"))]
-    east = run["P_E"][last]
-    after = run.times_s > PULSE_S
-    frequencies, amplitude = full_spectrum(run.samples["disk_x"][last], run.samples["disk_y"][last], _RATE_HZ)
+    last = run.times_s > 0.5 * run.times_s[-1]
+    times = run.times_s[last]
+    forces = run["P_E"][last] - run["P_W"][last] + 1j * (run["P_N"][last] - run["P_S"][last])
+    weighted = (forces - forces.mean()) * np.hanning(len(times))
+    spin, whirl = (abs(np.sum(weighted * np.exp(-2j * math.pi * hz * times))) for hz in (truth.spin_hz, truth.whirl_hz))
     return {
-        "backward": float(truth.whirls and truth.whirl_hz < 0.0),
-        "orbit_ring": float(np.hypot(run["ring_x"], run["ring_y"])[last].mean() * 1e3),
-        "orbit_disk": float(np.abs(run["disk_x"][last]).max() * 1e3),
-        "spin_lowest": float(run["spin_rate"][after].min() / (2.0 * math.pi)),
-        "whirl_hz": abs(whirl_frequency(run["ring_x"][last], run["ring_y"][last], run.times_s[last])),
-        "whirl_per_spin": abs(truth.whirl_hz) / truth.spin_hz,
-        "spectrum_hz": float(frequencies[np.argmax(amplitude)]),
-        "steady": truth.ripple_n / truth.normal_n,
-        "sensed_x": float(np.ptp(sensed[0]) / 2),
-        "sensed_y": float(np.ptp(sensed[1]) / 2),
+        "orbit_ring": truth.ring_m * 1e3,
+        "orbit_disk": truth.disk_m * 1e3,
+        "whirl_hz": abs(truth.whirl_hz),
+        "imbalance": 100.0 * float(spin / whirl),
+        "sensed_x": float(np.ptp(run.samples["P_E"][last] - run.samples["P_W"][last]) / 2),
         "east": truth.reaction_x_n,
-        "east_alone": float(np.ptp(east)),
-        "east_ms": 500.0 / abs(truth.whirl_hz),
-        "over_measured": truth.reaction_x_n / 500.0,
-    }
-
-
-def _speed_numbers(found: dict[float, Outcome]) -> dict[str, float]:
-    low, high = found[SPEEDS_HZ[0]], found[SPEEDS_HZ[-1]]
-    return {
-        **{f"force_{speed:g}": result.reaction_x_n for speed, result in found.items()},
-        "whirls_at": float(sum(result.whirls for result in found.values())),
-        "period_ratio": low.whirl_hz / high.whirl_hz,
-        "impulsive_ratio": high.slope_n_s / low.slope_n_s,
     }
 
 
 def spectra(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Full spectra of the disk's probes over time, as `rig.orbit.waterfall` gives them [mm]."""
     return waterfall(run.samples["disk_x"], run.samples["disk_y"], float(_RATE_HZ), run.times_s)
+
+
+def fine_spectrum(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Full spectrum of the orbit at the disk over the last half of a run [Hz], [mm]: of 2 s, which parts 1 Hz."""
+    half = len(run.times_s) // 2
+    x, y = (run[name][half:] * 1e3 for name in ("disk_x", "disk_y"))
+    return full_spectrum(x, y, float(_RATE_HZ), lines=8 * len(x))

@@ -96,7 +96,7 @@ def one_at_a_time() -> list[tuple[Assumed, Pulse, Pulse]]:
     ]
 
 
-def hypercube(samples: int) -> tuple[np.ndarray, list[Pulse]]:
+def hypercube(samples: int, *, parameters: str = DEFAULT_SET) -> tuple[np.ndarray, list[Pulse]]:
     """Latin hypercube over all free values: parts of their ranges, shape (samples, values), and the pulses."""
     from scipy.stats import qmc
 
@@ -105,6 +105,7 @@ def hypercube(samples: int) -> tuple[np.ndarray, list[Pulse]]:
     pulses = [
         Pulse(
             label=f"spread {number}",
+            parameters=parameters,
             changes=changes({entry.key: entry.at(float(part)) for entry, part in zip(entries, row, strict=True)}),
         )
         for number, row in enumerate(parts, 1)

@@ -1,4 +1,4 @@
-"""What the paper states, as data, and the verdict of a number on it."""
+"""What the paper states, as data, and the verdict of our numbers on it."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from functools import cache
 from importlib.resources import files
 from typing import Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from replays.studies.paper.spread import percentiles
 from rig.parameters import ParameterSet
 
 Verdict = Literal["agrees", "differs", "cannot be judged"]
 SETS = ("as-printed", "corrected")
 """The parameter sets that are held against the paper, in the order of the tables."""
+SURE = 0.95
+"""Share of ours that must lie in, or out of, what the paper states for a verdict."""
 _TEXT = 5e-3
 """How far a printed value may be off as it is rounded."""
 
@@ -34,11 +38,18 @@ class Statement(BaseModel):
     high: float = math.nan
     why: str = ""
 
-    def verdict(self, value: float) -> Verdict:
-        """Of one number on this."""
+    def inside(self, values: np.ndarray) -> float:
+        """Share of ours that agrees; nan where there is nothing to judge by. A motion that did not come is outside."""
         if not math.isfinite(self.low) or not math.isfinite(self.high):
-            return "cannot be judged"
-        return "agrees" if self.low <= value <= self.high else "differs"  # nan, a motion that did not come, differs
+            return math.nan
+        return float(np.mean((self.low <= values) & (values <= self.high))) if len(values) else 0.0
+
+    def verdict(self, values: np.ndarray) -> Verdict:
+        """Of ours, shape (n,), as far as phases of the shaft, assumed values and readings spread them."""
+        share = self.inside(values)
+        if share >= SURE:
+            return "agrees"
+        return "differs" if share <= 1.0 - SURE else "cannot be judged"
 
 
 class Printed(BaseModel):
@@ -86,3 +97,14 @@ def number(value: float) -> str:
     if abs(value) >= 1000.0:
         return f"{value:.0f}"
     return f"{value:.4g}"
+
+
+def distribution(values: np.ndarray) -> str:
+    """Median, and 5 to 95 % where they differ, as the tables show them: to three figures, four where it is narrow."""
+    low, middle, high = percentiles(values)
+    if not high - low > 1e-3 * abs(middle):
+        return number(middle)
+    figures = 3 if high - low < 0.03 * abs(middle) else 2
+    places = figures - math.floor(math.log10(abs(middle) or 1.0))
+    low, middle, high = (f"{round(each, places):.{max(0, places)}f}" for each in (low, middle, high))
+    return f"{middle} ({low}–{high})"
