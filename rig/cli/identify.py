@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,12 +25,13 @@ from rig.cli.progress import reporting
 from rig.cli.tables import Form, echo, echo_json, new_table
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rich.console import Console
 
     from recorder.reader import Recording
     from replays.recordings.experiment import Experiment
     from replays.recordings.identification import Identification
-    from replays.recordings.identification.question import Question
 
 
 @dataclass(frozen=True)
@@ -61,44 +62,46 @@ class Asked:
     ] = None
     engine: Engine = None
 
-    def question(self, recording: Recording, *, exact: bool) -> tuple[Question, list[str]]:
-        """The question, and what is fitted along because an imported log does not tell it.
+    def found(
+        self, recording: Recording, search: Search, *, exact: bool, progress: Callable[[str], None]
+    ) -> tuple[Identification, list[str]]:
+        """The fit, and what was fitted along because an imported log does not tell it.
 
         Raises:
             InputError: The recording, its scene or the model has no such thing.
         """
         from replays.recordings.experiment import is_imported
         from replays.recordings.identification import ask
-        from replays.recordings.identification.nuisance import asked_along, shortly_before, tune
+        from replays.recordings.identification import identify as run
+        from replays.recordings.identification.log import identify_log
+        from replays.recordings.identification.nuisance import asked_along, turned
+        from replays.recordings.identification.question import first_command_s
+        from replays.recordings.validation import load_criteria
 
-        keys, from_s = [key for part in self.fit for key in names_of(part)], self.from_s
-        experiment = self._experiment(recording)
+        keys = [key for part in self.fit for key in names_of(part)]
+        experiment, along = self._experiment(recording), dict[str, tuple[float, float] | None]()
         known = pairs("--prior", self.prior, "KEY=VALUE+-SIGMA")
         priors = {key: _two("prior", text, "+-") for key, text in known.items()}
-        along: dict[str, tuple[float, float] | None] = {}
-        begun: dict[str, str] = {}
+        starts = {key: _number("start", text) for key, text in pairs("--start", self.start, "KEY=VALUE").items()}
+        bounds = {
+            key: _two("bounds", text, ":") for key, text in pairs("--bounds", self.bounds, "KEY=LOW:HIGH").items()
+        }
+        given: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": names_of(self.channels) or None}
         if is_imported(recording) and not exact:
-            tuned = tune(recording, experiment, besides=keys)
-            experiment = tuned.begun
+            if first_command_s(experiment) > 0.0:
+                rules = load_criteria().imported
+                found = identify_log(
+                    recording, experiment, keys, **given, priors=priors, to_s=self.to_s, bandwidth=rules.bandwidth,
+                    variants=[one.set for one in rules.variants], progress=progress,
+                )  # fmt: skip
+                return found, [one.key for one in found.question.unknowns if one.along]
+            experiment = turned(recording, experiment)
             along = asked_along(experiment, keys)
-            keys += list(along)
             priors = {key: told for key, told in along.items() if told is not None} | priors
-            from_s = shortly_before(experiment) if from_s is None else from_s
-            begun = {key: str(value) for key, value in tuned.values.items() if key in along}
-        starts = begun | pairs("--start", self.start, "KEY=VALUE")
-        bounds = pairs("--bounds", self.bounds, "KEY=LOW:HIGH")
         question = ask(
-            recording,
-            experiment,
-            keys,
-            start={key: _number("start", text) for key, text in starts.items()},
-            bounds={key: _two("bounds", text, ":") for key, text in bounds.items()},
-            priors=priors,
-            along=along,
-            channels=names_of(self.channels) or None,
-            window=(from_s, self.to_s),
+            recording, experiment, [*keys, *along], **given, priors=priors, along=along, window=(self.from_s, self.to_s)
         )
-        return question, list(along)
+        return run(question, **asdict(search), progress=progress), list(along)
 
     def _experiment(self, recording: Recording) -> Experiment:
         from replays.recordings.experiment import Experiment
@@ -147,7 +150,6 @@ def identify(
     Ends with 1, and writes no set, where the model does not explain the recording: then no value is a result.
     """
     from recorder.reader import join
-    from replays.recordings.identification import identify as run
     from replays.recordings.identification.document import check_set, fitted_set, identification_document, write_set
     from replays.recordings.identification.summary import report_of
     from replays.report import check_report
@@ -158,9 +160,8 @@ def identify(
         check_report(report, force=force)
     recording = join(files)
     name = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
-    question, along = asked.question(recording, exact=exact)
     with reporting(compiles=True) as reporter:
-        found = run(question, **asdict(search), progress=reporter.step)
+        found, along = asked.found(recording, search, exact=exact, progress=reporter.step)
     fits = found.judgement.fits
     if output is not None and fits:
         write_set(fitted_set(found, recording=name), output)

@@ -65,6 +65,8 @@ _BEFORE_S = 0.03
 """... and so much of it is in the fit of all [s]."""
 _WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """How far behind the begin of the hammer pulse the fits look [s]."""
+_SURE = 0.9999
+"""Values that are further off than this part of right ones would be are wrong."""
 _WORSE = 1.2
 """A longer window is given up where it leaves more by this factor in a third of the channels; ..."""
 _BROKEN = 10.0
@@ -297,18 +299,14 @@ def asked_along(experiment: Experiment, keys: Sequence[str]) -> dict[str, tuple[
     return nuisances_of(experiment, few, besides=keys)
 
 
-def shortly_before(experiment: Experiment) -> float | None:
-    """Where the window of a search begins in an imported log [s]; None for its start."""
-    first_s = first_command_s(experiment)
-    return first_s - _BEFORE_S if first_s > 0.0 else None
-
-
 def tune(
     recording: Recording,
     experiment: Experiment,
     keys: Sequence[str] = NUISANCES,
     *,
-    besides: Sequence[str] = (),
+    known: Mapping[str, tuple[float, float]] | None = None,
+    channels: Sequence[str] | None = None,
+    to_s: float | None = None,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Tuned:
     """Fit what a log does not tell exactly, and nothing else, on windows that grow from the pulse.
@@ -320,7 +318,9 @@ def tune(
         recording: The log.
         experiment: What was done, as far as it is known.
         keys: What is fitted of it.
-        besides: What is left out of that, as it is asked anyway.
+        known: What is known of some of them: means and standard deviations.
+        channels: By which channels; None for all.
+        to_s: Samples are used up to here [s].
         progress: Told what is being done.
 
     Raises:
@@ -328,9 +328,10 @@ def tune(
     """
     progress("speed, angle and place of the shaft before the hammer pulse")
     begun = turned(recording, experiment) if ANGLE in keys else experiment
-    wanted = nuisances_of(begun, keys, besides=besides)
+    wanted = nuisances_of(begun, keys) | dict(known or {})
     first_s = first_command_s(begun)
-    whole = observe(recording, begun, window=(looks_from(begun), first_s + _WINDOWS_S[-1])).parts
+    end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
+    whole = observe(recording, begun, channels=channels, window=(looks_from(begun), end_s)).parts
     whole = {name: _thinned(part, first_s - _BEFORE_S) for name, part in whole.items()}
     found = _grown(begun, wanted, whole, progress, trusting=False)
     if max(found.scales) > _BROKEN:
@@ -392,11 +393,24 @@ def _grown(
         now = [max(1.0, _rms(z)) for z in here.apart]
         if scales and 3 * sum(_WORSE * a < b < _BROKEN * a for a, b in zip(scales, now, strict=True)) > len(now):
             break  # the model no longer explains it: that is to be judged, and not to be fitted away
+        if scales and _gone(found - values, covariance):
+            break  # what comes new is made up for by values that what was there before does not allow
         scales = now
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
         covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
         end_s = first_s + length
     return _Grown(values, covariance, end_s, scales)
+
+
+def _gone(moved: np.ndarray, covariance: np.ndarray) -> bool:
+    """Whether values move further than their covariance on a shorter window leaves open.
+
+    A right model is right on both: the test of J. A. Hausman, Specification tests in econometrics, Econometrica 46
+    (1978), with the variance of the longer one left out beside that of the shorter.
+    """
+    from scipy.stats import chi2
+
+    return float(moved @ np.linalg.solve(covariance, moved)) > chi2.ppf(_SURE, len(moved))
 
 
 def looks_from(experiment: Experiment) -> float:

@@ -88,6 +88,13 @@ class Window:
             whitened.append(np.where(self.known, (up - down) / width, 0.0))
         return np.einsum("nck,pk->ncp", np.stack(whitened, axis=-1), directions)
 
+    def slopes_by_keys(self, z: np.ndarray) -> np.ndarray:
+        """The same by each value alone, in the predictor's own steps, shape (rows, channels, unknowns)."""
+        observation = self.question.observation
+        found = self._predictor.derivatives(self.values(z)).slopes
+        columns = [observation.placed(one, self.rows) * s for one, s in zip(found, self._scale, strict=True)]
+        return np.nan_to_num(np.stack(columns, axis=-1) / observation.noise[:, None])
+
     def _side(self, z: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A point beside z and what is predicted there; z itself where the model does not take it."""
         try:
