@@ -80,7 +80,7 @@ def _show(found: Validation, console: Console) -> None:
     console.print(shown(f"{found.title}, scene {found.scene}") + (f", validated with {changed}" if changed else ""))
     console.print(found.verdict_line)
     for line in found.doubts[1:]:
-        console.print(f"nor does this: {line}")
+        console.print(f"also: {line}")
     if found.explained is not None:
         console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")
     for fault in found.faults:
