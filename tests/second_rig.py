@@ -5,7 +5,8 @@ angular momentum (a heavy symmetric top), no angles; friction is `mu F_n tanh(v_
 steps of 2 us through contacts, whose onset is where a step first ends inside the ring; sensors behind a Butterworth
 low-pass made by scipy, with a noise, a clock and an angle of the shaft of their own.
 
-    L' = torque,  u' = L x u / Ixx,  w = L . u / Izz,  theta' = w - G' u_x,  G' = (u_y u_z' - u_y' u_z) / (u_y^2 + u_z^2)
+    L' = torque,  u' = L x u / Ixx,  w = L . u / Izz,  theta' = w - G' u_x,
+    G' = (u_y u_z' - u_y' u_z) / (u_y^2 + u_z^2)
 
 Numbers are those of the paper's tables and of the product's page on its parameters; `Rig` has them by the paper's
 symbols [SI].
@@ -116,9 +117,9 @@ def _rates(rig, t, omega0, pulse, v0, y, dy, seen):
     dy[12] = (-cy - (north - south)) / rig.M_ih
     dy[13] = (beam - (east - west)) / rig.M_oh
     dy[14] = (north - south - rig.D_bh * y[14] - rig.K_bh * y[10]) / rig.M_oh
-    mm = 1e3
-    seen[0], seen[1] = mm * rig.arm_disk * (ux - rig.x0 / rig.arm_ring), mm * rig.arm_disk * (uy - rig.y0 / rig.arm_ring)
-    seen[2], seen[3] = mm * ex, mm * ey
+    disk = 1e3 * rig.arm_disk  # in mm
+    seen[0], seen[1] = disk * (ux - rig.x0 / rig.arm_ring), disk * (uy - rig.y0 / rig.arm_ring)
+    seen[2], seen[3] = 1e3 * ex, 1e3 * ey
     seen[4], seen[5], seen[6], seen[7] = north, south, east, west
     seen[8], seen[9], seen[10], seen[11] = dy[11], dy[12], dy[13], dy[14]
     seen[12] = turning / (2.0 * math.pi)

@@ -23,7 +23,7 @@ from rig.simulation import TICK_RATE_HZ, Frame, Simulation
 from rig.wire import EDGES, sensor_key, truth_key
 
 BEFORE_S = 0.5
-"""A log from the middle of a run is taken up so long before the hammer pulse [s]: a few turns tell where the shaft is."""
+"""A log from the middle of a run is taken up so long before the hammer pulse [s]: a few turns tell where it is."""
 GRID_S = 0.1
 """A whole number of samples of every rate [s]."""
 
@@ -36,7 +36,7 @@ class Experiment:
         scene: The scene, on the recorded parameters; it ends where the recording does.
         commands: What was sent to the rig beside the scene's own commands.
         first_s: Simulated time at which the recording begins [s].
-        begin: Where it is taken up, of a log from the middle of a run; None: the experiment begins at 0, with its scene.
+        begin: Where it is taken up, of a log from the middle of a run; None: at 0, where its scene begins.
     """
 
     scene: Scene

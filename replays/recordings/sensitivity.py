@@ -35,8 +35,8 @@ ANGLE = "shaft.angle_rad"
 STATE = {f"state.{name}": (unit, si, scale) for name, unit, si, scale in (
     ("ring_x", "mm", 1e-3, 0.1), ("ring_y", "mm", 1e-3, 0.1), ("vx", "mm/s", 1e-3, 10.0), ("vy", "mm/s", 1e-3, 10.0),
 )}  # fmt: skip
-"""Where the shaft is in the ring, and how fast, where a log from the middle of a run is taken up: unit, that in SI, change
-of size 1."""
+"""Where the shaft is in the ring, and how fast, where a log from the middle of a run is taken up: unit, that in SI,
+change of size 1."""
 _STEP = 1e-5
 """Step of a difference quotient, as a part of the value's scale, ..."""
 _LEAST_STEP = 1e-8
@@ -49,7 +49,7 @@ _ROWS_HZ = TICK_RATE_HZ // ROW_TICKS
 _COMMAND_KEY = re.compile(r"(hammer|speed|release)\.([1-9][0-9]*)\.(\w+)")
 _TICK_S = 1.0 / TICK_RATE_HZ
 _STEPS = {"at_s": 25.0 * _TICK_S, "duration_ms": 0.025}
-"""Steps of difference quotients of what a simulation rounds to its ticks, by field of a command, in the field's unit."""
+"""Steps of difference quotients of what a simulation rounds to ticks, by field of a command, in the field's unit."""
 _SCALES = {"at_s": 1e-3, "direction": 10.0}
 """What counts as a change of size 1 where the value itself may be 0 [s], [degrees]."""
 

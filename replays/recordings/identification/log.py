@@ -1,9 +1,9 @@
 """Numbers of a rig from a log of another system: with all that the log does not tell, and as right models leave them.
 
 The search is that of `nuisance.tune`, with what is asked among its numbers. What it comes to is judged as any fit is.
-Beside the noise, intervals hold what the values move by where some samples are left out (a jackknife: what the model
-lacks is not the same everywhere), and where something is as right as what was assumed: a friction that goes through
-zero, filters with other corners.
+Beside the noise, intervals hold what the values moved by as the last samples came, what they do where some are left
+out (a jackknife: what the model lacks is not the same everywhere), and where something is as right as what was assumed:
+a friction that goes through zero, filters with other corners.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from replays.recordings.experiment import Experiment
 from replays.recordings.identification.fit import Identification
 from replays.recordings.identification.judgement import Judgement, judge
 from replays.recordings.identification.nuisance import NUISANCES, looks_from, nuisances_of, tune
-from replays.recordings.identification.question import Observation, Question, ask
+from replays.recordings.identification.question import Observation, Question, ask, first_command_s
 from replays.recordings.identification.window import Window
 from replays.recordings.prediction import Measured
 from replays.recordings.sensitivity import ANGLE, with_values
 
-_STRETCHED_S, _STRETCH_S = 0.032, 0.004
-"""So much of the end is taken in stretches of so long [s]; all before is one."""
+_LONG_S, _SHORT_S = 0.1, 0.004
+"""Length of the stretches that are left out, before the hammer pulse and from it on [s]."""
 
 
 def identify_log(
@@ -80,15 +80,15 @@ def identify_log(
     window = _of(question)
     progress(f"fitted: {len(question.keys)} values, to {tuned.end_s:.4f} s; their intervals")
     slopes, residuals, known = window.slopes_by_keys(z), window.residuals(z), window.known
-    moved = _jackknife(question, slopes, residuals)
+    scale = np.array([unknown.scale for unknown in question.unknowns])
+    moved = np.hypot(_jackknife(question, slopes, residuals), [tuned.moved[key] for key in question.keys] / scale)
     other_filters = -apart / _louder_by(apart)
     shown = [residuals + other_filters]
     for changes in variants:
         shown.append(_of(replace(question, experiment=question.experiment.changed(dict(changes)))).residuals(z))
-    start = _step(question, slopes, residuals)
+    here = _step(question, slopes, residuals)
     for one in shown:
-        moved = np.hypot(moved, np.abs(_step(question, slopes, one) - start))
-    scale = np.array([unknown.scale for unknown in question.unknowns])
+        moved = np.hypot(moved, np.abs(_step(question, slopes, one) - here))
     return Identification(
         question=question, judgement=_wider(judge(window, z, slopes, residuals, known), moved * scale), window=window,
         z=z, stages=(), why="the model, or a search that follows it, goes no further", runs=window.runs, narrowed={},
@@ -104,8 +104,8 @@ def _jackknife(question: Question, slopes: np.ndarray, residuals: np.ndarray) ->
     from scipy.stats import t
 
     times_s = question.observation.times_s[: len(residuals)]
-    behind = times_s >= times_s[-1] - _STRETCHED_S
-    stretches = np.where(behind, 1 + ((times_s - times_s[-1] + _STRETCHED_S) / _STRETCH_S).astype(int), 0)
+    before_s = times_s - first_command_s(question.experiment)
+    stretches = np.floor(before_s / np.where(before_s < 0.0, _LONG_S, _SHORT_S)).astype(int)
     halves = []
     for groups in (np.broadcast_to(np.arange(residuals.shape[1]), residuals.shape),
                    np.broadcast_to(stretches[:, None], residuals.shape)):  # fmt: skip

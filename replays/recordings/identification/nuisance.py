@@ -15,10 +15,19 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.experiment import BEFORE_S, Experiment
+from replays.recordings.identification.agreement import (
+    BEYOND,
+    approach,
+    by_agreement,
+    centred,
+    channels_of,
+    rms,
+    signals_of,
+)
 from replays.recordings.identification.question import first_command_s, observe
 from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.sensitivity import ANGLE, STATE, Predictor, on_the_models_clock, value_of, with_values
-from rig.errors import InputError, SimulationError
+from rig.errors import InputError
 from rig.simulation import TICK_RATE_HZ
 
 NUISANCES = (
@@ -35,21 +44,12 @@ NUISANCES = (
 """In place of the time of the first pulse stand clock and angle: a simulation has pulses only at its own rows."""
 _PULSE = "hammer.1.at_s"
 _DEVIATIONS = {"clock.rate_ppm": 50.0, "clock.offset_s": 1e-4, "ring.offset_x": 0.1, "ring.offset_y": 0.1}
-"""What is known before, as standard deviations: of a crystal [ppm]; of a trigger that is found in samples behind a filter
-[s]; of a ring that was put where it is by hand [mm]; ..."""
-_RELATIVE = {"drive.speed_hz": 1e-4}
-"""... and of a speed read off the log, as a part of it."""
-BEYOND = 5.0
-"""A value that many standard deviations from what is known of it is a finding, and no fit goes further."""
-_ROUNDS = 8
+"""What is known before, as standard deviations: of a crystal [ppm]; of a trigger that is found in samples behind a
+filter [s]; of a ring that was put where it is by hand [mm]; ..."""
+_RELATIVE = {"drive.speed_hz": 1e-4, "hammer.1.duration_ms": 0.01}
+"""... and of a speed and the length of a pulse that are read off the log, as a part of them."""
 _EVERY = 8
 """Of the samples earlier before the hammer pulse so many are one: they tell where the shaft was."""
-_AGREED = 12
-"""Rounds of least squares until the channels' say is settled."""
-_SAME = 1.0
-"""A step that gains less, of a number that noise changes by some, is the last."""
-_PARTS = (1.0, 0.3, 0.1, 0.03)
-"""Parts of a step that are tried in turn, until one gains."""
 _ANOTHER = 0.2
 """Part by which two instruments do not differ that measure one speed."""
 _LOOSER = 100.0
@@ -65,8 +65,8 @@ _BEFORE_S = 0.03
 """... and so much of it is in the fit of all [s]."""
 _WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """How far behind the begin of the hammer pulse the fits look [s]."""
-_SURE = 0.9999
-"""Values that are further off than this part of right ones would be are wrong."""
+_LAST = 2
+"""Growths of the window by which it is told how far values are moved by what the model lacks."""
 _WORSE = 1.2
 """A longer window is given up where it leaves more by this factor in a third of the channels; ..."""
 _BROKEN = 10.0
@@ -117,6 +117,7 @@ class Tuned:
         fitted: What was fitted.
         values: The same, by key.
         covariance: Of them, shape (values, values).
+        moved: How far the last growths of the window moved each, by key.
         about_s: Where the clocks differ by the offset alone [s].
         end_s: End of the samples that it rests on [s].
         scales: RMS of what is left of each channel over its noise, at least 1.
@@ -127,6 +128,7 @@ class Tuned:
     fitted: tuple[Fitted, ...]
     values: dict[str, float]
     covariance: np.ndarray
+    moved: dict[str, float]
     about_s: float
     end_s: float
     scales: dict[str, float]
@@ -178,7 +180,7 @@ def nuisances_of(
 def turned(recording: Recording, experiment: Experiment) -> Experiment:
     """With speed, angle and place of the shaft as the motion before the hammer pulse has them.
 
-    Small motions are a sum: of one that begins elsewhere, and of one by the unbalance, a cosine and a sine of its angle.
+    Small motions are a sum: of one that begins elsewhere, and of one by the unbalance, as a cosine and a sine.
     Least squares over a few turns, in which a channel counts by what it leaves: one that is faulty has no say.
     """
     first_s = first_command_s(experiment)
@@ -192,7 +194,7 @@ def turned(recording: Recording, experiment: Experiment) -> Experiment:
 
     def shown(values: Sequence[float] | np.ndarray) -> list[np.ndarray]:
         found = predictor.predict(np.asarray(values)).values
-        return [one for one, _ in _channels(parts, found)]
+        return [one for one, _ in channels_of(parts, found)]
 
     still = np.zeros(len(keys))
     still[: len(keys) - 1] = predictor.start[:-1]
@@ -200,65 +202,15 @@ def turned(recording: Recording, experiment: Experiment) -> Experiment:
     moved = [shown(still + step) for step in np.diag(predictor.scales)[:-1]]
     middle = [(a + b) / 2.0 for a, b in zip(ahead, behind, strict=True)]
     target, columns = [], []
-    for c, (measured, floor) in enumerate(_channels(parts, {name: part.values for name, part in parts.items()})):
+    for c, (measured, floor) in enumerate(channels_of(parts, {name: part.values for name, part in parts.items()})):
         slopes = [(ahead[c] - behind[c]) / 2.0, beside[c] - middle[c], *(one[c] - ahead[c] for one in moved)]
         # What a probe's zero is, this does not tell: without each channel's mean.
-        target.append(_centred(measured - middle[c]) / floor)
-        columns.append(_centred(np.column_stack(slopes)) / floor)
-    found = _by_agreement(target, columns, _signals(parts))
+        target.append(centred(measured - middle[c]) / floor)
+        columns.append(centred(np.column_stack(slopes)) / floor)
+    found = by_agreement(target, columns, signals_of(parts))
     moves = np.array([*found[2:], 0.0]) * predictor.scales
     values = dict(zip(keys, (still + moves).tolist(), strict=True))
     return with_values(experiment, values | {ANGLE: math.atan2(found[1], found[0])})
-
-
-def _by_agreement(
-    target: list[np.ndarray],
-    columns: list[np.ndarray],
-    scales: list[float],
-    held: tuple[np.ndarray, np.ndarray] | None = None,
-) -> np.ndarray:
-    """Least squares over channels that count by what they leave themselves, shape (unknowns,).
-
-    Args:
-        target: Of each channel, over its noise, shape (n,).
-        columns: The same of each unknown, shape (n, unknowns).
-        scales: By what each counts less at first: of all that it shows, so that none is right from the start.
-        held: What is known of the unknowns before: means and standard deviations.
-    """
-    grams = [one.T @ one for one in columns]
-    sides = [one.T @ z for one, z in zip(columns, target, strict=True)]
-    found = np.zeros(columns[0].shape[1])
-    for _ in range(_AGREED):
-        square = sum(gram / scale**2 for gram, scale in zip(grams, scales, strict=True))
-        side = sum(one / scale**2 for one, scale in zip(sides, scales, strict=True))
-        if held is not None:
-            square, side = square + np.diag(held[1] ** -2.0), side + held[0] * held[1] ** -2.0
-        # In units in which each is 1 of its own: sizes differ by a million.
-        size = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-        found = size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
-        scales = [max(1.0, _rms(z - a @ found)) for z, a in zip(target, columns, strict=True)]
-    return found
-
-
-def _signals(parts: Mapping[str, Measured]) -> list[float]:
-    """How much each channel shows, over its noise."""
-    shown = _channels(parts, {name: part.values for name, part in parts.items()})
-    return [max(1.0, float(values.std()) / floor) for values, floor in shown]
-
-
-def _rms(values: np.ndarray) -> float:
-    return math.sqrt(float(values @ values) / len(values))
-
-
-def _channels(parts: Mapping[str, Measured], values: Mapping[str, np.ndarray]) -> list[tuple[np.ndarray, float]]:
-    """Values of each channel, shape (n,), and its noise."""
-    return [
-        (values[name][:, c], float(part.floor[c])) for name, part in parts.items() for c in range(len(part.channels))
-    ]
-
-
-def _centred(values: np.ndarray) -> np.ndarray:
-    return values - values.mean(axis=0)
 
 
 def _with_speed_of_edges(recording: Recording, experiment: Experiment) -> Experiment:
@@ -286,7 +238,7 @@ def _turning(parts: Mapping[str, Measured], speed_hz: float) -> float:
     found = 0.0
     for part in parts.values():
         turning = np.exp(2j * math.pi * speed_hz * part.times_s) * np.hanning(len(part.times_s))
-        found += float(np.sum(np.abs(turning @ (_centred(part.values) / part.floor)) ** 2)) / len(part.times_s)
+        found += float(np.sum(np.abs(turning @ (centred(part.values) / part.floor)) ** 2)) / len(part.times_s)
     return found
 
 
@@ -334,10 +286,11 @@ def tune(
     whole = observe(recording, begun, channels=channels, window=(looks_from(begun), end_s)).parts
     whole = {name: _thinned(part, first_s - _BEFORE_S) for name, part in whole.items()}
     found = _grown(begun, wanted, whole, progress, trusting=False)
-    if max(found.scales) > _BROKEN:
-        # Where channels are at odds from the start, it depends on whom one believes first.
-        trusting = _grown(begun, wanted, whole, progress, trusting=True)
-        found = max(found, trusting, key=lambda one: (one.end_s, -sum(map(math.log, one.scales))))
+    # Where channels are at odds from the start, it depends on whom one believes first: the log, or all but the hammer.
+    for without in ((), ("hammer",)):
+        if max(found.scales) > _BROKEN and (found.odds > _BROKEN or not without):
+            other = _grown(begun, wanted, whole, progress, trusting=True, without=without)
+            found = max(found, other, key=lambda one: (one.end_s, -sum(map(math.log, one.scales))))
     far = [key for key, value in zip(wanted, found.values, strict=True) if _is_beyond(float(value), wanted[key])]
     if far:
         looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
@@ -354,6 +307,7 @@ def tune(
         ),
         values=told,
         covariance=covariance,
+        moved=dict(zip(wanted, found.moved.tolist(), strict=True)),
         about_s=min(float(part.times_s[0]) for part in whole.values()),
         end_s=found.end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), found.scales, strict=True)),
@@ -362,12 +316,26 @@ def tune(
 
 @dataclass(frozen=True)
 class _Grown:
-    """Values on the longest window that they explain, their covariance, and what is left of each channel."""
+    """Values on the longest window that they explain, and what they are worth.
+
+    Attributes:
+        values: Shape (keys,).
+        covariance: Of them.
+        moved: How far the last growths of the window moved them, shape (keys,).
+        end_s: End of the window [s].
+        scales: What is left of each channel over its noise.
+    """
 
     values: np.ndarray
     covariance: np.ndarray
+    moved: np.ndarray
     end_s: float
     scales: list[float]
+
+    @property
+    def odds(self) -> float:
+        """What is left of the middle one of the channels."""
+        return float(np.median(self.scales))
 
 
 def _grown(
@@ -377,11 +345,21 @@ def _grown(
     progress: Callable[[str], None],
     *,
     trusting: bool,
+    without: Sequence[str] = (),
 ) -> _Grown:
-    """Fit on windows that grow from the pulse; `trusting` believes first what agrees with what the log tells."""
-    first_s = first_command_s(begun)
+    """Fit on windows that grow from the pulse.
+
+    Args:
+        begun: The experiment.
+        wanted: What is fitted, with what is known of it.
+        whole: The samples.
+        progress: Told what is being done.
+        trusting: Believe first what agrees with what the log tells.
+        without: Channels that have no say.
+    """
+    first_s, every = first_command_s(begun), [name not in without for part in whole.values() for name in part.names]
     values = np.array([value_of(begun, key) for key in wanted])
-    covariance, end_s, scales = np.eye(len(values)), first_s, list[float]()
+    covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
     for length in _WINDOWS_S:
         progress(f"{len(wanted)} numbers that the log does not tell exactly: to {first_s + length:.3f} s")
         parts = {name: part.until(first_s + length) for name, part in whole.items()}
@@ -389,28 +367,20 @@ def _grown(
         # Without a prior a value is held as loosely as makes no difference, so that what is not seen stays.
         loose = zip(predictor.start, predictor.scales, strict=True)
         known = np.array([prior or held for prior, held in zip(wanted.values(), loose, strict=True)]).T
-        found, here = _approach(predictor, values, known, trusting=trusting)
-        now = [max(1.0, _rms(z)) for z in here.apart]
+        found, here = approach(predictor, values, known, trusting=trusting, heard=every)
+        heard = [has and rms(z) <= _BROKEN for z, has in zip(here.apart, every, strict=True)]
+        if len(heard) / 2.0 < sum(heard) < len(heard):
+            # What is plainly wrong has no say at all: the little that it keeps moves what no other channel tells.
+            found, here = approach(predictor, found, known, trusting=True, heard=heard)
+        now = [max(1.0, rms(z)) for z in here.apart]
         if scales and 3 * sum(_WORSE * a < b < _BROKEN * a for a, b in zip(scales, now, strict=True)) > len(now):
             break  # the model no longer explains it: that is to be judged, and not to be fitted away
-        if scales and _gone(found - values, covariance):
-            break  # what comes new is made up for by values that what was there before does not allow
         scales = now
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
+        moves.append(np.abs(found - values))
         covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
         end_s = first_s + length
-    return _Grown(values, covariance, end_s, scales)
-
-
-def _gone(moved: np.ndarray, covariance: np.ndarray) -> bool:
-    """Whether values move further than their covariance on a shorter window leaves open.
-
-    A right model is right on both: the test of J. A. Hausman, Specification tests in econometrics, Econometrica 46
-    (1978), with the variance of the longer one left out beside that of the shorter.
-    """
-    from scipy.stats import chi2
-
-    return float(moved @ np.linalg.solve(covariance, moved)) > chi2.ppf(_SURE, len(moved))
+    return _Grown(values, covariance, np.max(moves[-_LAST:], axis=0), end_s, scales)
 
 
 def looks_from(experiment: Experiment) -> float:
@@ -423,62 +393,3 @@ def _thinned(part: Measured, until_s: float) -> Measured:
     """All rows from a time on, and some of those before it."""
     rows = np.arange(len(part.times_s))
     return part.chosen(rows[(part.times_s >= until_s) | (rows % _EVERY == 0)])
-
-
-@dataclass(frozen=True)
-class _Here:
-    """Channels at some values: measured less predicted over the noise, each shape (n,); with slopes, (n, unknowns)."""
-
-    apart: list[np.ndarray]
-    slopes: list[np.ndarray]
-
-    def cost(self, off: np.ndarray) -> float:
-        """What values are worth that leave this, and are so many standard deviations off what is known of them."""
-        agreement = sum(len(z) * math.log(1.0 + float(z @ z) / len(z)) for z in self.apart)
-        return agreement + float(off @ off)
-
-
-def _approach(
-    predictor: Predictor, values: np.ndarray, known: np.ndarray, *, trusting: bool
-) -> tuple[np.ndarray, _Here]:
-    """Values near some others at which most channels agree, and how the channels are there.
-
-    Args:
-        predictor: Of the channels.
-        values: Where the search begins, shape (keys,).
-        known: Means and standard deviations of the values before, shape (2, keys).
-        trusting: Whether channels count by what they leave from the start on.
-    """
-    means, deviations = known
-    low, high = means - BEYOND * deviations, means + BEYOND * deviations
-    here = _look(predictor, values)
-    assert here is not None
-    for _ in range(_ROUNDS):
-        slopes = predictor.derivatives(values).slopes
-        by_key = [[one / floor for one, floor in _channels(predictor.parts, slope)] for slope in slopes]
-        here = _Here(here.apart, [np.column_stack(columns) for columns in zip(*by_key, strict=True)])
-        say = [max(1.0, _rms(z)) for z in here.apart] if trusting else _signals(predictor.parts)
-        step = _by_agreement(here.apart, here.slopes, say, (means - values, deviations))
-        cost = here.cost((values - means) / deviations)
-        for part in _PARTS:
-            moved = np.clip(values + part * step, low, high)
-            ahead = _look(predictor, moved)
-            if ahead is not None and ahead.cost((moved - means) / deviations) < cost:
-                break
-        else:
-            break
-        gained = cost - ahead.cost((moved - means) / deviations)
-        values, here = moved, _Here(ahead.apart, here.slopes)
-        if gained < _SAME:
-            break
-    return values, here
-
-
-def _look(predictor: Predictor, values: np.ndarray) -> _Here | None:
-    """The channels at some values; None where the model does not take them."""
-    try:
-        found = predictor.predict(values).values
-    except (InputError, SimulationError):
-        return None
-    apart = {name: part.values - found[name] for name, part in predictor.parts.items()}
-    return _Here([one / floor for one, floor in _channels(predictor.parts, apart)], [])

@@ -46,7 +46,9 @@ _STARTS = (0.0, *(sign * part for part in (0.005, 0.01, 0.02, 0.035, 0.06, 0.1, 
 """Where a fit may start on the first window, as parts of the farthest that it may go ..."""
 _TRIED = 3
 """... and from how many of these it does."""
-_MOST = 0.95
+_BESIDE = 1e-3
+"""A change that explains less than this part of what the largest one does is not told beside it."""
+_MOST = 0.9
 """Changes of channels that together explain this part of all are it, though the model leaves something."""
 _MOST_TIED = 3
 """Of causes that explain the beginning equally, so many are tried with a second one behind it."""
@@ -175,9 +177,12 @@ def explain_log(
         end_s: How far the model has been followed [s].
     """
     sensors = sensor_faults(parts, nominal, end_s, others)
+    # What one fault brings along elsewhere, in the fit before, is none of its own.
+    most = max((one.explained for one in sensors), default=0.0)
+    sensors = [one for one in sensors if one.explained > _BESIDE * most]
     trigger = any(one.name == "hammer delay" for one in sensors)
     far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
-    cured = bool(sensors) and sum(one.explained for one in sensors) > _MOST
+    cured = bool(sensors) and (sum(one.explained for one in sensors) > _MOST or all(one.at_floor for one in sensors))
     conclusion, best = conclude(sensors, sensors if cured and not far else [], rules, end_s=end_s)
     if far:
         best = tuple(one.key for one in far)

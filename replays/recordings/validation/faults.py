@@ -35,7 +35,8 @@ _NEARLY = 0.05
 _UNITS = {
     25.4: "as mm for inch", 1.0 / 25.4: "as inch for mm", 1e3: "a thousand", 1e-3: "a thousandth",
     9.80665: "as m/s^2 for g", 1.0 / 9.80665: "as g for m/s^2", 4.4482: "as N for lbf", 1.0 / 4.4482: "as lbf for N",
-    60.0: "as 1/min for Hz", 1.0 / 60.0: "as Hz for 1/min", 2.0: "twice", 0.5: "half", 10.0: "ten times", 0.1: "a tenth",
+    60.0: "as 1/min for Hz", 1.0 / 60.0: "as Hz for 1/min", 2.0: "twice", 0.5: "half", 10.0: "tenfold",
+    0.1: "a tenth",
 }  # fmt: skip
 """Gains that slips with units and ranges make."""
 _SEARCH = 400

@@ -1,0 +1,143 @@
+"""Least squares over channels that count by what they leave themselves: one that is faulty does not turn the others.
+
+With what a channel leaves as its own measure, the sum over channels of the logarithm of that is made small, by least
+squares whose weights follow. Most channels together say what holds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from replays.recordings.prediction import Measured
+from replays.recordings.sensitivity import Predictor
+from rig.errors import InputError, SimulationError
+
+BEYOND = 5.0
+"""A value that many standard deviations from what is known of it is a finding, and no fit goes further."""
+_AGREED = 12
+"""Rounds of least squares until the channels' say is settled."""
+_SAME = 1.0
+"""A step that gains less, of a number that noise changes by some, is the last."""
+_PARTS = (1.0, 0.3, 0.1, 0.03)
+"""Parts of a step that are tried in turn, until one gains."""
+_ROUNDS = 8
+
+
+def by_agreement(
+    target: list[np.ndarray],
+    columns: list[np.ndarray],
+    scales: list[float],
+    held: tuple[np.ndarray, np.ndarray] | None = None,
+    heard: Sequence[bool] | None = None,
+) -> np.ndarray:
+    """Least squares over channels that count by what they leave themselves, shape (unknowns,).
+
+    Args:
+        target: Of each channel, over its noise, shape (n,).
+        columns: The same of each unknown, shape (n, unknowns).
+        scales: By what each counts less at first: of all that it shows, so that none is right from the start.
+        held: What is known of the unknowns before: means and standard deviations.
+        heard: Which channels have a say at all; None: each.
+    """
+    asked = [1.0 if one else 0.0 for one in heard or [True] * len(target)]
+    grams = [has * (one.T @ one) for one, has in zip(columns, asked, strict=True)]
+    sides = [has * (one.T @ z) for one, z, has in zip(columns, target, asked, strict=True)]
+    found = np.zeros(columns[0].shape[1])
+    for _ in range(_AGREED):
+        square = sum(gram / scale**2 for gram, scale in zip(grams, scales, strict=True))
+        side = sum(one / scale**2 for one, scale in zip(sides, scales, strict=True))
+        if held is not None:
+            square, side = square + np.diag(held[1] ** -2.0), side + held[0] * held[1] ** -2.0
+        # In units in which each is 1 of its own: sizes differ by a million.
+        size = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+        found = size * np.linalg.lstsq(square * np.outer(size, size), side * size, rcond=1e-14)[0]
+        scales = [max(1.0, rms(z - a @ found)) for z, a in zip(target, columns, strict=True)]
+    return found
+
+
+def signals_of(parts: Mapping[str, Measured]) -> list[float]:
+    """How much each channel shows, over its noise."""
+    shown = channels_of(parts, {name: part.values for name, part in parts.items()})
+    return [max(1.0, float(values.std()) / floor) for values, floor in shown]
+
+
+def rms(values: np.ndarray) -> float:
+    """Root of the mean square."""
+    return math.sqrt(float(values @ values) / len(values))
+
+
+def channels_of(parts: Mapping[str, Measured], values: Mapping[str, np.ndarray]) -> list[tuple[np.ndarray, float]]:
+    """Values of each channel, shape (n,), and its noise."""
+    return [
+        (values[name][:, c], float(part.floor[c])) for name, part in parts.items() for c in range(len(part.channels))
+    ]
+
+
+def centred(values: np.ndarray) -> np.ndarray:
+    """Without the mean of each column."""
+    return values - values.mean(axis=0)
+
+
+@dataclass(frozen=True)
+class Here:
+    """Channels at some values: measured less predicted over the noise, each shape (n,); with slopes, (n, unknowns)."""
+
+    apart: list[np.ndarray]
+    slopes: list[np.ndarray]
+
+    def cost(self, off: np.ndarray, heard: Sequence[bool]) -> float:
+        """What values are worth that leave this, and are so many standard deviations off what is known of them."""
+        apart = [z for z, has in zip(self.apart, heard, strict=True) if has]
+        agreement = sum(len(z) * math.log(1.0 + float(z @ z) / len(z)) for z in apart)
+        return agreement + float(off @ off)
+
+
+def approach(
+    predictor: Predictor, values: np.ndarray, known: np.ndarray, *, trusting: bool, heard: Sequence[bool]
+) -> tuple[np.ndarray, Here]:
+    """Values near some others at which most channels agree, and how the channels are there.
+
+    Args:
+        predictor: Of the channels.
+        values: Where the search begins, shape (keys,).
+        known: Means and standard deviations of the values before, shape (2, keys).
+        trusting: Whether channels count by what they leave from the start on.
+        heard: Which channels have a say.
+    """
+    means, deviations = known
+    low, high = means - BEYOND * deviations, means + BEYOND * deviations
+    here = _look(predictor, values)
+    assert here is not None
+    for _ in range(_ROUNDS):
+        slopes = predictor.derivatives(values).slopes
+        by_key = [[one / floor for one, floor in channels_of(predictor.parts, slope)] for slope in slopes]
+        here = Here(here.apart, [np.column_stack(columns) for columns in zip(*by_key, strict=True)])
+        say = [max(1.0, rms(z)) for z in here.apart] if trusting else signals_of(predictor.parts)
+        step = by_agreement(here.apart, here.slopes, say, (means - values, deviations), heard)
+        cost = here.cost((values - means) / deviations, heard)
+        for part in _PARTS:
+            moved = np.clip(values + part * step, low, high)
+            ahead = _look(predictor, moved)
+            if ahead is not None and ahead.cost((moved - means) / deviations, heard) < cost:
+                break
+        else:
+            break
+        gained = cost - ahead.cost((moved - means) / deviations, heard)
+        values, here = moved, Here(ahead.apart, here.slopes)
+        if gained < _SAME:
+            break
+    return values, here
+
+
+def _look(predictor: Predictor, values: np.ndarray) -> Here | None:
+    """The channels at some values; None where the model does not take them."""
+    try:
+        found = predictor.predict(values).values
+    except (InputError, SimulationError):
+        return None
+    apart = {name: part.values - found[name] for name, part in predictor.parts.items()}
+    return Here([one / floor for one, floor in channels_of(predictor.parts, apart)], [])
