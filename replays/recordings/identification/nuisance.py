@@ -48,8 +48,6 @@ _DEVIATIONS = {"clock.rate_ppm": 50.0, "clock.offset_s": 1e-4, "ring.offset_x": 
 filter [s]; of a ring that was put where it is by hand [mm]; ..."""
 _RELATIVE = {"drive.speed_hz": 1e-4, "hammer.1.duration_ms": 0.01}
 """... and of a speed and the length of a pulse that are read off the log, as a part of them."""
-_EVERY = 8
-"""Of the samples earlier before the hammer pulse so many are one: they tell where the shaft was."""
 _ANOTHER = 0.2
 """Part by which two instruments do not differ that measure one speed."""
 _LOOSER = 100.0
@@ -60,9 +58,7 @@ _LEAST_LOOK_S = 0.02
 _SETTLED_S = 0.01
 """Samples so soon behind the begin still show what filters were filled with [s]."""
 _MARGIN_S = 2e-3
-"""What is before the hammer pulse ends here [s], as its time is not known better ..."""
-_BEFORE_S = 0.03
-"""... and so much of it is in the fit of all [s]."""
+"""What is before the hammer pulse ends here [s], as its time is not known better."""
 _WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """How far behind the begin of the hammer pulse the fits look [s]."""
 _LAST = 2
@@ -75,7 +71,10 @@ _BROKEN = 10.0
 
 @dataclass(frozen=True)
 class Fitted:
-    """One fitted number: where it began, where it ended, and half of its 95 % interval, in its unit."""
+    """One fitted number: where it began, where it ended, and half of its 95 % interval, in its unit.
+
+    The interval is that of the noise, with what the last samples that came moved the number by.
+    """
 
     key: str
     start: float
@@ -284,7 +283,6 @@ def tune(
     first_s = first_command_s(begun)
     end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
     whole = observe(recording, begun, channels=channels, window=(looks_from(begun), end_s)).parts
-    whole = {name: _thinned(part, first_s - _BEFORE_S) for name, part in whole.items()}
     found = _grown(begun, wanted, whole, progress, trusting=False)
     # Where channels are at odds from the start, it depends on whom one believes first: the log, or all but the hammer.
     for without in ((), ("hammer",)):
@@ -296,7 +294,7 @@ def tune(
         looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
         found = _grown(begun, looser, whole, progress, trusting=True)
     values, covariance = found.values, found.covariance
-    half = 1.96 * np.sqrt(np.diag(covariance))
+    half = np.hypot(1.96 * np.sqrt(np.diag(covariance)), found.moved)
     told = dict(zip(wanted, values.tolist(), strict=True))
     return Tuned(
         begun=begun,
@@ -387,9 +385,3 @@ def looks_from(experiment: Experiment) -> float:
     """From where on samples before the hammer pulse are looked at [s]."""
     begin_s = experiment.first_s if experiment.begin is None else experiment.begin.tick / TICK_RATE_HZ + _SETTLED_S
     return max(begin_s, first_command_s(experiment) - BEFORE_S)
-
-
-def _thinned(part: Measured, until_s: float) -> Measured:
-    """All rows from a time on, and some of those before it."""
-    rows = np.arange(len(part.times_s))
-    return part.chosen(rows[(part.times_s >= until_s) | (rows % _EVERY == 0)])

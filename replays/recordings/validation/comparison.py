@@ -134,9 +134,12 @@ def _log_done_again(
     models = [tuned, *(tuned.changed(variant.set) for variant in rules.variants)]
     others += [model.predict(parts) for model in models[1:]]
     others += [tuned.predict({name: part.filtered(rules.bandwidth) for name, part in parts.items()})]
+    gains = {name: v + rules.calibration * (v - v.mean(axis=0)) for name, v in nominal.values.items()}
+    others += [replace(nominal, values=gains)]
     drawn = [models[n % len(models)].drawn(generator) for n in range(criteria.ensemble.members)]
     faults = signal_faults(measured(recording, tuned.begun.scene))
-    faults += edge_faults(recording.edges(), first_command_s(tuned.begun) or math.inf)
+    until_s = first_command_s(tuned.begun) or math.inf
+    faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
     return _DoneAgain(
         faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
         quick=bare(tuned.experiment), criteria=criteria.loosened(rules.noise), parts=tuned.on_time(parts),
@@ -150,7 +153,7 @@ def _window(again: _DoneAgain) -> tuple[float, float, str]:
     begin = min(float(part.times_s[0]) for part in parts.values())
     if again.tuned is not None:
         # What the fit leaves open, and what is not known of filters, makes a floor and no end.
-        parted = foreseeable_s(parts, again.nominal, again.others[1:-1], share=1.0)
+        parted = foreseeable_s(parts, again.nominal, again.others[1:-2], share=1.0)
         end = min(again.tuned.end_s, math.inf if parted is None else parted)
         return begin, end, "as far as fit and model go together" if end == again.tuned.end_s else "models part there"
     parted = foreseeable_s(parts, again.nominal, again.others, share=rules.share)

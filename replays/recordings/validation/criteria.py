@@ -124,6 +124,8 @@ class Imported(_Section):
     """By this part the noise may be off that was read off the log."""
     bandwidth: Positive
     """Corner of a real anti-alias filter over the one that is told."""
+    calibration: NotNegative
+    """By this part of what it shows a channel may be off: calibrations are no better."""
     variants: tuple[Variant, ...]
 
 

@@ -15,6 +15,8 @@ _RARE = 0.02
 """... where neighbours are equal this seldom elsewhere."""
 _RAIL, _AT_RAIL = 3, 6
 """Rows in a row at the largest or smallest number, and in all, that make a rail of it."""
+_ANOTHER = 0.2
+"""Part by which pulses are more or fewer than turns."""
 _LOUD = 3.0
 """Times the noise of its peers."""
 
@@ -64,18 +66,22 @@ def signal_faults(parts: dict[str, Measured]) -> list[SignalFault]:
     return found
 
 
-def edge_faults(edges_s: np.ndarray, until_s: float) -> list[SignalFault]:
+def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[SignalFault]:
     """Pulses that are missing or too many while the shaft turns evenly.
 
     Args:
         edges_s: Keyphasor edges [s].
         until_s: Up to when it does [s].
+        speed_hz: At what speed [Hz].
     """
     steps = np.diff(edges_s[edges_s < until_s])
     if len(steps) < 3:
         return []
-    turns = steps / np.median(steps)
-    found = []
+    turns, found = steps / np.median(steps), list[SignalFault]()
+    a_turn = 1.0 / (float(np.median(steps)) * speed_hz) if speed_hz > 0.0 else 1.0
+    if abs(a_turn - 1.0) > _ANOTHER:
+        begin, end = float(edges_s[0]), float(edges_s[len(steps)])
+        found.append(SignalFault("keyphasor", "pulses", begin, end, f"{a_turn:.3g} pulses a turn"))
     for what, rows in (("missing", turns > 1.5), ("too many", turns < 0.7)):
         at = np.flatnonzero(rows)
         if len(at):

@@ -1,0 +1,117 @@
+"""Faults of channels by themselves: each on made-up signals, with its name and size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from replays.recordings.prediction import Measured, Prediction
+from replays.recordings.validation.faults import sensor_faults
+from replays.recordings.validation.signals import edge_faults, signal_faults, steady_rows
+from rig.channels import default_table
+
+RATE_HZ, ROWS = 20_000, 6000
+TIMES = np.arange(ROWS) / RATE_HZ
+
+
+def signals(group: str, seed: int = 3) -> tuple[Measured, np.ndarray]:
+    """A group with smooth signals of its own in each channel, and what was to be seen."""
+    channels, rng = default_table().groups[group].channels, np.random.default_rng(seed)
+    floor = np.array([channel.noise_v / channel.sensitivity_v for channel in channels])
+    # One steady turning, and knocks that ring.
+    clean = np.stack([
+        floor[c] * (900.0 * np.sin(2.0 * math.pi * (7.0 * TIMES + rng.random()))
+                    + 300.0 * np.exp(-40.0 * np.maximum(TIMES - 0.15, 0.0)) * (TIMES > 0.15)
+                    * np.sin(2.0 * math.pi * (170.0 + 30.0 * c) * (TIMES - 0.15)))
+        + 3000.0 * (group == "forces") for c in range(len(channels))
+    ], axis=1)  # fmt: skip
+    values = clean + floor * rng.standard_normal(clean.shape)
+    part = Measured(
+        group, channels, TIMES, np.arange(ROWS), values, floor, np.ones(len(channels), dtype=bool), ideal=False
+    )
+    return part, clean
+
+
+def told(change: Callable[[np.ndarray, np.ndarray], None], group: str = "probes") -> list[tuple[str, float]]:
+    """Names and sizes of what is found where some columns are changed, given values and what was to be seen."""
+    part, clean = signals(group)
+    values = part.values.copy()
+    change(values, clean)
+    found = sensor_faults({group: replace(part, values=values)}, Prediction({group: clean}, {}, 1000), 1.0)
+    return [(one.name, one.value) for one in found]
+
+
+def test_nothing_is_found_where_nothing_is_wrong() -> None:
+    assert told(lambda values, clean: None) == []
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.02, 25.4, 1e-3])
+def test_gain(factor: float) -> None:
+    def change(values: np.ndarray, clean: np.ndarray) -> None:
+        values[:, 2] += (factor - 1.0) * clean[:, 2]
+
+    ((name, value),) = told(change)
+    assert name == ("ring_x signal" if factor < 0.02 else "ring_x gain")
+    assert value == pytest.approx(factor - 1.0, abs=1e-3)
+
+
+def test_polarity_of_a_preloaded_one_and_offset() -> None:
+    def change(values: np.ndarray, clean: np.ndarray) -> None:
+        values[:, 0] = 6000.0 - values[:, 0]
+        values[:, 2] += 4.0
+
+    assert [name for name, _ in told(change, "forces")] == ["P_N polarity", "P_E offset"]
+
+
+@pytest.mark.parametrize("rows", [1, 7, 30])
+def test_delays_that_are_the_same_are_told_together(rows: int) -> None:
+    def change(values: np.ndarray, clean: np.ndarray) -> None:
+        values[rows:, :2] += clean[:-rows, :2] - clean[rows:, :2]
+
+    ((name, value),) = told(change)
+    assert name == "disk_x, disk_y delay"
+    assert value == pytest.approx(rows / RATE_HZ, rel=0.01)
+
+
+def test_swapped_and_turned() -> None:
+    def swap(values: np.ndarray, clean: np.ndarray) -> None:
+        values[:, [0, 1]] = values[:, [1, 0]]
+
+    def turn(values: np.ndarray, clean: np.ndarray) -> None:
+        c, s = math.cos(0.2), math.sin(0.2)
+        values[:, 2:] += clean[:, 2:] @ np.array([[c - 1.0, s], [-s, c - 1.0]])
+
+    assert [name for name, _ in told(swap)] == ["disk_x and disk_y"]
+    ((name, value),) = told(turn)
+    assert (name, value) == ("ring_x and ring_y angle", pytest.approx(-0.2, abs=1e-3))
+
+
+def test_what_signals_show_by_themselves() -> None:
+    part, _ = signals("forces")
+    assert signal_faults({"forces": part}) == []
+    values = part.values.copy()
+    values[2000:2300, 0] = values[2000, 0]
+    values[:, 1] = np.minimum(values[:, 1], 3300.0)
+    values[:, 2] += 8.0 * part.floor[2] * np.random.default_rng(0).standard_normal(ROWS)
+    found = {(one.channel, one.what): one for one in signal_faults({"forces": replace(part, values=values)})}
+    assert set(found) == {("P_N", "stuck"), ("P_S", "clipped"), ("P_E", "noise")}
+    stuck = found["P_N", "stuck"]
+    assert (stuck.from_s, stuck.to_s) == (pytest.approx(0.1), pytest.approx(0.11495))
+
+
+def test_coarse_numbers_are_not_stuck() -> None:
+    part, _ = signals("drive")
+    values = np.round(part.values, 1)
+    assert steady_rows(values[:, 0]).any()
+    assert signal_faults({"drive": replace(part, values=values)}) == []
+
+
+def test_pulses() -> None:
+    edges_s = np.arange(40) / 6.2
+    assert edge_faults(edges_s, 6.0, 6.2) == []
+    assert "missing in 1 of" in edge_faults(np.delete(edges_s, 7), 6.0, 6.2)[0].line
+    assert "2 pulses a turn" in edge_faults(np.arange(40) / 12.4, 6.0, 6.2)[0].line
