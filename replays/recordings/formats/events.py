@@ -93,7 +93,8 @@ def speed_before(
             : max(1, round((min(until_s, 1e6) + zero_s - drive.start_s) * drive.rate_hz))
         ]
         return float(np.nanmean(values))
-    times = edges[edges < until_s * 1e6] if len(edges) else edges
+    times = edges[edges < until_s * 1e6]
+    times = times if len(times) > 1 else edges
     return (len(times) - 1) * 1e6 / float(times[-1] - times[0]) if len(times) > 1 else None
 
 

@@ -119,7 +119,10 @@ def sensor_faults(
             found.append(pair)
             seen |= {a.name, b.name}
     found += [_one_sensor(one, told) for name, one in off.items() if name not in seen]
-    return _together(found)
+    together = _together(found)
+    # Where all that moves is late by the same, it is the time.
+    late = {f"{', '.join(one.name for one in shown if one.moves)} delay"}
+    return [one for one in together if one.name not in late or len(together) > 1]
 
 
 @dataclass(frozen=True)
