@@ -59,6 +59,8 @@ _SETTLED_S = 0.01
 """Samples so soon behind the begin still show what filters were filled with [s]."""
 _MARGIN_S = 2e-3
 """What is before the hammer pulse ends here [s], as its time is not known better."""
+_BEFORE_S, _EVERY = 0.03, 8
+"""Of what is longer before the hammer pulse [s] so many samples are one: it tells where the shaft was, and no more."""
 _WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """How far behind the begin of the hammer pulse the fits look [s]."""
 _LAST = 2
@@ -116,7 +118,7 @@ class Tuned:
         fitted: What was fitted.
         values: The same, by key.
         covariance: Of them, shape (values, values).
-        moved: How far the last growths of the window moved each, by key.
+        moved: How far the last growths of the window moved each (root of the mean square), by key.
         about_s: Where the clocks differ by the offset alone [s].
         end_s: End of the samples that it rests on [s].
         scales: RMS of what is left of each channel over its noise, at least 1.
@@ -283,6 +285,7 @@ def tune(
     first_s = first_command_s(begun)
     end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
     whole = observe(recording, begun, channels=channels, window=(looks_from(begun), end_s)).parts
+    whole = {name: _thinned(part, first_s - _BEFORE_S) for name, part in whole.items()}
     found = _grown(begun, wanted, whole, progress, trusting=False)
     # Where channels are at odds from the start, it depends on whom one believes first: the log, or all but the hammer.
     for without in ((), ("hammer",)):
@@ -294,7 +297,7 @@ def tune(
         looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
         found = _grown(begun, looser, whole, progress, trusting=True)
     values, covariance = found.values, found.covariance
-    half = np.hypot(1.96 * np.sqrt(np.diag(covariance)), found.moved)
+    half = 1.96 * np.hypot(np.sqrt(np.diag(covariance)), found.moved)
     told = dict(zip(wanted, values.tolist(), strict=True))
     return Tuned(
         begun=begun,
@@ -319,7 +322,8 @@ class _Grown:
     Attributes:
         values: Shape (keys,).
         covariance: Of them.
-        moved: How far the last growths of the window moved them, shape (keys,).
+        moved: Root of the mean square of how far the last growths of the window moved them: what stands for the standard
+            deviation of what the model lacks, shape (keys,).
         end_s: End of the window [s].
         scales: What is left of each channel over its noise.
     """
@@ -378,10 +382,16 @@ def _grown(
         moves.append(np.abs(found - values))
         covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
         end_s = first_s + length
-    return _Grown(values, covariance, np.max(moves[-_LAST:], axis=0), end_s, scales)
+    return _Grown(values, covariance, np.sqrt(np.mean(np.square(moves[-_LAST:]), axis=0)), end_s, scales)
 
 
 def looks_from(experiment: Experiment) -> float:
     """From where on samples before the hammer pulse are looked at [s]."""
     begin_s = experiment.first_s if experiment.begin is None else experiment.begin.tick / TICK_RATE_HZ + _SETTLED_S
     return max(begin_s, first_command_s(experiment) - BEFORE_S)
+
+
+def _thinned(part: Measured, until_s: float) -> Measured:
+    """All rows from a time on, and some of those before it."""
+    rows = np.arange(len(part.times_s))
+    return part.chosen(rows[(part.times_s >= until_s) | (rows % _EVERY == 0)])
