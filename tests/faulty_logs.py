@@ -190,8 +190,8 @@ CASES = tuple(
        for name, level in (("ring_x", 0.0), ("P_E", 3000.0), ("inner_y", 0.0))]
     + [Case(f"hammer {ms:g} ms late", "hammer delay|time: shifted", before=_late(("hammer",), ms * 1e-3))
        for ms in (0.3, 1.0, 3.0)]
-    + [Case(f"{name} behind {hz} Hz", f"{name} (bandwidth|delay|gain and delay)", before=_slow(name, hz))
+    + [Case(f"{name} behind {hz} Hz", f"{name} (bandwidth|delay|gain and delay|signal missing)", before=_slow(name, hz))
        for name, hz in (("P_E", 3000), ("P_E", 1000), ("P_N", 300))]
-    + [Case(f"{rows} rows lost at {at_s:g} s", "clock: [-+]|time: |rows", behind=_lost(at_s, rows))
+    + [Case(f"{rows} rows lost at {at_s:g} s", "time rows|clock: [-+]", behind=_lost(at_s, rows))
        for at_s, rows in ((0.5, 20), (0.5, 200), (0.81, 100))]
 )  # fmt: skip

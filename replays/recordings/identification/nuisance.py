@@ -144,7 +144,9 @@ class Tuned:
 
     def drawn(self, generator: np.random.Generator) -> Tuned:
         """The same with values as far off as the fit leaves open, drawn from what it says."""
-        off = np.linalg.cholesky(self.covariance) @ generator.standard_normal(len(self.values))
+        size = np.sqrt(np.diag(self.covariance))  # of which some are a million times as large as others
+        sizes, directions = np.linalg.eigh(self.covariance / np.outer(size, size))
+        off = size * (directions @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(len(size))))
         return replace(self, values={key: value + d for (key, value), d in zip(self.values.items(), off, strict=True)})
 
     def predict(self, parts: dict[str, Measured]) -> Prediction:
@@ -286,16 +288,11 @@ def tune(
     end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
     whole = observe(recording, begun, channels=channels, window=(looks_from(begun), end_s)).parts
     whole = {name: _thinned(part, first_s - _BEFORE_S) for name, part in whole.items()}
-    found = _grown(begun, wanted, whole, progress, trusting=False)
-    # Where channels are at odds from the start, it depends on whom one believes first: the log, or all but the hammer.
-    for without in ((), ("hammer",)):
-        if max(found.scales) > _BROKEN and (found.odds > _BROKEN or not without):
-            other = _grown(begun, wanted, whole, progress, trusting=True, without=without)
-            found = max(found, other, key=lambda one: (one.end_s, -sum(map(math.log, one.scales))))
+    found = _best(begun, wanted, whole, progress)
     far = [key for key, value in zip(wanted, found.values, strict=True) if _is_beyond(float(value), wanted[key])]
     if far:
         looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
-        found = _grown(begun, looser, whole, progress, trusting=True)
+        found = max(found, _best(begun, looser, whole, progress), key=_Grown.worth)
     values, covariance = found.values, found.covariance
     half = 1.96 * np.hypot(np.sqrt(np.diag(covariance)), found.moved)
     told = dict(zip(wanted, values.tolist(), strict=True))
@@ -322,8 +319,8 @@ class _Grown:
     Attributes:
         values: Shape (keys,).
         covariance: Of them.
-        moved: Root of the mean square of how far the last growths of the window moved them: what stands for the standard
-            deviation of what the model lacks, shape (keys,).
+        moved: Root of the mean square of how far the last growths of the window moved them, shape (keys,): it stands
+            for the standard deviation of what the model lacks.
         end_s: End of the window [s].
         scales: What is left of each channel over its noise.
     """
@@ -338,6 +335,25 @@ class _Grown:
     def odds(self) -> float:
         """What is left of the middle one of the channels."""
         return float(np.median(self.scales))
+
+    def worth(self) -> tuple[float, float]:
+        """What goes on for longer is worth more, then what leaves less."""
+        return self.end_s, -sum(map(math.log, self.scales))
+
+
+def _best(
+    begun: Experiment,
+    wanted: dict[str, tuple[float, float] | None],
+    whole: dict[str, Measured],
+    progress: Callable[[str], None],
+) -> _Grown:
+    """Where channels are at odds from the start, it depends on whom one believes: the log, or all but the hammer."""
+    found = _grown(begun, wanted, whole, progress, trusting=False)
+    for without in ((), ("hammer",)):
+        if max(found.scales) > _BROKEN and (found.odds > _BROKEN or not without):
+            other = _grown(begun, wanted, whole, progress, trusting=True, without=without)
+            found = max(found, other, key=_Grown.worth)
+    return found
 
 
 def _grown(

@@ -30,6 +30,7 @@ from replays.recordings.validation.explanation import (
     vector,
 )
 from replays.recordings.validation.faults import Clock, sensor_faults
+from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import scaled
 from rig.errors import InputError, SimulationError
 
@@ -46,6 +47,8 @@ _STARTS = (0.0, *(sign * part for part in (0.005, 0.01, 0.02, 0.035, 0.06, 0.1, 
 """Where a fit may start on the first window, as parts of the farthest that it may go ..."""
 _TRIED = 3
 """... and from how many of these it does."""
+_AT_ODDS = 10.0
+"""Where this is left of the middle channel, over its noise, most are wrong, or what is held against them."""
 _BESIDE = 1e-3
 """A change that explains less than this part of what the largest one does is not told beside it."""
 _MOST = 0.9
@@ -163,7 +166,7 @@ def _behind(
 
 def explain_log(
     parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], tuned: Tuned, rules: Attribution,
-    *, from_s: float, end_s: float,
+    *, from_s: float, end_s: float, faults: Sequence[SignalFault] = (),
 ) -> Explained:  # fmt: skip
     """What explains that a log of another system differs: sensors, or what was fitted beyond what is known of it.
 
@@ -175,6 +178,7 @@ def explain_log(
         rules: Limits.
         from_s: First difference [s].
         end_s: How far the model has been followed [s].
+        faults: What signals show by themselves.
     """
     sensors = sensor_faults(parts, nominal, end_s, others)
     # What one fault brings along elsewhere, in the fit before, is none of its own.
@@ -187,6 +191,16 @@ def explain_log(
     if far:
         best = tuple(one.key for one in far)
         conclusion = "beyond what is known of it: " + "; ".join(one.line for one in far)
+    elif not best and faults:
+        conclusion = f"what signals show by themselves comes first: {'; '.join(one.line for one in faults)}"
+    elif not best and float(np.median(list(tuned.scales.values()))) > _AT_ODDS:
+        conclusion = "nothing goes together from the hammer pulse on: its time, several channels, or the model is off; "
+        conclusion += "this log cannot tell"
+    elif not best and sum(one.explained for one in sensors) > rules.enough:
+        part = sum(one.explained for one in sensors)
+        conclusion = (
+            f"nearest are {_listed(sensors)}: {part:.0%} of the difference; the rest is another fault, or the model"
+        )
     elif not best:
         conclusion = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
     return Explained(from_s, end_s, tuple(sorted(sensors, key=lambda one: -one.explained)), conclusion, best)

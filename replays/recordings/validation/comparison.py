@@ -169,7 +169,16 @@ def _explained(again: _DoneAgain, *, from_s: float, end_s: float, step: Callable
     if again.tuned is None:
         return attribute(again.quick, again.parts, again.nominal, rules, from_s=from_s, step=step)
     # Numbers of the model hang together with what was fitted: `rig identify` fits all.
-    return explain_log(again.parts, again.nominal, again.others, again.tuned, from_s=from_s, end_s=end_s, rules=rules)
+    return explain_log(
+        again.parts,
+        again.nominal,
+        again.others,
+        again.tuned,
+        from_s=from_s,
+        end_s=end_s,
+        rules=rules,
+        faults=again.faults,
+    )
 
 
 def calibration(recording: Recording, experiment: Experiment) -> list[str]:

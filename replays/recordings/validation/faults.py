@@ -119,10 +119,7 @@ def sensor_faults(
             found.append(pair)
             seen |= {a.name, b.name}
     found += [_one_sensor(one, told) for name, one in off.items() if name not in seen]
-    together = _together(found)
-    # Where all that moves is late by the same, it is the time.
-    late = {f"{', '.join(one.name for one in shown if one.moves)} delay"}
-    return [one for one in together if one.name not in late or len(together) > 1]
+    return _together(found, [one.name for one in shown if one.moves])
 
 
 @dataclass(frozen=True)
@@ -243,8 +240,11 @@ def _delayed(one: _Shown) -> tuple[float, np.ndarray, np.ndarray]:
     return late_s, spline(at), slope(at)
 
 
-def _together(found: list[Explanation]) -> list[Explanation]:
-    """Channels that are off by the same, told as one."""
+def _together(found: list[Explanation], moving: list[str]) -> list[Explanation]:
+    """Channels that are off by the same, told as one.
+
+    Where most of those that move are late, it is the others that are early; where all are, it is the time.
+    """
     kinds = [one.name.partition(" ")[2] for one in found]
     groups: list[list[Explanation]] = []
     for one, kind in zip(found, kinds, strict=True):
@@ -262,8 +262,15 @@ def _together(found: list[Explanation]) -> list[Explanation]:
         if more:
             kind, n = first.name.partition(" ")[2], sum(one.n for one in group)
             squares = sum(one.squares for one in group)
+            names = [one.name.partition(" ")[0] for one in group]
+            others = [name for name in moving if name not in names]
+            if kind == "delay" and len(others) < len(names):
+                if not others:
+                    continue
+                names, late_s = others, -first.value
+                first = replace(first, value=late_s, change=f"{late_s * 1e6:+.4g} \u00b5s")
             first = replace(
-                first, name=f"{', '.join(one.name.partition(' ')[0] for one in group)} {kind}",
+                first, name=f"{', '.join(names)} {kind}",
                 explained=sum(one.explained for one in group), squares=squares, n=n, left=math.sqrt(squares / n),
             )  # fmt: skip
         told.append(first)
@@ -277,7 +284,7 @@ def _smoothing_words(factors: np.ndarray) -> str:
 def _gain_words(gain: float) -> tuple[str, str]:
     if abs(gain + 1.0) < 0.1:
         return "polarity", "turned round"
-    if abs(gain) < 0.02:
+    if abs(gain) < 0.05:
         return "signal", "missing"
     known = next((text for factor, text in _UNITS.items() if abs(gain / factor - 1.0) < 0.02), "")
     return "gain", f"{100.0 * (gain - 1.0):+.3g} %" + (f" ({known})" if known else "")

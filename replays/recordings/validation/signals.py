@@ -13,8 +13,10 @@ _HELD = 8
 """So many equal numbers in a row are none that noise makes ..."""
 _RARE = 0.02
 """... where neighbours are equal this seldom elsewhere."""
-_RAIL, _AT_RAIL = 3, 6
+_RAIL, _AT_RAIL = 2, 4
 """Rows in a row at the largest or smallest number, and in all, that make a rail of it."""
+_UNEVEN, _UNEVEN_S = 8.0, 5e-5
+"""A turn is off by so many deviations of turns, and by as much [s]."""
 _ANOTHER = 0.2
 """Part by which pulses are more or fewer than turns."""
 _LOUD = 3.0
@@ -88,6 +90,12 @@ def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[Si
             begin, end = float(edges_s[at[0]]), float(edges_s[at[-1] + 1])
             text = f"pulses {what} in {len(at)} of {len(steps)} turns, the first at {begin:.3f} s"
             found.append(SignalFault("keyphasor", "pulses", begin, end, text))
+    even = np.abs(turns - 1.0) < 0.3
+    off_s = np.where(even, steps - np.median(steps), 0.0)
+    for at in np.flatnonzero(np.abs(off_s) > max(_UNEVEN * 1.5 * float(np.median(np.abs(off_s))), _UNEVEN_S)):
+        text = f"the turn that ends at {edges_s[at + 1]:.4f} s is {1e3 * off_s[at]:+.4g} ms long beside the others: "
+        text += "samples are missing in it, or double" if off_s[at] < 0.0 else "its time jumps"
+        found.append(SignalFault("time", "rows", float(edges_s[at]), float(edges_s[at + 1]), text))
     return found
 
 
