@@ -214,10 +214,11 @@ def _show(found: Identification, name: str, console: Console) -> None:
     for finding in found.judgement.findings:
         table.add_row(*cells(finding), style="" if finding.standing == "identified" else "yellow")
     console.print(table)
-    keys = found.question.keys
+    asked = [place for place, unknown in enumerate(found.question.unknowns) if not unknown.along]
+    keys = [found.question.keys[place] for place in asked]
     if len(keys) > 1:
         table = new_table("correlation", "", *(f">{key}" for key in keys))
-        for key, row in zip(keys, found.judgement.correlation, strict=True):
+        for key, row in zip(keys, found.judgement.correlation[asked][:, asked], strict=True):
             table.add_row(key, *("-" if value != value else f"{value:+.4f}" for value in row))
         console.print()
         console.print(table)

@@ -58,9 +58,10 @@ def cells(finding: Finding) -> tuple[str, ...]:
 def window_line(found: Identification) -> str:
     """Which samples were used, and why no more."""
     names = found.question.observation.names
+    grown = f", grown in {len(found.stages)} stages" if found.stages else ""
     return (
         f"window {found.from_s:.4f} to {found.window.end_s:.4f} s, {found.window.rows} rows of {len(names)} channels"
-        f"{_thinned(found)}, grown in {len(found.stages)} stages; it ends there: {found.why}"
+        f"{_thinned(found)}{grown}; it ends there: {found.why}"
     )
 
 
