@@ -184,7 +184,85 @@ def test_contact_parameters_come_out_of_a_log_from_the_middle_of_a_run(tmp_path:
         assert abs(finding.value - truth) < finding.half_width < 0.02 * truth
 
 
-@pytest.mark.skipif("RIG_FAULTY_LOGS" not in os.environ, reason="RIG_FAULTY_LOGS=1: a quarter of an hour")
+def damping_factor(restitution: float) -> float:
+    """c (1 + e) = ln[(1 + c) / (1 - c e)]: what returns the restitution that is asked for."""
+    from scipy.optimize import brentq
+
+    e = restitution
+    found = brentq(lambda c: c * (1.0 + e) - math.log((1.0 + c) / (1.0 - c * e)), 1e-6, 1.0 / e - 1e-6)
+    return float(found)  # pyright: ignore[reportArgumentType]
+
+
+FIVE = (
+    "contact.friction", "contact.restitution", "magnet.stiffness", "shaft.unbalance_eccentricity",
+    "house.inner_beam_damping",
+)  # fmt: skip
+LONG = pytest.mark.skipif("RIG_COVERAGE_SEEDS" not in os.environ, reason="RIG_COVERAGE_SEEDS=40: ten minutes")
+
+
+@LONG
+@pytest.mark.timeout(0)
+def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
+    """Five unknowns of a log from the middle of a run; other speeds, pulses, clocks, angles and noises."""
+    seeds, rules = int(os.environ["RIG_COVERAGE_SEEDS"]), load_criteria().imported
+    held = np.zeros(len(FIVE), dtype=int)
+    for seed in range(seeds):
+        rng = np.random.default_rng(1000 + seed)
+        mu, e, stiffness, eccentricity, damping = truth = np.array([0.25, 0.9, 1.7, 0.1, 238.0]) * (
+            1.0 + np.array([0.1, 0.02, 0.03, 0.1, 0.1]) * rng.uniform(-1.0, 1.0, 5)
+        )
+        rig = second_rig.Rig(
+            mu=mu, c=damping_factor(e), K_mag=1e3 * stiffness, eps=1e-3 * eccentricity, D_bv=damping
+        )  # fmt: skip
+        motion = second_rig.run(
+            rig, turned=rng.uniform(0.0, 6.28), speed_hz=float(rng.choice([4.2, 5.2, 6.2])),
+            force_n=rng.uniform(80.0, 120.0), duration_ms=rng.uniform(4.5, 5.5), settled_s=1.5 + rng.uniform(0.0, 0.2),
+            after_s=0.1,
+        )  # fmt: skip
+        recording = whole(
+            tmp_path, motion, seed=seed, case=faulty_logs.Case("", "", ppm=rng.uniform(-80.0, 80.0))
+        )  # fmt: skip
+        found = identify_log(
+            recording, Experiment.of(recording), FIVE, variants=[one.set for one in rules.variants],
+            bandwidth=rules.bandwidth,
+        )  # fmt: skip
+        findings = found.judgement.findings[: len(FIVE)]
+        off = np.array([(one.value - t) / one.half_width for one, t in zip(findings, truth, strict=True)])
+        held += np.abs(off) < 1.0
+        print(seed, f"to {found.window.end_s:.3f} s:", " ".join(f"{one:+.2f}" for one in off), held, flush=True)
+    assert held.min() >= 0.85 * seeds
+    assert held.sum() >= 0.91 * 5 * seeds
+
+
+@LONG
+@pytest.mark.parametrize("number", ["e = 0.85", "e = 0.89", "k_ns = 1.42e8", "K_bv = 1.29e7", "M_ih = 1.75"])
+def test_a_wrong_model_gives_no_wrong_number(number: str, tmp_path: Path) -> None:
+    name, _, value = number.partition(" = ")
+    wrong = {"c": damping_factor(float(value))} if name == "e" else {name: float(value)}
+    motion = second_rig.run(second_rig.Rig(**wrong), turned=1.0, settled_s=1.5, after_s=0.1)
+    recording, rules = whole(tmp_path, motion, seed=3), load_criteria().imported
+    found = identify_log(
+        recording, Experiment.of(recording), ("contact.friction", "magnet.stiffness"),
+        variants=[one.set for one in rules.variants], bandwidth=rules.bandwidth,
+    )  # fmt: skip
+    for finding, truth in zip(found.judgement.findings, (0.25, 1.7), strict=False):
+        assert finding.standing != "identified" or abs(finding.value - truth) < finding.half_width
+
+
+MATRIX = pytest.mark.skipif("RIG_FAULTY_LOGS" not in os.environ, reason="RIG_FAULTY_LOGS=1: twenty minutes")
+
+
+@MATRIX
+@pytest.mark.parametrize("seed", range(20))
+def test_aligned_logs_are_good(seed: int, tmp_path: Path) -> None:
+    """Four speeds, hard and soft pulses: whirl, or impacts that die out; angles and noise of their own."""
+    speed_hz, force_n = (3.2, 4.2, 5.2, 6.2)[seed % 4], (100.0, 60.0)[seed // 4 % 2]
+    aligned = second_rig.run(speed_hz=speed_hz, force_n=force_n, turned=0.9 * seed, settled_s=1.5)
+    found = validate(whole(tmp_path, aligned, seed=200 + seed))
+    assert found.good, [one.line for one in found.failures]
+
+
+@MATRIX
 @pytest.mark.parametrize("case", faulty_logs.CASES, ids=lambda case: case.name)
 def test_every_fault_has_its_name(case: faulty_logs.Case, motion: second_rig.Motion, tmp_path: Path) -> None:
     found = validate(whole(tmp_path, motion, seed=100 + faulty_logs.CASES.index(case), case=case))
