@@ -89,6 +89,7 @@ class Asked:
         given: dict[str, Any] = {"start": starts, "bounds": bounds, "channels": names_of(self.channels) or None}
         if is_imported(recording) and not exact:
             if first_command_s(experiment) > 0.0:
+                search.left_out(from_s=self.from_s)
                 rules = load_criteria().imported
                 found = identify_log(
                     recording, experiment, keys, **given, priors=priors, to_s=self.to_s, bandwidth=rules.bandwidth,
@@ -125,6 +126,22 @@ class Search:
     whole: Annotated[
         bool, typer.Option("--whole", help="Go on as far as the model stays linear, even if it no longer fits.")
     ] = False
+
+    def left_out(self, *, from_s: float | None) -> None:
+        """Refuse what a search in a log of another system does not have.
+
+        Raises:
+            InputError: The first such option.
+        """
+        from rig.errors import InputError
+
+        given = {"--from": from_s, **{f"--{name}": value for name, value in asdict(self).items()}}
+        usual = {"--from": None, **{f"--{name}": value for name, value in asdict(Search()).items()}}
+        for option, value in given.items():
+            if value != usual[option]:
+                raise InputError(
+                    option, "left out for a log of another system: it is fitted from its hammer pulse on", value
+                )
 
 
 def identify(

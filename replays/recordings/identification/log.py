@@ -21,7 +21,6 @@ from replays.recordings.identification.nuisance import NUISANCES, looks_from, nu
 from replays.recordings.identification.question import Observation, Question, ask, first_command_s
 from replays.recordings.identification.window import Window
 from replays.recordings.prediction import Measured
-from replays.recordings.sensitivity import ANGLE, with_values
 
 _LONG_S, _SHORT_S = 0.1, 0.004
 """Length of the stretches that are left out, before the hammer pulse and from it on [s]."""
@@ -67,11 +66,9 @@ def identify_log(
     )  # fmt: skip
     along = nuisances_of(tuned.begun, NUISANCES, besides=keys)
     held = {key: known for key, known in along.items() if known is not None} | dict(priors or {})
-    # An angle goes on from what the experiment has.
-    begun, found = with_values(tuned.begun, {ANGLE: tuned.values[ANGLE]}), tuned.values | {ANGLE: 0.0}
     question = ask(
-        recording, begun, (*keys, *along), start=found, bounds=bounds, priors=held, along=along, channels=channels,
-        window=(looks_from(begun), tuned.end_s),
+        recording, tuned.begun, (*keys, *along), start=tuned.values, bounds=bounds, priors=held, along=along,
+        channels=channels, window=(looks_from(tuned.begun), tuned.end_s),
     )  # fmt: skip
     progress("what filters with other corners would show")
     other = {name: part.filtered(bandwidth) for name, part in question.observation.parts.items()}
@@ -110,11 +107,13 @@ def _jackknife(question: Question, slopes: np.ndarray, residuals: np.ndarray) ->
     halves = []
     for groups in (np.broadcast_to(np.arange(residuals.shape[1]), residuals.shape),
                    np.broadcast_to(stretches[:, None], residuals.shape)):  # fmt: skip
-        without = np.array([_step(question, slopes, residuals, groups != one) for one in np.unique(groups)])
-        n = len(without)
+        parts = np.unique(groups)
+        if (n := len(parts)) < 2:
+            continue
+        without = np.array([_step(question, slopes, residuals, groups != one) for one in parts])
         deviation = np.sqrt((n - 1) / n * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
         halves.append(float(t.ppf(0.975, n - 1)) * deviation)
-    return np.maximum(*halves)
+    return np.max(halves, axis=0)
 
 
 def _of(question: Question, parts: dict[str, Measured] | None = None) -> Window:

@@ -177,7 +177,8 @@ def ask(
     rules = {key: experiment.scene.load_parameters().rule(key) for key in keys if key in load_parameters().entries}
     centres = {key: mean for key, (mean, _) in (priors or {}).items()} | dict(start or {})
     values = {key: centres.get(key, value_of(experiment, key)) for key in keys}
-    begun = with_values(experiment, values)
+    # An angle is one on what the experiment has.
+    begun = with_values(experiment, {key: value for key, value in values.items() if key != ANGLE})
     unknowns = []
     for key in keys:
         low, high = (bounds or {}).get(key) or _accepted(key)
