@@ -78,7 +78,8 @@ def identify_log(
     progress(f"fitted: {len(question.keys)} values, to {tuned.end_s:.4f} s; their intervals")
     slopes, residuals, known = window.slopes_by_keys(z), window.residuals(z), window.known
     scale = np.array([unknown.scale for unknown in question.unknowns])
-    moves = 1.96 * np.array([tuned.moved[key] for key in question.keys]) / scale
+    places = [list(tuned.values).index(key) for key in question.keys]
+    moves = 1.96 * np.sqrt(np.mean(tuned.moves[:, places] ** 2, axis=0)) / scale
     moved = np.hypot(_jackknife(question, slopes, residuals), moves)
     other_filters = -apart / _louder_by(apart)
     shown = [residuals + other_filters]

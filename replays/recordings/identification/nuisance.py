@@ -118,7 +118,8 @@ class Tuned:
         fitted: What was fitted.
         values: The same, by key.
         covariance: Of them, shape (values, values).
-        moved: How far the last growths of the window moved each (root of the mean square), by key.
+        moves: What the last growths of the window moved them by, shape (growths, values): they stand for the deviation
+            that what the model lacks makes.
         about_s: Where the clocks differ by the offset alone [s].
         end_s: End of the samples that it rests on [s].
         scales: RMS of what is left of each channel over its noise, at least 1.
@@ -129,7 +130,7 @@ class Tuned:
     fitted: tuple[Fitted, ...]
     values: dict[str, float]
     covariance: np.ndarray
-    moved: dict[str, float]
+    moves: np.ndarray
     about_s: float
     end_s: float
     scales: dict[str, float]
@@ -142,11 +143,17 @@ class Tuned:
         """The same numbers with another model."""
         return replace(self, begun=self.begun.changed(changes))
 
-    def drawn(self, generator: np.random.Generator) -> Tuned:
-        """The same with values as far off as the fit leaves open, drawn from what it says."""
+    def drawn(self, generator: np.random.Generator, *, moving: bool = False) -> Tuned:
+        """The same with values as far off as the fit leaves open, drawn from what it says.
+
+        Args:
+            generator: Of what is drawn.
+            moving: And as far as what the model lacks still moves them.
+        """
         size = np.sqrt(np.diag(self.covariance))  # of which some are a million times as large as others
         sizes, directions = np.linalg.eigh(self.covariance / np.outer(size, size))
         off = size * (directions @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(len(size))))
+        off += generator.standard_normal(len(self.moves)) @ self.moves * moving
         return replace(self, values={key: value + d for (key, value), d in zip(self.values.items(), off, strict=True)})
 
     def predict(self, parts: dict[str, Measured]) -> Prediction:
@@ -294,7 +301,7 @@ def tune(
         looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
         found = max(found, _best(begun, looser, whole, progress), key=_Grown.worth)
     values, covariance = found.values, found.covariance
-    half = 1.96 * np.hypot(np.sqrt(np.diag(covariance)), found.moved)
+    half = 1.96 * np.sqrt(np.diag(covariance) + np.mean(found.moves**2, axis=0))
     told = dict(zip(wanted, values.tolist(), strict=True))
     return Tuned(
         begun=begun,
@@ -305,7 +312,7 @@ def tune(
         ),
         values=told,
         covariance=covariance,
-        moved=dict(zip(wanted, found.moved.tolist(), strict=True)),
+        moves=found.moves,
         about_s=min(float(part.times_s[0]) for part in whole.values()),
         end_s=found.end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), found.scales, strict=True)),
@@ -319,15 +326,14 @@ class _Grown:
     Attributes:
         values: Shape (keys,).
         covariance: Of them.
-        moved: Root of the mean square of how far the last growths of the window moved them, shape (keys,): it stands
-            for the standard deviation of what the model lacks.
+        moves: What the last growths of the window moved them by, shape (growths, keys).
         end_s: End of the window [s].
         scales: What is left of each channel over its noise.
     """
 
     values: np.ndarray
     covariance: np.ndarray
-    moved: np.ndarray
+    moves: np.ndarray
     end_s: float
     scales: list[float]
 
@@ -395,10 +401,10 @@ def _grown(
             break  # the model no longer explains it: that is to be judged, and not to be fitted away
         scales = now
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))
-        moves.append(np.abs(found - values))
+        moves.append(found - values)
         covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
         end_s = first_s + length
-    return _Grown(values, covariance, np.sqrt(np.mean(np.square(moves[-_LAST:]), axis=0)), end_s, scales)
+    return _Grown(values, covariance, np.array(moves[-_LAST:]), end_s, scales)
 
 
 def looks_from(experiment: Experiment) -> float:

@@ -136,7 +136,7 @@ def _log_done_again(
     others += [tuned.predict({name: part.filtered(rules.bandwidth) for name, part in parts.items()})]
     gains = {name: v + rules.calibration * (v - v.mean(axis=0)) for name, v in nominal.values.items()}
     others += [replace(nominal, values=gains)]
-    drawn = [models[n % len(models)].drawn(generator) for n in range(criteria.ensemble.members)]
+    drawn = [models[n % len(models)].drawn(generator, moving=True) for n in range(criteria.ensemble.members)]
     faults = signal_faults(measured(recording, tuned.begun.scene))
     until_s = first_command_s(tuned.begun) or math.inf
     faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
