@@ -24,6 +24,8 @@ from replays.recordings.validation.trajectory import floors
 
 _TURNED_OFF = 0.02
 """By so much may two probes' signals differ from ones that are turned."""
+_FEW = 16
+"""Rows that tell no delay."""
 _LATEST_S = 2e-3
 """How late a channel is looked for [s]."""
 _ALIKE = 0.05
@@ -169,22 +171,20 @@ def _turned(a: _Shown, b: _Shown, told: _Telling) -> Explanation | None:
 
 def _one_sensor(one: _Shown, told: _Telling) -> Explanation:
     """The simplest change of a channel that leaves noise, else the one that leaves least."""
-    before, ones, e = one.apart, np.ones(len(one.values)), one.foretold
-    if excess(before[_steady(one)]) > 0.5 * excess(before):
-        held = "stuck" if _steady(one).any() else ""
-        if held:
-            kept = ~_steady(one)
-            return told(f"{one.name} {held}", _for_how_long(one.times_s[~kept]), 0.0, before[kept], before)
+    before, ones, e, held = one.apart, np.ones(len(one.values)), one.foretold, _steady(one)
+    if held.any() and excess(before[held]) > 0.5 * excess(before):
+        return told(f"{one.name} stuck", _for_how_long(one.times_s[held]), 0.0, before[~held], before)
     (shift,), left = one.left([ones], one.values - e)
     options = [(told(f"{one.name} offset", f"{shift:+.4g} {one.unit}", float(shift), left, before, one.unit), 1)]
     if one.moves:
-        late_s, delayed, slope = _delayed(one)
         for columns, numbers in (([e], 1), ([e, ones], 2)):
             factors, left = one.left(columns)
             what, change = _gain_words(float(factors[0]))
             more = f", {factors[1]:+.4g} {one.unit}" if numbers == 2 and what == "gain" else ""
             name = f"{one.name} {what}{' and offset' if more else ''}"
             options.append((told(name, change + more, float(factors[0]) - 1.0, left, before), numbers))
+    if one.moves and len(e) > _FEW and (np.diff(one.times_s) > 0.0).all():
+        late_s, delayed, slope = _delayed(one)
         (shift,), left = one.left([ones], one.values - delayed)
         name, change = f"{one.name} delay", f"{late_s * 1e6:+.4g} µs"
         options.append((told(name, change, late_s, (one.values - delayed) / one.floor, before, "s"), 1))
@@ -217,7 +217,7 @@ def _steady(one: _Shown) -> np.ndarray:
 
 
 def _for_how_long(times_s: np.ndarray) -> str:
-    return f"from {times_s[0]:.4f} s, {len(times_s)} rows" if len(times_s) else ""
+    return f"from {times_s[0]:.4f} s, {len(times_s)} rows"
 
 
 def _delayed(one: _Shown) -> tuple[float, np.ndarray, np.ndarray]:
