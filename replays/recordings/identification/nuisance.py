@@ -143,17 +143,17 @@ class Tuned:
         """The same numbers with another model."""
         return replace(self, begun=self.begun.changed(changes))
 
-    def drawn(self, generator: np.random.Generator, *, moving: bool = False) -> Tuned:
-        """The same with values as far off as the fit leaves open, drawn from what it says.
+    def before(self) -> Tuned:
+        """The same as the fit was before its window last grew: on that it was as right."""
+        moved = zip(self.values.items(), self.moves[-1].tolist(), strict=True)
+        return replace(self, values={key: value - by for (key, value), by in moved})
 
-        Args:
-            generator: Of what is drawn.
-            moving: And as far as what the model lacks still moves them.
-        """
+    def drawn(self, generator: np.random.Generator) -> Tuned:
+        """The same with values as far off as the fit leaves open, and as what the model lacks still moves them."""
         size = np.sqrt(np.diag(self.covariance))  # of which some are a million times as large as others
         sizes, directions = np.linalg.eigh(self.covariance / np.outer(size, size))
         off = size * (directions @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(len(size))))
-        off += generator.standard_normal(len(self.moves)) @ self.moves * moving
+        off += generator.standard_normal(len(self.moves)) @ self.moves
         return replace(self, values={key: value + d for (key, value), d in zip(self.values.items(), off, strict=True)})
 
     def predict(self, parts: dict[str, Measured]) -> Prediction:

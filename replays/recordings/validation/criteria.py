@@ -14,6 +14,9 @@ from rig.parameters import load_parameters
 
 DEFAULT = Path(__file__).with_name("default.toml")
 
+_LASTING = 2.0
+"""Times what noise may drift by: what a fit leaves is none, and its mean over a stretch does not shrink."""
+
 Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0.0)]
 Reason = Annotated[str, Field(min_length=1)]
@@ -126,6 +129,8 @@ class Imported(_Section):
     """Corner of a real anti-alias filter over the one that is told."""
     calibration: NotNegative
     """By this part of what it shows a channel may be off: calibrations are no better."""
+    statistics: NotNegative
+    """By this part of it a quantity of a phase may be off beside its spread."""
     variants: tuple[Variant, ...]
 
 
@@ -168,11 +173,15 @@ class Criteria(_Section):
     attribution: Attribution
     imported: Imported
 
-    def loosened(self, part: float) -> Criteria:
-        """For channels whose noise is known only to a part of it."""
-        wider = tuple(c.model_copy(update={"rms": c.rms * (1.0 + part), "peak": c.peak * (1.0 + part),
-                                           "drift": c.drift * (1.0 + part)}) for c in self.trajectory)  # fmt: skip
-        return self.model_copy(update={"trajectory": wider})
+    def loosened(self, part: float, statistics: float) -> Criteria:
+        """For channels whose noise is known only to a part of it, and quantities that models as right leave open."""
+        wide = 1.0 + part
+        wider = tuple(
+            c.model_copy(update={"rms": c.rms * wide, "peak": c.peak * wide, "drift": c.drift * wide * _LASTING})
+            for c in self.trajectory
+        )
+        more = tuple(c.model_copy(update={"relative": c.relative + statistics}) for c in self.statistics)
+        return self.model_copy(update={"trajectory": wider, "statistics": more})
 
     def trajectory_of(self, channel: str) -> TrajectoryCriterion | None:
         """The criterion of a channel."""
