@@ -122,11 +122,11 @@ def approach(
         for part in _PARTS:
             moved = np.clip(values + part * step, low, high)
             ahead = _look(predictor, moved)
-            if ahead is not None and ahead.cost((moved - means) / deviations, heard) < cost:
+            gained = 0.0 if ahead is None else cost - ahead.cost((moved - means) / deviations, heard)
+            if ahead is not None and gained > 0.0:
                 break
         else:
             break
-        gained = cost - ahead.cost((moved - means) / deviations, heard)
         values, here = moved, Here(ahead.apart, here.slopes)
         if gained < _SAME:
             break

@@ -18,7 +18,7 @@ from replays.recordings.experiment import Experiment
 from replays.recordings.identification.fit import Identification
 from replays.recordings.identification.judgement import Judgement, judge
 from replays.recordings.identification.nuisance import NUISANCES, looks_from, nuisances_of, tune
-from replays.recordings.identification.question import Observation, Question, ask, first_command_s
+from replays.recordings.identification.question import Question, ask, first_command_s
 from replays.recordings.identification.window import Window
 from replays.recordings.prediction import Measured
 
@@ -73,7 +73,9 @@ def identify_log(
     progress("what filters with other corners would show")
     other = {name: part.filtered(bandwidth) for name, part in question.observation.parts.items()}
     apart = _of(question, other).predicted(z := np.zeros(len(question.keys))) - _of(question).predicted(z)
-    question = replace(question, observation=_louder(question.observation, np.sqrt(np.nanmean(apart**2, axis=0))))
+    louder = np.hypot(1.0, np.sqrt(np.nanmean(apart**2, axis=0)))
+    observation = question.observation
+    question = replace(question, observation=replace(observation, noise=observation.noise * louder))
     window = _of(question)
     progress(f"fitted: {len(question.keys)} values, to {tuned.end_s:.4f} s; their intervals")
     slopes, residuals, known = window.slopes_by_keys(z), window.residuals(z), window.known
@@ -81,8 +83,7 @@ def identify_log(
     places = [list(tuned.values).index(key) for key in question.keys]
     moves = 1.96 * np.sqrt(np.mean(tuned.moves[:, places] ** 2, axis=0)) / scale
     moved = np.hypot(_jackknife(question, slopes, residuals), moves)
-    other_filters = -apart / _louder_by(apart)
-    shown = [residuals + other_filters]
+    shown = [residuals - apart / louder]
     for changes in variants:
         shown.append(_of(replace(question, experiment=question.experiment.changed(dict(changes)))).residuals(z))
     here = _step(question, slopes, residuals)
@@ -122,15 +123,6 @@ def _of(question: Question, parts: dict[str, Measured] | None = None) -> Window:
     if parts is not None:
         question = replace(question, observation=replace(question.observation, parts=parts))
     return Window(question, float(question.observation.times_s[-1]) + 1e-6)
-
-
-def _louder_by(apart: np.ndarray) -> np.ndarray:
-    """By what each channel's floor is larger than its noise, with what it may be off by, shape (channels,)."""
-    return np.hypot(1.0, np.sqrt(np.nanmean(apart**2, axis=0)))
-
-
-def _louder(observation: Observation, by: np.ndarray) -> Observation:
-    return replace(observation, noise=observation.noise * np.hypot(1.0, by))
 
 
 def _step(question: Question, slopes: np.ndarray, residuals: np.ndarray, kept: np.ndarray | None = None) -> np.ndarray:

@@ -41,7 +41,7 @@ NUISANCES = (
     "ring.offset_x",
     "ring.offset_y",
 )
-"""In place of the time of the first pulse stand clock and angle: a simulation has pulses only at its own rows."""
+"""In place of the time of the first pulse stand clock and angle: a simulation has pulses only at its own ticks."""
 _PULSE = "hammer.1.at_s"
 _DEVIATIONS = {"clock.rate_ppm": 50.0, "clock.offset_s": 1e-4, "ring.offset_x": 0.1, "ring.offset_y": 0.1}
 """What is known before, as standard deviations: of a crystal [ppm]; of a trigger that is found in samples behind a

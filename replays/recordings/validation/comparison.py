@@ -105,16 +105,15 @@ class _DoneAgain:
 def _done_again(
     recording: Recording, experiment: Experiment, criteria: Criteria, step: Callable[[str], None]
 ) -> _DoneAgain:
-    rules = criteria.window
-    parts = measured(recording, experiment.scene, longest_s=rules.longest_s)
-    how_far = "perturbed, to see how far it can be predicted"
     if is_imported(recording):
         return _log_done_again(recording, experiment, criteria, step)
+    rules = criteria.window
+    parts = measured(recording, experiment.scene, longest_s=rules.longest_s)
     bits = Bits(recording, experiment.simulation().table)
     step("re-simulated, payload by payload")
     nominal = predict(experiment, parts, follow=bits.follow)
     quick = bare(experiment)
-    step(how_far)
+    step("perturbed, to see how far it can be predicted")
     moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
     return _DoneAgain(quick, criteria, parts, nominal, (moved,), bits.finish(), None)
 
@@ -125,8 +124,9 @@ def _log_done_again(
     """A log of another system: what it does not tell is fitted, and what it cannot know counts as floor."""
     rules = criteria.imported
     tuned = tune(recording, experiment, rules.nuisances, progress=lambda text: step(f"log: {text}"))
-    parts = measured(recording, tuned.begun.scene, longest_s=criteria.window.longest_s)
-    parts = {name: part.from_(looks_from(tuned.begun)) for name, part in parts.items()}
+    whole, longest_s = measured(recording, tuned.begun.scene), criteria.window.longest_s
+    begin_s = looks_from(tuned.begun)
+    parts = {name: part.until(float(part.times_s[0]) + longest_s).from_(begin_s) for name, part in whole.items()}
     nominal = tuned.predict(parts)
     step("perturbed, and by models that are as right, to see how far it can be predicted")
     generator = np.random.default_rng(0)  # the same in every validation
@@ -137,7 +137,7 @@ def _log_done_again(
     gains = {name: v + rules.calibration * (v - v.mean(axis=0)) for name, v in nominal.values.items()}
     others += [replace(nominal, values=gains)]
     drawn = [models[n % len(models)].drawn(generator) for n in range(criteria.ensemble.members)]
-    faults = signal_faults(measured(recording, tuned.begun.scene))
+    faults = signal_faults(whole)
     until_s = first_command_s(tuned.begun) or math.inf
     faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
     return _DoneAgain(
