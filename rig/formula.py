@@ -37,6 +37,8 @@ FUNCTIONS: dict[str, tuple[int, Callable[..., Any]]] = {
 a horizontal and a vertical signal."""
 PLACES = {"shaft_x": "disk_x", "shaft_y": "disk_y"}
 """The shaft at a distance from the pivot [m]: it is rigid, so `shaft_x(arm)` is the disk's by the ratio of the arms."""
+_FARTHEST = 2.0
+"""No place is farther from the pivot than so many times the disk."""
 _OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
@@ -166,6 +168,9 @@ class Formulas:
             return lambda rows: act(*(each(rows) for each in of))
         if name in PLACES:
             column, arm = COLUMN[PLACES[name]], self._parameters["shaft.arm_disk"]
+            place = float(np.ravel(of[0](np.zeros((1, len(COLUMN)))))[0])
+            if not abs(place) <= _FARTHEST * arm:  # so are millimetres told from metres
+                raise InputError(field, f"{name} of a distance from the pivot within {_FARTHEST * arm:.3g} m", place)
             return lambda rows: of[0](rows) / arm * rows[:, column]
         degrees, values = self._curves[name]
         return lambda rows: np.interp(np.degrees(of[0](rows)), degrees, values, period=360.0)

@@ -182,6 +182,7 @@ WRONG = {
     "unknown in a formula": (channel('signal = "2 * disk_z"'), "such as disk_y"),
     "unknown parameter": (channel('signal = "shaft.arm * P_N"'), "such as shaft.arm_ring, shaft.arm_disk"),
     "law as a number": (channel('signal = "contact.exponent * P_N"'), "made of the parameters that are numbers"),
+    "millimetres": (channel('signal = "shaft_x(349)"'), "shaft_x of a distance from the pivot within 0.628 m"),
     "unknown function": (channel('signal = "sine(theta)"'), "made of the functions, such as sin"),
     "too many arguments": (channel('signal = "sin(theta, 1)"'), "sin of 1 argument; instead received 2"),
     "no formula": (channel('signal = "P_N +"'), "or a formula of them; instead received 'P_N +'"),
