@@ -71,6 +71,11 @@ class Channel(BaseModel):
         return self
 
     @property
+    def has_range(self) -> bool:
+        """Whether its range is one; of an imported channel of which none is told, it is the ends of its counts."""
+        return not self.kind.startswith("imported") or self.range_v != (-self.adc_v, self.adc_v)
+
+    @property
     def lsb_v(self) -> float:
         """Converter step [V]."""
         return 2.0 * self.adc_v / 2**self.adc_bits

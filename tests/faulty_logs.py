@@ -47,7 +47,11 @@ class Case:
 
     def named_by(self, found: Validation) -> bool:
         """Whether a validation calls it by its name."""
-        said = [one.line for one in found.faults] + ([found.explained.conclusion] if found.explained else [])
+        said = (
+            [one.line for one in found.faults]
+            + found.beyond
+            + ([found.explained.conclusion] if found.explained else [])
+        )
         return not found.good and any(re.search(self.told, one) for one in said)
 
 

@@ -6,7 +6,7 @@ Channels are the recording's own, with its calibration, filters and noise, on it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -26,6 +26,8 @@ from rig.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
 
 _FINE_BITS = 32
 """Bits of a predicted channel's converter: its steps are none of the recording's."""
+_BEYOND = 1024.0
+"""So much more than an imported log shows of a channel may be predicted: its unit, or gain, may be wrong."""
 _QUIET = 2.0
 """Below so many steps of noise a channel's rounding is not random: its floor is a bound, not a deviation."""
 _CHUNK_S = 0.1
@@ -99,6 +101,18 @@ class Measured:
         """The same where the recording's clock is late by a shift [s], and gains at a rate [1] from a time on [s]."""
         return replace(self, times_s=self.times_s - shift_s - rate * (self.times_s - about_s))
 
+    def earlier(self, late_s: Mapping[str, float]) -> Measured:
+        """The same with some channels as if they were not late [s]."""
+        from scipy.interpolate import CubicSpline
+
+        columns = [c for c, name in enumerate(self.names) if name in late_s]
+        if not columns:
+            return self
+        values = self.values.copy()
+        for c in columns:
+            values[:, c] = CubicSpline(self.times_s, values[:, c])(self.times_s + late_s[self.names[c]])
+        return replace(self, values=values)
+
     def only(self, names: Sequence[str]) -> Measured:
         """Some of the channels."""
         kept = [c for c, name in enumerate(self.names) if name in names]
@@ -109,8 +123,16 @@ class Measured:
 
     @cached_property
     def fine(self) -> tuple[Channel, ...]:
-        """The channels with a converter that hardly rounds."""
-        return tuple(channel.model_copy(update={"adc_bits": _FINE_BITS}) for channel in self.channels)
+        """The channels with a converter that hardly rounds, and where no range is known, without one."""
+        return tuple(
+            channel.model_copy(update={"adc_bits": _FINE_BITS} | ({} if channel.has_range else _wide(channel)))
+            for channel in self.channels
+        )
+
+
+def _wide(channel: Channel) -> dict[str, Any]:
+    reach_v = _BEYOND * channel.adc_v
+    return {"adc_v": reach_v, "range_v": (-reach_v, reach_v)}
 
 
 def measured(recording: Recording, scene: Scene, *, longest_s: float = math.inf) -> dict[str, Measured]:

@@ -203,9 +203,7 @@ def _channels_table(recording: Recording, health: dict[str, Any] | None) -> Tabl
             continue
         for channel in group.channels:
             ends = sorted((volts - channel.bias_v) / channel.sensitivity_v for volts in channel.range_v)
-            # Of an imported channel, the ends of its counts are no range.
-            known = not channel.kind.startswith("imported") or channel.range_v != (-channel.adc_v, channel.adc_v)
-            reach = f"{ends[0]:.4g} to {ends[1]:.4g}" if known else "not known"
+            reach = f"{ends[0]:.4g} to {ends[1]:.4g}" if channel.has_range else "not known"
             seen = found.get(shown(channel.name), {})
             numbers = [_number(seen.get(name), seen.get("noise") or channel.scale) for name in ("mean", "low", "high")]
             noise = ("" if seen.get(name) is None else f"{seen[name]:.2g}" for name in ("noise", "noise_calibrated"))

@@ -86,8 +86,8 @@ def _show(found: Validation, console: Console) -> None:
     for fault in found.faults:
         console.print(shown(f"signal: {fault.line}"))
     console.print(found.bits_line)
-    for line in found.fitted:
-        console.print(line)
+    for one in found.fitted:
+        console.print(one.line)
     if found.calibration:
         console.print(f"calibration: {found.calibration_line}")
     if found.bit_exact and not found.declared:

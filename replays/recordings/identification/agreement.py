@@ -110,7 +110,7 @@ def approach(
     """
     means, deviations = known
     low, high = means - BEYOND * deviations, means + BEYOND * deviations
-    here = _look(predictor, values)
+    here = look(predictor, values)
     assert here is not None
     for _ in range(_ROUNDS):
         slopes = predictor.derivatives(values).slopes
@@ -121,7 +121,7 @@ def approach(
         cost = here.cost((values - means) / deviations, heard)
         for part in _PARTS:
             moved = np.clip(values + part * step, low, high)
-            ahead = _look(predictor, moved)
+            ahead = look(predictor, moved)
             gained = 0.0 if ahead is None else cost - ahead.cost((moved - means) / deviations, heard)
             if ahead is not None and gained > 0.0:
                 break
@@ -133,7 +133,7 @@ def approach(
     return values, here
 
 
-def _look(predictor: Predictor, values: np.ndarray) -> Here | None:
+def look(predictor: Predictor, values: np.ndarray) -> Here | None:
     """The channels at some values; None where the model does not take them."""
     try:
         found = predictor.predict(values).values

@@ -21,6 +21,7 @@ from replays.recordings.identification.agreement import (
     by_agreement,
     centred,
     channels_of,
+    look,
     rms,
     signals_of,
 )
@@ -65,6 +66,8 @@ _WINDOWS_S = (4e-3, 8e-3, 13e-3, 20e-3, 30e-3)
 """How far behind the begin of the hammer pulse the fits look [s]."""
 _LAST = 2
 """Growths of the window by which it is told how far values are moved by what the model lacks."""
+_LATE_S = 5e-3
+"""So far from where the log has it the pulse is looked for where nothing goes together [s]."""
 _WORSE = 1.2
 """A longer window is given up where it leaves more by this factor in a third of the channels; ..."""
 _BROKEN = 10.0
@@ -138,6 +141,11 @@ class Tuned:
     def on_time(self, parts: dict[str, Measured]) -> dict[str, Measured]:
         """Channels of the log on the model's clock."""
         return on_the_models_clock(parts, self.values, about_s=self.about_s)
+
+    def better_than(self, other: Tuned) -> bool:
+        """Whether it goes on for longer, or as long with less left."""
+        left, its = (sum(math.log(scale) for scale in one.scales.values()) for one in (self, other))
+        return (self.end_s, -left) > (other.end_s, -its)
 
     def changed(self, changes: dict[str, Any]) -> Tuned:
         """The same numbers with another model."""
@@ -269,6 +277,7 @@ def tune(
     known: Mapping[str, tuple[float, float]] | None = None,
     channels: Sequence[str] | None = None,
     to_s: float | None = None,
+    late_s: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Tuned:
     """Fit what a log does not tell exactly, and nothing else, on windows that grow from the pulse.
@@ -283,6 +292,7 @@ def tune(
         known: What is known of some of them: means and standard deviations.
         channels: By which channels; None for all.
         to_s: Samples are used up to here [s].
+        late_s: By how much some channels are taken to be late [s].
         progress: Told what is being done.
 
     Raises:
@@ -294,8 +304,13 @@ def tune(
     first_s = first_command_s(begun)
     end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
     whole = observe(recording, begun, channels=channels, window=(looks_from(begun), end_s)).parts
+    whole = {name: part.earlier(late_s or {}) for name, part in whole.items()}
     whole = {name: _thinned(part, first_s - _BEFORE_S) for name, part in whole.items()}
     found = _best(begun, wanted, whole, progress)
+    if max(found.scales) > _BROKEN and (early := _with_earlier_pulse(begun, whole)) is not None:
+        other = _grown(early, wanted, whole, progress, trusting=True, without=("hammer",))
+        if other.worth() > found.worth():
+            begun, found = early, other
     far = [key for key, value in zip(wanted, found.values, strict=True) if _is_beyond(float(value), wanted[key])]
     if far:
         looser = wanted | {key: (told[0], _LOOSER * told[1]) for key in far if (told := wanted[key]) is not None}
@@ -362,6 +377,22 @@ def _best(
     return found
 
 
+def _with_earlier_pulse(begun: Experiment, whole: dict[str, Measured]) -> Experiment | None:
+    """With the pulse when most channels say that it came, where that is not when the hammer says."""
+    if not (first_s := first_command_s(begun)) or begun.begin is None:
+        return None
+    # Not what is long before: that tells nothing of it.
+    parts = {name: part.until(first_s + _WINDOWS_S[0]).from_(first_s - _LATE_S) for name, part in whole.items()}
+    predictor, at_s = Predictor(begun, (_PULSE,), parts), value_of(begun, _PULSE)
+
+    def left(late_s: float) -> float:
+        here = look(predictor, np.array([at_s + late_s]))
+        return math.inf if here is None else sum(math.log(max(1.0, rms(z))) for z in here.apart)
+
+    late_s = min(np.linspace(-_LATE_S, _LATE_S, 41).tolist(), key=left)
+    return with_values(begun, {_PULSE: at_s + late_s}) if left(late_s) < left(0.0) else None
+
+
 def _grown(
     begun: Experiment,
     wanted: dict[str, tuple[float, float] | None],
@@ -397,7 +428,8 @@ def _grown(
             # What is plainly wrong has no say at all: the little that it keeps moves what no other channel tells.
             found, here = approach(predictor, found, known, trusting=True, heard=heard)
         now = [max(1.0, rms(z)) for z in here.apart]
-        if scales and 3 * sum(_WORSE * a < b < _BROKEN * a for a, b in zip(scales, now, strict=True)) > len(now):
+        worse = [b / a for a, b in zip(scales, now, strict=False) if b > _WORSE * a]
+        if 2 * len(worse) > len(now) or 3 * sum(times < _BROKEN for times in worse) > len(now):
             break  # the model no longer explains it: that is to be judged, and not to be fitted away
         scales = now
         square = sum(one.T @ one / scale**2 for one, scale in zip(here.slopes, scales, strict=True))

@@ -18,6 +18,7 @@ from replays.recordings.prediction import Measured, Prediction, bare, measured, 
 from replays.recordings.validation.attribution import Explained, attribute, explain_log
 from replays.recordings.validation.bits import Bits, StreamBits
 from replays.recordings.validation.criteria import Criteria, load_criteria
+from replays.recordings.validation.faults import late_together
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.statistics import perturbed, statistics
@@ -64,7 +65,7 @@ def validate(
         truth=tuple(truth), phases=tuple(phases), statistics=tuple(judged),
         calibration=tuple(calibration(recording, experiment)),
         skipped=sum(stream.lost for stream in recording.streams.values()),
-        explained=None, fitted=tuple(one.line for one in again.tuned.fitted) if again.tuned is not None else (),
+        explained=None, fitted=again.tuned.fitted if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
         doubts=(*recording.doubts, *parameter_doubts(recording)), faults=again.faults,
     )  # fmt: skip
@@ -72,7 +73,19 @@ def validate(
     if validation.good or validation.doubts or not firsts:
         return validation
     step("what explains the difference")
-    return replace(validation, explained=_explained(again, from_s=min(firsts), end_s=end, step=step))
+    if again.tuned is None:
+        explained = attribute(
+            again.quick, again.parts, again.nominal, again.criteria.attribution, from_s=min(firsts), step=step
+        )
+        return replace(validation, explained=explained)
+    explained = _log_explained(again, from_s=min(firsts), end_s=end)
+    late_s = late_together(explained.ranked, again.parts)
+    if late_s:
+        step("the same with channels of a kind late together")
+        other = _log_done_again(recording, experiment, criteria, step, late_s=late_s)
+        if other.tuned is not None and other.tuned.better_than(again.tuned):
+            explained = _log_explained(other, from_s=min(firsts), end_s=min(end, other.tuned.end_s))
+    return replace(validation, explained=explained)
 
 
 @dataclass(frozen=True)
@@ -119,11 +132,15 @@ def _done_again(
 
 
 def _log_done_again(
-    recording: Recording, experiment: Experiment, criteria: Criteria, step: Callable[[str], None]
+    recording: Recording,
+    experiment: Experiment,
+    criteria: Criteria,
+    step: Callable[[str], None],
+    late_s: dict[str, float] | None = None,
 ) -> _DoneAgain:
     """A log of another system: what it does not tell is fitted, and what it cannot know counts as floor."""
     rules = criteria.imported
-    tuned = tune(recording, experiment, rules.nuisances, progress=lambda text: step(f"log: {text}"))
+    tuned = tune(recording, experiment, rules.nuisances, late_s=late_s, progress=lambda text: step(f"log: {text}"))
     whole, longest_s = measured(recording, tuned.begun.scene), criteria.window.longest_s
     begin_s = looks_from(tuned.begun)
     parts = {name: part.until(float(part.times_s[0]) + longest_s).from_(begin_s) for name, part in whole.items()}
@@ -165,21 +182,13 @@ def _window(again: _DoneAgain) -> tuple[float, float, str]:
     return begin, parted, f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
 
 
-def _explained(again: _DoneAgain, *, from_s: float, end_s: float, step: Callable[[str], None]) -> Explained:
-    rules = again.criteria.attribution
-    if again.tuned is None:
-        return attribute(again.quick, again.parts, again.nominal, rules, from_s=from_s, step=step)
+def _log_explained(again: _DoneAgain, *, from_s: float, end_s: float) -> Explained:
     # Numbers of the model hang together with what was fitted: `rig identify` fits all.
+    assert again.tuned is not None
     return explain_log(
-        again.parts,
-        again.nominal,
-        again.others,
-        again.tuned,
-        from_s=from_s,
-        end_s=end_s,
-        rules=rules,
+        again.parts, again.nominal, again.others, again.tuned, again.criteria.attribution, from_s=from_s, end_s=end_s,
         faults=again.faults,
-    )
+    )  # fmt: skip
 
 
 def calibration(recording: Recording, experiment: Experiment) -> list[str]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,14 +24,17 @@ from replays.recordings.validation.explanation import (
 from replays.recordings.validation.signals import steady_rows
 from replays.recordings.validation.trajectory import floors
 
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
 _TURNED_OFF = 0.02
 """By so much may two probes' signals differ from ones that are turned."""
 _FEW = 16
 """Rows that tell no delay."""
-_LATEST_S = 2e-3
+_LATEST_S = 4e-3
 """How late a channel is looked for [s]."""
-_ALIKE = 0.05
-"""Changes that differ by less than this part of them are the same one."""
+_ALIKE = 0.2
+"""Changes that differ by less than this part of them may be the same one."""
 _SLIGHT = 0.01
 """A second change of a channel that takes away no more than this part of the first is none."""
 _NEARLY = 0.05
@@ -67,10 +72,22 @@ class _Shown:
     floor: np.ndarray
     noise: float
 
+    @cached_property
+    def foretold_at(self) -> CubicSpline:
+        """What it should show at other times."""
+        from scipy.interpolate import CubicSpline
+
+        return CubicSpline(self.times_s, self.foretold)
+
     @property
     def apart(self) -> np.ndarray:
         """Residuals over the floor, shape (n,)."""
         return (self.values - self.foretold) / self.floor
+
+    @property
+    def price(self) -> float:
+        """What another number must take away: more than noise makes, and than what is wrong elsewhere brings along."""
+        return max(DECIDES, _SLIGHT * excess(self.apart))
 
     @property
     def moves(self) -> bool:
@@ -120,8 +137,22 @@ def sensor_faults(
         if pair is not None:
             found.append(pair)
             seen |= {a.name, b.name}
-    found += [_one_sensor(one, told) for name, one in off.items() if name not in seen]
-    return _together(found, [one.name for one in shown if one.moves])
+    alone = [_one_sensor(one, told) for name, one in off.items() if name not in seen]
+    return found + _together(alone, told, [one.name for one in shown if one.moves])
+
+
+def late_together(found: Sequence[Explanation], parts: Mapping[str, Measured]) -> dict[str, float]:
+    """Delay of each of those channels that may be late together [s], as half of their kind was found to be.
+
+    What the fit before took for motion hides it in the others.
+    """
+    units = {channel.name: channel.unit for part in parts.values() for channel in part.channels}
+    for one in found:
+        names = one.name.removesuffix(" delay").split(", ")
+        kind = [name for name, unit in units.items() if unit == units.get(names[0])]
+        if one.name.endswith(" delay") and len(kind) / 2.0 <= len(names) < len(kind) > 2:
+            return dict.fromkeys(kind, one.value)
+    return {}
 
 
 @dataclass(frozen=True)
@@ -169,45 +200,80 @@ def _turned(a: _Shown, b: _Shown, told: _Telling) -> Explanation | None:
     return told(f"{a.name} and {b.name} angle", f"{math.degrees(angle):+.3g} degrees", angle, left, before, "rad")
 
 
-def _one_sensor(one: _Shown, told: _Telling) -> Explanation:
+@dataclass(frozen=True)
+class _Alone:
+    """What one channel has, by itself.
+
+    Attributes:
+        shown: The channel.
+        told: What it has.
+        cost: Sum of squares that it leaves, and what its numbers cost.
+        numbers: Its gain less 1 and its delay [s], where it has one.
+    """
+
+    shown: _Shown
+    told: Explanation
+    cost: float
+    numbers: dict[str, float]
+
+    def by(self, kind: str, value: float) -> tuple[float, np.ndarray]:
+        """Cost of nothing but a gain or a delay that others pay for, with an offset or without, and what it leaves."""
+        one = self.shown
+        shown = (1.0 + value) * one.foretold if kind == "gain" else one.foretold_at(one.times_s - value)
+        _, left = one.left([np.ones(len(shown))], one.values - shown)
+        alone = (one.values - shown) / one.floor
+        costs = [(float(alone @ alone), alone), (float(left @ left) + one.price, left)]
+        return min(costs, key=lambda pair: pair[0])
+
+
+def _one_sensor(one: _Shown, told: _Telling) -> _Alone:
     """The simplest change of a channel that leaves noise, else the one that leaves least."""
     before, ones, e, held = one.apart, np.ones(len(one.values)), one.foretold, _steady(one)
+
+    def option(
+        name: str, change: str, value: float, left: np.ndarray, count: int = 1, unit: str = "", **numbers: float | None
+    ) -> _Alone:
+        found = told(f"{one.name} {name}", change, value, left, before, unit)
+        return _Alone(
+            one, found, found.squares + one.price * count, {k: v for k, v in numbers.items() if v is not None}
+        )
+
     if held.any() and excess(before[held]) > 0.5 * excess(before):
-        return told(f"{one.name} stuck", _for_how_long(one.times_s[held]), 0.0, before[~held], before)
+        return option("stuck", _for_how_long(one.times_s[held]), 0.0, before[~held])
     (shift,), left = one.left([ones], one.values - e)
-    options = [(told(f"{one.name} offset", f"{shift:+.4g} {one.unit}", float(shift), left, before, one.unit), 1)]
+    options = [option("offset", f"{shift:+.4g} {one.unit}", float(shift), left, unit=one.unit)]
     if one.moves:
-        for columns, numbers in (([e], 1), ([e, ones], 2)):
+        for columns, more in (([e], False), ([e, ones], True)):
             factors, left = one.left(columns)
-            what, change = _gain_words(float(factors[0]))
-            more = f", {factors[1]:+.4g} {one.unit}" if numbers == 2 and what == "gain" else ""
-            name = f"{one.name} {what}{' and offset' if more else ''}"
-            options.append((told(name, change + more, float(factors[0]) - 1.0, left, before), numbers))
+            what, change = _gain_words(gain := float(factors[0]))
+            if more and what == "gain":
+                what, change = "gain and offset", f"{change}, {factors[1]:+.4g} {one.unit}"
+            options.append(
+                option(what, change, off := gain - 1.0, left, 1 + more, gain=off if "gain" in what else None)
+            )
     if one.moves and len(e) > _FEW and (np.diff(one.times_s) > 0.0).all():
         late_s, delayed, slope = _delayed(one)
         (shift,), left = one.left([ones], one.values - delayed)
-        name, change = f"{one.name} delay", f"{late_s * 1e6:+.4g} µs"
-        options.append((told(name, change, late_s, (one.values - delayed) / one.floor, before, "s"), 1))
+        change = f"{late_s * 1e6:+.4g} µs"
+        options.append(option("delay", change, late_s, (one.values - delayed) / one.floor, unit="s", delay=late_s))
         if abs(shift) > one.noise:
-            options.append((told(f"{name} and offset", f"{change}, {shift:+.4g} {one.unit}", late_s, left, before), 2))
+            both = f"{change}, {shift:+.4g} {one.unit}"
+            options.append(option("delay and offset", both, late_s, left, 2, "s", delay=late_s))
         factors, left = one.left([delayed, ones])
-        what, also = _gain_words(float(factors[0]))
-        options.append(
-            (told(f"{one.name} {what} and delay", f"{also}, {change}", float(factors[0]) - 1.0, left, before), 3)
-        )
+        what, also = _gain_words(gain := float(factors[0]))
+        options.append(option(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 3, delay=late_s))
         factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - e)
-        options.append((told(f"{one.name} bandwidth", _smoothing_words(factors), float(factors[1]), left, before), 2))
-    # Another number must earn its place: by more than noise, and by more than what is wrong elsewhere brings along.
-    price = max(DECIDES, _SLIGHT * excess(before))
-    best = min(options, key=lambda pair: pair[0].squares + price * pair[1])[0]
-    if best.at_floor or best.left < _NEARLY * min(1.0, math.sqrt(float(before @ before) / len(before))) + 1.0:
+        lower = "lower" if factors[1] > 0.0 else "higher"
+        options.append(option("bandwidth", f"{lower} than told", float(factors[1]), left, 2))
+    best = min(options, key=lambda one: one.cost)
+    if best.told.at_floor or best.told.left < _NEARLY * min(1.0, math.sqrt(float(before @ before) / len(before))) + 1.0:
         return best
     rest = one.left([ones], one.values - e)[1]
     white = abs(float(rest[1:] @ rest[:-1]) / float(rest @ rest)) < 0.1
     tied = one.moves and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
     if white and not tied:
         ratio = float(rest.std())
-        return told(f"{one.name} noise", f"x {ratio:.2f}", ratio, rest / ratio, before)
+        return option("noise", f"x {ratio:.2f}", ratio, rest / ratio)
     return best
 
 
@@ -222,15 +288,13 @@ def _for_how_long(times_s: np.ndarray) -> str:
 
 def _delayed(one: _Shown) -> tuple[float, np.ndarray, np.ndarray]:
     """By how much a channel is late [s], what it should show then, and the slope of that [its unit/s]."""
-    from scipy.interpolate import CubicSpline
-
-    spline = CubicSpline(one.times_s, one.foretold)
+    spline = one.foretold_at
     slope, period_s = spline.derivative(), float(np.diff(one.times_s).min())
 
     def cost(late_s: float) -> float:
         return float(np.sum(one.left([spline(one.times_s - late_s), np.ones(len(one.values))])[1] ** 2))
 
-    rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), np.linspace(-_LATEST_S, _LATEST_S, 41) / period_s])))
+    rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), np.linspace(-_LATEST_S, _LATEST_S, 81) / period_s])))
     late_s = float(min(rows * period_s, key=cost))
     for _ in range(6):
         at = one.times_s - late_s
@@ -240,53 +304,45 @@ def _delayed(one: _Shown) -> tuple[float, np.ndarray, np.ndarray]:
     return late_s, spline(at), slope(at)
 
 
-def _together(found: list[Explanation], moving: list[str]) -> list[Explanation]:
-    """Channels that are off by the same, told as one.
+def _together(alone: list[_Alone], told: _Telling, moving: list[str]) -> list[Explanation]:
+    """Channels that are off by the same, told as one: where one number for all costs less than one for each.
 
     Where most of those that move are late, it is the others that are early; where all are, it is the time.
     """
-    kinds = [one.name.partition(" ")[2] for one in found]
-    groups: list[list[Explanation]] = []
-    for one, kind in zip(found, kinds, strict=True):
-        for group in groups:
-            if kind in ("gain", "delay") and group[0].name.endswith(f" {kind}"):
-                apart = abs(one.value - group[0].value)
-                if apart < _ALIKE * max(abs(one.value), abs(group[0].value)):
-                    group.append(one)
-                    break
-        else:
-            groups.append([one])
-    told = []
-    for group in groups:
-        first, *more = group
-        if more:
-            kind, n = first.name.partition(" ")[2], sum(one.n for one in group)
-            squares = sum(one.squares for one in group)
-            names = [one.name.partition(" ")[0] for one in group]
+    found = []
+    for kind in ("gain", "delay"):
+        of = {one.shown.name: one.numbers[kind] for one in alone if kind in one.numbers}
+        while of:
+            near = [
+                [name for name, other in of.items() if abs(other - value) < _ALIKE * max(abs(other), abs(value))]
+                for value in of.values()
+            ]
+            names = max(near, key=len)
+            value = float(np.median([of[name] for name in names]))
+            of = {name: value for name, value in of.items() if name not in names}
+            group = [one for one in alone if one.shown.name in names and one.by(kind, value)[0] < one.cost]
+            if len(group) < 2:
+                continue
+            alone = [one for one in alone if one not in group]
+            left = np.concatenate([one.by(kind, value)[1] for one in group])
+            change = _gain_words(1.0 + value)[1] if kind == "gain" else f"{value * 1e6:+.4g} µs"
+            names, unit = [one.shown.name for one in group], "s" if kind == "delay" else ""
             others = [name for name in moving if name not in names]
             if kind == "delay" and len(others) < len(names):
                 if not others:
                     continue
-                names, late_s = others, -first.value
-                first = replace(first, value=late_s, change=f"{late_s * 1e6:+.4g} \u00b5s")
-            first = replace(
-                first, name=f"{', '.join(names)} {kind}",
-                explained=sum(one.explained for one in group), squares=squares, n=n, left=math.sqrt(squares / n),
-            )  # fmt: skip
-        told.append(first)
-    return told
-
-
-def _smoothing_words(factors: np.ndarray) -> str:
-    return f"{'lower' if factors[1] > 0.0 else 'higher'} than told"
+                names, value, change = others, -value, f"{-value * 1e6:+.4g} µs"
+            before = np.concatenate([one.shown.apart for one in group])
+            found.append(told(f"{', '.join(names)} {kind}", change, value, left, before, unit))
+    return found + [one.told for one in alone]
 
 
 def _gain_words(gain: float) -> tuple[str, str]:
+    known = next((text for factor, text in _UNITS.items() if abs(gain / factor - 1.0) < 0.02), "")
     if abs(gain + 1.0) < 0.1:
         return "polarity", "turned round"
-    if abs(gain) < 0.05:
+    if abs(gain) < 0.05 and not known:
         return "signal", "missing"
-    known = next((text for factor, text in _UNITS.items() if abs(gain / factor - 1.0) < 0.02), "")
     return "gain", f"{100.0 * (gain - 1.0):+.3g} %" + (f" ({known})" if known else "")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from replays.recordings.identification.nuisance import Fitted
 from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.validation.attribution import Explained
 from replays.recordings.validation.bits import StreamBits
@@ -141,7 +142,7 @@ class Validation:
     calibration: tuple[str, ...]
     skipped: int
     explained: Explained | None
-    fitted: tuple[str, ...] = ()
+    fitted: tuple[Fitted, ...] = ()
     parts: dict[str, Measured] = field(repr=False, default_factory=dict)
     nominal: Prediction | None = field(repr=False, default=None)
     files: int = 1
@@ -151,7 +152,14 @@ class Validation:
     @property
     def good(self) -> bool:
         """Bit-exact, or within every criterion, and all of it is there."""
-        return not (self.doubts or self.faults) and ((self.bit_exact and not self.declared) or not self.failures)
+        return not (self.doubts or self.faults or self.beyond) and (
+            (self.bit_exact and not self.declared) or not self.failures
+        )
+
+    @property
+    def beyond(self) -> list[str]:
+        """What was fitted and is beyond what is known of it, in words: a finding, though everything goes together."""
+        return [one.line for one in self.fitted if one.beyond]
 
     @property
     def failures(self) -> list[Failure]:
@@ -219,6 +227,8 @@ class Validation:
             return f"NOT GOOD, the recording does not fit together: {self.doubts[0]}{more}"
         if self.faults and not self.failures:
             return f"NOT GOOD, a signal shows a fault: {'; '.join(one.line for one in self.faults)}"
+        if self.beyond and not self.failures:
+            return f"NOT GOOD, beyond what is known of it: {'; '.join(self.beyond)}"
         channels = [one.channel for one in self.residuals if one.good is False]
         tables = [one.table for one in self.truth if not one.good]
         phases = [one.phase for one in self.statistics if one.good is False]
@@ -245,7 +255,7 @@ class Validation:
                 "rows_lost": self.skipped,
                 "doubts": list(self.doubts),
                 "faults": [one._asdict() for one in self.faults],
-                "fitted": list(self.fitted),
+                "fitted": [one.line for one in self.fitted],
                 "calibration": list(self.calibration),
                 "window": {"from_s": self.window_s[0], "to_s": self.window_s[1], "reason": self.window_reason},
                 "trajectory": [asdict(one) for one in self.residuals],

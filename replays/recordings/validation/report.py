@@ -162,7 +162,7 @@ def _about(found: Validation) -> list[Row]:
         Row(("rows lost", str(found.skipped))),
     ]
     rows += [Row(("changed", f"{key} = {value}")) for key, value in found.changes.items()]
-    rows += [Row(("fitted first", line)) for line in found.fitted]
+    rows += [Row(("fitted first", one.line)) for one in found.fitted]
     if found.calibration:
         rows.append(Row(("calibration", found.calibration_line.removesuffix("; the report says how"))))
     return rows

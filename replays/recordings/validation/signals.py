@@ -110,7 +110,7 @@ def _held(name: str, unit: str, times_s: np.ndarray, values: np.ndarray) -> list
     for side, level in (("largest", values.max()), ("smallest", values.min())):
         at = steady_rows(np.where(values == level, level, np.arange(len(values)) + level + 1.0), _RAIL)
         runs = _runs(at)
-        if at.sum() >= _AT_RAIL and len(runs) > 1:
+        if at.sum() >= _AT_RAIL and (len(runs) > 1 or at.sum() < _HELD):
             rails |= at
             text = f"{at.sum()} rows at its {side}, {level:.6g} {unit}, the first at {times_s[runs[0][0]]:.4f} s"
             found.append(SignalFault(name, "clipped", *_span(times_s, runs), text))
