@@ -7,7 +7,7 @@
 | impulse of the first contact          | between (1+e) v times the reduced mass and the whole one           |
 | whirl frequency                       | -Omega R_S / (r0 + delta), delta by Hertz at m r (w^2 - w_n^2)     |
 | force in the whirl, rigid ring        | m r (w^2 - w_n^2), what bends the path                             |
-| slowest whirl that friction speeds up | w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)], eq. 43 put right            |
+| slowest whirl that friction speeds up | w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)], eq. 43                      |
 | least friction that keeps up whirl    | the same, solved for mu; with the houses' loss in the full rig     |
 | what whirl costs the houses           | forced vibration of two masses on a line                           |
 | swing of the friction in rolling      | m w^2 |X - Y|/2 of the ring's ellipse                              |

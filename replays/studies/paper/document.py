@@ -246,6 +246,10 @@ def _whirl(findings: Findings) -> dict[str, Any]:
     constants, fastest = findings.constants, findings.least[-1]
     own = condition.oscillator(constants)
     modal = constants.shaft.transverse_inertia / constants.shaft.arm_magnet**2
+    magnet, friction = constants.magnet, constants.contact.friction
+    # Eq. 43 letter by letter.
+    literal = condition.Oscillator(constants.shaft.mass, math.sqrt(magnet.stiffness / constants.shaft.mass), math.nan)
+    eq_10 = magnet.damping_x, magnet.damping_y
     spin = 2.0 * math.pi * fastest.spin_hz
     force = condition.normal_force(own, *condition.rolling_circle(constants, spin))
     turned = condition.pulse_whirl(constants, force_n=100.0, duration_s=5e-3)
@@ -262,6 +266,9 @@ def _whirl(findings: Findings) -> dict[str, Any]:
             "mass": own.mass,
             "natural_hz": own.natural / (2 * math.pi),
             "ratio": own.ratio,
+            "literal_hz": [
+                condition.critical_whirl(literal._replace(ratio=d), friction) / (2 * math.pi) for d in eq_10
+            ],
         },
         "slowest": findings.slowest,
         "least": findings.least,
