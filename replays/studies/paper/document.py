@@ -22,7 +22,6 @@ from replays.studies.paper.chart import draw_conditions, draw_law, draw_verdicts
 from replays.studies.paper.claim import (
     BANDWIDTHS_HZ,
     LAWS,
-    MEASURED_N,
     SCALES,
     bars,
     draw_mobility,
@@ -32,6 +31,7 @@ from replays.studies.paper.claim import (
     toward_measured,
 )
 from replays.studies.paper.findings import JUDGED_BY, Findings
+from replays.studies.paper.pulse import MEASURED_N
 from replays.studies.paper.spread import assumed_values, column, free_values, percentiles, present, rank_correlation
 from replays.studies.paper.statement import number
 from replays.studies.paper.table import IDLE_N, TABLES, Content, idle_changes, summary
@@ -45,8 +45,10 @@ _PRINT = (
     (re.compile(r"(?<![\w.])([A-Za-zωζνµ])_([A-Za-z0-9]{1,3})(?![A-Za-z0-9_])"), r"\1_{\2}"),
     (re.compile(r"(?<=\d)e([+-])0*(\d+)"), lambda power: f"·10^{{{power[1].strip('+')}{power[2]}}}"),
     (re.compile(r"(?<![\w.)])-(?=\d)|(?<=\{)-"), "−"),
+    (re.compile(r"\^(\w)"), r"^{\1}"),
+    (re.compile(r"(?<=\d) count\b"), ""),
 )
-"""As in print: R_S with its letter lowered, but no parameter's name; powers of ten; minus signs."""
+"""As in print: R_S with its letter lowered, but no parameter's name; powers; minus signs; a count has no unit."""
 _CELLS = " | "
 """Between the cells of a table in the text."""
 
@@ -205,7 +207,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
         "corners_hz": [hz for hz, result in low_passes if result.reaction_x_n <= MEASURED_N],
         "whirling": len(whirling),
         "share": float(np.mean([result.reaction_x_n <= MEASURED_N for result in whirling])) if whirling else math.nan,
-        "first": {"key": free_values()[first].key, "rank": ranks[first]},
+        "first": {"called": free_values()[first].called, "rank": ranks[first]},
     }
 
 

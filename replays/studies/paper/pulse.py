@@ -28,6 +28,8 @@ HAMMER_MS = "hammer.duration"
 PULSE_AT = "hammer.at"
 """A name of this report alone [s]: when it comes; the shaft's turn at the pulse decides which bounces follow."""
 RATE_HZ = 10_000
+MEASURED_N = 500.0
+"""Last label of the axis of the measured forces, Fig. 15(c, d): the only number that the text has of them."""
 
 
 @dataclass(frozen=True)

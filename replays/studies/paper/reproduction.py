@@ -12,6 +12,7 @@ import numpy as np
 from replays.studies.paper.pulse import (
     BANDWIDTH,
     FORCE_N,
+    MEASURED_N,
     SPEED_HZ,
     Outcome,
     Pulse,
@@ -186,7 +187,8 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.nda
     return {
         "backward": np.array([float(one.whirls and one.whirl_hz < 0.0) for one in spread]),
         "roll": of("roll_s", 1e3),
-        "orbit_ring": of("ring_m", 1e3),
+        # Of the disk, but in the clearance: either reading.
+        "orbit_ring": np.concatenate([of("ring_m", 1e3), of("disk_m", 1e3)]),
         "orbit_disk": of("disk_m", 1e3),
         "spin_lowest": column(spread, "slowest_hz"),
         "whirl_hz": of("whirl_hz", -1.0),
@@ -196,6 +198,8 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.nda
         "peak_sensed": np.maximum(column(spread, "peak_x_n"), column(spread, "peak_y_n")),
         "steady": of("ripple_n", 100.0) / of("normal_n"),
         "east": of("reaction_x_n"),
+        "measured": of("reaction_x_n", 1.0 / MEASURED_N),
+        "bouncing": of("true_peak_x_n") / of("reaction_x_n"),
         "slowest_whirls": np.array([float(one.whirls) for one in slow]),
         "period_ratio": np.array([low.whirl_hz / high.whirl_hz for low, high in pairs]),
         "impulsive_ratio": np.array([high.slope_n_s / low.slope_n_s for low, high in pairs]),
