@@ -17,7 +17,7 @@ from replays.report import Mark, Row
 from replays.studies.paper import condition
 from replays.studies.paper.claim import ENDS, LAWS, Groups, Results, claim_groups, less_mobile, median
 from replays.studies.paper.condition import Slip, Start, Threshold
-from replays.studies.paper.pulse import HAMMER_MS, Outcome, Pulse, outcomes
+from replays.studies.paper.pulse import HAMMER_MS, Outcome, Pulse, outcomes, pulse_model
 from replays.studies.paper.question import question_groups
 from replays.studies.paper.reproduction import SPEEDS_HZ, Reproduction, drop_spread, pulse_spread, reproduce
 from replays.studies.paper.spread import column, hypercube, phases
@@ -113,6 +113,10 @@ def planned_groups(*, quick: bool) -> Groups:
             pulse = Pulse(label=f"{length_ms:g} ms, {name}", parameters=name, changes={HAMMER_MS: length_ms})
             groups[f"length {length_ms:g} {name}"] = phases(pulse, 2 if quick else 12)
         _, groups[f"spread {name}"] = hypercube(16 if quick else 192, parameters=name)
+        longer = 5.0 if quick else 20.0
+        groups[f"lasting {name}"] = [
+            replace(pulse, duration_s=longer) for pulse in groups[f"spread {name}"][: few // 4]
+        ]
         groups[f"slow {name}"] = [replace(pulse, speed_hz=SPEEDS_HZ[0]) for pulse in groups[f"spread {name}"][:few]]
     for name, changed in less_mobile().items():
         some = groups["spread corrected"][:few]
@@ -122,7 +126,7 @@ def planned_groups(*, quick: bool) -> Groups:
 
 def steps(*, quick: bool) -> int:
     """How many steps `find` tells of."""
-    each = len(SETS) * (len(SPEEDS_HZ) + 5)
+    each = len(SETS) * (len(SPEEDS_HZ) + 4)
     return each + sum(len(group) for group in planned_groups(quick=quick).values()) + len(_forces(quick=quick)) + 3
 
 
@@ -175,44 +179,55 @@ def find(*, quick: bool = False, processes: int = 2, progress: Callable[[str], N
     ours = {
         name: {key: np.array([value]) for key, value in one.numbers.items()}
         | drops[name]
-        | pulse_spread(results[f"spread {name}"], results[f"slow {name}"])
+        | pulse_spread(*(results[f"{group} {name}"] for group in ("spread", "slow", "lasting")))
         for name, one in found.items()
     }
     findings.lines = [Line(said, {name: ours[name][said.quantity] for name in SETS}) for said in statements()]
     numbers = claim_numbers(findings)
-    findings.claims = [Line(said, {"corrected": np.atleast_1d(numbers[said.quantity])}) for said in claims()]
+    findings.claims = [Line(said, {"corrected": numbers[said.quantity]}) for said in claims()]
     return findings
 
 
-def claim_numbers(findings: Findings) -> dict[str, float | np.ndarray]:
-    """What each claim asks for, where phases, assumed values or readings spread it as an array."""
-    results, constants = findings.results, findings.constants
+def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
+    """What each claim asks for, of all runs and readings that have it, each shape (n,)."""
+    results = findings.results
 
     def stiffer(houses: Iterable[str], *quantities: str) -> np.ndarray:
         """Numbers of less mobile houses over those of the same run with the corrected ones; all are readings."""
         found = []
         for each in (results[f"spread {name}"] for name in houses):
             found += [column(each, name) / column(findings.spread[: len(each)], name) for name in quantities]
-        values = np.concatenate(found)
-        return values[np.isfinite(values)]
+        return np.concatenate(found)
 
     def laws(name: str, *groups: str) -> np.ndarray:
         """Medians of other contact laws over the default one's."""
         return np.array([median(results[group], name) for group in groups]) / median(results["base corrected"], name)
 
     other = [f"law {law}" for law in LAWS[1:]]
-    own = condition.oscillator(constants)
-    whirl = 2.0 * math.pi * findings.found["corrected"].numbers["whirl_hz"]
-    r0 = constants.contact.clearance
-    restoring = own.mass * own.natural**2 * r0 + 2.0 * own.mass * own.ratio * own.natural * whirl * r0
-    return {
+    conditions: list[tuple[float, ...]] = []
+    for pulse, result in zip(
+        hypercube(len(findings.spread))[1], findings.spread[: len(results["slow corrected"])], strict=False
+    ):
+        conditions.append(_conditions(pulse_model(pulse, pulse.changes).constants, result.whirl_hz))
+    found = {
         "house_raises": 1.0 / stiffer(["rigid"], "reaction_x_n"),
         "house_ripple": 1.0 / stiffer(["rigid"], "ripple_n"),
         "stiff_bouncing": stiffer(less_mobile(), "contacts", "roll_s", "rebound_m_s"),
         "stiff_force": stiffer(less_mobile(), "peak_normal_n", "true_peak_x_n", "true_peak_y_n"),
         "law_whirl": laws("reaction_x_n", *other, *(f"{end} contact.stiffness" for end in ENDS)),
-        "law_peak": np.abs(laws("peak_normal_n", *other) - 1.0),
-        "centrifugal": constants.shaft.mass * r0 * whirl**2 / restoring,
-        "critical": whirl / condition.critical_whirl(own, constants.contact.friction),
-        "eigenfrequency": own.natural / whirl,
+        "law_peak": 100.0 * np.abs(laws("peak_normal_n", *other) - 1.0),
+        **dict(zip(("centrifugal", "critical", "eigenfrequency"), np.array(conditions).T, strict=True)),
     }
+    return {name: values[np.isfinite(values)] for name, values in found.items()}
+
+
+def _conditions(constants: Constants, whirl_hz: float) -> tuple[float, ...]:
+    """Both sides of eqs. 42 and 43, and eigenfrequency and whirl frequency, the one over the other."""
+    own, r0, whirl = condition.oscillator(constants), constants.contact.clearance, 2.0 * math.pi * abs(whirl_hz)
+    restoring = own.mass * own.natural * r0 * (own.natural + 2.0 * own.ratio * whirl)
+    friction = constants.contact.friction
+    return (
+        constants.shaft.mass * r0 * whirl**2 / restoring,
+        whirl / condition.critical_whirl(own, friction),
+        own.natural / whirl,
+    )
