@@ -204,11 +204,11 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
         return np.array([median(results[group], name) for group in groups]) / median(results["base corrected"], name)
 
     other = [f"law {law}" for law in LAWS[1:]]
-    conditions: list[tuple[float, ...]] = []
+    both_sides: list[tuple[float, ...]] = []
     for pulse, result in zip(
         hypercube(len(findings.spread))[1], findings.spread[: len(results["slow corrected"])], strict=False
     ):
-        conditions.append(_conditions(pulse_model(pulse, pulse.changes).constants, result.whirl_hz))
+        both_sides.append(conditions(pulse_model(pulse, pulse.changes).constants, result.whirl_hz))
     found = {
         "house_raises": 1.0 / stiffer(["rigid"], "reaction_x_n"),
         "house_ripple": 1.0 / stiffer(["rigid"], "ripple_n"),
@@ -216,12 +216,12 @@ def claim_numbers(findings: Findings) -> dict[str, np.ndarray]:
         "stiff_force": stiffer(less_mobile(), "peak_normal_n", "true_peak_x_n", "true_peak_y_n"),
         "law_whirl": laws("reaction_x_n", *other, *(f"{end} contact.stiffness" for end in ENDS)),
         "law_peak": 100.0 * np.abs(laws("peak_normal_n", *other) - 1.0),
-        **dict(zip(("centrifugal", "critical", "eigenfrequency"), np.array(conditions).T, strict=True)),
+        **dict(zip(("centrifugal", "critical", "eigenfrequency"), np.array(both_sides).T, strict=True)),
     }
     return {name: values[np.isfinite(values)] for name, values in found.items()}
 
 
-def _conditions(constants: Constants, whirl_hz: float) -> tuple[float, ...]:
+def conditions(constants: Constants, whirl_hz: float) -> tuple[float, ...]:
     """Both sides of eqs. 42 and 43, and eigenfrequency and whirl frequency, the one over the other."""
     own, r0, whirl = condition.oscillator(constants), constants.contact.clearance, 2.0 * math.pi * abs(whirl_hz)
     restoring = own.mass * own.natural * r0 * (own.natural + 2.0 * own.ratio * whirl)

@@ -193,7 +193,8 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome], lasting: list[Outco
         "peak_sensed": np.maximum(column(spread, "peak_x_n"), column(spread, "peak_y_n")),
         "steady": of("ripple_n", 100.0) / of("normal_n"),
         "east": of("reaction_x_n"),
-        "imbalance": of("imbalance", 100.0),
+        # A line at the spin takes a long window.
+        "imbalance": 100.0 * column([one for one in lasting if one.whirls], "imbalance"),
         "measured": of("reaction_x_n", 1.0 / MEASURED_N),
         "bouncing": of("true_peak_x_n") / of("reaction_x_n"),
         "lasts": np.array([float(one.whirls) for one in lasting]),
