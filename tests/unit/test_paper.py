@@ -303,11 +303,10 @@ def test_number():
 
 
 def test_symbols_powers_and_signs_are_set_as_in_print():
-    words = "R_S/r_0 of house.k_T with  ω_n² and l_0B², -1.5e-05 to 2e+07 N/m^n in eqs. 24-25, a-b, 6 to 12 count"
-    printed = (
-        "R_{S}/r_{0} of house.k_T with ω_{n}² and l_{0B}², −1.5·10^{−5} to 2·10^{7} N/m^{n} in eqs. 24-25, a-b, 6 to 12"
-    )
+    words = "R_S/r_0 of house.k_T with  ω_n² and l_0B², -1.5e-05 to 2e+07 N/m^n in eqs. 24-25, a-b"
+    printed = "R_{S}/r_{0} of house.k_T with ω_{n}² and l_{0B}², −1.5·10^{−5} to 2·10^{7} N/m^{n} in eqs. 24-25, a-b"
     assert in_print(words) == printed
+    assert [in_print(words) for words in ("6 to 12 count", "eqs. 24 and 25 count")] == ["6 to 12", "eqs. 24 and 25"]
 
 
 def test_terminal_tells_every_statement_and_the_rule(findings: Findings, capsys, monkeypatch):

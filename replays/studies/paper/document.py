@@ -46,7 +46,7 @@ _PRINT = (
     (re.compile(r"(?<=\d)e([+-])0*(\d+)"), lambda power: f"·10^{{{power[1].strip('+')}{power[2]}}}"),
     (re.compile(r"(?<![\w.)])-(?=\d)|(?<=\{)-"), "−"),
     (re.compile(r"\^(\w)"), r"^{\1}"),
-    (re.compile(r"(?<=\d) count\b"), ""),
+    (re.compile(r"(?<=\d) count$"), ""),
 )
 """As in print: R_S with its letter lowered, but no parameter's name; powers; minus signs; a count has no unit."""
 _CELLS = " | "

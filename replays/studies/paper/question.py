@@ -247,5 +247,5 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
         "ratio": _PRINTED_RATIO,
         "axes": (orbit, drop, probes, disk, measured, east),
         "simulated": together(orbit, drop, disk, east),
-        "with_measured": together(orbit, drop, disk, measured, east),
+        "at_probes": together(orbit, probes, disk, east),
     }
