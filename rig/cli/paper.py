@@ -96,4 +96,4 @@ def _show(findings: Findings, console: Console) -> None:
         says, _, *cells, verdict = row.cells
         table.add_row(says, *cells, Text(verdict, colours[row.mark]))
     console.print(table)
-    console.print(f"median (5–95 %) over phases, assumed values and readings; {JUDGED_BY}")
+    console.print(f"median (5–95 %), inside (of how many) over phases, assumed values and readings; {JUDGED_BY}")

@@ -7,7 +7,7 @@
 | impulse of the first contact          | between (1+e) v times the reduced mass and the whole one           |
 | whirl frequency                       | -Omega R_S / (r0 + delta), delta by Hertz at m r (w^2 - w_n^2)     |
 | force in the whirl, rigid ring        | m r (w^2 - w_n^2), what bends the path                             |
-| slowest whirl that friction speeds up | w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)], eq. 43 put right            |
+| slowest whirl that friction speeds up | w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)], eq. 43                      |
 | least friction that keeps up whirl    | the same, solved for mu; with the houses' loss in the full rig     |
 | what whirl costs the houses           | forced vibration of two masses on a line                           |
 | swing of the friction in rolling      | m w^2 |X - Y|/2 of the ring's ellipse                              |
@@ -27,7 +27,8 @@ import numpy as np
 import pytest
 
 from replays.studies.paper import condition
-from replays.studies.paper.pulse import Outcome, Pulse, outcome, pulse_scene
+from replays.studies.paper.findings import conditions
+from replays.studies.paper.pulse import Outcome, Pulse, outcome
 from replays.studies.paper.question import fall, weight_at_ring
 from replays.studies.paper.reproduction import drop_impact, drop_impulse
 from replays.studies.stability.motion import base_model, move, quiet_inputs, state
@@ -217,14 +218,19 @@ def test_free_decay_is_faster_than_the_ratio_that_damping_is_made_of():
 
 
 def test_unbalance_in_whirl_is_a_line_of_its_force():
-    run = simulate(pulse_scene(Pulse(changes={"drive.mode": "ideal", "model.stator": "rigid"}, duration_s=2.0)))
-    last = run.times_s > 1.0
-    times, spin = run.times_s[last], 2 * math.pi * 6.2
-    forces = run["P_E"][last] - run["P_W"][last] + 1j * (run["P_N"][last] - run["P_S"][last])
-    weighted = (forces - forces.mean()) * np.hanning(len(times))
-    whirl = -rolling(6.2)[0]
-    line, highest = (abs(np.sum(weighted * np.exp(-1j * w * times))) for w in (spin, whirl))
+    found = outcome(Pulse(changes={"drive.mode": "ideal", "model.stator": "rigid"}, duration_s=4.0))
+    spin, whirl = 2 * math.pi * 6.2, rolling(6.2)[0]
     unbalance = (
         P["shaft.mass"] * P["shaft.unbalance_eccentricity"] * spin**2 * P["shaft.arm_disk"] / P["shaft.arm_ring"]
     )
-    assert line / highest == pytest.approx(unbalance / (MASS * R0 * whirl**2), rel=0.02)
+    assert found.imbalance == pytest.approx(unbalance / (MASS * R0 * whirl**2), rel=0.01)
+
+
+def test_conditions_of_the_paper_are_those_of_the_closed_forms():
+    """Eqs. 42 and 43 with the shaft as a mass at the ring: M r0 w^2 over spring and damper, w over the slowest."""
+    whirl, natural = 2 * math.pi * 83.7, math.sqrt(STIFFNESS / MASS)
+    held_by = STIFFNESS * R0 + DAMPING * R0 * whirl
+    share = DAMPING / (2 * MASS * natural * P["contact.friction"])
+    slowest = natural * (share + math.sqrt(1 + share**2))
+    expected = (P["shaft.mass"] * R0 * whirl**2 / held_by, whirl / slowest, natural / whirl)
+    assert conditions(base_model(ModelLevels()).constants, -83.7) == pytest.approx(expected, rel=1e-12)

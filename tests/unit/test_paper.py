@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from replays.report.document import Heading, Paragraph, Picture, Report, Table
-from replays.studies.paper.claim import Bar, bars, claim_groups, correction_keys, toward_measured
+from replays.studies.paper.claim import CORRECTIONS, Bar, bars, claim_groups, correction_keys, toward_measured
 from replays.studies.paper.document import in_print, write_up
 from replays.studies.paper.figure import first_impacts
 from replays.studies.paper.findings import Findings, find, planned_groups, steps
@@ -154,13 +154,7 @@ def test_bandwidth_lowers_the_peak_and_not_the_contact():
 
 
 def test_corrections_are_where_the_sets_differ():
-    assert set(correction_keys()) == {
-        "contact.damping_factor",
-        "house.outer_mass",
-        "house.pair_stiffness_vertical",
-        "house.pair_stiffness_horizontal",
-        "house.gap_counts_outer",
-    }
+    assert set(correction_keys()) == set(CORRECTIONS)
 
 
 def test_tornado_is_widest_first_and_tells_what_reaches_the_measured():
@@ -168,9 +162,9 @@ def test_tornado_is_widest_first_and_tells_what_reaches_the_measured():
     results = {name: [blank] for name in claim_groups(ensemble=1)}
     results["low shaft.radius"] = [Outcome("backward whirl", reaction_x_n=350.0)]
     found = bars(results, "reaction_x_n")
-    assert found[0] == Bar("shaft.radius", "assumed value", (350.0, 540.0, 540.0))
+    assert found[0] == Bar("shaft radius", "assumed value", (350.0, 540.0, 540.0))
     assert toward_measured(found) == found[:1]
-    assert {entry.key for entry in free_values()} <= {bar.name for bar in found}
+    assert {entry.called for entry in free_values()} <= {bar.name for bar in found}
     assert {entry.key for entry, _, _ in one_at_a_time()} == {entry.key for entry in free_values()}
 
 
@@ -197,6 +191,11 @@ def test_quick_variant_has_a_number_on_every_line(findings: Findings, told: list
         assert verdict
     spread = {line.statement.quantity: len(line.values["corrected"]) for line in findings.lines}
     assert spread["peak_x"] == len(findings.spread), "all assumed values at once"
+    assert spread["orbit_ring"] == 2 * spread["orbit_disk"], "in the ring or at the disk"
+    claims_of = {line.statement.quantity: line.values["corrected"] for line in findings.claims}
+    few = len(findings.results["spread rigid"])
+    assert len(claims_of["stiff_force"]) == 3 * 3 * few > 9, "three houses and three readings of each sample"
+    assert len(claims_of["house_raises"]) == few
     assert spread["drop_amplified"] == 2 * spread["drop_reaction"] > 2, "two readings of each sample"
     assert all(len(findings.results[name]) == len(group) for name, group in planned_groups(quick=True).items())
 
@@ -304,9 +303,10 @@ def test_number():
 
 
 def test_symbols_powers_and_signs_are_set_as_in_print():
-    words = "R_S/r_0 of house.k_T with  ω_n² and l_0B², -1.5e-05 to 2e+07 in eqs. 24-25, a-b"
-    printed = "R_{S}/r_{0} of house.k_T with ω_{n}² and l_{0B}², −1.5·10^{−5} to 2·10^{7} in eqs. 24-25, a-b"
+    words = "R_S/r_0 of house.k_T with  ω_n² and l_0B², -1.5e-05 to 2e+07 N/m^n in eqs. 24-25, a-b"
+    printed = "R_{S}/r_{0} of house.k_T with ω_{n}² and l_{0B}², −1.5·10^{−5} to 2·10^{7} N/m^{n} in eqs. 24-25, a-b"
     assert in_print(words) == printed
+    assert [in_print(words) for words in ("6 to 12 count", "eqs. 24 and 25 count")] == ["6 to 12", "eqs. 24 and 25"]
 
 
 def test_terminal_tells_every_statement_and_the_rule(findings: Findings, capsys, monkeypatch):
@@ -340,7 +340,7 @@ def test_what_is_corrected_on_purpose_does_not_differ(findings: Findings):
     kept = load_parameters("corrected")
     for printed, row in zip(printed_values(), table.rows, strict=True):
         agrees = abs(kept[printed.key] / printed.value - 1.0) < 5e-3
-        assert (row.cells[-1], row.mark) == (("agrees", "good") if agrees else ("corrected", "open"))
+        assert (row.cells[-1], row.mark) == (("as printed", "plain") if agrees else ("corrected", "open"))
     assert {row.cells[0] for row in table.rows if row.mark == "open"} == {
         "M_{oh} (as-printed holds M_{ih} + M_{oh})", "K_{ft}, printed of one; both sets hold a pair's k_{T}"
     }  # fmt: skip

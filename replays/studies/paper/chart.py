@@ -38,7 +38,7 @@ def draw_conditions(
     slowest: list[Threshold], least: list[Threshold], starts: list[Start], constants: Constants
 ) -> Figure:
     """Thresholds in the plane of friction and whirl frequency, and what becomes of a pulse over friction."""
-    figure = new_figure(5.8, "Bartha's second condition (eq. 43), its sign put right")
+    figure = new_figure(5.8, "Bartha's second condition (eq. 43)")
     plane, scan = figure.subplots(1, 2)
     own = oscillator(constants)
     mu = np.geomspace(3e-3, 0.6, 200)

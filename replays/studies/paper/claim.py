@@ -9,19 +9,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.report.canvas import BLACK, BLUE, GREEN, ORANGE, RED, SKY, house_style, legend_below, new_figure
-from replays.studies.paper.pulse import BANDWIDTH, Outcome, Pulse
+from replays.studies.paper.pulse import BANDWIDTH, MEASURED_N, Outcome, Pulse
 from replays.studies.paper.spread import column, free_values, one_at_a_time, phases, rank_correlation
 from rig.parameters import load_parameters
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MEASURED_N = 500.0
-"""Where the axis of the measured forces ends, Fig. 15(c, d): the only number that the text has of them."""
 HOUSE_KEYS = (
     "house.inner_beam_stiffness", "house.outer_beam_stiffness", "house.pair_stiffness_vertical",
     "house.pair_stiffness_horizontal", "house.inner_beam_damping", "house.outer_beam_damping",
 )  # fmt: skip
+CORRECTIONS = {
+    "contact.damping_factor": "damping factor of eq. 44",
+    "house.outer_mass": "outer mass of eqs. 24, 25",
+    "house.pair_stiffness_vertical": "N/S pair of eqs. 23, 25",
+    "house.pair_stiffness_horizontal": "E/W pair of eq. 24",
+    "house.gap_counts_outer": "gap of eqs. 13, 14, 40",
+}
+"""What each parameter in which `corrected` differs from `as-printed` puts right."""
 SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
 """Factors on the stiffness and damping of the houses' supports: more is less mobile."""
 BANDWIDTHS_HZ = (50.0, 100.0, 200.0, 500.0, 1000.0, 4900.0)
@@ -54,8 +60,8 @@ def claim_groups(*, ensemble: int) -> Groups:
         changed = Pulse(label=key, parameters="as-printed", changes={key: corrected[key].value})
         groups[f"correction {key}"] = phases(changed, ensemble)
     for scale in SCALES:
-        changes = {key: float(corrected[key].value) * scale for key in HOUSE_KEYS}
-        groups[f"mobility {scale:g}"] = phases(replace(base, label=f"house x {scale:g}", changes=changes), ensemble)
+        changed = replace(base, label=f"house x {scale:g}", changes=supports(scale))
+        groups[f"mobility {scale:g}"] = phases(changed, ensemble)
     for name, changed in alternatives().items():
         groups[f"alternative {name}"] = phases(replace(changed, label=name), ensemble)
     for law in LAWS:
@@ -70,12 +76,23 @@ def claim_groups(*, ensemble: int) -> Groups:
     return groups
 
 
+def supports(scale: float) -> dict[str, Any]:
+    """Stiffness and damping of all supports of the houses, scaled."""
+    corrected = load_parameters("corrected").entries
+    return {key: float(corrected[key].value) * scale for key in HOUSE_KEYS}
+
+
+def less_mobile() -> dict[str, dict[str, Any]]:
+    """Houses that give way less, by name."""
+    return {"× 3": supports(3.0), "× 10": supports(10.0), "rigid": {"model.stator": "rigid"}}
+
+
 def alternatives() -> dict[str, Pulse]:
     """Other readings of the model and of printed values."""
     return {
         "house rigid": Pulse(changes={"model.stator": "rigid"}),
         "outer house fixed": Pulse(changes={"model.stator": "inner-house"}),
-        "houses of dtu-2019": Pulse(parameters="dtu-2019"),
+        "houses as identified in 2019": Pulse(parameters="dtu-2019"),
         "restitution 0.5": Pulse(changes={"contact.restitution": 0.5}),
         "friction 0.15": Pulse(changes={"contact.friction": 0.15}),
         "drive held at 6.2 Hz": Pulse(changes={"drive.mode": "ideal"}),
@@ -121,11 +138,11 @@ def bars(results: Results, quantity: str) -> list[Bar]:
         return median(results[group], quantity)
 
     found = [
-        Bar(entry.key, "assumed value", (of(f"low {entry.key}"), base, of(f"high {entry.key}")))
+        Bar(entry.called, "assumed value", (of(f"low {entry.key}"), base, of(f"high {entry.key}")))
         for entry in free_values()
     ]
-    found += [Bar(f"{key} put right", "correction", (printed, of(f"correction {key}"))) for key in correction_keys()]
-    found.append(Bar("all put right", "correction", (printed, base)))
+    found += [Bar(CORRECTIONS[key], "correction", (printed, of(f"correction {key}"))) for key in correction_keys()]
+    found.append(Bar("all corrections", "correction", (printed, base)))
     found.append(Bar("house, 1/10 to 10 times as stiff", "house", (of("mobility 0.1"), base, of("mobility 10"))))
     found += [Bar(name, "other reading", (base, of(f"alternative {name}"))) for name in alternatives()]
     found.append(Bar("contact law", "other reading", tuple(of(f"law {law}") for law in LAWS)))
@@ -133,7 +150,7 @@ def bars(results: Results, quantity: str) -> list[Bar]:
 
 
 def toward_measured(found: list[Bar]) -> list[Bar]:
-    """Lines of which an end is no higher than what was measured."""
+    """Lines of which an end is no higher than the last label of the measured axis."""
     return [bar for bar in found if any(value <= MEASURED_N for value in bar.values)]
 
 
@@ -145,8 +162,12 @@ def draw_tornado(results: Results, spread: list[Outcome]) -> Figure:
     figure = new_figure(11.6, "What moves the force: one change at a time (ranges of assumed values are assumed)")
     panels = figure.subplots(2, 1)
     shown = {
-        "reaction_x_n": ("E − W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
-        "peak_x_n": ("highest E − W in the impacts, median of the phases [N]", 5000.0, "end of the simulated axis"),
+        "reaction_x_n": ("E − W amplitude in whirl [N]", MEASURED_N, "last label of the measured axis"),
+        "peak_x_n": (
+            "highest E − W in the impacts, median of the phases [N]",
+            5000.0,
+            "last label of the simulated axis",
+        ),
     }
     for axes, (quantity, (label, level, text)) in zip(panels, shown.items(), strict=True):
         _draw_bars(axes, bars(results, quantity)[:_MOST_BARS][::-1], level)
@@ -191,7 +212,7 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
     figure = new_figure(8.4, f"All assumed values at once: Latin hypercube, {len(spread)} runs")
     panels = figure.subplots(2, 2).ravel()
     shown = {
-        "reaction_x_n": ("E − W amplitude in whirl [N]", MEASURED_N, "end of the measured axis"),
+        "reaction_x_n": ("E − W amplitude in whirl [N]", MEASURED_N, "last label of the measured axis"),
         "peak_x_n": ("highest E − W [N]", None, ""),
         "whirl_hz": ("whirl frequency [Hz]", -83.7, "the paper, Fig. 14"),
     }
@@ -215,7 +236,7 @@ def draw_spread(parts: np.ndarray, spread: list[Outcome]) -> Figure:
     for place, (name, colour, label) in enumerate(ranked):
         ranks = np.nan_to_num(rank_correlation(parts, np.abs(column(spread, name))))
         panels[3].barh(rows + 0.27 * (place - 1), ranks, height=0.26, color=colour, label=label)
-    panels[3].set_yticks(rows, [entry.key for entry in entries])
+    panels[3].set_yticks(rows, [entry.called for entry in entries])
     panels[3].invert_yaxis()
     panels[3].set(xlabel="rank correlation [1]", xlim=(-1.05, 1.05))
     legend_below(figure)

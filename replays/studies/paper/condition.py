@@ -3,8 +3,8 @@
 A point mass m on an orbit of radius r that touches the ring, at the whirl frequency w, on a spring K and a damper D:
 radially N = m r (w^2 - w_n^2), so that w must be above w_n (the paper's eq. 42); along the ring friction drives with at
 most mu N and damping brakes with D r w. So whirl is kept up, and a sliding whirl gains speed, where
-mu (w^2 - w_n^2) >= 2 zeta w_n w, that is |w| >= w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)]. This is eq. 43 with its sign put
-right: it prints "<=" of a whirl frequency that is negative there, and so says the opposite of its text.
+mu (w^2 - w_n^2) >= 2 zeta w_n w, that is |w| >= w_n [zeta/mu + sqrt(1 + (zeta/mu)^2)]. This is eq. 43, whose "<=" is
+of two negative frequencies (the sentence after it speaks of the sign), with the ratio zeta for its D, which has a unit.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def oscillator(constants: Constants) -> Oscillator:
 
 
 def critical_whirl(own: Oscillator, friction: float) -> float:
-    """Slowest whirl that friction keeps up against damping [rad/s], eq. 43 with its sign put right."""
+    """Slowest whirl that friction keeps up against damping [rad/s], eq. 43."""
     share = own.ratio / friction
     return own.natural * (share + math.sqrt(1.0 + share * share))
 

@@ -22,7 +22,6 @@ from replays.studies.paper.chart import draw_conditions, draw_law, draw_verdicts
 from replays.studies.paper.claim import (
     BANDWIDTHS_HZ,
     LAWS,
-    MEASURED_N,
     SCALES,
     bars,
     draw_mobility,
@@ -32,6 +31,7 @@ from replays.studies.paper.claim import (
     toward_measured,
 )
 from replays.studies.paper.findings import JUDGED_BY, Findings
+from replays.studies.paper.pulse import MEASURED_N
 from replays.studies.paper.spread import assumed_values, column, free_values, percentiles, present, rank_correlation
 from replays.studies.paper.statement import number
 from replays.studies.paper.table import IDLE_N, TABLES, Content, idle_changes, summary
@@ -45,8 +45,10 @@ _PRINT = (
     (re.compile(r"(?<![\w.])([A-Za-zωζνµ])_([A-Za-z0-9]{1,3})(?![A-Za-z0-9_])"), r"\1_{\2}"),
     (re.compile(r"(?<=\d)e([+-])0*(\d+)"), lambda power: f"·10^{{{power[1].strip('+')}{power[2]}}}"),
     (re.compile(r"(?<![\w.)])-(?=\d)|(?<=\{)-"), "−"),
+    (re.compile(r"\^(\w)"), r"^{\1}"),
+    (re.compile(r"(?<=\d) count$"), ""),
 )
-"""As in print: R_S with its letter lowered, but no parameter's name; powers of ten; minus signs."""
+"""As in print: R_S with its letter lowered, but no parameter's name; powers; minus signs; a count has no unit."""
 _CELLS = " | "
 """Between the cells of a table in the text."""
 
@@ -205,7 +207,7 @@ def _moves(findings: Findings) -> dict[str, Any]:
         "corners_hz": [hz for hz, result in low_passes if result.reaction_x_n <= MEASURED_N],
         "whirling": len(whirling),
         "share": float(np.mean([result.reaction_x_n <= MEASURED_N for result in whirling])) if whirling else math.nan,
-        "first": {"key": free_values()[first].key, "rank": ranks[first]},
+        "first": {"called": free_values()[first].called, "rank": ranks[first]},
     }
 
 
@@ -246,6 +248,10 @@ def _whirl(findings: Findings) -> dict[str, Any]:
     constants, fastest = findings.constants, findings.least[-1]
     own = condition.oscillator(constants)
     modal = constants.shaft.transverse_inertia / constants.shaft.arm_magnet**2
+    magnet, friction = constants.magnet, constants.contact.friction
+    # Eq. 43 letter by letter.
+    literal = condition.Oscillator(constants.shaft.mass, math.sqrt(magnet.stiffness / constants.shaft.mass), math.nan)
+    eq_10 = magnet.damping_x, magnet.damping_y
     spin = 2.0 * math.pi * fastest.spin_hz
     force = condition.normal_force(own, *condition.rolling_circle(constants, spin))
     turned = condition.pulse_whirl(constants, force_n=100.0, duration_s=5e-3)
@@ -262,6 +268,9 @@ def _whirl(findings: Findings) -> dict[str, Any]:
             "mass": own.mass,
             "natural_hz": own.natural / (2 * math.pi),
             "ratio": own.ratio,
+            "literal_hz": [
+                condition.critical_whirl(literal._replace(ratio=d), friction) / (2 * math.pi) for d in eq_10
+            ],
         },
         "slowest": findings.slowest,
         "least": findings.least,

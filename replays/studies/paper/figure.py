@@ -31,8 +31,8 @@ _IMPACTS_MS = 14.0
 _BEFORE, _IMPACTS, _SETTLED = GREEN, RED, BLUE
 
 
-def _axis_lines(axes: Any, *levels: float, text: str = "the paper's axis", measured: bool = False) -> None:
-    """Dashed lines where the paper's axis ends."""
+def _axis_lines(axes: Any, *levels: float, text: str = "the paper's labels", measured: bool = False) -> None:
+    """Dashed lines at the last labels of the paper's axis."""
     look = {**_PAPER, "color": PINK, "lw": 1.5, "ls": (0, (1, 1.5))} if measured else _PAPER
     for level in levels:
         axes.axhline(level, **look)
@@ -126,10 +126,10 @@ def draw_drop(found: dict[str, Reproduction]) -> Figure:
         force.plot(t, run["P_S"] - run["P_N"], color=BLUE, lw=1.6)
         force.plot(t, run.samples["P_S"] - run.samples["P_N"], color=RED, lw=0.8, label="transducers")
         _axis_lines(force, 0.0, 100.0)
-        _axis_lines(force, 80.0, text="the paper's axis, measured", measured=True)
+        _axis_lines(force, 80.0, text="the paper's labels, measured", measured=True)
         house.plot(t, run["inner_ay"], color=BLUE, lw=1.2)
         _axis_lines(house, -100.0, 100.0)
-        _axis_lines(house, -40.0, 40.0, text="the paper's axis, measured", measured=True)
+        _axis_lines(house, -40.0, 40.0, text="the paper's labels, measured", measured=True)
         for axes in (force, house):
             axes.set(xlabel="time, first impacts [ms]", xlim=first_impacts(run["penetration"], t))
     _name_first(
@@ -213,11 +213,11 @@ def draw_reactions(found: dict[str, Reproduction]) -> Figure:
             truth, sensed = run[a] - run[b], run.samples[a] - run.samples[b]
             whole, settled = panels[place], panels[2 + place]
             draw_signals(whole, t, (truth, BLUE, ""))
-            _axis_lines(whole, -5000.0, 5000.0, text="the paper's axis: simulated above, measured below")
+            _axis_lines(whole, -5000.0, 5000.0, text="the paper's labels: simulated above, measured below")
             whole.set(xlabel="time [s]")
             settled.plot(t[last], truth[last], color=BLUE, lw=1.8, label="truth")
             settled.plot(t[last], sensed[last], color=RED, lw=0.9, label="transducers")
-            _axis_lines(settled, -500.0, 500.0, text="the paper's axis: simulated above, measured below")
+            _axis_lines(settled, -500.0, 500.0, text="the paper's labels: simulated above, measured below")
             settled.set(xlabel="time, settled whirl [s]")
     _name_first(columns, "E − W [N]", "N − S [N]", "E − W [N]", "N − S [N]")
     legend_below(figure)
@@ -238,8 +238,8 @@ def draw_east(found: dict[str, Reproduction]) -> Figure:
         axes.plot(t, (run.samples["P_E"] - run.samples["P_W"])[last], color=RED, lw=0.9, label="E − W, transducers")
         axes.plot(t, run["P_E"][last] - preload, color=GREEN, lw=1.5, label="EAST alone, less its preload")
         axes.plot(t, run["normal_force"][last], color="0.3", lw=1.2, ls=":", label="normal force in the contact")
-        _axis_lines(axes, 0.0, 900.0, text="the paper's axis, simulated and measured")
-        axes.axhline(500.0, color=PINK, lw=1.4, ls=(0, (1, 2)), zorder=1, label="end of Fig. 15's axis, measured")
+        _axis_lines(axes, 0.0, 900.0, text="the paper's labels, simulated and measured")
+        axes.axhline(500.0, color=PINK, lw=1.4, ls=(0, (1, 2)), zorder=1, label="Fig. 15's last label, measured")
         axes.set(xlabel="time [ms]", xlim=(0, 12))
     _name_first(columns, "force [N]")
     legend_below(figure, columns=3)

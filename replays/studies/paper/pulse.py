@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from rig.errors import InputError
 from rig.offline import Run, simulate
 from rig.parameters import DEFAULT_SET, load_parameters
 from rig.scenes import Scene, load_scene
+
+if TYPE_CHECKING:
+    from rig.model import Model
 
 FORCE_N = 100.0
 """Peak of the pulse: the paper, section 6.2."""
@@ -28,6 +31,8 @@ HAMMER_MS = "hammer.duration"
 PULSE_AT = "hammer.at"
 """A name of this report alone [s]: when it comes; the shaft's turn at the pulse decides which bounces follow."""
 RATE_HZ = 10_000
+MEASURED_N = 500.0
+"""Last label of the axis of the measured forces, Fig. 15(c, d): the only number that the text has of them."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,7 @@ class Outcome:
         slowest_hz: Lowest spin of the whole run [Hz].
         roll_s: From the pulse until it rolls for good [s].
         slope_n_s: Largest rate of P_E - P_W while it whirls [N/s].
+        imbalance: Line of the reactions at the spin over that at the whirl frequency [1].
     """
 
     outcome: str
@@ -98,6 +104,7 @@ class Outcome:
     slowest_hz: float = math.nan
     roll_s: float = math.nan
     slope_n_s: float = math.nan
+    imbalance: float = math.nan
 
     @property
     def whirls(self) -> bool:
@@ -112,7 +119,7 @@ def pulse_scene(pulse: Pulse) -> Scene:
     changes.pop(BANDWIDTH, None)
     above_mm = changes.pop(CENTRED_BY, None)
     if above_mm is not None:
-        changes["ring.offset_y"] = _centre_mm(pulse, changes) + above_mm
+        changes["ring.offset_y"] = pulse_model(pulse, changes).sag * 1e3 + above_mm
     hammer = {"at_s": at_s, "command": "hammer", "force_n": pulse.force_n, "duration_ms": hammer_ms, "direction": "x"}
     return load_scene(
         "hammer",
@@ -129,12 +136,12 @@ def pulse_scene(pulse: Pulse) -> Scene:
     )
 
 
-def _centre_mm(pulse: Pulse, changes: dict[str, Any]) -> float:
-    """Height at which the ring is centred on the shaft at rest [mm]."""
+def pulse_model(pulse: Pulse, changes: dict[str, Any]) -> Model:
+    """The model of a pulse with these changes, those that are not of its parameters left out."""
     from rig.model import build_model
 
     own = load_parameters(pulse.parameters)
-    return build_model(own.override({key: v for key, v in changes.items() if key in own.entries})).sag * 1e3
+    return build_model(own.override({key: v for key, v in changes.items() if key in own.entries}))
 
 
 def outcome(pulse: Pulse) -> Outcome:
@@ -202,8 +209,16 @@ def read(run: Run, *, at_s: float, bandwidth_hz: float | None = None) -> Outcome
         disk_m=float(np.abs(run["disk_x"][settled]).max()),
         roll_s=number("time_to_roll") - at_s,
         slope_n_s=float(np.abs(np.diff(pair_x[settled])).max() * RATE_HZ),
+        imbalance=_line(run, number("spin"), settled) / _line(run, number("whirl_frequency"), settled),
         **whole,
     )
+
+
+def _line(run: Run, hz: float, rows: slice) -> float:
+    """Height of the line of the reactions, as they turn, at a frequency, backward negative."""
+    forces = (run["P_E"] - run["P_W"] + 1j * (run["P_N"] - run["P_S"]))[rows]
+    weights = np.hanning(len(forces)) * np.exp(-2j * math.pi * hz * run.times_s[rows])
+    return float(abs(np.sum((forces - forces.mean()) * weights)))
 
 
 def rebound(run: Run) -> float:

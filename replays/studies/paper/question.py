@@ -12,6 +12,7 @@ from replays.studies.paper.condition import oscillator
 from replays.studies.paper.pulse import Pulse
 from replays.studies.paper.reproduction import G, Reproduction, bare_drop, drop_impact, drop_impulse
 from replays.studies.paper.spread import free_values, phases
+from replays.studies.paper.statement import statements
 from rig.kernels.constants import Constants
 from rig.magnets import cylinder_stiffness, field_sum_stiffness
 from rig.model import magnet_geometry, reference_impact
@@ -220,16 +221,19 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
     r0 = constants.contact.clearance * 1e3
     lever = constants.shaft.arm_disk / constants.shaft.arm_ring
 
-    def axis(name: str, ours: float, low: float, high: float) -> Axis:
+    stated = {each.quantity: (each.low, each.high) for each in statements()}
+
+    def axis(name: str, ours: float, quantity: str) -> Axis:
         # Lengths and forces of the whirl go with r0 at equal spin and R_S / r0.
+        low, high = stated[quantity]
         return Axis(name, ours, low, high, (r0 * low / ours, r0 * high / ours))
 
-    orbit = axis("orbit ±1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], 0.4, 1.0)
-    drop = axis("drop ±1 mm, in the ring, Fig. 10", r0, 0.4, 1.0)
-    probes = axis("the same, at the probes", r0 * lever, 0.4, 1.0)
-    disk = axis("x(t) ±2 mm at the probes, Fig. 12(c)", n["orbit_disk"], 0.8, 2.0)
-    measured = axis("E − W ±500 N, measured, Fig. 15(c)", n["sensed_x"], 200.0, 500.0)
-    east = axis("EAST 0 to 900 N, Fig. 16", n["east"], 360.0, 900.0)
+    orbit = axis("orbit ±1 mm, in the ring, Fig. 12(a)", n["orbit_ring"], "orbit_ring")
+    drop = axis("drop ±1 mm, in the ring, Fig. 10", r0, "drop_span")
+    probes = axis("the same, at the probes", r0 * lever, "drop_span")
+    disk = axis("x(t) ±2 mm at the probes, Fig. 12(c)", n["orbit_disk"], "orbit_disk")
+    measured = axis("E − W ±500 N, measured, Fig. 15(c)", n["sensed_x"], "peak_sensed")
+    east = axis("EAST 0 to 900 N, Fig. 16", n["east"], "east")
 
     radius = next(entry for entry in free_values() if entry.key == "shaft.radius")
 
@@ -243,5 +247,5 @@ def clearance_numbers(found: dict[str, Reproduction]) -> Numbers:
         "ratio": _PRINTED_RATIO,
         "axes": (orbit, drop, probes, disk, measured, east),
         "simulated": together(orbit, drop, disk, east),
-        "with_measured": together(orbit, drop, disk, measured, east),
+        "at_probes": together(orbit, probes, disk, east),
     }

@@ -12,11 +12,11 @@ import numpy as np
 from replays.studies.paper.pulse import (
     BANDWIDTH,
     FORCE_N,
+    MEASURED_N,
     SPEED_HZ,
     Outcome,
     Pulse,
     low_passed,
-    outcome,
     pulse_scene,
     read,
 )
@@ -49,7 +49,6 @@ class Reproduction:
         whirl: Sections 6.2 and 6.3, all sensors on; the pulse comes at `PULSE_S`.
         held: The same on a drive that holds its speed, truth alone.
         speeds: Section 6.4 by speed of the drive [Hz], truth alone.
-        lasting: A pulse and 20 s, as long as Fig. 13 shows; quick, 5 s.
         numbers: Of these runs, each in its statement's unit.
     """
 
@@ -58,7 +57,6 @@ class Reproduction:
     whirl: Run
     held: Run
     speeds: dict[float, Run]
-    lasting: Outcome
     numbers: dict[str, float]
 
 
@@ -85,16 +83,13 @@ def reproduce(parameters: str, *, quick: bool = False, progress: Callable[[str],
     for speed in SPEEDS_HZ:
         speeds[speed] = simulate(pulse_scene(Pulse(parameters=parameters, speed_hz=speed)))
         tell(f"{speed:g} Hz, {parameters}")
-    lasting = outcome(Pulse(parameters=parameters, duration_s=5.0 if quick else 20.0))
-    tell(f"lasting whirl, {parameters}")
     numbers = {
         "magnet_force": magnet_force(whirl),
-        "lasts": float(lasting.whirls),
         "drop_reaction": drop_numbers(drop)["drop_reaction"],
         **_whirl_numbers(whirl),
         **{f"force_{speed:g}": read(run, at_s=0.02).reaction_x_n for speed, run in speeds.items()},
     }
-    return Reproduction(parameters, drop, whirl, held, speeds, lasting, numbers)
+    return Reproduction(parameters, drop, whirl, held, speeds, numbers)
 
 
 def magnet_force(run: Run) -> float:
@@ -170,12 +165,13 @@ def drop_numbers(run: Run, *, bandwidth_hz: float = 4900.0) -> dict[str, float]:
     }
 
 
-def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.ndarray]:
+def pulse_spread(spread: list[Outcome], slow: list[Outcome], lasting: list[Outcome]) -> dict[str, np.ndarray]:
     """Numbers of the pulse with all assumed values spread at once, by statement, each shape (n,).
 
     Args:
         spread: At 6.2 Hz. Numbers of the whirl are of those that whirl.
         slow: The first of these at 3.2 Hz.
+        lasting: The first of these for 20 s, as long as Fig. 13 shows.
     """
     whirling = [one for one in spread if one.whirls]
     pairs = [(low, high) for low, high in zip(slow, spread, strict=False) if low.whirls and high.whirls]
@@ -186,7 +182,8 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.nda
     return {
         "backward": np.array([float(one.whirls and one.whirl_hz < 0.0) for one in spread]),
         "roll": of("roll_s", 1e3),
-        "orbit_ring": of("ring_m", 1e3),
+        # Of the disk, but in the clearance: either reading.
+        "orbit_ring": np.concatenate([of("ring_m", 1e3), of("disk_m", 1e3)]),
         "orbit_disk": of("disk_m", 1e3),
         "spin_lowest": column(spread, "slowest_hz"),
         "whirl_hz": of("whirl_hz", -1.0),
@@ -196,6 +193,11 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.nda
         "peak_sensed": np.maximum(column(spread, "peak_x_n"), column(spread, "peak_y_n")),
         "steady": of("ripple_n", 100.0) / of("normal_n"),
         "east": of("reaction_x_n"),
+        # A line at the spin takes a long window.
+        "imbalance": 100.0 * column([one for one in lasting if one.whirls], "imbalance"),
+        "measured": of("reaction_x_n", 1.0 / MEASURED_N),
+        "bouncing": of("true_peak_x_n") / of("reaction_x_n"),
+        "lasts": np.array([float(one.whirls) for one in lasting]),
         "slowest_whirls": np.array([float(one.whirls) for one in slow]),
         "period_ratio": np.array([low.whirl_hz / high.whirl_hz for low, high in pairs]),
         "impulsive_ratio": np.array([high.slope_n_s / low.slope_n_s for low, high in pairs]),
@@ -205,15 +207,10 @@ def pulse_spread(spread: list[Outcome], slow: list[Outcome]) -> dict[str, np.nda
 def _whirl_numbers(run: Run) -> dict[str, float]:
     truth = read(run, at_s=PULSE_S)
     last = run.times_s > 0.5 * run.times_s[-1]
-    times = run.times_s[last]
-    forces = run["P_E"][last] - run["P_W"][last] + 1j * (run["P_N"][last] - run["P_S"][last])
-    weighted = (forces - forces.mean()) * np.hanning(len(times))
-    spin, whirl = (abs(np.sum(weighted * np.exp(-2j * math.pi * hz * times))) for hz in (truth.spin_hz, truth.whirl_hz))
     return {
         "orbit_ring": truth.ring_m * 1e3,
         "orbit_disk": truth.disk_m * 1e3,
         "whirl_hz": abs(truth.whirl_hz),
-        "imbalance": 100.0 * float(spin / whirl),
         "sensed_x": float(np.ptp(run.samples["P_E"][last] - run.samples["P_W"][last]) / 2),
         "east": truth.reaction_x_n,
     }

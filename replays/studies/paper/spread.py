@@ -23,6 +23,8 @@ class Assumed(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     key: str
+    called: str
+    """In words, as pictures and tables have it."""
     name: str = Field(default="", alias="as")
     """What a pulse takes it by, where that is not the key."""
     low: float = math.nan

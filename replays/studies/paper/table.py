@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 from replays.report import Row
 from replays.studies.closed_forms import impact
-from replays.studies.paper.claim import MEASURED_N, Bar, bars, toward_measured
+from replays.studies.paper.claim import Bar, bars, toward_measured
 from replays.studies.paper.findings import LENGTHS_MS, MARKS, Findings, Line
+from replays.studies.paper.pulse import MEASURED_N
 from replays.studies.paper.spread import column
 from replays.studies.paper.statement import SETS, distribution, number, printed_values
 from rig.parameters import load_parameters
@@ -36,14 +37,16 @@ def _printed(findings: Findings) -> Content:
     rows = []
     for printed in printed_values():
         said = printed.verdict(sets["corrected"])
-        if said == "differs" and sets["corrected"].entries[printed.key].kind == "corrected":
+        if said == "agrees":
+            said = "as printed"
+        elif sets["corrected"].entries[printed.key].kind == "corrected":
             said = "corrected"
         values = [number(parameters[printed.key]) for parameters in sets.values()]
         sources = [f"{name}: {each.entries[printed.key].source}" for name, each in sets.items()]
-        source = "" if said == "agrees" else "; ".join(sources)
+        source = "" if said == "as printed" else "; ".join(sources)
         unit = "" if printed.unit == "1" else printed.unit
         cells = (printed.symbol, printed.place, unit, number(printed.value), *values, source, said)
-        rows.append(Row(cells, MARKS.get(said, "open")))
+        rows.append(Row(cells, "plain" if said == "as printed" else MARKS.get(said, "open")))
     return Content(("symbol", "where", "unit", "printed", *SETS, "why it differs", "corrected set"), rows)
 
 
@@ -64,9 +67,8 @@ def _worked_out(findings: Findings) -> Content:
          damping(0.026, "house.inner_beam_stiffness", inner)),
         ("D_bh = 2 ζ_y √(K_bh M_oh), ζ_y = 0.054, M_oh as printed [N s/m]", 1576.0,
          damping(0.054, support, printed_outer)),
-        ("the same with M_ih + M_oh of eqs. 24, 25 [N s/m]", 1576.0, damping(0.054, support, printed_outer + inner)),
-        ("the same with the corrected M_oh alone [N s/m]", 1576.0, damping(0.054, support, outer)),
-        ("whirl frequency 6.2 R_S/r_0 [Hz]", 83.7, 6.2 * p["shaft.radius"] / p["ring.clearance"]),
+        ("the same with M_ih + M_oh of eqs. 24, 25 [N s/m]", None, damping(0.054, support, printed_outer + inner)),
+        ("the same with the corrected M_oh alone [N s/m]", None, damping(0.054, support, outer)),
     ]  # fmt: skip
     given = 0.90
     eq_44 = impact(mass=1.0, speed=0.1, stiffness=1e10, exponent=1.5, factor=0.75 * (1.0 - given**2), speed_floor=1e-3)
@@ -79,7 +81,7 @@ def _worked_out(findings: Findings) -> Content:
     rows = []
     for name, printed, ours in worked:
         if printed is None:
-            rows.append(Row((name, "–", number(ours), "cannot be judged"), "open"))
+            rows.append(Row((name, "–", number(ours), "not printed")))
             continue
         verdict = "agrees" if abs(ours / printed - 1.0) < 5e-3 else "differs"
         rows.append(Row((name, number(printed), number(ours), verdict), MARKS[verdict]))
@@ -127,7 +129,7 @@ def _lengths(findings: Findings) -> Content:
                 values = column(group, f"true_{said.quantity}_n")
                 cells += [distribution(values), f"{round(said.inside(values) * len(values))} of {len(values)}"]
             rows.append(Row(tuple(cells)))
-    return Content(("pulse", "E − W [N]", "on the axis", "N − S [N]", "on the axis"), rows)
+    return Content(("pulse", "E − W [N]", "agree", "N − S [N]", "agree"), rows)
 
 
 TABLES: dict[str, Callable[[Findings], Content]] = {
