@@ -111,7 +111,7 @@ def is_imported(recording: Recording) -> bool:
 def is_from_the_middle(recording: Recording) -> bool:
     """Whether it is one of a rig that ran before: where its shaft was, only its samples tell."""
     mapped = recording.scene.get("import", {}).get("mapping", {}).get("experiment", {})
-    return mapped.get("commands") == "detected" and "lead_s" not in mapped
+    return mapped.get("commands", "scene") != "scene" and "lead_s" not in mapped
 
 
 def _taken_up(recording: Recording, scene: Scene, first_s: float) -> Begin:

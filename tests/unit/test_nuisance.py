@@ -18,6 +18,7 @@ from replays.recordings.identification.log import identify_log
 from replays.recordings.identification.nuisance import nuisances_of, tune
 from replays.recordings.sensitivity import ANGLE, value_of, with_values
 from replays.recordings.validation import load_criteria, validate
+from rig.errors import InputError
 from rig.offline import simulate
 from rig.scenes import load_scene
 from tests import faulty_logs, second_rig
@@ -56,13 +57,13 @@ source = "keyphasor"
 )
 
 
-def imported(folder: Path, columns: dict[str, np.ndarray], mapping: str) -> Recording:
+def imported(folder: Path, columns: dict[str, np.ndarray], mapping: str, head: str = HEAD) -> Recording:
     """A recording of columns of another recorder."""
     import pyarrow as pa
     from pyarrow import parquet
 
     parquet.write_table(pa.table(columns), folder / "log.parquet")
-    (folder / "log.toml").write_text(HEAD + mapping, encoding="utf-8")
+    (folder / "log.toml").write_text(head + mapping, encoding="utf-8")
     write_recording(convert([folder / "log.parquet"], load_mapping(folder / "log.toml")), folder / "log.mcap")
     return Recording.open(folder / "log.mcap")
 
@@ -161,6 +162,34 @@ def test_an_aligned_log_is_good(motion: second_rig.Motion, tmp_path: Path) -> No
     found = validate(whole(tmp_path, motion, seed=8))
     assert found.good, found.verdict_line
     assert found.window_s[1] > 0.815
+
+
+QUIET = """
+[experiment]
+scene = "stable-run"
+speed_hz = "measured"
+commands = []
+"""
+
+
+def test_a_log_without_a_pulse_is_taken_up_as_well(motion: second_rig.Motion, tmp_path: Path) -> None:
+    """It is of a shaft that turned before; of one that was in contact already, nobody knows from where it came."""
+    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    for name, rows in (("quiet", own_s < 0.7), ("contact", own_s > 1.0)):
+        (folder := tmp_path / name).mkdir()
+        part = {channel: one[rows] for channel, one in values.items()}
+        found = validate(imported(folder, {"time": own_s[: rows.sum()], **part}, WHOLE.replace("5000", "4000"), QUIET))
+        assert found.good == (name == "quiet")
+        if found.explained is not None:
+            assert found.explained.conclusion.startswith("the log begins in contact")
+
+
+def test_a_log_has_to_begin_before_the_pulse(motion: second_rig.Motion, tmp_path: Path) -> None:
+    own_s, values = second_rig.log(motion, seed=7, ppm=PPM)
+    late = {name: one[own_s > 0.795] for name, one in values.items()}
+    recording = imported(tmp_path, {"time": own_s[: len(late["speed"])], **late}, WHOLE)
+    with pytest.raises(InputError, match="begins more than 10 ms before the hammer pulse"):
+        validate(recording)
 
 
 def test_a_fault_of_four_channels_at_once_is_named(motion: second_rig.Motion, tmp_path: Path) -> None:

@@ -166,7 +166,7 @@ def _behind(
 
 def explain_log(
     parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], tuned: Tuned, rules: Attribution,
-    *, from_s: float, end_s: float, faults: Sequence[SignalFault] = (),
+    *, from_s: float, end_s: float, faults: Sequence[SignalFault] = (), touching: bool = False,
 ) -> Explained:  # fmt: skip
     """What explains that a log of another system differs: sensors, or what was fitted beyond what is known of it.
 
@@ -179,6 +179,7 @@ def explain_log(
         from_s: First difference [s].
         end_s: How far the model has been followed [s].
         faults: What signals show by themselves.
+        touching: The shaft is in contact where the log begins.
     """
     sensors = sensor_faults(parts, nominal, end_s, others)
     # What one fault brings along elsewhere, in the fit before, is none of its own.
@@ -194,8 +195,12 @@ def explain_log(
     elif not best and faults:
         conclusion = f"what signals show by themselves comes first: {'; '.join(one.line for one in faults)}"
     elif not best and float(np.median(list(tuned.scales.values()))) > _AT_ODDS:
-        conclusion = "nothing goes together from the hammer pulse on: its time, several channels, or the model is off; "
-        conclusion += "this log cannot tell"
+        if touching:
+            conclusion = "the log begins in contact, and where the shaft was before that, it does not tell: "
+            conclusion += "take one that begins before the hammer pulse"
+        else:
+            conclusion = "nothing goes together from the hammer pulse on: its time, several channels, or the model is "
+            conclusion += "off; this log cannot tell"
     elif not best and sum(one.explained for one in sensors) > rules.enough:
         part = sum(one.explained for one in sensors)
         conclusion = (

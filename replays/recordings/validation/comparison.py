@@ -19,6 +19,7 @@ from replays.recordings.validation.attribution import Explained, attribute, expl
 from replays.recordings.validation.bits import Bits, StreamBits
 from replays.recordings.validation.criteria import Criteria, load_criteria
 from replays.recordings.validation.outcome import Validation
+from replays.recordings.validation.phases import PHASES
 from replays.recordings.validation.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.statistics import perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
@@ -72,7 +73,8 @@ def validate(
     if validation.good or validation.doubts or not firsts:
         return validation
     step("what explains the difference")
-    return replace(validation, explained=_explained(again, from_s=min(firsts), end_s=end, step=step))
+    touching = bool(phases) and phases[0].name not in (PHASES[0], PHASES[-1])
+    return replace(validation, explained=_explained(again, min(firsts), end, step, touching=touching))
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,9 @@ def _window(again: _DoneAgain) -> tuple[float, float, str]:
     return begin, parted, f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
 
 
-def _explained(again: _DoneAgain, *, from_s: float, end_s: float, step: Callable[[str], None]) -> Explained:
+def _explained(
+    again: _DoneAgain, from_s: float, end_s: float, step: Callable[[str], None], *, touching: bool
+) -> Explained:
     rules = again.criteria.attribution
     if again.tuned is None:
         return attribute(again.quick, again.parts, again.nominal, rules, from_s=from_s, step=step)
@@ -179,6 +183,7 @@ def _explained(again: _DoneAgain, *, from_s: float, end_s: float, step: Callable
         end_s=end_s,
         rules=rules,
         faults=again.faults,
+        touching=touching,
     )
 
 
