@@ -184,6 +184,21 @@ def test_a_log_without_a_pulse_is_taken_up_as_well(motion: second_rig.Motion, tm
             assert found.explained.conclusion.startswith("the log begins in contact")
 
 
+def test_pulses_that_nothing_foretells_are_no_fault(motion: second_rig.Motion, tmp_path: Path) -> None:
+    """One before the hammer tells the angle by the speed, as contact slows the shaft behind; none tells nothing."""
+    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    few = ("ring_x", "ring_y", "speed", "hammer", "keyphasor")
+    columns = {"time": own_s[: (own_s > 0.63).sum()], **{name: values[name][own_s > 0.63] for name in few}}
+    keyphasor, *channels = WHOLE.replace("5000", "4000").split("[channels.")
+    mapping = "".join(f"[channels.{one}" for one in channels if one.partition("]")[0] in few)
+    (told := tmp_path / "told").mkdir()
+    recording = imported(told, columns, keyphasor + mapping)
+    begin, (before, *_) = Experiment.of(recording).begin, recording.edges()
+    assert begin is not None
+    assert math.remainder(begin.angle + 2.0 * math.pi * 6.2 * before, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-3)
+    assert validate(imported(tmp_path, columns, mapping)).good
+
+
 def test_a_log_has_to_begin_before_the_pulse(motion: second_rig.Motion, tmp_path: Path) -> None:
     own_s, values = second_rig.log(motion, seed=7, ppm=PPM)
     late = {name: one[own_s > 0.795] for name, one in values.items()}

@@ -138,9 +138,12 @@ def _log_done_again(
     others += [tuned.predict({name: part.filtered(rules.bandwidth) for name, part in parts.items()})]
     gains = {name: v + rules.calibration * (v - v.mean(axis=0)) for name, v in nominal.values.items()}
     others += [replace(nominal, values=gains)]
+    until_s = first_command_s(tuned.begun) or math.inf
+    if np.count_nonzero(recording.edges() < until_s) < 2:
+        # Nothing tells well enough when a pulse is due: it is as likely as not, at any time.
+        others.insert(1, _with_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
     drawn = [models[n % len(models)].drawn(generator) for n in range(criteria.ensemble.members)]
     faults = signal_faults(whole)
-    until_s = first_command_s(tuned.begun) or math.inf
     faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
     return _DoneAgain(
         faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
@@ -148,6 +151,14 @@ def _log_done_again(
         parts=tuned.on_time(parts),
         nominal=nominal, others=tuple(others), bits={}, tuned=tuned,
     )  # fmt: skip
+
+
+def _with_pulses(
+    parts: dict[str, Measured], nominal: Prediction, change: Callable[[np.ndarray], np.ndarray]
+) -> Prediction:
+    """A prediction with other pulses of the keyphasor."""
+    pulses = {name: [channel.name == "keyphasor" for channel in part.channels] for name, part in parts.items()}
+    return replace(nominal, values={k: np.where(pulses[k], change(v), v) for k, v in nominal.values.items()})
 
 
 def _window(again: _DoneAgain) -> tuple[float, float, str]:
