@@ -146,7 +146,7 @@ class Tuned:
     def before(self) -> Tuned:
         """The same as the fit was before its window last grew: on that it was as right."""
         moved = zip(self.values.items(), self.moves[-1].tolist(), strict=True)
-        return replace(self, values={key: value - by for (key, value), by in moved})
+        return replace(self, values=_possible(self.begun, {key: value - by for (key, value), by in moved}))
 
     def drawn(self, generator: np.random.Generator) -> Tuned:
         """The same with values as far off as the fit leaves open, and as what the model lacks still moves them."""
@@ -154,7 +154,8 @@ class Tuned:
         sizes, directions = np.linalg.eigh(self.covariance / np.outer(size, size))
         off = size * (directions @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(len(size))))
         off += generator.standard_normal(len(self.moves)) @ self.moves
-        return replace(self, values={key: value + d for (key, value), d in zip(self.values.items(), off, strict=True)})
+        moved = {key: value + d for (key, value), d in zip(self.values.items(), off.tolist(), strict=True)}
+        return replace(self, values=_possible(self.begun, moved))
 
     def predict(self, parts: dict[str, Measured]) -> Prediction:
         """What is predicted for channels of the log, on its own clock."""
@@ -322,6 +323,18 @@ def tune(
         end_s=found.end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), found.scales, strict=True)),
     )
+
+
+def _possible(experiment: Experiment, values: dict[str, float]) -> dict[str, float]:
+    """Values as a rig can have them: one that it cannot, far off where a log tells little, stays as it was."""
+    try:
+        with_values(experiment, values)
+    except InputError:
+        if len(values) == 1:
+            return {key: value_of(experiment, key) for key in values}
+        each = (_possible(experiment, {key: value}) for key, value in values.items())
+        return {key: value for one in each for key, value in one.items()}
+    return values
 
 
 @dataclass(frozen=True)
