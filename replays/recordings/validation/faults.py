@@ -185,16 +185,18 @@ def _one_sensor(one: _Shown, told: _Telling) -> Explanation:
             options.append((told(name, change + more, float(factors[0]) - 1.0, left, before), numbers))
     if one.moves and len(e) > _FEW and (np.diff(one.times_s) > 0.0).all():
         late_s, delayed, slope = _delayed(one)
+        ended = abs(late_s) > _LATEST_S + 2.0 * float(np.diff(one.times_s).min())  # that is the search's end
         (shift,), left = one.left([ones], one.values - delayed)
         name, change = f"{one.name} delay", f"{late_s * 1e6:+.4g} µs"
-        options.append((told(name, change, late_s, (one.values - delayed) / one.floor, before, "s"), 1))
-        if abs(shift) > one.noise:
+        if not ended:
+            options.append((told(name, change, late_s, (one.values - delayed) / one.floor, before, "s"), 1))
+        if abs(shift) > one.noise and not ended:
             options.append((told(f"{name} and offset", f"{change}, {shift:+.4g} {one.unit}", late_s, left, before), 2))
         factors, left = one.left([delayed, ones])
         what, also = _gain_words(float(factors[0]))
-        options.append(
-            (told(f"{one.name} {what} and delay", f"{also}, {change}", float(factors[0]) - 1.0, left, before), 3)
-        )
+        if not ended:
+            both = told(f"{one.name} {what} and delay", f"{also}, {change}", float(factors[0]) - 1.0, left, before)
+            options.append((both, 3))
         factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - e)
         options.append((told(f"{one.name} bandwidth", _smoothing_words(factors), float(factors[1]), left, before), 2))
     # Another number must earn its place: by more than noise, and by more than what is wrong elsewhere brings along.
