@@ -111,7 +111,7 @@ def is_imported(recording: Recording) -> bool:
 def is_from_the_middle(recording: Recording) -> bool:
     """Whether it is one of a rig that ran before: where its shaft was, only its samples tell."""
     mapped = recording.scene.get("import", {}).get("mapping", {}).get("experiment", {})
-    return mapped.get("commands") == "detected" and "lead_s" not in mapped
+    return mapped.get("commands", "scene") != "scene" and "lead_s" not in mapped
 
 
 def _taken_up(recording: Recording, scene: Scene, first_s: float) -> Begin:
@@ -119,8 +119,10 @@ def _taken_up(recording: Recording, scene: Scene, first_s: float) -> Begin:
     hammer_s = min((timed.at_s for timed in scene.commands), default=first_s)
     begin_s = math.floor(round(max(first_s, hammer_s - BEFORE_S) / GRID_S, 6)) * GRID_S
     edges_s = recording.edges()
+    edges_s = edges_s[edges_s < hammer_s] if scene.commands else edges_s  # behind the pulse it slows down
     if len(edges_s) < 2:
-        return Begin(round(begin_s * TICK_RATE_HZ))
+        turns = (begin_s - edges_s.sum()) * scene.drive.speed_hz if len(edges_s) else 0.0
+        return Begin(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))
     near = max(0, min(int(np.searchsorted(edges_s, begin_s)) - 1, len(edges_s) - 2))
     turns = (begin_s - edges_s[near]) / (edges_s[near + 1] - edges_s[near])
     return Begin(round(begin_s * TICK_RATE_HZ), angle=2.0 * math.pi * (turns % 1.0))

@@ -33,6 +33,9 @@ from tests.commands import said, shown
         ("Kraft Süd", "force", "", "", "S"),
         ("F_north", "force", "", "", "N"),
         ("LoadCellWest", "force", "", "", "W"),
+        ("ai2 FN", "force", "", "", "N"),
+        ("P_o", "force", "", "", "O"),
+        ("FO", "force", "", "", "O"),
         ("fuerza_este", "force", "", "", "E"),
         ("Kraftaufnehmer O", "force", "", "", "O"),
         ("Beschl. Innengehäuse x", "acceleration", "inner", "x", ""),
@@ -106,6 +109,7 @@ def test_each_signal_is_taken_for_what_it_is(
         (("Effort O [N]", "Effort E [N]"), ("P_W sure", "P_E sure")),
         (("disk_x [mm]", "disk_x_ [mm]"), ("disk_x sure", "")),
         (("Drehzahl [V]",), ("speed sure",)),
+        (("ai0 ring x [V]", "ai1 ring y [V]"), ("ring_x sure", "ring_y sure")),
     ],
 )
 def test_what_nothing_speaks_for_stays_a_channel_of_its_own(
@@ -293,6 +297,24 @@ def test_a_picture_shows_short_blows_of_long_signals(tmp_path: Path) -> None:
     assert times[-1] > 0.998 * t[-1]
     overview.draw(guesses, tmp_path / "x.png")
     assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("name", "at_s", "channel"),
+    [("tach [V]", (0.1, 0.5), "keyphasor"), ("keyphasor", (0.3,), "keyphasor"), ("tach [V]", (0.3,), "speed"),
+     ("gate [V]", (0.1, 0.5), "")],
+)  # fmt: skip
+def test_few_pulses_are_those_of_what_a_name_says(
+    name: str, at_s: tuple[float, ...], channel: str, tmp_path: Path
+) -> None:
+    """Of a short log, or a slow shaft; and where no hammer hit, the template says how that is told."""
+    path, t = tmp_path / "x.csv", np.arange(3000) / 3000
+    train = np.sum([(t >= at) & (t < at + 0.01) for at in at_s], axis=0)
+    np.savetxt(path, np.column_stack([t, train]), delimiter=",", header=f"time,{name}", comments="", fmt="%.6f")
+    text, (found,) = guessed([path])
+    assert found.channel == channel
+    assert ("\n[keyphasor]" in text) == (channel == "keyphasor")
+    assert "# commands = []" in text
 
 
 @pytest.mark.parametrize(

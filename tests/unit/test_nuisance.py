@@ -18,6 +18,7 @@ from replays.recordings.identification.log import identify_log
 from replays.recordings.identification.nuisance import nuisances_of, tune
 from replays.recordings.sensitivity import ANGLE, value_of, with_values
 from replays.recordings.validation import load_criteria, validate
+from rig.errors import InputError
 from rig.offline import simulate
 from rig.scenes import load_scene
 from tests import faulty_logs, second_rig
@@ -56,13 +57,13 @@ source = "keyphasor"
 )
 
 
-def imported(folder: Path, columns: dict[str, np.ndarray], mapping: str) -> Recording:
+def imported(folder: Path, columns: dict[str, np.ndarray], mapping: str, head: str = HEAD) -> Recording:
     """A recording of columns of another recorder."""
     import pyarrow as pa
     from pyarrow import parquet
 
     parquet.write_table(pa.table(columns), folder / "log.parquet")
-    (folder / "log.toml").write_text(HEAD + mapping, encoding="utf-8")
+    (folder / "log.toml").write_text(head + mapping, encoding="utf-8")
     write_recording(convert([folder / "log.parquet"], load_mapping(folder / "log.toml")), folder / "log.mcap")
     return Recording.open(folder / "log.mcap")
 
@@ -161,6 +162,63 @@ def test_an_aligned_log_is_good(motion: second_rig.Motion, tmp_path: Path) -> No
     found = validate(whole(tmp_path, motion, seed=8))
     assert found.good, found.verdict_line
     assert found.window_s[1] > 0.815
+
+
+QUIET = """
+[experiment]
+scene = "stable-run"
+speed_hz = "measured"
+commands = []
+"""
+
+
+def test_what_has_no_name_is_told_of_its_channel(motion: second_rig.Motion, tmp_path: Path) -> None:
+    """The lines' hum on one probe is no fault of the model."""
+    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    few = ("disk_x", "disk_y", "ring_x", "ring_y", "speed")
+    mapping = "".join(f"[channels.{one}" for one in WHOLE.split("[channels.") if one.partition("]")[0] in few)
+    quiet = own_s < 0.7
+    columns = {"time": own_s[quiet], **{name: values[name][quiet] for name in few}}
+    columns["disk_y"] += 0.01 * np.sin(100.0 * math.pi * own_s[quiet])
+    found = validate(imported(tmp_path, columns, mapping.replace("5000", "4000"), QUIET)).explained
+    assert found is not None
+    assert found.best == ()
+    assert found.conclusion.startswith("of 5 channels disk_y alone")
+
+
+def test_a_log_without_a_pulse_is_taken_up_as_well(motion: second_rig.Motion, tmp_path: Path) -> None:
+    """It is of a shaft that turned before; of one that was in contact already, nobody knows from where it came."""
+    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    for name, rows in (("quiet", own_s < 0.7), ("contact", own_s > 1.0)):
+        (folder := tmp_path / name).mkdir()
+        part = {channel: one[rows] for channel, one in values.items()}
+        found = validate(imported(folder, {"time": own_s[: rows.sum()], **part}, WHOLE.replace("5000", "4000"), QUIET))
+        assert found.good == (name == "quiet")
+        if found.explained is not None:
+            assert found.explained.conclusion.startswith("the log begins in contact")
+
+
+def test_pulses_that_nothing_foretells_are_no_fault(motion: second_rig.Motion, tmp_path: Path) -> None:
+    """One before the hammer tells the angle by the speed, as contact slows the shaft behind; none tells nothing."""
+    own_s, values = second_rig.log(motion, seed=7, rate_hz=10_000.0, bandwidth_hz=4000.0, ppm=PPM)
+    few = ("ring_x", "ring_y", "speed", "hammer", "keyphasor")
+    columns = {"time": own_s[: (own_s > 0.63).sum()], **{name: values[name][own_s > 0.63] for name in few}}
+    keyphasor, *channels = WHOLE.replace("5000", "4000").split("[channels.")
+    mapping = "".join(f"[channels.{one}" for one in channels if one.partition("]")[0] in few)
+    (told := tmp_path / "told").mkdir()
+    recording = imported(told, columns, keyphasor + mapping)
+    begin, (before, *_) = Experiment.of(recording).begin, recording.edges()
+    assert begin is not None
+    assert math.remainder(begin.angle + 2.0 * math.pi * 6.2 * before, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-3)
+    assert validate(imported(tmp_path, columns, mapping)).good
+
+
+def test_a_log_has_to_begin_before_the_pulse(motion: second_rig.Motion, tmp_path: Path) -> None:
+    own_s, values = second_rig.log(motion, seed=7, ppm=PPM)
+    late = {name: one[own_s > 0.795] for name, one in values.items()}
+    recording = imported(tmp_path, {"time": own_s[: len(late["speed"])], **late}, WHOLE)
+    with pytest.raises(InputError, match="begins more than 10 ms before the hammer pulse"):
+        validate(recording)
 
 
 def test_a_fault_of_four_channels_at_once_is_named(motion: second_rig.Motion, tmp_path: Path) -> None:

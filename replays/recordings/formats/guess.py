@@ -179,14 +179,19 @@ def _kind(each: Guess) -> str:
     if units.kind(each.entry.unit) not in ("", "voltage", "number"):
         return ""
     kind = named.kind if len(named.kind_word) > 1 else ""
-    if len(view.edges) and kind in ("", "speed", "keyphasor"):
-        each.reasons += [word, f"{len(view.edges)} even pulses"]
+    # Few pulses tell nothing of what they are; a signal that turns by its name and has two levels is no speed.
+    pulses = view.edges if not kind else view.pulses if len(view.pulses) > 1 or kind == "keyphasor" else ()
+    if len(pulses) and kind in ("", "speed", "keyphasor"):
+        each.reasons += [word, f"{len(pulses)} {'even ' * bool(len(view.edges))}pulses"]
         each.sure = SURE if kind else LIKELY
         return "keyphasor"
     if kind == "keyphasor":
         return ""  # no pulses
     if kind == "force" and view.blows and not named.side:
         kind = "hammer"
+    if not kind and each.volts and named.place in _PAIRS["length"] and named.axis:
+        each.sure = SURE
+        return "length"
     if not kind and each.volts and _PROBE_V[0] < view.mean < _PROBE_V[1] and view.spread < 0.3 * abs(view.mean):
         each.reasons.append(f"rests at {view.mean:.3g} V, as a probe does")
         each.sure = LIKELY
@@ -373,9 +378,9 @@ def _opposite(each: Guess, found: Sequence[Guess]) -> list[str]:
 def _turns(guesses: Sequence[Guess]) -> None:
     """Pulses and speed check each other: pulses a turn, and the speed's unit where nobody tells it."""
     pulse = next((each for each in guesses if each.channel == "keyphasor"), None)
-    if pulse is None or len(pulse.look.edges) < 2:
+    if pulse is None or len(pulse.look.pulses) < 2:
         return
-    rate_hz = 1.0 / median((pulse.look.edges[1:] - pulse.look.edges[:-1]).tolist())
+    rate_hz = 1.0 / median((pulse.look.pulses[1:] - pulse.look.pulses[:-1]).tolist())
     speed = next((each for each in guesses if each.channel == "speed"), None) or _speed_of(guesses, rate_hz)
     if speed is None or not speed.look.mean:
         pulse.reasons.append(f"{rate_hz:.4g} pulses a second")
@@ -430,7 +435,7 @@ def _scale(each: Guess, unit: str, usual_v: float) -> None:
             each.reasons.append(f"told: {each.sensitivity}")
         else:
             each.sensitivity = f"{usual_v:g} V/{unit}"
-            each.asks["sensitivity"] = "assumed: the file tells none"
+            each.asks["sensitivity"] = "assumed, and that its volts rise toward +: the file tells none"
         bias = _BIAS.search(text)
         if bias is not None:
             scale = units.size_si(bias[2]) / units.size_si(each.entry.unit)

@@ -61,13 +61,18 @@ class Look:
         return float(self.values.min()), float(self.values.max())
 
     @cached_property
-    def edges(self) -> np.ndarray:
-        """Rising edges of a pulse train [s], shape (k,); none where it is no pulse train."""
+    def pulses(self) -> np.ndarray:
+        """Rising edges of a signal that is at one of two levels [s], shape (k,), however few; else none."""
         low, high = self.extent
         reach = _NEAR * (high - low)
         if not reach or np.mean((self.values < low + reach) | (self.values > high - reach)) < _TWO_LEVELS:
             return np.empty(0)
-        found, _ = clock.crossings(self.values, self.axis, threshold=None, hysteresis=None)
+        return clock.crossings(self.values, self.axis, threshold=None, hysteresis=None)[0]
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Rising edges of a pulse train [s], shape (k,); none where it is no pulse train."""
+        found = self.pulses
         if len(found) < _EDGES:
             return np.empty(0)
         apart = np.diff(found)

@@ -215,8 +215,8 @@ class ExperimentMapping(_Section):
     commands: tuple[dict[str, Any], ...] | Literal["scene", "detected"] = "scene"
     """Commands with at_s in the recording's time; those of the scene; or the hammer pulses that were found."""
     lead_s: Annotated[FiniteFloat, Field(ge=0.0, le=60.0)] | None = None
-    """The scene began so long before the first sample [s]. Left out: with the first sample; where hammer pulses were
-    found, the rig was running before, and where its shaft was, the samples tell."""
+    """The scene began so long before the first sample [s]. Left out: with the first sample; where commands are not the
+    scene's own, the rig was running before, and where its shaft was, the samples tell."""
 
 
 class Mapping(_Section):

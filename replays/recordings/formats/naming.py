@@ -14,7 +14,8 @@ _KINDS = {
     "speed": "speed rpm upm drehzahl spin tacho tach tachometer vitesse velocidad velocita giri regime toeren omega",
     "acceleration": "acc accel accelerometer acceleration beschl beschleunigung accelerometre aceleracion "
     "accelerazione accelerometro acelerometro versnelling iepe icp vib vibration",
-    "force": "kraft kraftmessdose force forces fuerza forza load loadcell effort kracht transducer kistler f fx fy p",
+    "force": "kraft kraftmessdose force forces fuerza forza load loadcell effort kracht transducer kistler f fx fy p "
+    "fn fs fe fw fo pn ps pe pw po",
     "length": "weg wegsonde wegaufnehmer sonde probe prox proximity proximiter displacement disp position pos "
     "gap abstand wirbelstrom eddy eddycurrent deplacement desplazamiento spostamento verplaatsing orbit taster d s",
 }  # fmt: skip
@@ -30,9 +31,10 @@ _AXES = {
     "y": "y ay fy ver vert vertical verticale vertikal senkrecht lotrecht",
 }
 _SIDES = {
-    "N": "n north nord norte noord noorden norden", "S": "s south sued sud sur zuid sueden",
-    "E": "e east ost est este oost osten", "W": "w west ouest oeste ovest westen",
+    "N": "n fn pn north nord norte noord noorden norden", "S": "s fs ps south sued sud sur zuid sueden",
+    "E": "e fe pe east ost est este oost osten", "W": "w fw pw west ouest oeste ovest westen",
 }  # fmt: skip
+_LONE_O = ("o", "fo", "po")
 _O = {"E": "W", "W": "E"}
 """The side that a lone `O` stands for, beside one that is named: Ost beside W, Ouest or Oeste beside E."""
 _LONG = 4
@@ -93,8 +95,8 @@ def read_name(name: str) -> Named:
             kind = wanted
             break
     rest = [word for word in words if word != kind_word or len(kind_word) > 1]
-    side_word = next((word for word in reversed(rest) if word in _SIDE_OF or word == "o"), "")
-    side = _SIDE_OF.get(side_word, side_word.upper())
+    side_word = next((word for word in reversed(rest) if word in _SIDE_OF or word in _LONE_O), "")
+    side = _SIDE_OF.get(side_word, side_word[-1:].upper())
     axis = _found(words, _AXIS_OF)[0]
     return Named(kind, kind_word, _found(words, _PLACE_OF)[0], axis, side, len(side_word) == 1)
 

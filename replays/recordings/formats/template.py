@@ -150,9 +150,9 @@ def _happened(guesses: Sequence[Guess], *, several: bool) -> list[str]:
     """Edges of the keyphasor and pulses of the hammer, where they were found."""
     lines = []
     for each in guesses:
-        if each.channel == "keyphasor" and len(each.look.edges):
+        if each.channel == "keyphasor" and len(each.look.pulses):
             mark = f"    # {CHECK}: {text}" if (text := each.asks.get("pulses_per_turn")) else ""
-            lines += ["", f"[keyphasor]    # {len(each.look.edges)} edges", f"source = {_quoted(each.entry.name)}"]
+            lines += ["", f"[keyphasor]    # {len(each.look.pulses)} edges", f"source = {_quoted(each.entry.name)}"]
             lines += [*_where(each, several=several), f"threshold = {each.look.threshold:.4g}"]
             lines += [f"pulses_per_turn = {each.pulses_per_turn}{mark}"]
         if each.channel == "hammer" and each.look.blows and each.gain:
@@ -184,15 +184,14 @@ def _example_of(table: str, guesses: Sequence[Guess]) -> list[str]:
         return _shared(kept, guesses)
     if table != "[experiment]":
         return kept
-    found = {each.channel for each in guesses}
-    without = {
-        "set",
-        *(() if found & {"speed", "keyphasor"} else ("speed_hz",)),
-        *(() if "hammer" in found else ("commands",)),
-    }
-    kept = [line for line in kept if line.split(" ")[0] not in {*without, "lead_s"}]
-    return [line if line.split(" ")[0] != "scene" or "hammer" in found else line.replace('"hammer"', '"stable-run"', 1)
-            for line in kept]  # fmt: skip
+    without = {"set", "lead_s", *(() if {each.channel for each in guesses} & {"speed", "keyphasor"} else ("speed_hz",))}
+    kept = [line for line in kept if line.split(" ")[0] not in without and not line.startswith(" ")]
+    if any(each.channel == "hammer" and each.look.blows for each in guesses):
+        return kept
+    quiet = {"scene": 'scene = "stable-run"                # a name of `rig scenes`, or a file',
+             "commands": "commands = []                       # no hammer pulse was found; where one was: "
+             '[{ at_s = 0.8, command = "hammer", force_n = 100, duration_ms = 5 }]'}  # fmt: skip
+    return [quiet.get(line.split(" ")[0], line) for line in kept]
 
 
 def _shared(lines: list[str], guesses: Sequence[Guess]) -> list[str]:

@@ -28,7 +28,7 @@ from replays.recordings.identification.agreement import (
 from replays.recordings.identification.question import first_command_s, observe
 from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.sensitivity import ANGLE, STATE, Predictor, on_the_models_clock, value_of, with_values
-from rig.errors import InputError
+from rig.errors import InputError, Words
 from rig.simulation import TICK_RATE_HZ
 
 NUISANCES = (
@@ -154,7 +154,7 @@ class Tuned:
     def before(self) -> Tuned:
         """The same as the fit was before its window last grew: on that it was as right."""
         moved = zip(self.values.items(), self.moves[-1].tolist(), strict=True)
-        return replace(self, values={key: value - by for (key, value), by in moved})
+        return replace(self, values=_possible(self.begun, {key: value - by for (key, value), by in moved}))
 
     def drawn(self, generator: np.random.Generator) -> Tuned:
         """The same with values as far off as the fit leaves open, and as what the model lacks still moves them."""
@@ -162,7 +162,8 @@ class Tuned:
         sizes, directions = np.linalg.eigh(self.covariance / np.outer(size, size))
         off = size * (directions @ (np.sqrt(np.maximum(sizes, 0.0)) * generator.standard_normal(len(size))))
         off += generator.standard_normal(len(self.moves)) @ self.moves
-        return replace(self, values={key: value + d for (key, value), d in zip(self.values.items(), off, strict=True)})
+        moved = {key: value + d for (key, value), d in zip(self.values.items(), off.tolist(), strict=True)}
+        return replace(self, values=_possible(self.begun, moved))
 
     def predict(self, parts: dict[str, Measured]) -> Prediction:
         """What is predicted for channels of the log, on its own clock."""
@@ -201,9 +202,9 @@ def turned(recording: Recording, experiment: Experiment) -> Experiment:
     Small motions are a sum: of one that begins elsewhere, and of one by the unbalance, as a cosine and a sine.
     Least squares over a few turns, in which a channel counts by what it leaves: one that is faulty has no say.
     """
-    first_s = first_command_s(experiment)
+    first_s = _told_until_s(experiment)
     experiment = _with_speed_of_edges(recording, experiment)
-    start_s, end_s = looks_from(experiment), first_s - _MARGIN_S if first_s > 0.0 else math.inf
+    start_s, end_s = looks_from(experiment), first_s - _MARGIN_S
     if end_s - start_s < _LEAST_LOOK_S:
         return experiment
     parts = observe(recording, experiment, window=(start_s, end_s)).parts
@@ -296,12 +297,17 @@ def tune(
         progress: Told what is being done.
 
     Raises:
-        InputError: There are no samples to do it by.
+        InputError: There are no samples to do it by, or none before the pulse.
     """
     progress("speed, angle and place of the shaft before the hammer pulse")
     begun = turned(recording, experiment) if ANGLE in keys else experiment
     wanted = nuisances_of(begun, keys) | dict(known or {})
-    first_s = first_command_s(begun)
+    first_s = _told_until_s(begun)
+    if first_s <= looks_from(begun):
+        must = (
+            f"a log that begins more than {1e3 * _SETTLED_S:g} ms before the hammer pulse, to tell where the shaft was"
+        )
+        raise InputError("file", must, Words(f"{recording.path}, of which the pulse comes at {first_s:.4g} s"))
     end_s = min(first_s + _WINDOWS_S[-1], math.inf if to_s is None else to_s)
     whole = observe(recording, begun, channels=channels, window=(looks_from(begun), end_s)).parts
     whole = {name: part.earlier(late_s or {}) for name, part in whole.items()}
@@ -332,6 +338,18 @@ def tune(
         end_s=found.end_s,
         scales=dict(zip((name for part in whole.values() for name in part.names), found.scales, strict=True)),
     )
+
+
+def _possible(experiment: Experiment, values: dict[str, float]) -> dict[str, float]:
+    """Values as a rig can have them: one that it cannot, far off where a log tells little, stays as it was."""
+    try:
+        with_values(experiment, values)
+    except InputError:
+        if len(values) == 1:
+            return {key: value_of(experiment, key) for key in values}
+        each = (_possible(experiment, {key: value}) for key, value in values.items())
+        return {key: value for one in each for key, value in one.items()}
+    return values
 
 
 @dataclass(frozen=True)
@@ -412,7 +430,7 @@ def _grown(
         trusting: Believe first what agrees with what the log tells.
         without: Channels that have no say.
     """
-    first_s, every = first_command_s(begun), [name not in without for part in whole.values() for name in part.names]
+    first_s, every = _told_until_s(begun), [name not in without for part in whole.values() for name in part.names]
     values = np.array([value_of(begun, key) for key in wanted])
     covariance, end_s, scales, moves = np.eye(len(values)), first_s, list[float](), [np.zeros(len(values))]
     for length in _WINDOWS_S:
@@ -437,6 +455,11 @@ def _grown(
         covariance, values = np.linalg.inv(square + np.diag(known[1] ** -2.0)), found
         end_s = first_s + length
     return _Grown(values, covariance, np.array(moves[-_LAST:]), end_s, scales)
+
+
+def _told_until_s(experiment: Experiment) -> float:
+    """When the first hammer pulse comes; without one, as long behind the begin as is looked at before a pulse [s]."""
+    return first_command_s(experiment) or looks_from(experiment) + BEFORE_S
 
 
 def looks_from(experiment: Experiment) -> float:

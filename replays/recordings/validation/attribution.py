@@ -7,7 +7,7 @@ of the residual each explains, so that two that explain it alike are seen to do 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -47,6 +47,8 @@ _STARTS = (0.0, *(sign * part for part in (0.005, 0.01, 0.02, 0.035, 0.06, 0.1, 
 """Where a fit may start on the first window, as parts of the farthest that it may go ..."""
 _TRIED = 3
 """... and from how many of these it does."""
+_FEW = 0.3
+"""Less than this part of the channels may be off by themselves: of more it is the model."""
 _AT_ODDS = 10.0
 """Where this is left of the middle channel, over its noise, most are wrong, or what is held against them."""
 _BESIDE = 1e-3
@@ -166,7 +168,7 @@ def _behind(
 
 def explain_log(
     parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], tuned: Tuned, rules: Attribution,
-    *, from_s: float, end_s: float, faults: Sequence[SignalFault] = (),
+    *, from_s: float, end_s: float, faults: Sequence[SignalFault] = (), touching: bool = False,
 ) -> Explained:  # fmt: skip
     """What explains that a log of another system differs: sensors, or what was fitted beyond what is known of it.
 
@@ -179,6 +181,7 @@ def explain_log(
         from_s: First difference [s].
         end_s: How far the model has been followed [s].
         faults: What signals show by themselves.
+        touching: The shaft is in contact where the log begins.
     """
     sensors = sensor_faults(parts, nominal, end_s, others)
     # What one fault brings along elsewhere, in the fit before, is none of its own.
@@ -186,7 +189,10 @@ def explain_log(
     sensors = [one for one in sensors if one.explained > _BESIDE * most]
     trigger = any(one.name == "hammer delay" for one in sensors)
     far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
-    cured = bool(sensors) and (sum(one.explained for one in sensors) > _MOST or all(one.at_floor for one in sensors))
+    cured = bool(sensors) and (
+        all(one.at_floor for one in sensors)
+        or (sum(one.explained for one in sensors) > _MOST and not _whole_kind(sensors, parts))
+    )
     conclusion, best = conclude(sensors, sensors if cured and not far else [], rules, end_s=end_s)
     if far:
         best = tuple(one.key for one in far)
@@ -194,13 +200,20 @@ def explain_log(
     elif not best and faults:
         conclusion = f"what signals show by themselves comes first: {'; '.join(one.line for one in faults)}"
     elif not best and float(np.median(list(tuned.scales.values()))) > _AT_ODDS:
-        conclusion = "nothing goes together from the hammer pulse on: its time, several channels, or the model is off; "
-        conclusion += "this log cannot tell"
+        if touching:
+            conclusion = "the log begins in contact, and where the shaft was before that, it does not tell: "
+            conclusion += "take one that begins before the hammer pulse"
+        else:
+            conclusion = "nothing goes together from the hammer pulse on: its time, several channels, or the model is "
+            conclusion += "off; this log cannot tell"
     elif not best and sum(one.explained for one in sensors) > rules.enough:
         part = sum(one.explained for one in sensors)
         conclusion = (
             f"nearest are {_listed(sensors)}: {part:.0%} of the difference; the rest is another fault, or the model"
         )
+    elif not best and 0 < len(few := _channels_in(sensors, tuned.scales)) < _FEW * len(tuned.scales):
+        conclusion = f"of {len(tuned.scales)} channels {_and(few)} alone: a fault that has no name here, as hum, "
+        conclusion += "cross-talk or drift, or a number of the model that moves no other; this log cannot tell"
     elif not best:
         conclusion = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
     return Explained(from_s, end_s, tuple(sorted(sensors, key=lambda one: -one.explained)), conclusion, best)
@@ -448,6 +461,29 @@ def conclude(
     if len(equal) == 1:
         return f"{short}{single.kind}: {single.name} {single.change} ({part})", names
     return f"{short}{_listed(equal)} explain it equally ({part}); this recording cannot tell them apart", names
+
+
+def _channels_in(found: list[Explanation], names: Iterable[str]) -> list[str]:
+    """Channels that explanations are about."""
+    words = {word for one in found for word in one.name.replace(",", " ").split()}
+    return [name for name in names if name in words]
+
+
+def _whole_kind(found: list[Explanation], parts: dict[str, Measured]) -> bool:
+    """Whether all channels of a kind are off, and not alike: then it is what they show, and none of them."""
+    kinds: dict[str, list[str]] = {}
+    for channel in (channel for part in parts.values() for channel in part.channels):
+        kinds.setdefault(channel.unit, []).append(channel.name)
+    return any(
+        len(names) > 2
+        and _channels_in(found, names) == names
+        and sum(bool(_channels_in([one], names)) for one in found) > 1
+        for names in kinds.values()
+    )
+
+
+def _and(names: list[str]) -> str:
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
 
 
 def _listed(found: list[Explanation]) -> str:

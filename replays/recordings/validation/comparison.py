@@ -20,6 +20,7 @@ from replays.recordings.validation.bits import Bits, StreamBits
 from replays.recordings.validation.criteria import Criteria, load_criteria
 from replays.recordings.validation.faults import late_together
 from replays.recordings.validation.outcome import Validation
+from replays.recordings.validation.phases import PHASES
 from replays.recordings.validation.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.statistics import perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
@@ -78,13 +79,14 @@ def validate(
             again.quick, again.parts, again.nominal, again.criteria.attribution, from_s=min(firsts), step=step
         )
         return replace(validation, explained=explained)
-    explained = _log_explained(again, from_s=min(firsts), end_s=end)
+    touching = bool(phases) and phases[0].name not in (PHASES[0], PHASES[-1])
+    explained = _log_explained(again, from_s=min(firsts), end_s=end, touching=touching)
     late_s = late_together(explained.ranked, again.parts)
     if late_s:
         step("the same with channels of a kind late together")
         other = _log_done_again(recording, experiment, criteria, step, late_s=late_s)
         if other.tuned is not None and other.tuned.better_than(again.tuned):
-            explained = _log_explained(other, from_s=min(firsts), end_s=min(end, other.tuned.end_s))
+            explained = _log_explained(other, from_s=min(firsts), end_s=min(end, other.tuned.end_s), touching=touching)
     return replace(validation, explained=explained)
 
 
@@ -153,9 +155,12 @@ def _log_done_again(
     others += [tuned.predict({name: part.filtered(rules.bandwidth) for name, part in parts.items()})]
     gains = {name: v + rules.calibration * (v - v.mean(axis=0)) for name, v in nominal.values.items()}
     others += [replace(nominal, values=gains)]
+    until_s = first_command_s(tuned.begun) or math.inf
+    if np.count_nonzero(recording.edges() < until_s) < 2:
+        # Nothing tells well enough when a pulse is due: it is as likely as not, at any time.
+        others.insert(1, _with_pulses(parts, nominal, lambda pulses: 1.0 - pulses))
     drawn = [models[n % len(models)].drawn(generator) for n in range(criteria.ensemble.members)]
     faults = signal_faults(whole)
-    until_s = first_command_s(tuned.begun) or math.inf
     faults += edge_faults(recording.edges(), until_s, tuned.begun.scene.drive.speed_hz)
     return _DoneAgain(
         faults=tuple(faults), members=tuple(one.predict(parts) for one in drawn),
@@ -163,6 +168,14 @@ def _log_done_again(
         parts=tuned.on_time(parts),
         nominal=nominal, others=tuple(others), bits={}, tuned=tuned,
     )  # fmt: skip
+
+
+def _with_pulses(
+    parts: dict[str, Measured], nominal: Prediction, change: Callable[[np.ndarray], np.ndarray]
+) -> Prediction:
+    """A prediction with other pulses of the keyphasor."""
+    pulses = {name: [channel.name == "keyphasor" for channel in part.channels] for name, part in parts.items()}
+    return replace(nominal, values={k: np.where(pulses[k], change(v), v) for k, v in nominal.values.items()})
 
 
 def _window(again: _DoneAgain) -> tuple[float, float, str]:
@@ -182,12 +195,12 @@ def _window(again: _DoneAgain) -> tuple[float, float, str]:
     return begin, parted, f"{change} reaches {rules.share:g} of a channel's noise at {parted:.4f} s"
 
 
-def _log_explained(again: _DoneAgain, *, from_s: float, end_s: float) -> Explained:
+def _log_explained(again: _DoneAgain, *, from_s: float, end_s: float, touching: bool) -> Explained:
     # Numbers of the model hang together with what was fitted: `rig identify` fits all.
     assert again.tuned is not None
     return explain_log(
         again.parts, again.nominal, again.others, again.tuned, again.criteria.attribution, from_s=from_s, end_s=end_s,
-        faults=again.faults,
+        faults=again.faults, touching=touching,
     )  # fmt: skip
 
 

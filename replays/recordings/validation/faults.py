@@ -253,15 +253,16 @@ def _one_sensor(one: _Shown, told: _Telling) -> _Alone:
             )
     if one.moves and len(e) > _FEW and (np.diff(one.times_s) > 0.0).all():
         late_s, delayed, slope = _delayed(one)
-        (shift,), left = one.left([ones], one.values - delayed)
-        change = f"{late_s * 1e6:+.4g} µs"
-        options.append(option("delay", change, late_s, (one.values - delayed) / one.floor, unit="s", delay=late_s))
-        if abs(shift) > one.noise:
-            both = f"{change}, {shift:+.4g} {one.unit}"
-            options.append(option("delay and offset", both, late_s, left, 2, "s", delay=late_s))
-        factors, left = one.left([delayed, ones])
-        what, also = _gain_words(gain := float(factors[0]))
-        options.append(option(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 3, delay=late_s))
+        if abs(late_s) <= _LATEST_S + 2.0 * float(np.diff(one.times_s).min()):  # else that is the search's end
+            (shift,), left = one.left([ones], one.values - delayed)
+            change = f"{late_s * 1e6:+.4g} µs"
+            options.append(option("delay", change, late_s, (one.values - delayed) / one.floor, unit="s", delay=late_s))
+            if abs(shift) > one.noise:
+                both = f"{change}, {shift:+.4g} {one.unit}"
+                options.append(option("delay and offset", both, late_s, left, 2, "s", delay=late_s))
+            factors, left = one.left([delayed, ones])
+            what, also = _gain_words(gain := float(factors[0]))
+            options.append(option(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 3, delay=late_s))
         factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - e)
         lower = "lower" if factors[1] > 0.0 else "higher"
         options.append(option("bandwidth", f"{lower} than told", float(factors[1]), left, 2))
