@@ -15,7 +15,7 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.experiment import Experiment
-from rig.channels import Channel, Group
+from rig.channels import Channel, Group, default_table
 from rig.errors import InputError
 from rig.formula import Formulas
 from rig.offline import frames
@@ -26,8 +26,8 @@ from rig.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
 
 _FINE_BITS = 32
 """Bits of a predicted channel's converter: its steps are none of the recording's."""
-_BEYOND = 1024.0
-"""So much more than an imported log shows of a channel may be predicted: its unit, or gain, may be wrong."""
+_BEYOND = 16.0
+"""So much more than an imported log shows of a channel may be predicted, where the rig has none of that name."""
 _QUIET = 2.0
 """Below so many steps of noise a channel's rounding is not random: its floor is a bound, not a deviation."""
 _CHUNK_S = 0.1
@@ -131,7 +131,14 @@ class Measured:
 
 
 def _wide(channel: Channel) -> dict[str, Any]:
+    """A range that holds what the rig's own channel of that name may show: of the log's, the unit may be wrong."""
+    own = next(
+        (one for group in default_table().groups.values() for one in group.channels if one.name == channel.name), None
+    )
     reach_v = _BEYOND * channel.adc_v
+    if own is not None and own.unit == channel.unit:
+        ends = ((volts - own.bias_v) / own.sensitivity_v for volts in own.range_v)
+        reach_v = max(channel.adc_v, 2.0 * max(abs(channel.bias_v + channel.sensitivity_v * end) for end in ends))
     return {"adc_v": reach_v, "range_v": (-reach_v, reach_v)}
 
 

@@ -77,6 +77,18 @@ def test_delays_that_are_the_same_are_told_together(rows: int) -> None:
     assert value == pytest.approx(rows / RATE_HZ, rel=0.01)
 
 
+def test_one_that_has_more_beside_the_same_delay_is_told_with_the_others() -> None:
+    """A ten-thousandth of gain and a little offset are what a fit leaves, and no faults beside 1.6 ms of delay."""
+
+    def change(values: np.ndarray, clean: np.ndarray) -> None:
+        values[8:, :3] += clean[:-8, :3] - clean[8:, :3]
+        values[:, 1] += 2e-4 * clean[:, 1]
+        values[:, 2] += 0.2 * values[:, 2].std() / 900.0
+
+    ((name, _),) = told(change)
+    assert name == "disk_x, disk_y, ring_x delay"
+
+
 def test_swapped_and_turned() -> None:
     def swap(values: np.ndarray, clean: np.ndarray) -> None:
         values[:, [0, 1]] = values[:, [1, 0]]
@@ -96,9 +108,10 @@ def test_what_signals_show_by_themselves() -> None:
     values = part.values.copy()
     values[2000:2300, 0] = values[2000, 0]
     values[:, 1] = np.minimum(values[:, 1], 3300.0)
+    values[4000:4005, 3] = values[:, 3].max() + 1.0  # one short peak
     values[:, 2] += 8.0 * part.floor[2] * np.random.default_rng(0).standard_normal(ROWS)
     found = {(one.channel, one.what): one for one in signal_faults({"forces": replace(part, values=values)})}
-    assert set(found) == {("P_N", "stuck"), ("P_S", "clipped"), ("P_E", "noise")}
+    assert set(found) == {("P_N", "stuck"), ("P_S", "clipped"), ("P_E", "noise"), ("P_W", "clipped")}
     stuck = found["P_N", "stuck"]
     assert (stuck.from_s, stuck.to_s) == (pytest.approx(0.1), pytest.approx(0.11495))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -325,3 +326,16 @@ def test_aligned_logs_are_good(seed: int, tmp_path: Path) -> None:
 def test_every_fault_has_its_name(case: faulty_logs.Case, motion: second_rig.Motion, tmp_path: Path) -> None:
     found = validate(whole(tmp_path, motion, seed=100 + faulty_logs.CASES.index(case), case=case))
     assert case.named_by(found), (found.explained, found.faults)
+
+
+@MATRIX
+@pytest.mark.parametrize(("number", "told"), [
+    ("r0 = 0.945e-3", "model: ring.clearance"), ("P0 = 3300.0", "or house.preload"),
+    ("eps = 0.11e-3", "model: shaft.unbalance_eccentricity"), ("K_mag = 1751.0", "nearest are .* or the model"),
+])  # fmt: skip
+def test_another_number_of_the_model_passes_for_no_sensor(number: str, told: str, tmp_path: Path) -> None:
+    name, _, value = number.partition(" = ")
+    other = second_rig.run(second_rig.Rig(**{name: float(value)}), turned=1.0, settled_s=1.5, after_s=0.1)
+    found = validate(whole(tmp_path, other, seed=4))
+    assert found.explained is not None
+    assert re.search(told, found.explained.conclusion)

@@ -30,6 +30,7 @@ from replays.recordings.validation.explanation import (
     vector,
 )
 from replays.recordings.validation.faults import Clock, sensor_faults
+from replays.recordings.validation.numbers import numbers_of_the_model
 from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import scaled
 from rig.errors import InputError, SimulationError
@@ -193,10 +194,14 @@ def explain_log(
         all(one.at_floor for one in sensors)
         or (sum(one.explained for one in sensors) > _MOST and not _whole_kind(sensors, parts))
     )
-    conclusion, best = conclude(sensors, sensors if cured and not far else [], rules, end_s=end_s)
+    numbers = numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=end_s) if sensors or far else []
+    # One that explains no more than the sensors do is not told beside them.
+    numbers = [one for one in numbers if one.at_floor or one.explained > _MOST]
+    conclusion, best = conclude([*sensors, *numbers], sensors if cured else [], rules, end_s=end_s)
     if far:
-        best = tuple(one.key for one in far)
-        conclusion = "beyond what is known of it: " + "; ".join(one.line for one in far)
+        also = f"; {conclusion}" if best else ""
+        best = (*(one.key for one in far), *best)
+        conclusion = "beyond what is known of it: " + "; ".join(one.line for one in far) + also
     elif not best and faults:
         conclusion = f"what signals show by themselves comes first: {'; '.join(one.line for one in faults)}"
     elif not best and float(np.median(list(tuned.scales.values()))) > _AT_ODDS:
@@ -216,7 +221,9 @@ def explain_log(
         conclusion += "cross-talk or drift, or a number of the model that moves no other; this log cannot tell"
     elif not best:
         conclusion = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
-    return Explained(from_s, end_s, tuple(sorted(sensors, key=lambda one: -one.explained)), conclusion, best)
+    return Explained(
+        from_s, end_s, tuple(sorted([*sensors, *numbers], key=lambda one: -one.explained)), conclusion, best
+    )
 
 
 class _CandidateFit:
@@ -443,7 +450,9 @@ def conclude(
     if cured and (single is None or not single.at_floor or len(cured) == 1):
         names = tuple(one.name for one in cured)
         text = "; ".join(f"{one.name} {one.change}" for one in cured)
-        also = [one for one in alone if one.at_floor]
+        most = sum(one.explained for one in cured)
+        # What is one number against several is told beside them, if it explains as much.
+        also = [one for one in alone if one.at_floor or (cured[1:] and one.explained > most - rules.equal)]
         if also:
             text = f"sensor: {text}, or {_listed(also)} explain it alike; this recording cannot tell"
             return text, (*names, *(one.name for one in also))
