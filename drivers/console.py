@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 from rig import wire
@@ -21,12 +22,18 @@ class Accepted:
         id: Number of the command in this run; the stream's event `command` carries it too.
         tick: Simulated time at which it takes effect [ticks]; for a step, at which it was done.
         time_s: The same [s].
+        fault: Of a fault, its number.
+        channels: Of a fault, its channels.
+        first_row: Number of the first row that it changes, by group.
     """
 
     command: str
     id: int
     tick: int
     time_s: float
+    fault: int = 0
+    channels: tuple[str, ...] = ()
+    first_row: Mapping[str, int] = field(default_factory=dict)
 
 
 class Console:
@@ -109,6 +116,29 @@ class Console:
             RefusedError: The rig refused, for the reason in the message.
         """
         return self._command("release")
+
+    def fault(self, channel: str, kind: str, *, for_s: float | None = None, **numbers: Any) -> Accepted:
+        """Make a channel misbehave; `rig fault --list` has the kinds and their numbers.
+
+        Args:
+            channel: A channel, or a group for all of its channels.
+            kind: What it does.
+            for_s: How long [s]; until it is cleared unless given.
+            numbers: Of the kind, such as `factor=1.05` of a gain.
+
+        Raises:
+            RefusedError: The rig refused, for the reason in the message.
+        """
+        given = {} if for_s is None else {"for_s": for_s}
+        return self._command("fault", channel=channel, kind=kind, **given, **numbers)
+
+    def clear(self, number: int | str = "all") -> Accepted:
+        """End a fault by its number, or all.
+
+        Raises:
+            RefusedError: There is no such fault.
+        """
+        return self._command("clear", id=number)
 
     def stop(self) -> Accepted:
         """End the run.
@@ -196,4 +226,6 @@ class Console:
         reply = wire.decode_document(payload)
         if not reply.get("accepted"):
             raise RefusedError(str(reply.get("error", f"the rig refused {command} without a reason")))
-        return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"])
+        told = {"fault": reply.get("fault", 0), "channels": tuple(reply.get("channels", ()))}
+        told["first_row"] = dict(reply.get("first_row", {}))
+        return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"], **told)

@@ -1,13 +1,14 @@
-"""What can be done to the rig while it runs: a hammer's pulse, another speed, the release of the magnets."""
+"""What can be done to the rig while it runs: a pulse of the hammer, another speed, the magnets' release, faults."""
 
 from __future__ import annotations
 
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, FiniteFloat, field_validator
+from pydantic import ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
-from rig.errors import InputError
+from rig.errors import InputError, UnknownNameError
+from rig.faults import KINDS, AnyKind
 from rig.outside import Written, check
 
 _DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0), "-x": (-1.0, 0.0), "-y": (0.0, -1.0)}
@@ -60,8 +61,42 @@ class ReleaseCommand(_Command):
     command: Literal["release"] = "release"
 
 
-Command = HammerCommand | SpeedCommand | ReleaseCommand
-COMMANDS: dict[str, type[Command]] = {"hammer": HammerCommand, "speed": SpeedCommand, "release": ReleaseCommand}
+class FaultCommand(_Command):
+    """A channel, or a group of them, begins to misbehave: `rig.faults` has the kinds and their numbers."""
+
+    command: Literal["fault"] = "fault"
+    channel: str
+    """A channel, or a group: all of its channels."""
+    what: Annotated[AnyKind, Field(discriminator="kind")]
+    """The kind and its numbers; they stand beside `channel`."""
+    for_s: Annotated[FiniteFloat, Field(gt=0.0, le=86_400.0)] | None = None
+    """How long [s]; until it is cleared unless given."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flat(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or "what" in data:
+            return data
+        own = {key: value for key, value in data.items() if key in cls.model_fields}
+        rest = {key: value for key, value in data.items() if key not in own}
+        kind = rest.get("kind")
+        if not isinstance(kind, str) or kind not in KINDS:
+            raise UnknownNameError("kind", "one of the kinds", kind, KINDS)
+        return {**own, "what": check(KINDS[kind], rest, field="")}
+
+
+class ClearCommand(_Command):
+    """Ends a fault, by its number, or all of them; from then on it is as if there had been none."""
+
+    command: Literal["clear"] = "clear"
+    id: Annotated[int, Field(ge=1)] | Literal["all"] = "all"
+
+
+Command = HammerCommand | SpeedCommand | ReleaseCommand | FaultCommand | ClearCommand
+COMMANDS: dict[str, type[Command]] = {
+    "hammer": HammerCommand, "speed": SpeedCommand, "release": ReleaseCommand, "fault": FaultCommand,
+    "clear": ClearCommand,
+}  # fmt: skip
 
 
 def check_command(name: str, request: dict[str, Any]) -> Command:

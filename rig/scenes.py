@@ -189,11 +189,22 @@ class Scene(Written):
     pick: Pick | None = None
     """What `rig ladder --write` has stored; only fidelity "auto" makes use of it."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _faults(cls, data: Any) -> Any:
+        # In a file faults stand under a heading of their own.
+        if not isinstance(data, dict) or "faults" not in data:
+            return data
+        faults = cls._tables(data["faults"], "faults")
+        timed = [{"command": "fault", **each} if isinstance(each, dict) else each for each in faults]
+        rest = {key: value for key, value in data.items() if key != "faults"}
+        return {**rest, "commands": [*cls._tables(data.get("commands", ())), *timed]}
+
     @field_validator("commands", mode="before")
     @classmethod
-    def _tables(cls, commands: Any) -> Any:
+    def _tables(cls, commands: Any, heading: str = "commands") -> Any:
         if not isinstance(commands, list | tuple):
-            raise ValueError("a list of tables, each headed [[commands]]")
+            raise InputError(heading, f"a list of tables, each headed [[{heading}]]", commands)
         return commands
 
     @field_validator("set")

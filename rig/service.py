@@ -28,7 +28,7 @@ from rig.transport.limit import CommandLimit
 if TYPE_CHECKING:
     from rig.simulation import Frame, Simulation
 
-SIMULATION_COMMANDS = ("hammer", "speed", "release")
+SIMULATION_COMMANDS = ("hammer", "speed", "release", "fault", "clear")
 """Commands that the simulation itself checks and carries out."""
 COMMANDS = (*SIMULATION_COMMANDS, "stop", "step", "note")
 REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
@@ -231,16 +231,18 @@ class Service(ServedRun):
 
     def _carry_out(self, pending: Pending) -> dict[str, Any]:
         asked, tick, done_tick = pending.asked, self._simulation.tick, None
+        told: dict[str, Any] = {}
         if pending.command == "stop":
             self._stop_requested = True
         elif isinstance(asked, Step):
             done_tick = self._check_step(asked)
         elif not isinstance(asked, Note):
             tick = self._simulation.submit(pending.command, dict(pending.request))
+            told = self._simulation.told
             self._keep({"id": self._accepted + 1, "tick": tick, "command": pending.command, "request": pending.request})
         reply = self._accept(pending, tick if done_tick is None else done_tick)
         if done_tick is None:
-            pending.answer(reply)
+            pending.answer({**reply, **told})
         else:
             self._steps.append((done_tick, pending, reply))
         if isinstance(asked, Note):

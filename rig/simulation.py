@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from rig.channels import ChannelTable
-from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, check_command
+from rig.commands import ClearCommand, FaultCommand, HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.engines import ENGINES, load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, PEAK_FORCE, STEPS
 from rig.errors import InputError, SimulationError, Words
@@ -31,6 +31,7 @@ from rig.model import build_model, describe
 from rig.motion import BRANCH_ALARM, FINER, Accuracy, Begin, Motion, energy_balance, initial_state
 from rig.scenes import Scene, load_scene, scene_document
 from rig.sensors.conditioning import Conditioner
+from rig.sensors.faulty import Faulty
 from rig.sensors.keyphasor import Keyphasor
 from rig.speed_target import Segment, segments
 from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key
@@ -81,7 +82,7 @@ class Snapshot:
 
 _CHANGING = (
     "tick", "first_row", "_segments", "_engaged", "_pulse", "_pending", "_motion", "_companion", "_accuracy", "_last",
-    "_conditioners", "_keyphasor",
+    "_conditioners", "_keyphasor", "_edges_shown", "_faulty",
 )  # fmt: skip
 
 
@@ -99,6 +100,7 @@ class Simulation:
         row_ticks: Ticks between observed rows.
         begin: Where it is taken up; None: at the scene's own start.
         kept_every: Rows from one that samples fall on to the next; 1 where some fall between rows.
+        told: What the last command comes to beside its tick: a fault's number, channels and first faulty rows.
 
     Example:
         >>> import rig
@@ -140,8 +142,13 @@ class Simulation:
             )
             for rate in dict.fromkeys(group.rate_hz for group in groups)
         ]
+        self._faulty = Faulty(
+            self.table, self._conditioners, seed=scene.seed, row_ticks=self.row_ticks, noisy=sensors.noise,
+            ideal=sensors.chain == "ideal",
+        )  # fmt: skip
         marked = any(channel.signal == "keyphasor" for channel in self.table.channels.values())
         self._keyphasor = Keyphasor() if marked else None
+        self._edges_shown = 0
         self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
         self._truth_columns = np.array([COLUMN[column] for columns in S.TRUTH.values() for column in columns])
         ends = accumulate(len(columns) for columns in S.TRUTH.values())
@@ -149,6 +156,7 @@ class Simulation:
             name: slice(end - len(columns), end) for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
         }
 
+        self.told: dict[str, Any] = {}
         self.tick = self._start = 0 if begin is None else begin.tick
         if self.tick % self.block_ticks:
             raise InputError("begin.tick", f"a multiple of {self.block_ticks}", self.tick)
@@ -211,7 +219,7 @@ class Simulation:
             # What changes on a row changes behind it: sensors see the row before the change, then that after it.
             row, beyond = divmod(stop - start, self.row_ticks)
             if not beyond:
-                counts.append(self._condition(rows[seen : row + 1]))
+                counts.append(self._condition(rows[seen : row + 1], start + seen * self.row_ticks))
                 seen = row
         rows = rows[:n]
         self._last = rows[-1].copy()
@@ -253,7 +261,7 @@ class Simulation:
         Raises:
             InputError: Unknown, malformed, out of range, or not possible now.
         """
-        command = check_command(name, request)
+        command, self.told = check_command(name, request), {}
         waiting = [other for tick, other in self._pending if tick <= self.tick]
         if isinstance(command, HammerCommand):
             busy_until = self._pulse[2] if self._pulse is not None else 0
@@ -264,6 +272,8 @@ class Simulation:
             top = self.model.parameters.entries["drive.top_speed"].value
             if not isinstance(top, str) and command.speed_hz > top:
                 raise InputError("speed.speed_hz", f"at most drive.top_speed = {top:g} Hz", command.speed_hz)
+        elif isinstance(command, FaultCommand | ClearCommand):
+            self.told = self._faulty.check(command, self.tick, waiting)
         elif not self._engaged or any(isinstance(other, ReleaseCommand) for other in waiting):
             raise InputError("release", "given once (the magnets have let go already)", Words("another release"))
         insort(self._pending, (self.tick, command), key=lambda entry: entry[0])
@@ -391,6 +401,8 @@ class Simulation:
                 self._pulse = (command, self.tick, self.tick + max(1, length))
             elif isinstance(command, SpeedCommand):
                 self._ramp_to(2.0 * math.pi * command.speed_hz)
+            elif isinstance(command, FaultCommand | ClearCommand):
+                event |= self._faulty.take(command, self.tick, self._pending)
             else:
                 self._release()
             events.append(event)
@@ -444,9 +456,18 @@ class Simulation:
             magnet_engaged=self._engaged,
         )
 
-    def _condition(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+    def _condition(self, rows: np.ndarray, tick: int) -> dict[str, np.ndarray]:
         made = self._formulas.values(rows)
-        return {name: counts for each in self._conditioners for name, counts in each.counts(rows, made).items()}
+        if not self._faulty.active:
+            return {name: counts for each in self._conditioners for name, counts in each.counts(rows, made).items()}
+        end = tick + (len(rows) - 1) * self.row_ticks
+        ticks = [tick, *self._faulty.changes(tick, end), end]
+        places = [(each - tick) // self.row_ticks for each in ticks]
+        parts = [
+            self._faulty.counts(rows[a : b + 1], made[a : b + 1], begin)
+            for begin, a, b in zip(ticks, places, places[1:], strict=False)
+        ]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
         found = {}
@@ -463,8 +484,9 @@ class Simulation:
     def _edges(self, rows: np.ndarray, start: int) -> Block | None:
         if self._keyphasor is None:
             return None
-        index = self._keyphasor.edges_seen
         edges = self._keyphasor.edges(rows, self.row_ticks)
+        edges = self._faulty.edges(edges, rows, start)
+        index, self._edges_shown = self._edges_shown, self._edges_shown + len(edges)
         return self._block(start, index, 0, edges[:, None]) if len(edges) else None
 
     def _truth(self, rows: np.ndarray, start: int) -> dict[str, Block]:

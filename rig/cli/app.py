@@ -37,6 +37,7 @@ COMMANDS = {
         "hammer": "Hit the shaft of a running rig at the disk",
         "speed": "Set the spin speed of a running rig",
         "release": "Make the magnets of a running rig let go of the shaft",
+        "fault": "Make a channel of a running rig misbehave, or end that",
         "step": "Let a rig that runs with --pace lockstep simulate TICKS more",
         "note": "Put a note into every recording that is being made of a rig",
         "status": "Show how a running rig is doing: time, pace, lateness, losses",

@@ -9,7 +9,7 @@ from rig.kernels.stage import stage
 
 KEYPHASOR_WIDTH = math.radians(10.0)
 """Angle over which the mark is seen [rad], ..."""
-_EDGE = math.radians(1.0)
+EDGE = math.radians(1.0)
 """... and over which it comes into sight and goes, as wide as the probe's tip: both assumed [rad]."""
 
 
@@ -58,7 +58,7 @@ def write_observed(
     out[S.RING_Y] = lA * uy - state.y_ih - contact.offset_y
     out[S.SPIN_RATE] = state.dth
     ahead = (state.theta + math.pi) % (2.0 * math.pi) - math.pi
-    seen = 0.5 + min(ahead, KEYPHASOR_WIDTH - ahead) / _EDGE
+    seen = 0.5 + min(ahead, KEYPHASOR_WIDTH - ahead) / EDGE
     out[S.KEYPHASOR] = min(max(seen, 0.0), 1.0)
     out[S.DRIVE_TORQUE] = motion.torque
     out[S.MAGNET_X] = magnets.x

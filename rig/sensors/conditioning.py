@@ -6,13 +6,14 @@ A channel is a chain in continuous time (`rig.sensors.filters`), and so its samp
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numba import njit
 
-from rig.channels import Group, check_signals
+from rig.channels import Channel, Group, check_signals
 from rig.kernels.signals import COLUMN
 from rig.kernels.stage import kernel
 from rig.sampling import between
@@ -231,7 +232,10 @@ class Conditioner:
             self._spans.append((group.name, sum(width for _, _, width in self._spans), len(group.channels)))
         self._places = np.array([(before, width, c) for _, before, width in self._spans for c in range(width)])
         none = np.zeros(0, complex), np.zeros(0, complex), 1.0
-        filters = [none if ideal else channel_poles(channel, row_rate_hz) for channel in channels]
+        filters = [
+            none if ideal or math.isinf(channel.bandwidth_hz) else channel_poles(channel, row_rate_hz)
+            for channel in channels
+        ]
         most = max(len(poles) for poles, _, _ in filters)
         sets = -(-len(channels) // _LANES)
         # Lanes without a channel make zeros.
@@ -259,12 +263,65 @@ class Conditioner:
         self._steps, self._phases = steps.reshape(sets, -1), phases.reshape(sets, -1)
         self._waves = np.zeros((sets, most * 2 * _LANES))
         self._past: np.ndarray | None = None
+        self._row_rate_hz, self._noise, self._ideal = row_rate_hz, noise, ideal
+        self._lanes = {channel.name: divmod(c, _LANES) for c, channel in enumerate(channels)}
+        self._inherited: list[tuple[str, np.ndarray, np.ndarray]] = []
+        """Of a twin that has not begun: channels, with the states of their poles and their volts before."""
         self._streams = noise_streams([channel.name for channel in channels] if noise and not ideal else [], seed)
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Column of each channel's signal in the rows, or behind them, shape (channels,)."""
+        return self._columns
+
+    def twin(self, channels: Mapping[str, Channel], *, rate_hz: int, first: int, row: int, columns: int) -> Conditioner:
+        """Another chain of some of the channels, which goes on from where this one is.
+
+        Args:
+            channels: The channels by name; one with another filter begins in the steady state of its first row.
+            rate_hz: Samples a second.
+            first: Number of its first sample.
+            row: Number of its first row.
+            columns: From which on its signals are, one behind the other.
+        """
+        # Not checked: no table has channels without a range, or without a filter.
+        group = Group.model_construct(name="twin", title="", rate_hz=rate_hz, channels=tuple(channels.values()))
+        other = Conditioner(
+            [group], row_rate_hz=self._row_rate_hz, seed=0, noise=self._noise, ideal=self._ideal,
+            columns=range(columns, columns + len(channels)),
+        )  # fmt: skip
+        other._late = first * other._apart - row * other._parts
+        other.take_over(self, list(channels))
+        return other
+
+    def take_over(self, other: Conditioner, names: Sequence[str]) -> None:
+        """Go on from another's noise, and where they have the same filters, from their states."""
+        mine = {channel.name: channel for group in self.groups for channel in group.channels}
+        theirs = {channel.name: channel for group in other.groups for channel in group.channels}
+        for name in names:
+            at = list(mine).index(name), list(theirs).index(name)
+            if len(self._streams) and len(other._streams):
+                self._streams[at[0]] = other._streams[at[1]]
+            filters = [(one.bandwidth_hz, one.filter_order, one.highpass_hz) for one in (mine[name], theirs[name])]
+            if filters[0] == filters[1] and other._past is not None:
+                part, lane = other._lanes[name]
+                waves = other._waves[part].reshape(-1, _LANES)[:, lane].copy()
+                self._inherited.append((name, waves, other._past[part].reshape(2, _LANES)[:, lane].copy()))
+
+    def _go_on(self) -> None:
+        """Begin with what was taken over, once the rest is settled."""
+        assert self._past is not None
+        for name, waves, past in self._inherited:
+            part, lane = self._lanes[name]
+            own = self._waves[part].reshape(-1, _LANES)
+            own[: len(waves), lane] = waves[: len(own)]
+            self._past[part].reshape(2, _LANES)[:, lane] = past
+        self._inherited = []
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Conditioner:
         """With states of its own; what does not change is shared."""
         other = copy.copy(self)
-        for name in ("_waves", "_past", "_streams"):
+        for name in ("_waves", "_past", "_streams", "_inherited"):
             setattr(other, name, copy.copy(getattr(self, name)))
         return other
 
@@ -282,6 +339,8 @@ class Conditioner:
             made = np.empty((len(rows), 0))
         if self._past is None:
             self._past = self._settle(rows, made)
+        if self._inherited:
+            self._go_on()
         span = (len(rows) - 1) * self._parts
         samples = max(0, -((self._late - span) // self._apart))
         counts = np.empty(samples * len(self._columns), dtype=np.int32)

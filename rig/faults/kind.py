@@ -1,0 +1,125 @@
+"""What a kind of fault is made of: where it acts, its numbers, and what it may change."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, get_args
+
+import numpy as np
+from pydantic import ConfigDict
+
+from rig.channels import Channel
+from rig.outside import Written
+
+
+class Draws:
+    """Numbers of a fault, by place: uniform in (0, 1), four a place, of counters (Philox), so that no order matters."""
+
+    def __init__(self, *key: int) -> None:
+        self._key = np.random.SeedSequence(key).generate_state(2, np.uint64)
+
+    def uniform(self, n: np.ndarray) -> np.ndarray:
+        """Four numbers at each place, shape (len(n), 4).
+
+        Args:
+            n: Places, ascending; few are left out.
+        """
+        if not len(n):
+            return np.empty((0, 4))
+        first, count = int(n[0]), int(n[-1] - n[0]) + 1
+        bits = (
+            np.random.Philox(key=self._key, counter=[first + (1 << 62), 0, 0, 0]).random_raw(4 * count).reshape(-1, 4)
+        )
+        return ((bits >> np.uint64(11)) + 0.5)[n - first] * 2.0**-53
+
+    def normal(self, n: np.ndarray) -> np.ndarray:
+        """A normal number at each place, shape (len(n),), by Box and Muller."""
+        u = self.uniform(n)
+        return np.sqrt(-2.0 * np.log(u[:, 0])) * np.cos(2.0 * math.pi * u[:, 1])
+
+
+@dataclass(frozen=True)
+class At:
+    """Where a fault acts: rows of the model, or samples.
+
+    Attributes:
+        t: Time since it began [s], shape (n,).
+        n: Numbers of the rows or samples, shape (n,).
+        channel: On which channel.
+        draw: Numbers of the fault.
+        kept: What it keeps from block to block.
+        other: The same signal, or volts, of another channel by name, shape (n,).
+        angle: Of the shaft [rad], shape (n,).
+        rate: Of that [rad/s], shape (n,).
+    """
+
+    t: np.ndarray
+    n: np.ndarray
+    channel: Channel
+    draw: Draws
+    kept: dict[str, float]
+    other: Callable[[str], np.ndarray]
+    angle: np.ndarray
+    rate: np.ndarray
+
+
+class Kind(Written):
+    """One kind of fault. What it does not change stays as it was."""
+
+    model_config = ConfigDict(strict=True)
+
+    stage: ClassVar[str]
+    channel_only: ClassVar[str] = ""
+    """Signal of the only channels that it is for."""
+
+    @classmethod
+    def name(cls) -> str:
+        """As it is called."""
+        return get_args(cls.model_fields["kind"].annotation)[0]
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Other channels that it takes signals of."""
+        return ()
+
+    def on(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Channels that it changes, where it is asked for of some."""
+        return names
+
+    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
+        """Raise InputError where it would change nothing, or nothing that makes sense.
+
+        Args:
+            channel: The channel.
+            ideal: Whether the scene leaves filters and noise out.
+            noisy: Whether its sensors are noisy.
+        """
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        """What the sensor feels [its unit], shape (n,)."""
+        return x
+
+    def volts(self, v: np.ndarray, at: At) -> np.ndarray:
+        """What comes from the conditioner [V], shape (n,)."""
+        return v
+
+    def chain(self, channel: Channel) -> Channel:
+        """The channel with another filter."""
+        return channel
+
+    def late_s(self, at: At) -> np.ndarray | None:
+        """How late samples are taken [s], shape (n,); None where it is not about time."""
+        return None
+
+    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
+        """What the converter says, before it is limited, shape (n,)."""
+        return c
+
+    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
+        """Keyphasor edges as they are shown [ticks], where there were these, shape (edges,).
+
+        `at.angle` and `at.rate` are the shaft's at the edges.
+        """
+        return ticks

@@ -1,0 +1,480 @@
+"""What may go wrong with a channel: kinds of faults by the stage of its chain, each an equation with units and limits.
+
+In the equations x is what the sensor feels [the channel's unit], v the conditioner's output [V], c the converter's
+counts, t the time since the fault began [s], and u(n), g(n) uniform and normal numbers of the fault's own, of row or
+sample n: the same in every run with the same seed, however it is cut into blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, get_args
+
+import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
+
+from rig.channels import Channel
+from rig.errors import InputError
+from rig.faults.kind import At, Kind
+from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
+
+Part = Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)]
+Positive = Annotated[FiniteFloat, Field(gt=0.0)]
+NotNegative = Annotated[FiniteFloat, Field(ge=0.0)]
+MOST_LATE_US = 10_000.0
+"""Latest that a sample may be taken [us]."""
+_SIGMAS = 4.0
+"""A jitter is late by so many of its deviations on the mean, and no sample by more than twice that."""
+
+
+def _grown(at: At, ramp_s: float) -> np.ndarray | float:
+    return np.minimum(at.t / ramp_s, 1.0) if ramp_s else 1.0
+
+
+# ---- transducer ----
+
+
+class Gain(Kind):
+    """Sensitivity: x' = x (1 + (factor - 1) min(t / ramp_s, 1))."""
+
+    stage = "transducer"
+    kind: Literal["gain"] = "gain"
+    factor: FiniteFloat
+    ramp_s: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _changes(self) -> Gain:
+        if self.factor in (1.0, -1.0):
+            raise InputError("factor", "other than 1, and than -1, which is polarity", self.factor)
+        return self
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        return x * (1.0 + (self.factor - 1.0) * _grown(at, self.ramp_s))
+
+
+class Offset(Kind):
+    """Zero: x' = x + value min(t / ramp_s, 1); value in the channel's unit."""
+
+    stage = "transducer"
+    kind: Literal["offset"] = "offset"
+    value: FiniteFloat
+    ramp_s: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _changes(self) -> Offset:
+        if self.value == 0.0:
+            raise InputError("value", "other than 0", self.value)
+        return self
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        return x + self.value * _grown(at, self.ramp_s)
+
+
+class Drift(Kind):
+    """x' = x + rate t, rate in the channel's unit a second; with tau_s: x' = x + rate tau_s (1 - exp(-t / tau_s))."""
+
+    stage = "transducer"
+    kind: Literal["drift"] = "drift"
+    rate: FiniteFloat
+    tau_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _changes(self) -> Drift:
+        if self.rate == 0.0:
+            raise InputError("rate", "other than 0", self.rate)
+        return self
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        far_s = at.t if self.tau_s is None else -self.tau_s * np.expm1(-at.t / self.tau_s)
+        return x + self.rate * far_s
+
+
+class Polarity(Kind):
+    """x' = -x."""
+
+    stage = "transducer"
+    kind: Literal["polarity"] = "polarity"
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        return -x
+
+
+class Stuck(Kind):
+    """x'(t) = x(0): what follows in the chain, its noise too, goes on; `freeze` holds the counts."""
+
+    stage = "transducer"
+    kind: Literal["stuck"] = "stuck"
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        return np.full(len(x), at.kept.setdefault(at.channel.name, float(x[0])))
+
+    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
+        return ticks[:0]
+
+
+class Nonlinear(Kind):
+    """Ends of the linear range: x' = end tanh(x / end), end in the channel's unit."""
+
+    stage = "transducer"
+    kind: Literal["nonlinear"] = "nonlinear"
+    end: Positive
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        return self.end * np.tanh(x / self.end)
+
+
+# ---- cable and conditioner ----
+
+
+class Open(Kind):
+    """An open cable: v' = level_v."""
+
+    stage = "cable"
+    kind: Literal["open"] = "open"
+    level_v: Annotated[FiniteFloat, Field(ge=-30.0, le=30.0)] = 0.0
+
+    def volts(self, v: np.ndarray, at: At) -> np.ndarray:
+        return np.full(len(v), self.level_v)
+
+    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
+        return ticks[:0]
+
+
+class Short(Open):
+    """A short circuit: v' = 0."""
+
+    kind: Literal["short"] = "short"  # pyright: ignore[reportIncompatibleVariableOverride]
+    level_v: Annotated[FiniteFloat, Field(ge=0.0, le=0.0)] = 0.0
+
+
+class Intermittent(Open):
+    """A loose contact: v' = level_v in those slots of slot_s whose u(slot) < part."""
+
+    kind: Literal["intermittent"] = "intermittent"  # pyright: ignore[reportIncompatibleVariableOverride]
+    part: Part = 0.2
+    slot_s: Annotated[FiniteFloat, Field(ge=1e-4, le=100.0)] = 0.01
+
+    def volts(self, v: np.ndarray, at: At) -> np.ndarray:
+        slots = np.floor(at.t / self.slot_s + 1e-9).astype(np.int64)
+        slots_here = np.arange(slots[0], slots[-1] + 1)
+        off = at.draw.uniform(slots_here)[:, 0] < self.part
+        return np.where(off[slots - slots[0]], self.level_v, v)
+
+    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
+        return ticks[self.volts(np.full(len(ticks), np.inf), at) == np.inf] if len(ticks) else ticks
+
+
+class Hum(Kind):
+    """The mains: v' = v + amplitude_v (sin(2 pi f t) + third sin(6 pi f t)) + offset_v.
+
+    Asked for of a group it is one hum in all its channels, as a loop through the ground makes it.
+    """
+
+    stage = "cable"
+    kind: Literal["hum"] = "hum"
+    amplitude_v: Positive
+    frequency_hz: Annotated[FiniteFloat, Field(gt=0.0, le=1000.0)] = 50.0
+    third: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = 0.0
+    offset_v: Annotated[FiniteFloat, Field(ge=-10.0, le=10.0)] = 0.0
+
+    def volts(self, v: np.ndarray, at: At) -> np.ndarray:
+        turn = 2.0 * math.pi * self.frequency_hz * at.t
+        return v + self.amplitude_v * (np.sin(turn) + self.third * np.sin(3.0 * turn)) + self.offset_v
+
+
+class Crosstalk(Kind):
+    """v' = v + 10^(db / 20) (v_source - its bias)."""
+
+    stage = "cable"
+    kind: Literal["crosstalk"] = "crosstalk"
+    source: str
+    db: Annotated[FiniteFloat, Field(ge=-120.0, le=0.0)] = -40.0
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self.source,)
+
+    def volts(self, v: np.ndarray, at: At) -> np.ndarray:
+        return v + 10.0 ** (self.db / 20.0) * at.other(self.source)
+
+
+class Saturation(Kind):
+    """A conditioner that gives less: v' = v within part of its range about the middle."""
+
+    stage = "cable"
+    kind: Literal["saturation"] = "saturation"
+    part: Part
+
+    def volts(self, v: np.ndarray, at: At) -> np.ndarray:
+        low, high = at.channel.range_v
+        reach = self.part * (high - low) / 2.0
+        return np.clip(v, (low + high) / 2.0 - reach, (low + high) / 2.0 + reach)
+
+
+class Swap(Kind):
+    """Two cables changed over: v' = v of the other channel, and the other way round."""
+
+    stage = "cable"
+    kind: Literal["swap"] = "swap"
+    other: str
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self.other,)
+
+    def on(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        return (*names, self.other)
+
+
+# ---- filter ----
+
+
+class NoFilter(Kind):
+    """No anti-alias filter: what is above half of the rate folds back."""
+
+    stage = "filter"
+    kind: Literal["no-filter"] = "no-filter"
+
+    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
+        if ideal:
+            raise InputError("kind", "one that a scene without filters can have, such as clip", self.name())
+
+
+class Bandwidth(NoFilter):
+    """Another corner of the low-pass [Hz]; its order stays."""
+
+    kind: Literal["bandwidth"] = "bandwidth"  # pyright: ignore[reportIncompatibleVariableOverride]
+    corner_hz: Annotated[FiniteFloat, Field(ge=1.0, le=1e6)]
+
+    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
+        super().refuse(channel, ideal=ideal, noisy=noisy)
+        if self.corner_hz > channel.bandwidth_hz:
+            must = f"below its bandwidth of {channel.bandwidth_hz:g} Hz; no-filter takes the filter away"
+            raise InputError("corner_hz", must, self.corner_hz)
+        if self.corner_hz == channel.bandwidth_hz:
+            raise InputError("corner_hz", f"other than the channel's own, {self.corner_hz:g}", self.corner_hz)
+
+    def chain(self, channel: Channel) -> Channel:
+        return channel.model_copy(update={"bandwidth_hz": self.corner_hz})
+
+
+# ---- clock ----
+
+
+class Late(Kind):
+    """A sample of time s shows what was at s - late_us: a multiplexer's skew. Nothing from before the fault is shown.
+
+    Nothing can be early: what is not yet cannot be shown. Make all the others late instead.
+    """
+
+    stage = "clock"
+    kind: Literal["late"] = "late"
+    late_us: Annotated[FiniteFloat, Field(gt=0.0, le=MOST_LATE_US)]
+
+    def late_s(self, at: At) -> np.ndarray:
+        return np.full(len(at.t), 1e-6 * self.late_us)
+
+
+class Clock(Kind):
+    """A clock that is fast: a sample of time t since it began is taken at t / (1 + ppm 1e-6), 10 ms late at most."""
+
+    stage = "clock"
+    kind: Literal["clock"] = "clock"
+    ppm: Annotated[FiniteFloat, Field(gt=0.0, le=1e5)]
+
+    def late_s(self, at: At) -> np.ndarray:
+        return np.minimum(at.t * (1.0 - 1.0 / (1.0 + 1e-6 * self.ppm)), 1e-6 * MOST_LATE_US)
+
+
+class Jitter(Kind):
+    """Samples late by rms_us (4 + g(n)), white, g within 4: the mean of 4 rms_us is a delay, as none can be early."""
+
+    stage = "clock"
+    kind: Literal["jitter"] = "jitter"
+    rms_us: Annotated[FiniteFloat, Field(gt=0.0, le=1000.0)]
+
+    def late_s(self, at: At) -> np.ndarray:
+        return 1e-6 * self.rms_us * (_SIGMAS + np.clip(at.draw.normal(at.n), -_SIGMAS, _SIGMAS))
+
+
+class Wander(Kind):
+    """Samples late by amplitude_us (1 - cos(2 pi t / period_s))."""
+
+    stage = "clock"
+    kind: Literal["wander"] = "wander"
+    amplitude_us: Annotated[FiniteFloat, Field(gt=0.0, le=MOST_LATE_US / 2.0)]
+    period_s: Annotated[FiniteFloat, Field(ge=0.01, le=3600.0)] = 1.0
+
+    def late_s(self, at: At) -> np.ndarray:
+        return 1e-6 * self.amplitude_us * (1.0 - np.cos(2.0 * math.pi * at.t / self.period_s))
+
+
+# ---- converter ----
+
+
+class Noise(Kind):
+    """c' = c + sqrt(factor^2 - 1) noise_v g(n) / step: its noise times factor."""
+
+    stage = "converter"
+    kind: Literal["noise"] = "noise"
+    factor: Annotated[FiniteFloat, Field(gt=1.0, le=1e6)]
+
+    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
+        if ideal or not noisy or not channel.noise_v:
+            raise InputError(
+                "kind", f"one for a channel without noise, as {channel.name} here, such as spikes", "noise"
+            )
+
+    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
+        more = math.sqrt(self.factor**2 - 1.0) * at.channel.noise_v / at.channel.lsb_v
+        return c + np.rint(more * at.draw.normal(at.n))
+
+
+class Spikes(Kind):
+    """c' = c + size_v / step with either sign, in samples whose u(n) < rate_hz / their rate."""
+
+    stage = "converter"
+    kind: Literal["spikes"] = "spikes"
+    rate_hz: Positive = 10.0
+    size_v: Positive = 1.0
+
+    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
+        u = at.draw.uniform(at.n)
+        size = np.where(u[:, 1] < 0.5, -1.0, 1.0) * np.rint(self.size_v / at.channel.lsb_v)
+        return c + np.where(u[:, 0] < self.rate_hz / at.channel.rate_hz, size, 0.0)
+
+
+class Bits(Kind):
+    """The lowest bits are lost: c' = 2^lost floor(c / 2^lost)."""
+
+    stage = "converter"
+    kind: Literal["bits"] = "bits"
+    lost: Annotated[int, Field(ge=1, le=31)]
+
+    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
+        if self.lost >= channel.adc_bits:
+            raise InputError("lost", f"below the converter's {channel.adc_bits} bits", self.lost)
+
+    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
+        return np.floor(c / 2.0**self.lost) * 2.0**self.lost
+
+
+class StuckBit(Kind):
+    """One bit of the counts, from 0 for the lowest, is always the same."""
+
+    stage = "converter"
+    kind: Literal["stuck-bit"] = "stuck-bit"
+    bit: Annotated[int, Field(ge=0, le=30)]
+    value: Literal[0, 1] = 1
+
+    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
+        if self.bit > channel.adc_bits - 2:
+            raise InputError("bit", f"at most {channel.adc_bits - 2}, below the sign", self.bit)
+
+    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
+        whole, mask = c.astype(np.int64), np.int64(1 << self.bit)
+        return ((whole | mask) if self.value else (whole & ~mask)).astype(float)
+
+
+class Clip(Kind):
+    """A smaller reference: c' = c within part of the converter's range."""
+
+    stage = "converter"
+    kind: Literal["clip"] = "clip"
+    part: Part
+
+    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
+        most = math.floor(self.part * 2.0 ** (at.channel.adc_bits - 1))
+        return np.clip(c, -most, most - 1)
+
+
+class Freeze(Kind):
+    """c'(n) = c(0): one and the same number, without noise."""
+
+    stage = "converter"
+    kind: Literal["freeze"] = "freeze"
+
+    def counts(self, c: np.ndarray, at: At) -> np.ndarray:
+        return np.full(len(c), at.kept.setdefault(at.channel.name, float(c[0])) if len(c) else 0.0)
+
+    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
+        return ticks[:0]
+
+
+# ---- keyphasor ----
+
+
+class MissPulses(Kind):
+    """No pulse in turns whose u(turn) < part."""
+
+    stage = "keyphasor"
+    channel_only = "keyphasor"
+    kind: Literal["miss-pulses"] = "miss-pulses"
+    part: Annotated[FiniteFloat, Field(gt=0.0, le=1.0)] = 0.2
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        return np.where(_picked(at, self.part), 0.0, x)
+
+    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
+        return ticks[~_picked(at, self.part)] if len(ticks) else ticks
+
+
+class ExtraPulses(MissPulses):
+    """A pulse half a turn behind that of turns whose u(turn) < part."""
+
+    kind: Literal["extra-pulses"] = "extra-pulses"  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        return np.maximum(x, np.where(_picked(at, self.part), _mark(at.angle - math.pi), 0.0))
+
+    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
+        if not len(ticks):
+            return ticks
+        extra = ticks + 1e6 * math.pi / at.rate
+        return np.sort(np.concatenate([ticks, extra[_picked(at, self.part)]]))
+
+
+class EdgeJitter(Kind):
+    """The pulse of a turn is late by rms_us (4 + g(turn)), g within 4."""
+
+    stage = "keyphasor"
+    channel_only = "keyphasor"
+    kind: Literal["edge-jitter"] = "edge-jitter"
+    rms_us: Annotated[FiniteFloat, Field(gt=0.0, le=1000.0)]
+
+    def _late_s(self, at: At) -> np.ndarray:
+        turns, known = _turns(at)
+        late_s = 1e-6 * self.rms_us * (_SIGMAS + np.clip(at.draw.normal(known), -_SIGMAS, _SIGMAS))
+        return late_s[turns - known[0]]
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        return _mark(at.angle - at.rate * self._late_s(at))
+
+    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
+        return ticks + 1e6 * self._late_s(at) if len(ticks) else ticks
+
+
+def _turns(at: At) -> tuple[np.ndarray, np.ndarray]:
+    """Number of each row's turn, counted from a quarter before its mark, shape (n,); and all that there are."""
+    turns = np.floor(at.angle / (2.0 * math.pi) + 0.25).astype(np.int64)
+    return turns, np.arange(turns.min(), turns.max() + 1)
+
+
+def _picked(at: At, part: float) -> np.ndarray:
+    """Whether rows are of turns that are hit, shape (n,)."""
+    turns, known = _turns(at)
+    return (at.draw.uniform(known)[:, 0] < part)[turns - known[0]]
+
+
+def _mark(angle: np.ndarray) -> np.ndarray:
+    """What the keyphasor sees of its mark, as `rig.kernels.observe` has it, shape (n,)."""
+    ahead = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
+
+
+AnyKind = (
+    Gain | Offset | Drift | Polarity | Stuck | Nonlinear | Open | Short | Intermittent | Hum | Crosstalk | Saturation
+    | Swap | NoFilter | Bandwidth | Late | Clock | Jitter | Wander | Noise | Spikes | Bits | StuckBit | Clip | Freeze
+    | MissPulses | ExtraPulses | EdgeJitter
+)  # fmt: skip
+KINDS: dict[str, type[Kind]] = {kind.name(): kind for kind in get_args(AnyKind)}

@@ -1,0 +1,400 @@
+"""Channels that misbehave: beside the chain that goes on as if nothing were wrong, another one of the faulty channels.
+
+What the sound chain says is never touched: a fault ends on the row, and what comes then is as if it had never been.
+Its twin begins with the state and the noise of the sound one, and differs from it by the faults alone.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import insort
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rig.channels import Channel, ChannelTable
+from rig.commands import ClearCommand, FaultCommand
+from rig.errors import InputError, Words
+from rig.faults import At, Draws, Kind, NoFilter, Swap, channels_of
+from rig.kernels.signals import COLUMN, N_ROW
+from rig.sensors.conditioning import Conditioner
+
+_TICKS_HZ = 1_000_000
+_MOST = 64
+"""Faults at a time."""
+_FINE = 8
+"""Samples that are taken at times of their own are read off so many between two, ..."""
+_NODES = 6
+"""... by the polynomial through so many."""
+_REACH_V = 1e3
+"""What a faulty cable carries is limited by the converter alone."""
+
+
+@dataclass
+class Active:
+    """One fault on its channels.
+
+    Attributes:
+        id: Its number.
+        what: The fault.
+        names: Its channels.
+        begin: First tick, a whole row.
+        draws: Its numbers, for each channel.
+        end: Tick from which on there is none, a whole row.
+        kept: What it keeps.
+    """
+
+    id: int
+    what: Kind
+    names: tuple[str, ...]
+    begin: int
+    draws: dict[str, Draws]
+    end: float = math.inf
+    kept: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class _Twin:
+    """Chain of some faulty channels of one conditioner: `made` of names, and how their filters were changed."""
+
+    conditioner: Conditioner
+    channels: dict[str, Channel]
+    fine: bool
+    first: int
+    """Number of its first sample."""
+    past: np.ndarray
+    """Samples that are kept, shape (n, channels), ..."""
+    at: int
+    """... of which the first has this number."""
+
+
+class Faulty:
+    """All faults of a run.
+
+    Args:
+        table: Its channels.
+        conditioners: Their chains.
+        seed: Of the faults' own numbers.
+        row_ticks: Ticks between rows.
+        ideal: Whether the scene leaves filters and noise out.
+        noisy: Whether its sensors are noisy.
+    """
+
+    def __init__(
+        self,
+        table: ChannelTable,
+        conditioners: Sequence[Conditioner],
+        *,
+        seed: int,
+        row_ticks: int,
+        ideal: bool,
+        noisy: bool,
+    ) -> None:
+        self.table, self.conditioners, self._seed, self.row_ticks = table, conditioners, seed, row_ticks
+        self._ideal, self._noisy = ideal, noisy
+        self.active: list[Active] = []
+        self._begun = 0
+        self._twins: dict[tuple[int, bool], _Twin] = {}
+
+    def targets(self, command: FaultCommand) -> tuple[str, ...]:
+        """Channels that a fault would change.
+
+        Raises:
+            InputError: It makes no sense on them.
+        """
+        return channels_of(command.what, command.channel, self.table, ideal=self._ideal, noisy=self._noisy)
+
+    def check(self, command: FaultCommand | ClearCommand, tick: int, waiting: Sequence[object]) -> dict[str, Any]:
+        """What a command that is given now will come to, as `take` tells it.
+
+        Args:
+            command: To begin a fault, or to end some.
+            tick: Now.
+            waiting: Commands that are carried out before it.
+
+        Raises:
+            InputError: It cannot be carried out.
+        """
+        before = sum(isinstance(other, FaultCommand) for other in waiting)
+        known = [one.id for one in self.active if one.end == math.inf or one.end > tick]
+        if isinstance(command, FaultCommand):
+            if len(known) + before >= _MOST:
+                raise InputError("fault", f"one of at most {_MOST} at a time", Words("another"))
+            return self._told(self._begun + before + 1, self.targets(command), tick)
+        known += range(self._begun + 1, self._begun + before + 1)
+        if command.id != "all" and command.id not in known:
+            there = ", ".join(map(str, known)) or "none"
+            raise InputError("clear.id", f"the number of a fault that there is ({there}), or all", command.id)
+        return {}
+
+    def take(self, command: FaultCommand | ClearCommand, tick: int, pending: list[tuple[int, Any]]) -> dict[str, Any]:
+        """Begin or end faults at the first row at or behind a tick.
+
+        Args:
+            command: What is done.
+            tick: When.
+            pending: Takes the end of one that is to last for some time.
+
+        Returns:
+            Numbers, channels, and the first rows that it changes, by group.
+        """
+        row = -(-tick // self.row_ticks) * self.row_ticks
+        if isinstance(command, ClearCommand):
+            ended = [one for one in self.active if command.id in ("all", one.id) and one.end > row]
+            for one in ended:
+                one.end = row
+            names = tuple(dict.fromkeys(name for one in ended for name in one.names))
+            return {**self._told(0, names, tick), "fault": [one.id for one in ended]}
+        self._begun += 1
+        names, what = self.targets(command), command.what
+        places = {name: n for n, name in enumerate(self.table.channels)}
+        # A hum, a clock and a loose plug are one for all channels of a group; noise is each channel's own.
+        own = what.stage == "converter"
+        draws = {name: Draws(self._seed, self._begun, places[name] + 1 if own else 0) for name in names}
+        self.active.append(Active(self._begun, what, names, row, draws))
+        if command.for_s is not None:
+            over = tick + max(1, round(command.for_s * _TICKS_HZ))
+            insort(pending, (over, ClearCommand(id=self._begun)), key=lambda entry: entry[0])
+        return self._told(self._begun, names, tick)
+
+    def _told(self, number: int, names: Sequence[str], tick: int) -> dict[str, Any]:
+        row = -(-tick // self.row_ticks) * self.row_ticks
+        groups = {name: group for name, group in self.table.groups.items() if set(group.names) & set(names)}
+        first = {name: -(-row * group.rate_hz // _TICKS_HZ) for name, group in groups.items()}
+        return {"fault": number, "channels": list(names), "first_row": first}
+
+    def changes(self, begin: int, end: int) -> list[int]:
+        """Ticks between two at which faults begin or end."""
+        ticks = {int(tick) for one in self.active for tick in (one.begin, one.end) if begin < tick < end}
+        return sorted(ticks)
+
+    def counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
+        """Samples from the first of these rows on that lie before the last one, by group.
+
+        Args:
+            rows: Observed rows, shape (n, N_ROW), between which no fault begins or ends.
+            made: Signals by formulas, shape (n, m).
+            tick: Of the first row.
+        """
+        self.active = [one for one in self.active if one.end > tick]
+        active = [one for one in self.active if one.begin <= tick]
+        found: dict[str, np.ndarray] = {}
+        volts = _Volts(self, rows, made, tick, active)
+        for place, conditioner in enumerate(self.conditioners):
+            names = [channel.name for group in conditioner.groups for channel in group.channels]
+            faulty = {name: [one for one in active if name in one.names] for name in names}
+            faulty = {name: faults for name, faults in faulty.items() if faults}
+            shown = self._shown(place, conditioner, faulty, volts, tick) if faulty else {}
+            if not faulty:
+                self._twins = {key: twin for key, twin in self._twins.items() if key[0] != place}
+            counts = conditioner.counts(rows, made)
+            for group in conditioner.groups:
+                for c, name in enumerate(group.names):
+                    if name in shown:
+                        counts[group.name][:, c] = shown[name]
+            found |= counts
+        return found
+
+    def edges(self, edges: np.ndarray, rows: np.ndarray, tick: int) -> np.ndarray:
+        """Keyphasor edges as they are shown [ticks from the first row], shape (edges,).
+
+        Args:
+            edges: Those that there are.
+            rows: Observed rows that they lie in.
+            tick: Of the first row.
+        """
+        ticks = self.row_ticks * np.arange(len(rows))
+        for one in self.active:
+            marks = [name for name in one.names if self.table.channels[name].signal == "keyphasor"]
+            if not marks:
+                continue
+            inside = (edges + tick >= one.begin) & (edges + tick < one.end)
+            here = edges[inside]
+            angle, rate = (np.interp(here, ticks, rows[:, COLUMN[name]]) for name in ("theta", "theta_rate"))
+            turns = 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))  # an edge is where the angle is whole turns
+            t = (here + tick - one.begin) / _TICKS_HZ
+            at = At(
+                t, np.arange(len(here)), self.table.channels[marks[0]], one.draws[marks[0]], {}, _nothing, turns, rate
+            )
+            edges = np.sort(np.concatenate([edges[~inside], one.what.edges(here, at)]))
+        return edges
+
+    def _shown(
+        self, place: int, conditioner: Conditioner, faulty: Mapping[str, list[Active]], volts: _Volts, tick: int
+    ) -> dict[str, np.ndarray]:
+        """Counts of the faulty channels of one conditioner by name, each shape (samples,)."""
+        shown: dict[str, np.ndarray] = {}
+        span = (len(volts.rows) - 1) * self.row_ticks
+        rate = conditioner.groups[0].rate_hz
+        n = np.arange(-(-tick * rate // _TICKS_HZ), -(-(tick + span) * rate // _TICKS_HZ))
+        for fine in (False, True):
+            names = [name for name, faults in faulty.items() if fine == any(_is_late(one.what) for one in faults)]
+            channels = {name: self._channel(name, faulty[name]) for name in names}
+            twin = self._twin((place, fine), conditioner, channels, tick)
+            if twin is None:
+                continue
+            signals = np.stack([volts.signal(name) for name in names], axis=1)
+            (counts,) = twin.conditioner.counts(volts.rows, signals).values()
+            for c, name in enumerate(names):
+                channel, faults = self.table.channels[name], faulty[name]
+                values = counts[:, c].astype(float)
+                if fine:
+                    values = self._late(twin, values, c, n, channel, faults)
+                for one in faults:
+                    values = one.what.counts(values, self._at(one, channel, n, n / rate, volts.signal))
+                most = 2.0 ** (channel.adc_bits - 1)
+                shown[name] = np.clip(values, -most, most - 1.0).astype(np.int32)
+            if fine:
+                twin.at, twin.past = _kept(twin, counts, rate)
+        return shown
+
+    def _twin(
+        self, key: tuple[int, bool], conditioner: Conditioner, channels: dict[str, Channel], tick: int
+    ) -> _Twin | None:
+        """The chain of some channels, as it was, or begun from the sound one."""
+        before = self._twins.pop(key, None)
+        if not channels:
+            return None
+        if before is not None and before.channels == channels:
+            self._twins[key] = before
+            return before
+        rate = conditioner.groups[0].rate_hz * (_FINE if key[1] else 1)
+        first = -(-tick * rate // _TICKS_HZ)
+        made = conditioner.twin(channels, rate_hz=rate, first=first, row=tick // self.row_ticks, columns=N_ROW)
+        if before is not None:
+            made.take_over(
+                before.conditioner, [name for name in channels if channels[name] == before.channels.get(name)]
+            )
+        twin = _Twin(made, channels, key[1], first, np.empty((0, len(channels)), np.int32), first)
+        if before is not None and before.fine and set(channels) <= set(before.channels):
+            columns = [list(before.channels).index(name) for name in channels]
+            twin.first, twin.past, twin.at = before.first, before.past[:, columns], before.at
+        self._twins[key] = twin
+        return twin
+
+    def _channel(self, name: str, faults: Sequence[Active]) -> Channel:
+        """A channel as its twin's chain has it: with another filter, limited by the converter alone."""
+        channel = self.table.channels[name]
+        for one in faults:
+            channel = one.what.chain(channel)
+        late = any(_is_late(one.what) for one in faults)
+        wide = {"range_v": (-_REACH_V, _REACH_V), **({"adc_bits": 32, "noise_v": 0.0} if late else {})}
+        bare = any(type(one.what) is NoFilter for one in faults)
+        return channel.model_copy(update={**wide, **({"bandwidth_hz": math.inf} if bare else {})})
+
+    def _at(
+        self, one: Active, channel: Channel, n: np.ndarray, times_s: np.ndarray, other: Callable[[str], np.ndarray]
+    ) -> At:
+        none = np.empty(0)
+        t = times_s - one.begin / _TICKS_HZ
+        return At(t, n, channel, one.draws[channel.name], one.kept, other, none, none)
+
+    def _late(
+        self, twin: _Twin, counts: np.ndarray, c: int, n: np.ndarray, channel: Channel, faults: list[Active]
+    ) -> np.ndarray:
+        """Counts of samples that are taken late, not yet rounded, shape (n,)."""
+        rate = channel.rate_hz
+        late_s = np.zeros(len(n))
+        for one in faults:
+            more = one.what.late_s(self._at(one, channel, n, n / rate, _nothing))
+            late_s += 0.0 if more is None else more
+        # Not from before the fault, and with samples enough to read between.
+        here = n * _FINE
+        wanted = np.maximum(here - late_s * rate * _FINE, np.minimum(here, twin.first + _NODES - 1))
+        known = np.concatenate([twin.past[:, c], counts])
+        whole = np.floor(wanted).astype(np.int64)
+        places = (whole - (_NODES - 1) - twin.at)[:, None] + np.arange(_NODES)
+        weights = _lagrange(wanted - whole + _NODES - 1)
+        exact = wanted == whole
+        values = np.where(
+            exact, known[np.clip(whole - twin.at, 0, len(known) - 1)],
+            (known[np.clip(places, 0, len(known) - 1)] * weights).sum(axis=1),
+        )  # fmt: skip
+        values *= 2.0 ** (channel.adc_bits - 32)
+        if self._noisy and not self._ideal:
+            values += channel.noise_v / channel.lsb_v * Draws(self._seed, faults[0].id, -1 % 2**32).normal(n)
+        return np.rint(values)
+
+
+class _Volts:
+    """What faulty channels feel, in SI, over some rows: signal faults, range, and faults of cables."""
+
+    def __init__(self, faulty: Faulty, rows: np.ndarray, made: np.ndarray, tick: int, active: list[Active]) -> None:
+        self.rows, self._made, self._active, self._faulty = rows, made, active, faulty
+        self._times_s = (tick + faulty.row_ticks * np.arange(len(rows))) / _TICKS_HZ
+        self._n = tick // faulty.row_ticks + np.arange(len(rows))
+        self._columns = {
+            name: column
+            for conditioner in faulty.conditioners
+            for name, column in zip(
+                (channel.name for group in conditioner.groups for channel in group.channels),
+                conditioner.columns.tolist(), strict=True,
+            )
+        }  # fmt: skip
+        self._conditioned: dict[str, np.ndarray] = {}
+
+    def _at(self, one: Active, channel: Channel) -> At:
+        t = self._times_s - one.begin / _TICKS_HZ
+        angle, rate = self.rows[:, COLUMN["theta"]], self.rows[:, COLUMN["theta_rate"]]
+        return At(t, self._n, channel, one.draws[channel.name], one.kept, self._beyond_bias, angle, rate)
+
+    def _felt(self, name: str) -> np.ndarray:
+        """What the sensor feels [its unit], with the faults of transducers."""
+        channel, column = self._faulty.table.channels[name], self._columns[name]
+        x = self.rows[:, column] if column < N_ROW else self._made[:, column - N_ROW]
+        x = x / channel.si
+        for one in self._active:
+            if name in one.names:
+                x = one.what.signal(x, self._at(one, channel))
+        return x
+
+    def conditioned(self, name: str) -> np.ndarray:
+        """What its conditioner puts out [V]."""
+        if name not in self._conditioned:
+            channel = self._faulty.table.channels[name]
+            volts = channel.bias_v + channel.sensitivity_v * self._felt(name)
+            self._conditioned[name] = np.clip(volts, *channel.range_v)
+        return self._conditioned[name]
+
+    def _beyond_bias(self, name: str) -> np.ndarray:
+        return self.conditioned(name) - self._faulty.table.channels[name].bias_v
+
+    def signal(self, name: str) -> np.ndarray:
+        """A signal [SI] that gives what arrives at the converter's filter, shape (rows,)."""
+        channel = self._faulty.table.channels[name]
+        swapped = [one for one in self._active if name in one.names and isinstance(one.what, Swap)]
+        source = name
+        for one in swapped:
+            source = next(other for other in one.names if other != name)
+        volts = self.conditioned(source)
+        for one in self._active:
+            if name in one.names:
+                volts = one.what.volts(volts, self._at(one, channel))
+        return (volts - channel.bias_v) / channel.sensitivity_v * channel.si
+
+
+def _is_late(what: Kind) -> bool:
+    return type(what).late_s is not Kind.late_s
+
+
+def _nothing(_: str) -> np.ndarray:
+    return np.empty(0)
+
+
+def _kept(twin: _Twin, counts: np.ndarray, rate: int) -> tuple[int, np.ndarray]:
+    """Samples that later ones may still be read off: the number of the first, and they."""
+    known = np.concatenate([twin.past, counts])
+    most = round(rate * _FINE * 0.0201) + 2 * _NODES
+    return twin.at + max(0, len(known) - most), known[-most:]
+
+
+def _lagrange(places: np.ndarray) -> np.ndarray:
+    """Weights of the nodes 0 to 5 at places between them, shape (n, 6)."""
+    nodes = np.arange(_NODES)
+    weights = np.ones((len(places), _NODES))
+    for k in nodes:
+        for m in nodes[nodes != k]:
+            weights[:, k] *= (places - m) / (k - m)
+    return weights
