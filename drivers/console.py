@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Self
 
 from rig import wire
@@ -22,18 +22,27 @@ class Accepted:
         id: Number of the command in this run; the stream's event `command` carries it too.
         tick: Simulated time at which it takes effect [ticks]; for a step, at which it was done.
         time_s: The same [s].
-        fault: Of a fault, its number.
-        channels: Of a fault, its channels.
-        first_row: Number of the first row that it changes, by group.
     """
 
     command: str
     id: int
     tick: int
     time_s: float
-    fault: int = 0
-    channels: tuple[str, ...] = ()
-    first_row: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptedFault(Accepted):
+    """The reply to a fault.
+
+    Attributes:
+        fault: Its number.
+        channels: Its channels.
+        first_row: Number of the first row that it changes, by group.
+    """
+
+    fault: int
+    channels: tuple[str, ...]
+    first_row: Mapping[str, int]
 
 
 class Console:
@@ -117,7 +126,7 @@ class Console:
         """
         return self._command("release")
 
-    def fault(self, channel: str, kind: str, *, for_s: float | None = None, **numbers: Any) -> Accepted:
+    def fault(self, channel: str, kind: str, *, for_s: float | None = None, **numbers: Any) -> AcceptedFault:
         """Make a channel misbehave; `rig fault --list` has the kinds and their numbers.
 
         Args:
@@ -130,7 +139,9 @@ class Console:
             RefusedError: The rig refused, for the reason in the message.
         """
         given = {} if for_s is None else {"for_s": for_s}
-        return self._command("fault", channel=channel, kind=kind, **given, **numbers)
+        reply = self._reply("fault", channel=channel, kind=kind, **given, **numbers)
+        told = {name: reply[name] for name in ("id", "tick", "time_s", "fault", "first_row")}
+        return AcceptedFault(command="fault", channels=tuple(reply["channels"]), **told)
 
     def clear(self, number: int | str = "all") -> Accepted:
         """End a fault by its number, or all.
@@ -218,6 +229,10 @@ class Console:
         return getattr(self._client, "connection", None)
 
     def _command(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> Accepted:
+        reply = self._reply(command, timeout_s, **fields)
+        return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"])
+
+    def _reply(self, command: str, timeout_s: float | None = None, /, **fields: Any) -> dict[str, Any]:
         for name, value in fields.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise InputError(name, "a finite number", value)
@@ -226,6 +241,4 @@ class Console:
         reply = wire.decode_document(payload)
         if not reply.get("accepted"):
             raise RefusedError(str(reply.get("error", f"the rig refused {command} without a reason")))
-        told = {"fault": reply.get("fault", 0), "channels": tuple(reply.get("channels", ()))}
-        told["first_row"] = dict(reply.get("first_row", {}))
-        return Accepted(command=command, id=reply["id"], tick=reply["tick"], time_s=reply["time_s"], **told)
+        return reply

@@ -108,3 +108,20 @@ def check_command(name: str, request: dict[str, Any]) -> Command:
     if name not in COMMANDS:
         raise InputError("command", f"one of {', '.join(COMMANDS)}", name)
     return check(COMMANDS[name], request, field=name)
+
+
+def with_faults(scene: Any) -> Any:
+    """A scene as it is written, whose faults, under a heading of their own there, stand among its commands.
+
+    Raises:
+        InputError: They are no tables.
+    """
+    if not isinstance(scene, dict) or "faults" not in scene:
+        return scene
+    faults, commands = scene["faults"], scene.get("commands", ())
+    if not isinstance(faults, list | tuple) or not all(isinstance(each, dict) for each in faults):
+        raise InputError("faults", "a list of tables, each headed [[faults]]", faults)
+    rest = {key: value for key, value in scene.items() if key != "faults"}
+    if isinstance(commands, list | tuple):
+        rest["commands"] = [*commands, *({"command": "fault", **each} for each in faults)]
+    return rest

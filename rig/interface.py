@@ -10,6 +10,7 @@ from typing import Any
 from rig import wire
 from rig.channels import Channel
 from rig.commands import COMMANDS
+from rig.faults import described
 from rig.kernels import signals
 from rig.scenes import SensorChoice, rig_table
 from rig.transport.access import DOORS, PLAIN, ROLES, TRUTH, Verb
@@ -152,9 +153,20 @@ def _documents() -> list[str]:
     ]
     for name, command in COMMANDS.items():
         fields = "; ".join(_field(key, field) for key, field in command.model_fields.items() if key != "command")
+        fields = fields.replace("`what`", "`kind` and its numbers, below")
         lines.append(f"| `{wire.command_key(name)}` | {fields or 'no fields'} |")
     lines += [f"| `{wire.command_key(name)}` | {what} |" for name, what in _OTHER_COMMANDS.items()]
     lines += [
+        "",
+        "A fault begins at the first row at or behind its tick; the reply adds its number `fault`, its `channels` and "
+        "`first_row` by group, as do the events `fault` and `clear`. Once it has ended, what comes is as if it had "
+        "never been. x is what the sensor feels [the channel's unit], v the conditioner's output [V], c the "
+        "converter's counts, t the time since it began [s], u(n) and g(n) uniform and normal numbers by row, sample, "
+        "slot or turn, of the scene's seed.",
+        "",
+        "| kind | stage | what it does | numbers | channels |",
+        "|---|---|---|---|---|",
+        *(f"| `{name}` | {' | '.join(rest)} |" for name, *rest in described()),
         "",
         f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.",
         "",

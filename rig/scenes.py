@@ -13,7 +13,7 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from rig.channel_file import check_table, read_channels
 from rig.channels import ChannelTable, check_signals, default_table
-from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand
+from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand, with_faults
 from rig.engines import ENGINES
 from rig.errors import InputError, Words, such_as
 from rig.formula import Formulas
@@ -191,20 +191,14 @@ class Scene(Written):
 
     @model_validator(mode="before")
     @classmethod
-    def _faults(cls, data: Any) -> Any:
-        # In a file faults stand under a heading of their own.
-        if not isinstance(data, dict) or "faults" not in data:
-            return data
-        faults = cls._tables(data["faults"], "faults")
-        timed = [{"command": "fault", **each} if isinstance(each, dict) else each for each in faults]
-        rest = {key: value for key, value in data.items() if key != "faults"}
-        return {**rest, "commands": [*cls._tables(data.get("commands", ())), *timed]}
+    def _faults_too(cls, data: Any) -> Any:
+        return with_faults(data)
 
     @field_validator("commands", mode="before")
     @classmethod
-    def _tables(cls, commands: Any, heading: str = "commands") -> Any:
+    def _tables(cls, commands: Any) -> Any:
         if not isinstance(commands, list | tuple):
-            raise InputError(heading, f"a list of tables, each headed [[{heading}]]", commands)
+            raise ValueError("a list of tables, each headed [[commands]]")
         return commands
 
     @field_validator("set")
@@ -222,11 +216,8 @@ class Scene(Written):
                 must = f"one of {', '.join(takes)} with engine {self.engine.name}"
                 raise InputError(f"model.{field}", must, getattr(self.model, field))
         if self.engine.tolerance and not method.tolerance:
-            raise InputError(
-                "engine.tolerance",
-                f"left out with engine {self.engine.name}, whose steps are fixed",
-                self.engine.tolerance,
-            )
+            must = f"left out with engine {self.engine.name}, whose steps are fixed"
+            raise InputError("engine.tolerance", must, self.engine.tolerance)
         if self.engine.companion and not self.engine.tolerance:
             raise InputError("engine.companion", "false without an engine.tolerance", True)
         return self
@@ -259,15 +250,13 @@ class Scene(Written):
             command = timed.request
             if isinstance(command, ReleaseCommand):
                 if not held:
-                    raise InputError(
-                        "release", "given once, while the magnets hold", Words(f"another at {timed.at_s:g} s")
-                    )
+                    again = Words(f"another at {timed.at_s:g} s")
+                    raise InputError("release", "given once, while the magnets hold", again)
                 held = False
             elif isinstance(command, HammerCommand):
                 if timed.at_s < free_s:
-                    raise InputError(
-                        "hammer", f"idle (in a pulse until {free_s:g} s)", Words(f"a pulse at {timed.at_s:g} s")
-                    )
+                    again = Words(f"a pulse at {timed.at_s:g} s")
+                    raise InputError("hammer", f"idle (in a pulse until {free_s:g} s)", again)
                 free_s = timed.at_s + command.duration_ms * 1e-3
         return self
 

@@ -23,6 +23,7 @@ from rig.commands import ClearCommand, FaultCommand, HammerCommand, ReleaseComma
 from rig.engines import ENGINES, load_engine
 from rig.engines.memory import CEILING, CLAMPS, CONTACTS, FLOORED, PEAK_FORCE, STEPS
 from rig.errors import InputError, SimulationError, Words
+from rig.faulty import Faulty
 from rig.kernels import signals as S
 from rig.kernels.constants import Inputs
 from rig.kernels.magnet import magnet_force
@@ -31,7 +32,6 @@ from rig.model import build_model, describe
 from rig.motion import BRANCH_ALARM, FINER, Accuracy, Begin, Motion, energy_balance, initial_state
 from rig.scenes import Scene, load_scene, scene_document
 from rig.sensors.conditioning import Conditioner
-from rig.sensors.faulty import Faulty
 from rig.sensors.keyphasor import Keyphasor
 from rig.speed_target import Segment, segments
 from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key

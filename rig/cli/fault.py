@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -12,36 +10,15 @@ from rig.cli.connection import Connection, show
 from rig.cli.groups import panel
 from rig.cli.tables import echo, new_table, table_console
 from rig.errors import InputError, UnknownNameError, Words
-from rig.faults import KINDS
 
 _numbers = panel("Numbers of the kinds")
+_OWN = ("channel", "kind", "for_s", "clear", "listed", "connection")
 
 
-def _fields() -> dict[str, list[str]]:
-    """All numbers by name, with the kinds that have them."""
-    found: dict[str, list[str]] = {}
-    for name, kind in KINDS.items():
-        for field in kind.model_fields:
-            if field != "kind":
-                found.setdefault(field, []).append(name)
-    return found
+def _of(kinds: str, *, metavar: str = "X") -> Any:
+    return _numbers(f"Of {kinds}.", metavar=metavar)
 
 
-def _with_numbers(function: Callable[..., None]) -> Callable[..., None]:
-    """A command with an option for each number of a kind."""
-    signature = inspect.signature(function, eval_str=True)
-    own = [one for one in signature.parameters.values() if one.kind is not one.VAR_KEYWORD]
-    for name, kinds in _fields().items():
-        texts = any(KINDS[kind].model_fields[name].annotation is str for kind in kinds)
-        option = _numbers(f"Of {', '.join(kinds)}.", f"--{name.replace('_', '-')}", metavar="CHANNEL" if texts else "X")
-        kind = Annotated[str | None, option] if texts else Annotated[float | None, option]
-        own.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind))
-    function.__signature__ = signature.replace(parameters=own)  # pyright: ignore[reportFunctionMemberAccess]
-    function.__annotations__ = {one.name: one.annotation for one in own}
-    return function
-
-
-@_with_numbers
 def fault(
     channel: Annotated[
         str | None, typer.Argument(metavar="[CHANNEL|GROUP]", help="A channel, or a group for all of its channels.")
@@ -51,10 +28,36 @@ def fault(
     for_s: Annotated[float | None, typer.Option(metavar="S", help="How long, in s; until it is cleared.")] = None,
     clear: Annotated[str | None, typer.Option(metavar="ID|all", help="End a fault by its number, or all.")] = None,
     listed: Annotated[bool, typer.Option("--list", help="Show all kinds and their numbers.")] = False,
+    factor: Annotated[float | None, _of("gain, noise")] = None,
+    ramp_s: Annotated[float | None, _of("gain, offset")] = None,
+    value: Annotated[float | None, _of("offset, stuck-bit")] = None,
+    rate: Annotated[float | None, _of("drift")] = None,
+    tau_s: Annotated[float | None, _of("drift")] = None,
+    end: Annotated[float | None, _of("nonlinear")] = None,
+    level_v: Annotated[float | None, _of("open, short, intermittent")] = None,
+    part: Annotated[float | None, _of("intermittent, saturation, clip, miss-pulses, extra-pulses")] = None,
+    slot_s: Annotated[float | None, _of("intermittent")] = None,
+    amplitude_v: Annotated[float | None, _of("hum")] = None,
+    frequency_hz: Annotated[float | None, _of("hum")] = None,
+    third: Annotated[float | None, _of("hum")] = None,
+    offset_v: Annotated[float | None, _of("hum")] = None,
+    source: Annotated[str | None, _of("crosstalk", metavar="CHANNEL")] = None,
+    db: Annotated[float | None, _of("crosstalk")] = None,
+    other: Annotated[str | None, _of("swap", metavar="CHANNEL")] = None,
+    corner_hz: Annotated[float | None, _of("bandwidth")] = None,
+    late_us: Annotated[float | None, _of("late")] = None,
+    ppm: Annotated[float | None, _of("clock")] = None,
+    rms_us: Annotated[float | None, _of("jitter, edge-jitter")] = None,
+    amplitude_us: Annotated[float | None, _of("wander")] = None,
+    period_s: Annotated[float | None, _of("wander")] = None,
+    rate_hz: Annotated[float | None, _of("spikes")] = None,
+    size_v: Annotated[float | None, _of("spikes")] = None,
+    lost: Annotated[float | None, _of("bits")] = None,
+    bit: Annotated[float | None, _of("stuck-bit")] = None,
     connection: Connection,
-    **numbers: Any,
 ) -> None:
-    """Make a channel of a running rig misbehave, to the sample; the reply tells the first row."""
+    """Make a channel of a running rig misbehave, or end that; the reply tells the first row that changes."""
+    given = {name: _plain(value) for name, value in locals().items() if value is not None and name not in _OWN}
     if listed:
         _show_kinds()
         return
@@ -64,9 +67,10 @@ def fault(
         with connection.console("fault") as rig:
             show(rig.clear(int(clear) if clear.isdecimal() else clear), "clear")
         return
+    from rig.faults import KINDS
+
     if kind not in KINDS:
         raise UnknownNameError("KIND", "one of `rig fault --list`", kind or "nothing", KINDS)
-    given = {name: _plain(value) for name, value in numbers.items() if value is not None}
     with connection.console("fault") as rig:
         accepted = rig.fault(str(channel), kind, for_s=for_s, **given)
     show(accepted, "fault")
@@ -82,12 +86,10 @@ def _plain(value: Any) -> Any:
 
 
 def _show_kinds() -> None:
-    table = new_table("", "kind", "stage", "what it does", "numbers", "on", wrapped=("what it does", "numbers"))
-    for name, kind in KINDS.items():
-        doc = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
-        numbers = []
-        for field, info in kind.model_fields.items():
-            if field != "kind":
-                numbers.append(field if info.is_required() else f"{field} ({info.get_default()})")
-        table.add_row(name, kind.stage, doc, ", ".join(numbers), kind.channel_only or "any")
+    from rig.faults import described
+
+    headings = ("kind", "stage", "what it does", "numbers", "on")
+    table = new_table("", *headings, wrapped=("what it does", "numbers"), spare=("on", "stage"))
+    for row in described():
+        table.add_row(*row)
     table_console().print(table)

@@ -7,7 +7,7 @@ from rig.errors import InputError, UnknownNameError
 from rig.faults.kind import At, Draws, Kind
 from rig.faults.kinds import KINDS, AnyKind, NoFilter, Swap
 
-__all__ = ["KINDS", "AnyKind", "At", "Draws", "Kind", "NoFilter", "Swap", "channels_of"]
+__all__ = ["KINDS", "AnyKind", "At", "Draws", "Kind", "NoFilter", "Swap", "channels_of", "described"]
 
 
 def channels_of(what: Kind, target: str, table: ChannelTable, *, ideal: bool, noisy: bool) -> tuple[str, ...]:
@@ -46,3 +46,17 @@ def channels_of(what: Kind, target: str, table: ChannelTable, *, ideal: bool, no
     for name in names:
         what.refuse(known[name], ideal=ideal, noisy=noisy)
     return names
+
+
+def described() -> list[tuple[str, str, str, str, str]]:
+    """Of each kind its name, stage, equation, numbers with defaults, and the channels that it is for."""
+    found = []
+    for name, kind in KINDS.items():
+        numbers = [
+            key + ("" if field.is_required() else " (none)" if field.default is None else f" ({field.default:g})")
+            for key, field in kind.model_fields.items()
+            if key != "kind"
+        ]
+        doc = " ".join((kind.__doc__ or "").split())
+        found.append((name, kind.stage, doc, ", ".join(numbers) or "none", kind.channel_only or "any"))
+    return found

@@ -53,6 +53,7 @@ class At:
         other: The same signal, or volts, of another channel by name, shape (n,).
         angle: Of the shaft [rad], shape (n,).
         rate: Of that [rad/s], shape (n,).
+        mark: What the keyphasor sees at an angle of the shaft.
     """
 
     t: np.ndarray
@@ -63,6 +64,7 @@ class At:
     other: Callable[[str], np.ndarray]
     angle: np.ndarray
     rate: np.ndarray
+    mark: Callable[[np.ndarray], np.ndarray]
 
 
 class Kind(Written):

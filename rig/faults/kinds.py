@@ -16,7 +16,6 @@ from pydantic import Field, FiniteFloat, model_validator
 from rig.channels import Channel
 from rig.errors import InputError
 from rig.faults.kind import At, Kind
-from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
 
 Part = Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)]
 Positive = Annotated[FiniteFloat, Field(gt=0.0)]
@@ -425,7 +424,7 @@ class ExtraPulses(MissPulses):
     kind: Literal["extra-pulses"] = "extra-pulses"  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return np.maximum(x, np.where(_picked(at, self.part), _mark(at.angle - math.pi), 0.0))
+        return np.maximum(x, np.where(_picked(at, self.part), at.mark(at.angle - math.pi), 0.0))
 
     def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
         if not len(ticks):
@@ -448,7 +447,7 @@ class EdgeJitter(Kind):
         return late_s[turns - known[0]]
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return _mark(at.angle - at.rate * self._late_s(at))
+        return at.mark(at.angle - at.rate * self._late_s(at))
 
     def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
         return ticks + 1e6 * self._late_s(at) if len(ticks) else ticks
@@ -464,12 +463,6 @@ def _picked(at: At, part: float) -> np.ndarray:
     """Whether rows are of turns that are hit, shape (n,)."""
     turns, known = _turns(at)
     return (at.draw.uniform(known)[:, 0] < part)[turns - known[0]]
-
-
-def _mark(angle: np.ndarray) -> np.ndarray:
-    """What the keyphasor sees of its mark, as `rig.kernels.observe` has it, shape (n,)."""
-    ahead = (angle + math.pi) % (2.0 * math.pi) - math.pi
-    return np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
 
 
 AnyKind = (

@@ -319,7 +319,9 @@ def test_an_unknown_command_is_refused_with_those_that_are_known() -> None:
         for name in ("explode", "Hammer", "%s", "x" * 5000):
             reply = wire.decode_document(rig.listener.client.request(wire.command_key(name), b"{}"))
             assert reply["accepted"] is False
-            assert reply["error"].startswith("command must be one of hammer, speed, release, stop, step, note")
+            assert reply["error"].startswith(
+                "command must be one of hammer, speed, release, fault, clear, stop, step, note"
+            )
             assert len(reply["error"]) < 1000
 
 

@@ -18,6 +18,7 @@ from rig.channels import Channel, ChannelTable
 from rig.commands import ClearCommand, FaultCommand
 from rig.errors import InputError, Words
 from rig.faults import At, Draws, Kind, NoFilter, Swap, channels_of
+from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.sensors.conditioning import Conditioner
 
@@ -215,9 +216,8 @@ class Faulty:
             angle, rate = (np.interp(here, ticks, rows[:, COLUMN[name]]) for name in ("theta", "theta_rate"))
             turns = 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))  # an edge is where the angle is whole turns
             t = (here + tick - one.begin) / _TICKS_HZ
-            at = At(
-                t, np.arange(len(here)), self.table.channels[marks[0]], one.draws[marks[0]], {}, _nothing, turns, rate
-            )
+            mark = self.table.channels[marks[0]]
+            at = At(t, np.arange(len(here)), mark, one.draws[mark.name], {}, _nothing, turns, rate, _mark)
             edges = np.sort(np.concatenate([edges[~inside], one.what.edges(here, at)]))
         return edges
 
@@ -289,7 +289,7 @@ class Faulty:
     ) -> At:
         none = np.empty(0)
         t = times_s - one.begin / _TICKS_HZ
-        return At(t, n, channel, one.draws[channel.name], one.kept, other, none, none)
+        return At(t, n, channel, one.draws[channel.name], one.kept, other, none, none, _mark)
 
     def _late(
         self, twin: _Twin, counts: np.ndarray, c: int, n: np.ndarray, channel: Channel, faults: list[Active]
@@ -338,7 +338,7 @@ class _Volts:
     def _at(self, one: Active, channel: Channel) -> At:
         t = self._times_s - one.begin / _TICKS_HZ
         angle, rate = self.rows[:, COLUMN["theta"]], self.rows[:, COLUMN["theta_rate"]]
-        return At(t, self._n, channel, one.draws[channel.name], one.kept, self._beyond_bias, angle, rate)
+        return At(t, self._n, channel, one.draws[channel.name], one.kept, self._beyond_bias, angle, rate, _mark)
 
     def _felt(self, name: str) -> np.ndarray:
         """What the sensor feels [its unit], with the faults of transducers."""
@@ -373,6 +373,12 @@ class _Volts:
             if name in one.names:
                 volts = one.what.volts(volts, self._at(one, channel))
         return (volts - channel.bias_v) / channel.sensitivity_v * channel.si
+
+
+def _mark(angle: np.ndarray) -> np.ndarray:
+    """What the keyphasor sees of its mark, as rows have it (`rig.kernels.observe`), shape (n,)."""
+    ahead = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
 
 
 def _is_late(what: Kind) -> bool:
