@@ -301,6 +301,10 @@ class Agreement:
         for one in given.values():
             asked.setdefault((one["command"], one["tick"]), []).append(("its command", one["request"]))
         effects = {(one["event"], one["tick"]): one for one in self._events if isinstance(one.get("tick"), int)}
+        for one in effects.values():
+            if one["event"] == "fault" and isinstance(one.get("for_s"), float | int):
+                over = one["tick"] + max(1, round(one["for_s"] * self._ticks_hz))
+                asked.setdefault(("clear", over), []).append(("its end", {"id": one.get("fault")}))
         for (name, tick), event in effects.items():
             if name not in COMMANDS or not self._scene:
                 continue

@@ -21,6 +21,7 @@ from rig.faults import At, Draws, Kind, NoFilter, Swap, channels_of
 from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.sensors.conditioning import Conditioner
+from rig.sensors.keyphasor import FRACTIONS, TURN
 
 _TICKS_HZ = 1_000_000
 _MOST = 64
@@ -97,6 +98,9 @@ class Faulty:
         self._ideal, self._noisy = ideal, noisy
         self.active: list[Active] = []
         self._begun = 0
+        self._last_edge = math.nan
+        self._held = np.empty(0)
+        """Edges that come later than the ones that they stand for [ticks]."""
         self._twins: dict[tuple[int, bool], _Twin] = {}
 
     def targets(self, command: FaultCommand) -> tuple[str, ...]:
@@ -206,20 +210,31 @@ class Faulty:
             rows: Observed rows that they lie in.
             tick: Of the first row.
         """
-        ticks = self.row_ticks * np.arange(len(rows))
-        for one in self.active:
-            marks = [name for name in one.names if self.table.channels[name].signal == "keyphasor"]
-            if not marks:
+        real, end = edges + tick, tick + self.row_ticks * len(rows)
+        before = np.append(self._last_edge, real[:-1])
+        self._last_edge = float(real[-1]) if len(real) else self._last_edge
+        marks = {name for name, channel in self.table.channels.items() if channel.signal == "keyphasor"}
+        faults = [(one, mark) for one in self.active for mark in one.names if mark in marks]
+        if not faults and not len(self._held):
+            return edges
+        # The rate that edges tell: what rows tell there depends on where a block begins.
+        rate = 2e6 * math.pi / (real - before[: len(real)])
+        turns = np.rint(np.interp(edges, self.row_ticks * np.arange(len(rows)), rows[:, COLUMN["theta"]]) / TURN) * TURN
+        found = real
+        for one, mark in faults:
+            inside = (found >= one.begin) & (found < one.end)
+            if not inside.any():
                 continue
-            inside = (edges + tick >= one.begin) & (edges + tick < one.end)
-            here = edges[inside]
-            angle, rate = (np.interp(here, ticks, rows[:, COLUMN[name]]) for name in ("theta", "theta_rate"))
-            turns = 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))  # an edge is where the angle is whole turns
-            t = (here + tick - one.begin) / _TICKS_HZ
-            mark = self.table.channels[marks[0]]
-            at = At(t, np.arange(len(here)), mark, one.draws[mark.name], {}, _nothing, turns, rate, _mark)
-            edges = np.sort(np.concatenate([edges[~inside], one.what.edges(here, at)]))
-        return edges
+            here, nearest = found[inside], np.maximum(np.searchsorted(real, found[inside], side="right") - 1, 0)
+            at = At(
+                (here - one.begin) / _TICKS_HZ, np.arange(len(here)), self.table.channels[mark], one.draws[mark], {},
+                _nothing, turns[nearest], rate[nearest], _mark,
+            )  # fmt: skip
+            shown = np.rint(one.what.edges(here, at) * FRACTIONS) / FRACTIONS
+            found = np.sort(np.concatenate([found[~inside], shown[np.isfinite(shown)]]))
+        found = np.sort(np.concatenate([self._held, found]))
+        self._held = found[found >= end]
+        return found[found < end] - tick
 
     def _shown(
         self, place: int, conditioner: Conditioner, faulty: Mapping[str, list[Active]], volts: _Volts, tick: int

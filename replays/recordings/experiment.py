@@ -13,8 +13,9 @@ from typing import Any, Self
 import numpy as np
 
 from recorder.reader import Recording
-from rig.commands import COMMANDS
+from rig.commands import COMMANDS, ClearCommand, FaultCommand, check_command
 from rig.errors import InputError, Words
+from rig.faults import channels_of
 from rig.motion import Begin
 from rig.offline import Run, SentCommand, frames, simulate
 from rig.parameters import DEFAULT_SET, load_parameters, set_names
@@ -84,6 +85,25 @@ class Experiment:
             InputError: An unknown key, or a value that it must not have.
         """
         return replace(self, scene=change_scene(self.scene, changes))
+
+    def without_faults(self) -> Experiment:
+        """The same with sound sensors: as one who knows nothing of faults has it."""
+        kept = tuple(one for one in self.scene.commands if not isinstance(one.request, FaultCommand | ClearCommand))
+        sent = tuple(one for one in self.commands if one.name not in ("fault", "clear"))
+        return replace(self, scene=self.scene.model_copy(update={"commands": kept}), commands=sent)
+
+    @property
+    def faulty(self) -> set[str]:
+        """Channels that were told to misbehave, some time."""
+        timed = [one.request for one in self.scene.commands] + [
+            check_command(one.name, dict(one.request)) for one in self.commands if one.name == "fault"
+        ]
+        table, sensors = self.scene.table, self.scene.sensors
+        told = [one for one in timed if isinstance(one, FaultCommand)]
+        ideal = sensors.chain == "ideal"
+        return {
+            name for one in told for name in channels_of(one.what, one.channel, table, ideal=ideal, noisy=sensors.noise)
+        }
 
     def simulation(self) -> Simulation:
         """A simulation of the scene, at its start; `frames` sends it the commands."""

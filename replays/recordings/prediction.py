@@ -396,10 +396,10 @@ def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chun
 
 
 def bare(experiment: Experiment) -> Experiment:
-    """The same motion with one cheap sensor and no companion: rows stay as far apart as they were."""
+    """The same motion with one cheap, sound sensor and no companion: rows stay as far apart as they were."""
     groups = (experiment.scene.channels or rig_table()).groups.values()
     fewest = min(groups, key=lambda group: len(group.channels))
-    return experiment.changed(
+    return experiment.without_faults().changed(
         {
             "engine.companion": False,
             "sensors.groups": [fewest.name],

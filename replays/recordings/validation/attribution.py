@@ -112,7 +112,8 @@ def attribute(
     shift_s = Clock(parts, nominal, end_s).coarse_shift()
     for until_s in (whole_s, end_s):
         step(f"sensors and time, to {until_s:.3f} s")
-        sensors, timed = sensor_faults(parts, nominal, until_s), Clock(parts, nominal, until_s).faults(shift_s)
+        sensors = sensor_faults(parts, nominal, until_s, from_s=from_s)
+        timed = Clock(parts, nominal, until_s).faults(shift_s)
         cured = bool(sensors) and all(one.at_floor for one in sensors)
         if cured or any(one.at_floor for one in timed):
             break

@@ -33,6 +33,7 @@ def validate(
     criteria: Criteria | None = None,
     changes: dict[str, Any] | None = None,
     declared: bool = False,
+    blind: bool = False,
     step: Callable[[str], None] = lambda _text: None,
 ) -> Validation:
     """Hold a recording against its own experiment.
@@ -43,6 +44,7 @@ def validate(
         changes: Other values of scene or parameters than the recorded ones, by dotted key.
         declared: Judge by the declared comparison even where every bit is equal: what another build, on which it is
             not, would be judged by.
+        blind: As if nothing were known of the faults that the rig was told to have.
         step: Told what is being done.
 
     Raises:
@@ -52,6 +54,8 @@ def validate(
     experiment = Experiment.of(recording)
     if changes:
         experiment = experiment.changed(changes)
+    if blind:
+        experiment = experiment.without_faults()
     again = _done_again(recording, experiment, criteria, step)
     begin, end, reason = _window(again)
     trajectory = residuals(again.parts, again.nominal, again.others, again.criteria, end_s=end)
@@ -126,6 +130,9 @@ def _done_again(
     parts = measured(recording, experiment.scene, longest_s=rules.longest_s)
     bits = Bits(recording, experiment.simulation().table)
     step("re-simulated, payload by payload")
+    # Of channels that were told to misbehave only bits are compared: what is predicted is sound.
+    sound = {name: [one for one in part.names if one not in experiment.faulty] for name, part in parts.items()}
+    parts = {name: part.only(sound[name]) for name, part in parts.items() if sound[name]} or parts
     nominal = predict(experiment, parts, follow=bits.follow)
     quick = bare(experiment)
     step("perturbed, to see how far it can be predicted")

@@ -31,6 +31,10 @@ _TURNED_OFF = 0.02
 """By so much may two probes' signals differ from ones that are turned."""
 _FEW = 16
 """Rows that tell no delay."""
+_SURE = 6.0
+"""Times its noise, by which a sample, or the mean of some, is off."""
+_SETTLES_S = 2e-3
+"""Filters have forgotten a jump by then."""
 _LATEST_S = 4e-3
 """How late a channel is looked for [s]."""
 _ALIKE = 0.2
@@ -105,8 +109,9 @@ class _Shown:
 
 
 def sensor_faults(
-    parts: dict[str, Measured], nominal: Prediction, end_s: float, others: Sequence[Prediction] = ()
-) -> list[Explanation]:
+    parts: dict[str, Measured], nominal: Prediction, end_s: float, others: Sequence[Prediction] = (), *,
+    from_s: float = -math.inf,
+) -> list[Explanation]:  # fmt: skip
     """What each channel that differs may have, by itself, or as one of a pair.
 
     Args:
@@ -114,20 +119,24 @@ def sensor_faults(
         nominal: What was predicted.
         end_s: End of the window [s].
         others: What might be predicted as well.
+        from_s: About the first difference: a fault that begins on the way is looked for behind it [s].
     """
+    if math.isfinite(from_s):
+        from_s = _onset_s(parts, nominal, from_s, end_s)
     shown = []
     for name, part in parts.items():
-        n = part.rows_until(end_s)
-        floor = floors(part, nominal.values[name][:n], [other.values[name][:n] for other in others])
+        rows = slice(part.rows_until(from_s), part.rows_until(end_s))
+        foretold, *shown_too = (one.values[name][rows] for one in (nominal, *others))
+        floor = floors(part, foretold, shown_too)
         shown += [
             _Shown(
-                part.channels[c].name, part.channels[c].unit, part.times_s[:n], part.values[:n, c],
-                nominal.values[name][:n, c], floor[:, c], float(part.floor[c]),
+                part.channels[c].name, part.channels[c].unit, part.times_s[rows], part.values[rows, c],
+                foretold[:, c], floor[:, c], float(part.floor[c]),
             )
             for c in smooth_columns(part)
         ]  # fmt: skip
     total = sum(excess(one.apart) for one in shown)
-    off = {one.name: one for one in shown if len(one.values) > 2 and not is_noise(one.apart)}
+    off = {one.name: one for one in shown if len(one.values) > _FEW and not is_noise(one.apart)}
     told = _Telling(total, end_s)
     found, seen = [], set()
     for a, b in combinations(off.values(), 2):
@@ -139,6 +148,22 @@ def sensor_faults(
             seen |= {a.name, b.name}
     alone = [_one_sensor(one, told) for name, one in off.items() if name not in seen]
     return found + _together(alone, told, [one.name for one in shown if one.moves])
+
+
+def _onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end_s: float) -> float:
+    """From when on a channel is not as it should be, with what filters need to settle, if enough is left [s]."""
+    onsets = [end_s]
+    for name, part in parts.items():
+        rows = slice(part.rows_until(from_s), part.rows_until(end_s))
+        z = ((part.values - nominal.values[name][: len(part.values)]) / part.floor)[rows, smooth_columns(part)]
+        sums = np.cumsum(np.vstack([np.zeros(z.shape[1]), z]), axis=0)
+        lasting = np.abs(sums[_FEW:] - sums[:-_FEW]) > _SURE * math.sqrt(_FEW)
+        # A mean over some rows tells it when it has gone on for a part of them.
+        firsts = np.concatenate([np.flatnonzero((np.abs(z) > _SURE).any(axis=1)),
+                                 np.flatnonzero(lasting.any(axis=1)) + _FEW - 1])  # fmt: skip
+        onsets += [float(part.times_s[rows][firsts.min()])] if len(firsts) else []
+    onset_s = min(onsets)
+    return onset_s + _SETTLES_S if end_s - onset_s > 3.0 * _SETTLES_S else onset_s
 
 
 def late_together(found: Sequence[Explanation], parts: Mapping[str, Measured]) -> dict[str, float]:

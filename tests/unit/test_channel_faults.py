@@ -1,0 +1,253 @@
+"""Channels that misbehave on command: each kind by its equation, on its rows, and nothing else anywhere."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from replays.recordings.experiment import Experiment
+from replays.recordings.validation import validate
+from rig.cli import fault as command
+from rig.errors import InputError
+from rig.faults import KINDS
+from rig.scenes import load_scene, parse_scene, scene_document
+from rig.simulation import Simulation
+from tests.physics.test_identification import recorded
+
+EXAMPLES: dict[str, dict[str, Any]] = {
+    "gain": {"factor": 1.1}, "offset": {"value": 0.05}, "drift": {"rate": 5.0}, "polarity": {}, "stuck": {},
+    "nonlinear": {"end": 0.01}, "open": {"level_v": 1.0}, "short": {}, "intermittent": {"part": 0.5, "slot_s": 0.002},
+    "hum": {"amplitude_v": 0.1}, "crosstalk": {"source": "P_N", "db": -20.0}, "saturation": {"part": 0.001},
+    "swap": {"other": "speed"}, "no-filter": {}, "bandwidth": {"corner_hz": 50.0}, "late": {"late_us": 2000.0},
+    "clock": {"ppm": 5e4}, "jitter": {"rms_us": 100.0}, "wander": {"amplitude_us": 2000.0, "period_s": 0.05},
+    "noise": {"factor": 3.0}, "spikes": {"rate_hz": 500.0, "size_v": 0.5}, "bits": {"lost": 6},
+    "stuck-bit": {"bit": 8}, "clip": {"part": 1e-4}, "freeze": {}, "miss-pulses": {"part": 1.0},
+    "extra-pulses": {"part": 1.0}, "edge-jitter": {"rms_us": 300.0},
+}  # fmt: skip
+SCENE = load_scene("hammer", {"duration_s": 0.4, "drive.speed_hz": 15.0})
+FROM, TO = 0.1, 0.3
+CHANNELS = tuple(SCENE.table.channels)
+
+
+def run(*faults: dict[str, Any], cut: int = 50_000, scene: Any = SCENE) -> tuple[dict[str, np.ndarray], list[Any]]:
+    """Counts of every channel by name, edges under "edges" [ticks], and events."""
+    simulation, found, edges, events = Simulation(scene), dict[str, list[np.ndarray]](), [np.empty(0)], []
+    for fault in faults:
+        while simulation.tick < round(1e6 * fault.get("at_s", FROM)):
+            step(simulation, cut, found, edges, events)
+        simulation.submit("fault", {key: value for key, value in fault.items() if key != "at_s"})
+    while simulation.tick < simulation.end_tick:
+        step(simulation, cut, found, edges, events)
+    return {name: np.concatenate(parts) for name, parts in found.items()} | {"edges": np.concatenate(edges)}, events
+
+
+def step(simulation: Simulation, cut: int, found: Any, edges: Any, events: Any) -> None:
+    frame = simulation.advance(cut)
+    for group, block in frame.samples.items():
+        for c, name in enumerate(simulation.table.groups[group].names):
+            found.setdefault(name, []).append(block.values[:, c])
+    if frame.edges is not None:
+        edges.append(frame.edges.values[:, 0] + frame.edges.tick)
+    events += frame.events
+
+
+def differs(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> dict[str, tuple[int, int]]:
+    """First and last rows that differ, by channel."""
+    rows = {name: np.flatnonzero(one[name] != other[name]) for name in one if name != "edges"}
+    return {name: (int(each[0]), int(each[-1])) for name, each in rows.items() if len(each)}
+
+
+@pytest.fixture(scope="module")
+def sound() -> dict[str, np.ndarray]:
+    return run()[0]
+
+
+def example(kind: str, channel: str) -> dict[str, Any]:
+    return {"channel": channel, "kind": kind, "for_s": TO - FROM, **EXAMPLES[kind]}
+
+
+def test_every_kind_has_an_example_and_its_options() -> None:
+    assert set(EXAMPLES) == set(KINDS)
+    numbers = {field for kind in KINDS.values() for field in kind.model_fields if field != "kind"}
+    own = {"channel", "kind", "for_s", "clear", "listed", "connection"}
+    assert {one for one in command.fault.__annotations__ if one != "return"} == numbers | own
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_is_on_its_channels_and_rows_alone(kind: str, sound: dict[str, np.ndarray]) -> None:
+    """However the run is cut; once it is over, every count is what it would have been."""
+    channel = "keyphasor" if KINDS[kind].channel_only else "disk_x"
+    there, events = run(example(kind, channel))
+    found = differs(there, sound)
+    (begun,) = (event for event in events if event["event"] == "fault")
+    assert set(found) == set(begun["channels"])
+    (rate_hz,) = {SCENE.table.channels[name].rate_hz for name in found}
+    for first, last in found.values():
+        assert begun["first_row"][SCENE.table.channels[channel].group] == FROM * rate_hz
+        assert FROM * rate_hz <= first <= last < TO * rate_hz
+        # What comes at random, or once a turn, may come later; the rest is seen within the filter's first samples.
+        assert first <= FROM * rate_hz + 4 or kind in (
+            "intermittent",
+            "spikes",
+            "miss-pulses",
+            "extra-pulses",
+            "edge-jitter",
+        )
+    finely, _ = run(example(kind, channel), cut=1_000)
+    assert not differs(there, finely)
+    np.testing.assert_array_equal(there["edges"], finely["edges"])
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_every_kind_does_something_on_every_channel_or_is_refused(channel: str, sound: dict[str, np.ndarray]) -> None:
+    refused: set[str] = set()
+    for kind, numbers in EXAMPLES.items():
+        if kind in ("swap", "crosstalk"):
+            key = "other" if kind == "swap" else "source"
+            numbers = numbers | {key: "P_N" if channel != "P_N" else "disk_x"}
+        try:
+            there, _ = run({"channel": channel, "kind": kind, **numbers})
+        except InputError:
+            refused.add(kind)
+            continue
+        # A hammer that rests, and a spin that is all but even, show nothing of what acts on their motion.
+        still = channel in ("hammer", "speed") and kind in (
+            "gain", "polarity", "stuck", "nonlinear", "no-filter", "bandwidth", "saturation", "short", "clip",
+            "intermittent",
+        )  # fmt: skip
+        assert channel in differs(there, sound) or still or channel == "keyphasor"
+    assert refused <= {"noise", *(kind for kind in KINDS if KINDS[kind].channel_only)}
+
+
+def engineering(counts: dict[str, np.ndarray], name: str) -> np.ndarray:
+    channel = SCENE.table.channels[name]
+    return counts[name][round(0.12 * channel.rate_hz) : round(0.29 * channel.rate_hz)] * channel.scale + channel.offset
+
+
+@pytest.mark.parametrize(("channel", "kind", "number", "value"), [
+    ("P_E", "gain", "factor", 1.07), ("ring_y", "gain", "factor", 0.4), ("P_W", "offset", "value", 30.0),
+    ("ring_x", "offset", "value", 0.03), ("P_N", "drift", "rate", 400.0), ("disk_y", "hum", "amplitude_v", 0.2),
+    ("P_S", "noise", "factor", 5.0), ("inner_x", "noise", "factor", 2.5), ("disk_x", "late", "late_us", 730.0),
+    ("P_E", "late", "late_us", 90.0),
+])  # fmt: skip
+def test_its_size_comes_out_of_the_counts(
+    channel: str, kind: str, number: str, value: float, sound: dict[str, np.ndarray]
+) -> None:
+    """Within 1 %, or three standard deviations of what noise makes of it."""
+    there, _ = run({"channel": channel, "kind": kind, "for_s": TO - FROM, number: value})
+    y, x = engineering(there, channel), engineering(sound, channel)
+    about = SCENE.table.channels[channel]
+    t = (np.arange(len(x)) + round(0.12 * about.rate_hz)) / about.rate_hz - FROM
+    noise = about.noise_v / abs(about.sensitivity_v)
+    if kind == "gain":
+        found, slack = float(x @ y / (x @ x)), 3.0 * noise / math.sqrt(float(x @ x))
+    elif kind == "offset":
+        found, slack = float(np.mean(y - x)), 0.0
+    elif kind == "drift":
+        found, slack = float(t @ (y - x) / (t @ t)), 0.0
+    elif kind == "hum":
+        turn = np.exp(-2j * math.pi * 50.0 * t)
+        # What the channel's filter lets through of 50 Hz is all of it.
+        found, slack = abs(2.0 * np.mean((y - x) * turn)) * abs(about.sensitivity_v), 0.0
+    elif kind == "noise":
+        found = math.sqrt(float(np.var(y - x)) / noise**2 + 1.0)
+        slack = 3.0 * found / math.sqrt(2.0 * len(x))
+    else:
+        steps = np.linspace(0.8, 1.2, 401) * value
+        at = np.arange(len(x)) / about.rate_hz
+        costs = [float(np.sum((y - np.interp(at - 1e-6 * late, at, x))[50:] ** 2)) for late in steps]
+        found, slack = float(steps[int(np.argmin(costs))]), 2.0
+    assert abs(found - value) < max(0.01 * value, slack)
+
+
+def test_what_pulses_lack_or_have_too_many_edges_have_too(sound: dict[str, np.ndarray]) -> None:
+    inside = [edge for edge in sound["edges"] if FROM <= edge * 1e-6 < TO]
+    missing, extra, late = (
+        run(example(kind, "keyphasor"))[0]["edges"] for kind in ("miss-pulses", "extra-pulses", "edge-jitter")
+    )
+    assert len(sound["edges"]) - len(missing) == len(inside) > 2
+    assert len(extra) - len(sound["edges"]) == len(inside)
+    moved = late[~np.isin(late, sound["edges"])] - np.array(inside)
+    assert len(moved) == len(inside)
+    assert ((moved > 0.0) & (moved < 8 * 300.0)).all()
+
+
+def test_several_at_once_on_a_group_and_one_of_them_cleared(sound: dict[str, np.ndarray]) -> None:
+    hum = {"channel": "probes", "kind": "hum", "amplitude_v": 0.2}
+    there, _ = run(hum, {"channel": "disk_x", "kind": "noise", "factor": 4.0, "at_s": 0.15, "for_s": 0.05})
+    alone, _ = run(hum)
+    assert set(differs(there, sound)) == {"disk_x", "disk_y", "ring_x", "ring_y"}
+    first, last = differs(there, alone)["disk_x"]
+    assert 3000 <= first <= last < 4000
+    scales = {name: abs(SCENE.table.channels[name].lsb_v) for name in ("disk_x", "ring_y")}
+    one, other = (scales[name] * (alone[name] - sound[name]) for name in scales)
+    np.testing.assert_allclose(one, other, atol=5e-6)  # one hum in all of them
+
+
+def test_a_snapshot_holds_the_faults(sound: dict[str, np.ndarray]) -> None:
+    simulation = Simulation(SCENE)
+    simulation.submit("fault", {"channel": "P_E", "kind": "late", "late_us": 500.0})
+    simulation.advance(50_000)
+    snapshot = simulation.snapshot()
+    first = simulation.advance(50_000).samples["forces"].values
+    simulation.restore(snapshot)
+    np.testing.assert_array_equal(simulation.advance(50_000).samples["forces"].values, first)
+
+
+def test_faults_of_a_scene_are_recorded_and_done_again_bit_by_bit(tmp_path: Any) -> None:
+    text = {
+        "duration_s": 0.3, "drive": {"speed_hz": 6.2},
+        "faults": [{"at_s": 0.1, "channel": "P_E", "kind": "gain", "factor": 1.05},
+                   {"at_s": 0.12, "channel": "probes", "kind": "jitter", "rms_us": 20.0, "for_s": 0.1}],
+    }  # fmt: skip
+    scene = parse_scene(text)
+    assert [timed.request.command for timed in scene.commands] == ["fault", "fault"]
+    assert parse_scene(scene_document(scene)) == scene
+    commands = scene_document(scene)["commands"]
+    recording = recorded(tmp_path / "f.mcap", "stable-run", duration_s=0.3, commands=commands)
+    assert validate(recording).bit_exact
+    assert Experiment.of(recording).faulty == {"P_E", "disk_x", "disk_y", "ring_x", "ring_y"}
+    blind = validate(recording, blind=True)
+    assert not blind.good
+    (named,) = [
+        fault for fault in [command] if blind.explained is not None and "P_E gain" in blind.explained.conclusion
+    ] or [None]
+    assert named is not None
+
+
+@pytest.mark.parametrize(("request_", "says"), [
+    ({"channel": "disk_z", "kind": "open"}, "fault.channel must be one of the channels"),
+    ({"channel": "disk_x", "kind": "opn"}, "kind must be one of the kinds, such as open"),
+    ({"channel": "disk_x"}, "kind must be one of the kinds"),
+    ({"channel": "disk_x", "kind": "gain"}, "factor must be given"),
+    ({"channel": "disk_x", "kind": "gain", "factor": 1.0}, "factor must be other than 1"),
+    ({"channel": "disk_x", "kind": "gain", "factor": "2"}, "factor must be"),
+    ({"channel": "disk_x", "kind": "gain", "factor": 2.0, "size": 1}, "size must be a field that there is"),
+    ({"channel": "disk_x", "kind": "offset", "value": math.inf}, "value must be"),
+    ({"channel": "disk_x", "kind": "swap", "other": "disk_x"}, "fault.swap must be with another channel"),
+    ({"channel": "probes", "kind": "swap", "other": "P_N"}, "fault.channel must be one channel for swap"),
+    ({"channel": "disk_x", "kind": "miss-pulses"}, "fault.channel must be keyphasor for miss-pulses"),
+    ({"channel": "speed", "kind": "bandwidth", "corner_hz": 3000.0}, "corner_hz must be below its bandwidth"),
+    ({"channel": "disk_x", "kind": "bits", "lost": 24}, "lost must be below the converter's"),
+    ({"channel": "disk_x", "kind": "late", "late_us": -3.0}, "late_us must be greater than 0"),
+    ({"channel": "disk_x", "kind": "open", "for_s": 0.0}, "for_s must be greater than 0"),
+])  # fmt: skip
+def test_what_cannot_be_done_is_refused_in_one_line(request_: dict[str, Any], says: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Simulation(SCENE).submit("fault", request_)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_only_a_fault_that_there_is_can_be_cleared() -> None:
+    simulation = Simulation(SCENE)
+    simulation.submit("fault", {"channel": "P_E", "kind": "open"})
+    assert simulation.told == {"fault": 1, "channels": ["P_E"], "first_row": {"forces": 0}}
+    with pytest.raises(InputError, match=r"clear\.id must be the number of a fault that there is"):
+        simulation.submit("clear", {"id": 2})
+    simulation.submit("clear", {"id": 1})
+    assert {"id": "all"}
+    assert simulation.submit("clear", {}) == 0
