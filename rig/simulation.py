@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from rig import calibrator
 from rig.channels import ChannelTable
 from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.engines import ENGINES, load_engine
@@ -114,7 +115,7 @@ class Simulation:
         self.tick_rate_hz = TICK_RATE_HZ
         self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
-        self._engine = load_engine(scene.engine.name)
+        self._engine = calibrator.STILL if scene.generator is not None else load_engine(scene.engine.name)
         self._method = ENGINES[scene.engine.name]
         sensors, self.row_ticks = scene.sensors, scene.row_ticks
         # Steps are as long as may be of those that end on the rows.
@@ -138,15 +139,21 @@ class Simulation:
                 ideal=sensors.chain == "ideal",
                 columns=self._formulas.columns(group for group in groups if group.rate_hz == rate),
             )
-            for rate in dict.fromkeys(group.rate_hz for group in groups)
+            for rate in dict.fromkeys(group.rate_hz for group in groups if scene.generator is None)
         ]
         marked = any(channel.signal == "keyphasor" for channel in self.table.channels.values())
         self._keyphasor = Keyphasor() if marked else None
+        if scene.generator is not None:
+            tick = 0 if begin is None else begin.tick
+            self._conditioners, turns = calibrator.stand_ins(scene, row_ticks=self.row_ticks, tick=tick)
+            self._keyphasor = turns if marked else None
         self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
         self._truth_columns = np.array([COLUMN[column] for columns in S.TRUTH.values() for column in columns])
         ends = accumulate(len(columns) for columns in S.TRUTH.values())
         self._truth_parts = {
-            name: slice(end - len(columns), end) for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
+            name: slice(end - len(columns), end)
+            for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
+            if scene.generator is None  # else nothing of the model is true
         }
 
         self.tick = self._start = 0 if begin is None else begin.tick
@@ -254,6 +261,8 @@ class Simulation:
             InputError: Unknown, malformed, out of range, or not possible now.
         """
         command = check_command(name, request)
+        if self.scene.generator is not None:
+            raise InputError(name, "left out: signals of a [generator] stand for the physics", Words("a command to it"))
         waiting = [other for tick, other in self._pending if tick <= self.tick]
         if isinstance(command, HammerCommand):
             busy_until = self._pulse[2] if self._pulse is not None else 0
@@ -278,6 +287,8 @@ class Simulation:
 
     def health(self) -> dict[str, Any]:
         """Spin, energy ledger and doubts at the present tick, for the status."""
+        if self.scene.generator is not None:
+            return calibrator.health(self.scene)
         first = self.first_row
         last = first if self._last is None else self._last
         balance = energy_balance(last[None, :], first)
@@ -352,9 +363,9 @@ class Simulation:
             "truth": {
                 name: {
                     "rate_hz": self.scene.sensors.truth_rate_hz,
-                    "columns": [signals[column]._asdict() for column in columns],
+                    "columns": [signals[column]._asdict() for column in S.TRUTH[name]],
                 }
-                for name, columns in S.TRUTH.items()
+                for name in self._truth_parts
             },
         }
 
