@@ -219,6 +219,8 @@ class Scene(Written):
         return self
 
     def __repr__(self) -> str:
+        if self.generator is not None:
+            return f"Scene({self.name}: {self.duration_s:g} s of signals, {self.generator.kind}; seed {self.seed})"
         speeds = [speed for _, speed in self.drive.profile] or [self.drive.speed_hz]
         speed = " to ".join(f"{each:g}" for each in dict.fromkeys((speeds[0], speeds[-1])))
         commands = f"{len(self.commands)} command{'s' * (len(self.commands) != 1)}"

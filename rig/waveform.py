@@ -11,10 +11,10 @@ import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
 from rig.errors import InputError, Words
-from rig.outside import TOML_BYTES, Written, open_file
+from rig.outside import Written, open_file
 
-_MOST = 200_000
-"""Most numbers of a waveform."""
+_MOST, _BYTES = 200_000, 8 << 20
+"""Most numbers of a waveform, and most bytes of its file: every recording of it holds it."""
 _FIELD = "generator.file"
 
 
@@ -58,17 +58,21 @@ def read_waveform(path: Path) -> Waveform:
     """
     try:
         with open_file(path) as file:
-            text = file.read(TOML_BYTES * 8 + 1).decode("utf-8-sig")
-        headings, *rows = [row for row in csv.reader(text.splitlines()) if row]
-        numbers = np.array(rows, dtype=float)
+            data = file.read(_BYTES + 1)
     except OSError as error:
         raise InputError(_FIELD, "a file that can be read", Words(f"{path} ({error.strerror})")) from None
+    if len(data) > _BYTES:
+        raise InputError(_FIELD, f"at most {_BYTES >> 20} MB", Words(f"{path}, which is larger"))
+    try:
+        headings, *rows = [row for row in csv.reader(data.decode("utf-8-sig").splitlines()) if row]
+        numbers = np.array(rows, dtype=float)
     except (ValueError, csv.Error) as error:
         raise InputError(_FIELD, "a CSV file of headings and rows of numbers", Words(f"{path} ({error})")) from None
     if numbers.ndim != 2 or not headings[0].startswith("time") or not np.isfinite(numbers).all():
         raise InputError(_FIELD, "with a first column `time [s]` and a number in every field", str(path))
-    if len(numbers) < 4 or numbers.size > _MOST:
-        raise InputError(_FIELD, f"of 4 rows at least, and {_MOST} numbers at most", numbers.size)
+    if len(numbers) < 4 or numbers[:, 1:].size > _MOST:
+        received = Words(f"{len(numbers)} rows of {numbers.shape[1] - 1}")
+        raise InputError(_FIELD, f"of 4 rows at least, and {_MOST} numbers at most", received)
     times_s = numbers[:, 0]
     rate_hz = round((len(times_s) - 1) / float(times_s[-1] - times_s[0] or 1.0), 6)
     if not 1e-6 <= rate_hz <= 1e6 or np.ptp(times_s - np.arange(len(times_s)) / rate_hz) > 0.01 / rate_hz:
