@@ -285,6 +285,12 @@ def test_the_physics_is_left_out_and_what_asks_for_it_is_refused() -> None:
     assert not frame.rows.any()
     assert frame.rows.shape[1] == N_ROW
     assert simulation.health()["warnings"] == []
+    run = simulate("test-sine", duration_s=0.01)
+    assert run.names == ()
+    with pytest.raises(KeyError, match="name must be one of the signals it keeps"):
+        _ = run["disk_x"]
+    with pytest.raises(InputError, match=r"^scene must be one of the physics"):
+        simulate("test-sine", duration_s=0.01, signals=["disk_x"])
     assert simulation.parameters_document()
 
 
