@@ -81,7 +81,7 @@ def test_counts_are_the_closed_form_to_half_a_step_of_the_converter(kind: str, r
         {"kind": kind, **given, "channels": {"P_E": shifted}}, sensors={"noise": False, "rate_hz": rate_hz}
     )
     simulation = Simulation(scene)
-    counts = np.concatenate([simulation.advance(20_000).samples["forces"].values for _ in range(10)])
+    counts = np.concatenate([simulation.advance(20_000).samples["forces"].values for _ in range(5)])
     channels = scene.table.groups["forces"].channels
     t = [Fraction(n, rate_hz) for n in range(len(counts))]
     for name, late, ahead, middle in (("P_N", 0, 0, 0.0), ("P_E", Fraction(30, 10**6), Fraction(1, 10), 0.25)):
