@@ -99,6 +99,21 @@ COMMANDS: dict[str, type[Command]] = {
 }  # fmt: skip
 
 
+class TimedCommand(Written):
+    """A command at a fixed time of the scene."""
+
+    at_s: Annotated[FiniteFloat, Field(ge=0.0)]
+    request: Annotated[Command, Field(discriminator="command")]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flat(cls, data: Any) -> Any:
+        # In the file the command's own fields stand beside at_s.
+        if isinstance(data, dict) and "request" not in data:
+            return {"at_s": data.get("at_s"), "request": {key: value for key, value in data.items() if key != "at_s"}}
+        return data
+
+
 def check_command(name: str, request: dict[str, Any]) -> Command:
     """Check a command that came from outside.
 

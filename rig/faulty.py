@@ -170,19 +170,28 @@ class Faulty:
         first = {name: -(-row * group.rate_hz // _TICKS_HZ) for name, group in groups.items()}
         return {"fault": number, "channels": list(names), "first_row": first}
 
-    def changes(self, begin: int, end: int) -> list[int]:
-        """Ticks between two at which faults begin or end."""
-        ticks = {int(tick) for one in self.active for tick in (one.begin, one.end) if begin < tick < end}
-        return sorted(ticks)
-
     def counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
         """Samples from the first of these rows on that lie before the last one, by group.
 
         Args:
-            rows: Observed rows, shape (n, N_ROW), between which no fault begins or ends.
+            rows: Observed rows, shape (n, N_ROW).
             made: Signals by formulas, shape (n, m).
             tick: Of the first row.
         """
+        if not self.active:
+            return {name: counts for each in self.conditioners for name, counts in each.counts(rows, made).items()}
+        end = tick + (len(rows) - 1) * self.row_ticks
+        changes = {int(at) for one in self.active for at in (one.begin, one.end) if tick < at < end}
+        ticks = [tick, *sorted(changes), end]
+        places = [(each - tick) // self.row_ticks for each in ticks]
+        parts = [
+            self._counts(rows[a : b + 1], made[a : b + 1], begin)
+            for begin, a, b in zip(ticks, places, places[1:], strict=False)
+        ]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
+        """The same of rows between which no fault begins or ends."""
         self.active = [one for one in self.active if one.end > tick]
         active = [one for one in self.active if one.begin <= tick]
         found: dict[str, np.ndarray] = {}

@@ -12,7 +12,8 @@ from rig.channels import Channel
 from rig.commands import COMMANDS
 from rig.faults import described
 from rig.kernels import signals
-from rig.scenes import SensorChoice, rig_table
+from rig.sampling import SensorChoice
+from rig.scenes import rig_table
 from rig.transport.access import DOORS, PLAIN, ROLES, TRUTH, Verb
 
 _DOCUMENTS = {

@@ -185,7 +185,7 @@ def simulate(
         scene: What to run: a scene that comes with the rig by its name, the path of a .toml file, or a loaded one.
         changes: Other values by dotted key, of the scene or of its parameters, as for `rig.load_scene`.
         duration_s: Another duration than the scene's [s].
-        signals: Names of the model's signals to keep; all of them unless given.
+        signals: Names of the model's signals to keep; all of them unless given (of test signals, there are none).
         folder: Where signals.npy, samples.npy and counts.npy are written (a new one is made; with groups of several
             rates, a file for each), to be read from there row by row as they are used; in memory unless given.
         commands: What is sent on the way, as for `frames`.
@@ -211,8 +211,11 @@ def simulate(
         >>> rig.simulate("hammer", duration_s=0.05, signals=["normal_force"])
         Run(hammer: 0.05 s, 1000 rows at 20000 Hz of 1 signals and 15 channels; split 25 us, seed 1)
     """
-    names = NAMES if signals is None else _names(signals)
     scene = load_scene(scene, changes)
+    if signals is not None:
+        scene.check_physics()
+    kept_by_default = NAMES if scene.generator is None else ()
+    names = kept_by_default if signals is None else _names(signals)
     if duration_s is not None:
         scene = parse_scene({**scene.model_dump(), "duration_s": duration_s})
     simulation = Simulation(scene)

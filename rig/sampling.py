@@ -1,11 +1,15 @@
-"""How far apart rows of the model are for the sensors, and where the samples of a rate fall between them."""
+"""What a scene measures; how far apart rows of the model are for it, and where the samples of a rate fall between."""
 
 from __future__ import annotations
 
 import math
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
 
 from rig.channels import ChannelTable
 from rig.errors import InputError
+from rig.outside import Written
 
 TICKS_HZ = 1_000_000
 ROW_TICKS = 25
@@ -16,6 +20,35 @@ _A_WAVE = 7.5
 """... and how many there are at least in a period of the highest bandwidth."""
 _MOST = 4096
 """Most places between rows that the samples of one rate may have: what each is made of is worked out beforehand."""
+
+
+class SensorChoice(Written):
+    """What is measured, and how often."""
+
+    groups: tuple[str, ...] = ()
+    """Groups of channels that are on; none named: all."""
+    rate_hz: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """Sample rate of every channel [Hz]; 0: that of each group in the channel table."""
+    truth_rate_hz: Annotated[int, Field(ge=10, le=1_000_000)] = 2_000
+    """Rate of the truth that is published beside the sensors [Hz]."""
+    noise: bool = True
+    """False leaves the sensors' noise out."""
+    chain: Literal["ideal", "full"] = "full"
+    """The full chain of filter, noise, offset and converter, or what the sensor measures and nothing else."""
+
+    @field_validator("rate_hz")
+    @classmethod
+    def _a_rate(cls, rate_hz: int) -> int:
+        if 0 < rate_hz < 100:
+            raise ValueError("at least 100, or 0 for the channel table's own")
+        return rate_hz
+
+    @field_validator("truth_rate_hz")
+    @classmethod
+    def _whole_period(cls, rate_hz: int) -> int:
+        if 1_000_000 % rate_hz:
+            raise ValueError("a rate whose period is a whole number of microseconds, such as 1000, 2000 or 10000")
+        return rate_hz
 
 
 def row_ticks(table: ChannelTable, *, truth_rate_hz: int, ideal: bool) -> int:

@@ -5,43 +5,27 @@ from __future__ import annotations
 import json
 import tomllib
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from rig.channel_file import check_table, read_channels
 from rig.channels import ChannelTable, check_signals, default_table
-from rig.commands import Command, HammerCommand, ReleaseCommand, SpeedCommand, with_faults
+from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, TimedCommand, with_faults
 from rig.engines import ENGINES
 from rig.errors import InputError, Words, such_as
 from rig.formula import Formulas
+from rig.generators import Generator, Source, sources
 from rig.kernels.signals import COLUMN
 from rig.levels import ModelLevels
 from rig.outside import Written, check, parse_toml, read_toml, table_in
 from rig.parameters import DEFAULT_SET, ParameterSet, load_parameters
 from rig.pick import Pick, digest, equations_digest
-from rig.sampling import check_rates, row_ticks
+from rig.sampling import SensorChoice, check_rates, row_ticks
+from rig.speed_target import Drive
 
 SCENES = Path(__file__).with_name("scenes")
-_APART_S = 0.01
-"""Least time between two points of a speed profile [s]: well above any step."""
-
-
-class TimedCommand(Written):
-    """A command at a fixed time of the scene."""
-
-    at_s: Annotated[FiniteFloat, Field(ge=0.0)]
-    request: Annotated[Command, Field(discriminator="command")]
-
-    @model_validator(mode="before")
-    @classmethod
-    def _flat(cls, data: Any) -> Any:
-        # In the file the command's own fields stand beside at_s.
-        if isinstance(data, dict) and "request" not in data:
-            return {"at_s": data.get("at_s"), "request": {key: value for key, value in data.items() if key != "at_s"}}
-        return data
 
 
 class Initial(Written):
@@ -54,27 +38,6 @@ class Initial(Written):
     """Shaft in the ring, for position "given" [mm]."""
     magnets: bool = True
     """False: the magnets have let go already."""
-
-
-class Drive(Written):
-    """What the motor aims at."""
-
-    mode: Literal["torque", "ideal"] = "torque"
-    """A torque law (the spin can dip) or a prescribed spin."""
-    speed_hz: Annotated[FiniteFloat, Field(ge=0.0)] = 0.0
-    """Constant speed [Hz], unless a profile is given."""
-    profile: tuple[tuple[FiniteFloat, FiniteFloat], ...] = ()
-    """Points (time [s], speed [Hz]), joined by straight lines; the last is held."""
-
-    @field_validator("profile")
-    @classmethod
-    def _ascending(cls, profile: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-        times = [time for time, _ in profile]
-        if profile and (times[0] != 0.0 or any(b < a + _APART_S - 1e-9 for a, b in pairwise(times))):
-            raise ValueError(f"points of ascending time, at least {_APART_S:g} s apart, the first at 0")
-        if any(speed < 0.0 for _, speed in profile):
-            raise ValueError("points of speed >= 0")
-        return profile
 
 
 class EngineChoice(Written):
@@ -124,35 +87,6 @@ def rig_table() -> ChannelTable:
     return table
 
 
-class SensorChoice(Written):
-    """What is measured, and how often."""
-
-    groups: tuple[str, ...] = ()
-    """Groups of channels that are on; none named: all."""
-    rate_hz: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    """Sample rate of every channel [Hz]; 0: that of each group in the channel table."""
-    truth_rate_hz: Annotated[int, Field(ge=10, le=1_000_000)] = 2_000
-    """Rate of the truth that is published beside the sensors [Hz]."""
-    noise: bool = True
-    """False leaves the sensors' noise out."""
-    chain: Literal["ideal", "full"] = "full"
-    """The full chain of filter, noise, offset and converter, or what the sensor measures and nothing else."""
-
-    @field_validator("rate_hz")
-    @classmethod
-    def _a_rate(cls, rate_hz: int) -> int:
-        if 0 < rate_hz < 100:
-            raise ValueError("at least 100, or 0 for the channel table's own")
-        return rate_hz
-
-    @field_validator("truth_rate_hz")
-    @classmethod
-    def _whole_period(cls, rate_hz: int) -> int:
-        if 1_000_000 % rate_hz:
-            raise ValueError("a rate whose period is a whole number of microseconds, such as 1000, 2000 or 10000")
-        return rate_hz
-
-
 class Scene(Written):
     """One run: initial state, drive, timed commands, engine, sensors, seed, and the parameters it runs on.
 
@@ -184,6 +118,8 @@ class Scene(Written):
     sensors: SensorChoice = SensorChoice()
     channels: ChannelTable | None = None
     """The user's own channel table, read from the file that a scene names (`rig.channel_file`); none: the rig's."""
+    generator: Generator | None = None
+    """Test signals in place of the physics (`rig.generators`)."""
     fidelity: Literal["given", "auto"] = "given"
     """Model and engine as given here, or as `rig ladder` has picked and stored them."""
     pick: Pick | None = None
@@ -261,6 +197,17 @@ class Scene(Written):
         return self
 
     @model_validator(mode="after")
+    def _possible_generator(self) -> Scene:
+        if self.generator is not None:
+            for name, given in (("commands", self.commands), ("drive.profile", self.drive.profile)):
+                if given:
+                    raise InputError(name, "left out with a [generator], which stands for the physics", Words("some"))
+            if self.fidelity == "auto":
+                raise InputError("fidelity", '"given" with a [generator], which has no model', "auto")
+            self.sources()
+        return self
+
+    @model_validator(mode="after")
     def _pick_in_force(self) -> Scene:
         if self.fidelity == "auto":
             if self.pick is None:
@@ -272,6 +219,8 @@ class Scene(Written):
         return self
 
     def __repr__(self) -> str:
+        if self.generator is not None:
+            return f"Scene({self.name}: {self.duration_s:g} s of signals, {self.generator.kind}; seed {self.seed})"
         speeds = [speed for _, speed in self.drive.profile] or [self.drive.speed_hz]
         speed = " to ".join(f"{each:g}" for each in dict.fromkeys((speeds[0], speeds[-1])))
         commands = f"{len(self.commands)} command{'s' * (len(self.commands) != 1)}"
@@ -309,6 +258,28 @@ class Scene(Written):
         """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step."""
         sensors = self.sensors
         return row_ticks(self.table, truth_rate_hz=sensors.truth_rate_hz, ideal=sensors.chain == "ideal")
+
+    def sources(self) -> dict[str, Source]:
+        """What the generator puts at the converter of every channel that is on: `sources()["disk_x"].volts(times_s)`.
+
+        Raises:
+            InputError: The scene has no generator.
+        """
+        if self.generator is None:
+            raise InputError("scene", "one with a [generator]", self.name)
+        rate = self.sensors.rate_hz or None
+        # A channel's place among all of them does not hang on which are on.
+        made = sources(self.generator, (self.channels or rig_table()).only((), rate), self.drive.speed_hz)
+        return {name: made[name] for name in self.table.channels}
+
+    def check_physics(self) -> None:
+        """Refuse a scene of test signals, in which nothing moves.
+
+        Raises:
+            InputError: It is one.
+        """
+        if self.generator is not None:
+            raise InputError("scene", "one of the physics, without a [generator]", self.name)
 
     def formulas(self) -> Formulas:
         """What the channels' formulas may use."""
@@ -368,8 +339,9 @@ def load_scene(scene: Scene | str | Path, overrides: dict[str, Any] | None = Non
         return scene if overrides is None else change_scene(scene, overrides)
     path = scene_path(scene)
     data = {"name": path.stem, **read_toml(path)}
-    if isinstance(data.get("channels"), str):
-        data["channels"] = path.parent / data["channels"]  # as whoever wrote the scene means it
+    for table, key in ((data, "channels"), (data.get("generator"), "file")):
+        if isinstance(table, dict) and isinstance(table.get(key), str):
+            table[key] = path.parent / table[key]  # as whoever wrote the scene means it
     for key, value in _keyed(overrides or {}):
         _override(data, key, read_value(value, field=key) if isinstance(value, str) else value)
     try:
@@ -441,7 +413,7 @@ _PICKED = ("drive.mode", "sensors.chain")
 def pick_digests(scene: Scene) -> tuple[str, str, str]:
     """What a pick depends on: digests of the scene as given, of its parameters, and of equations and engines."""
     # Neither its name nor the seed of the sensors' noise changes what a scene does.
-    left_out = {"name", "title", "seed", "parameters", "set", "model", "engine", "fidelity", "pick"}
+    left_out = {"name", "title", "seed", "parameters", "set", "model", "engine", "fidelity", "pick", "generator"}
     given = scene.model_dump_json(exclude=left_out)
     values = {key: [entry.value, entry.unit] for key, entry in scene.load_parameters().entries.items()}
     return digest(given.encode()), digest(json.dumps(values, sort_keys=True).encode()), equations_digest()
@@ -463,7 +435,7 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
     *path, last = key.split(".")
     fields: Any = Scene
     for part in [*path, last]:
-        known = getattr(fields, "model_fields", {})
+        known = _inner(fields)
         if part not in known:
             known = [*_scene_keys(), *load_parameters().entries]
             raise InputError(key, such_as("a field of a scene or a parameter", key, known), value)
@@ -480,9 +452,14 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
 def _scene_keys() -> list[str]:
     keys = []
     for name, field in Scene.model_fields.items():
-        inner = getattr(field.annotation, "model_fields", None)
+        inner = _inner(field.annotation)
         keys += [f"{name}.{part}" for part in inner] if inner else [name]
     return keys
+
+
+def _inner(annotation: Any) -> dict[str, Any]:
+    """The fields of a table, also of the one that may be left out."""
+    return getattr(Generator if Generator in get_args(annotation) else annotation, "model_fields", {})
 
 
 def read_value(text: str, *, field: str = "value") -> Any:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from rig import calibrator
 from rig.channels import ChannelTable
 from rig.commands import ClearCommand, FaultCommand, HammerCommand, ReleaseCommand, SpeedCommand, check_command
 from rig.engines import ENGINES, load_engine
@@ -116,7 +117,7 @@ class Simulation:
         self.tick_rate_hz = TICK_RATE_HZ
         self._warm = False
         self.model = build_model(scene.load_parameters(), scene.model)
-        self._engine = load_engine(scene.engine.name)
+        self._engine = calibrator.STILL if scene.generator is not None else load_engine(scene.engine.name)
         self._method = ENGINES[scene.engine.name]
         sensors, self.row_ticks = scene.sensors, scene.row_ticks
         # Steps are as long as may be of those that end on the rows.
@@ -140,20 +141,26 @@ class Simulation:
                 ideal=sensors.chain == "ideal",
                 columns=self._formulas.columns(group for group in groups if group.rate_hz == rate),
             )
-            for rate in dict.fromkeys(group.rate_hz for group in groups)
+            for rate in dict.fromkeys(group.rate_hz for group in groups if scene.generator is None)
         ]
+        marked = any(channel.signal == "keyphasor" for channel in self.table.channels.values())
+        self._keyphasor = Keyphasor() if marked else None
+        self._edges_shown = 0
+        if scene.generator is not None:
+            tick = 0 if begin is None else begin.tick
+            self._conditioners, turns = calibrator.stand_ins(scene, row_ticks=self.row_ticks, tick=tick)
+            self._keyphasor = turns if marked else None
         self._faulty = Faulty(
             self.table, self._conditioners, seed=scene.seed, row_ticks=self.row_ticks, noisy=sensors.noise,
             ideal=sensors.chain == "ideal",
         )  # fmt: skip
-        marked = any(channel.signal == "keyphasor" for channel in self.table.channels.values())
-        self._keyphasor = Keyphasor() if marked else None
-        self._edges_shown = 0
         self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
         self._truth_columns = np.array([COLUMN[column] for columns in S.TRUTH.values() for column in columns])
         ends = accumulate(len(columns) for columns in S.TRUTH.values())
         self._truth_parts = {
-            name: slice(end - len(columns), end) for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
+            name: slice(end - len(columns), end)
+            for (name, columns), end in zip(S.TRUTH.items(), ends, strict=True)
+            if scene.generator is None  # else nothing of the model is true
         }
 
         self.told: dict[str, Any] = {}
@@ -262,6 +269,8 @@ class Simulation:
             InputError: Unknown, malformed, out of range, or not possible now.
         """
         command, self.told = check_command(name, request), {}
+        if self.scene.generator is not None:
+            raise InputError(name, "left out: signals of a [generator] stand for the physics", Words("a command to it"))
         waiting = [other for tick, other in self._pending if tick <= self.tick]
         if isinstance(command, HammerCommand):
             busy_until = self._pulse[2] if self._pulse is not None else 0
@@ -288,6 +297,8 @@ class Simulation:
 
     def health(self) -> dict[str, Any]:
         """Spin, energy ledger and doubts at the present tick, for the status."""
+        if self.scene.generator is not None:
+            return calibrator.health(self.scene)
         first = self.first_row
         last = first if self._last is None else self._last
         balance = energy_balance(last[None, :], first)
@@ -362,9 +373,9 @@ class Simulation:
             "truth": {
                 name: {
                     "rate_hz": self.scene.sensors.truth_rate_hz,
-                    "columns": [signals[column]._asdict() for column in columns],
+                    "columns": [signals[column]._asdict() for column in S.TRUTH[name]],
                 }
-                for name, columns in S.TRUTH.items()
+                for name in self._truth_parts
             },
         }
 
@@ -457,17 +468,7 @@ class Simulation:
         )
 
     def _condition(self, rows: np.ndarray, tick: int) -> dict[str, np.ndarray]:
-        made = self._formulas.values(rows)
-        if not self._faulty.active:
-            return {name: counts for each in self._conditioners for name, counts in each.counts(rows, made).items()}
-        end = tick + (len(rows) - 1) * self.row_ticks
-        ticks = [tick, *self._faulty.changes(tick, end), end]
-        places = [(each - tick) // self.row_ticks for each in ticks]
-        parts = [
-            self._faulty.counts(rows[a : b + 1], made[a : b + 1], begin)
-            for begin, a, b in zip(ticks, places, places[1:], strict=False)
-        ]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return self._faulty.counts(rows, self._formulas.values(rows), tick)
 
     def _sample(self, counts: list[dict[str, np.ndarray]], start: int) -> dict[str, Block]:
         found = {}

@@ -1,7 +1,8 @@
-"""Runs as files for other tools: MCAP, Parquet, CSV, by the suffix.
+"""Runs as files for other tools: MCAP, Parquet, CSV, WAV, by the suffix.
 
 Tables have one row a sample: `time [s]`, every signal of the model as `truth.NAME [unit]` (SI), and every sensor as
-`NAME [unit]`. A file is written beside its place and moved there when it is whole.
+`NAME [unit]`; of test signals there is no model. A WAV has the sensors' volts, for an analogue output, as `rig export`
+makes it. A file is written beside its place and moved there when it is whole.
 """
 
 from __future__ import annotations
@@ -11,21 +12,24 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 import numpy as np
 
+from recorder.reader import Recording
 from replays.recordings.background import Background
 from replays.recordings.formats import columnar, delimited
-from replays.recordings.formats.export import check_output
+from replays.recordings.formats.export import check_output, export
+from replays.recordings.formats.selection import select
 from rig import wire
-from rig.errors import InputError, Words, whole_file
+from rig.errors import PART_SUFFIX, InputError, Words, whole_file
 from rig.kernels.signals import ROW
 from rig.offline import frames
 from rig.simulation import Frame, Simulation
 
-SUFFIXES = (".mcap", ".parquet", ".csv")
+SUFFIXES = (".mcap", ".parquet", ".csv", ".wav")
 
 
 class RunWriter(Protocol):
@@ -56,6 +60,8 @@ def writer_for(path: Path, simulation: Simulation, *, force: bool = False) -> Ru
     check_run_output(path, force=force)
     if path.suffix == ".mcap":
         return McapRun(path, simulation, force=force)
+    if path.suffix == ".wav":
+        return _WavRun(path, simulation, force=force)
     if path.suffix == ".parquet":
         return _TableRun(path, simulation, columnar.ParquetRows)
     return _TableRun(path, simulation, lambda draft, schema: delimited.CsvRows(draft, schema.names))
@@ -68,7 +74,7 @@ def write_run(
 
     Args:
         simulation: What is run, from where it is.
-        path: File that ends in .mcap (as `rig record` would have made it), .parquet or .csv.
+        path: File that ends in .mcap (as `rig record` would have made it), .parquet, .csv or .wav.
         force: Replace an existing file.
         progress: Told the part done, 0 to 1.
 
@@ -109,8 +115,9 @@ def table_columns(simulation: Simulation) -> list[str]:
 
 
 def _on_rows(simulation: Simulation) -> bool:
-    """Whether samples fall on rows, so that there is truth beside them."""
-    return all(simulation.tick_rate_hz % group.rate_hz == 0 for group in simulation.table.groups.values())
+    """Whether there is truth beside the samples: of a model, whose rows they fall on."""
+    on_rows = all(simulation.tick_rate_hz % group.rate_hz == 0 for group in simulation.table.groups.values())
+    return on_rows and simulation.scene.generator is None
 
 
 def table_rows(simulation: Simulation, frame: Frame) -> np.ndarray:
@@ -155,6 +162,39 @@ class _TableRun:
 
     def _append(self, rows: np.ndarray) -> None:
         self._writer.write(list(rows.T))
+
+
+class _WavRun:
+    """A recording in a folder of its own until the run is whole, then exported."""
+
+    def __init__(self, path: Path, simulation: Simulation, *, force: bool) -> None:
+        self.path, self.simulation, self._force = path, simulation, force
+
+    def __enter__(self) -> Self:
+        table_columns(self.simulation)  # refused where there are several rates
+        with ExitStack() as stack:
+            folder = Path(
+                stack.enter_context(
+                    TemporaryDirectory(dir=self.path.parent, prefix=f"{self.path.name}.", suffix=PART_SUFFIX)
+                )
+            )
+            self._recording = folder / self.path.with_suffix(".mcap").name
+            self._run = McapRun(self._recording, self.simulation, view_rate_hz=0.0).__enter__()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            self._run.__exit__(kind, error, trace)
+            if kind is None:
+                volts = select(Recording.open(self._recording), unit="volts", merged=True)
+                export(volts, self.path, force=self._force)
+
+    def write(self, frame: Frame) -> None:
+        """Take the next frame."""
+        self._run.write(frame)
 
 
 class McapRun:

@@ -352,6 +352,11 @@ def predict(
     parts = {name: part for name, part in parts.items() if len(part.times_s)}
     last_s = max((float(part.times_s[-1]) for part in parts.values()), default=0.0)
     simulation = experiment.simulation()
+    if experiment.scene.generator is not None:
+        if follow is not None:
+            for frame in experiment.frames(simulation):
+                follow(frame)
+        return Prediction({name: _generated(experiment.scene, part) for name, part in parts.items()}, {}, 1)
     row_rate_hz = TICK_RATE_HZ // simulation.row_ticks
     taking = _channels(parts, experiment.scene, row_rate_hz=row_rate_hz)
     chunk_s = min(_CHUNK_S, last_s + 2e-3)  # the row of the last sample must be in it, and some behind it
@@ -384,6 +389,14 @@ def predict(
     )
 
 
+def _generated(scene: Scene, part: Measured) -> np.ndarray:
+    """What a group shows of test signals, in its channels' units, shape (rows, channels)."""
+    sources = scene.sources()
+    volts = [sources[channel.name].volts(part.times_s).clip(-channel.adc_v, channel.adc_v) for channel in part.channels]
+    shown = [(v - channel.bias_v) / channel.sensitivity_v for v, channel in zip(volts, part.channels, strict=True)]
+    return np.stack(shown, axis=1)
+
+
 def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chunk_s: float, row_rate_hz: int) -> int:
     """From when on the channels are worked out: early enough for their filters to have settled at the first sample."""
     chunk = round(chunk_s * row_rate_hz)
@@ -397,6 +410,8 @@ def _begin_tick(parts: dict[str, Measured], taking: Sequence[_Channels], *, chun
 
 def bare(experiment: Experiment) -> Experiment:
     """The same motion with one cheap, sound sensor and no companion: rows stay as far apart as they were."""
+    if experiment.scene.generator is not None:
+        return experiment
     groups = (experiment.scene.channels or rig_table()).groups.values()
     fewest = min(groups, key=lambda group: len(group.channels))
     return experiment.without_faults().changed(

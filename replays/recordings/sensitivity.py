@@ -19,13 +19,13 @@ import numpy as np
 
 from replays.recordings.experiment import Experiment
 from replays.recordings.prediction import LeadIns, Measured, Prediction, bare, predict
-from rig.commands import check_command
+from rig.commands import TimedCommand, check_command
 from rig.errors import InputError, SimulationError
 from rig.model import build_model
 from rig.motion import Begin
 from rig.parameters import load_parameters
 from rig.sampling import ROW_TICKS
-from rig.scenes import Scene, TimedCommand, change_scene, parse_scene
+from rig.scenes import Scene, change_scene, parse_scene
 from rig.simulation import TICK_RATE_HZ
 
 CLOCK = {"clock.offset_s": ("s", 5e-3), "clock.rate_ppm": ("ppm", 1e3)}

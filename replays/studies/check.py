@@ -58,6 +58,7 @@ def finer(scene: Scene) -> dict[str, float]:
     Raises:
         InputError: There is no finer step.
     """
+    scene.check_physics()
     engine = scene.engine
     if ENGINES[engine.name].tolerance:
         return {"tolerance": engine.tolerance * _FINER}

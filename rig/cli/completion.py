@@ -86,6 +86,10 @@ SCENE_KEYS = (
     *("engine.name", "engine.step_us", "engine.tolerance", "engine.companion"),
     *("model.magnet", "model.shaft", "model.stator", "model.contact", "model.friction"),
     *("sensors.groups", "sensors.rate_hz", "sensors.truth_rate_hz", "sensors.noise", "sensors.chain"),
+    *("generator.kind", "generator.amplitude", "generator.amplitude_v", "generator.offset", "generator.offset_v"),
+    *("generator.phase_deg", "generator.delay_us", "generator.frequency_hz", "generator.frequencies"),
+    *("generator.period_s", "generator.order", "generator.seed", "generator.crest", "generator.apart"),
+    *("generator.file", "generator.channels"),
 )
 """Fields of a scene that `--set` is for: the scene's own module would take half a second to tell them."""
 

@@ -109,6 +109,7 @@ class Asked:
         from rig.scenes import load_scene
 
         experiment = Experiment.of(recording) if self.scene is None else Experiment(scene=load_scene(self.scene))
+        experiment.scene.check_physics()
         if self.parameters is not None:
             experiment = experiment.changed({"parameters": self.parameters, "set": {}})
         return experiment if self.engine is None else experiment.changed({"engine.name": self.engine})

@@ -59,6 +59,7 @@ def ladder(
         check_folder(output, field="--output")
     # A pick is made anew from what the scene is without one.
     loaded = load_scene(scene, {**SceneChanges(changes=changes).overrides(), "fidelity": "given"})
+    loaded.check_physics()
     if write is not None:
         check_target(write, scene, loaded)
     with reporting(compiles=True) as reporter:

@@ -101,8 +101,9 @@ def status_table(document: dict[str, Any]) -> Table:
     else:
         rows.append(("read ahead", f"{queue['depth']} instants"))
     rows.append(("spin", _figure(document["spin_hz"], "Hz")))
-    residual, dissipated = _figure(energy.get("residual_j"), "J"), _figure(energy.get("dissipated_j"), "J")
-    rows.append(("energy", f"residual {residual}, dissipated {dissipated}"))
+    if energy:  # test signals and recordings have none
+        residual, dissipated = _figure(energy.get("residual_j"), "J"), _figure(energy.get("dissipated_j"), "J")
+        rows.append(("energy", f"residual {residual}, dissipated {dissipated}"))
     engine, share = document.get("engine") or {}, energy.get("residual_share")
     if engine and share is not None:
         rows.append(("engine", f"{engine['name']}, {engine['step_us']} us"))

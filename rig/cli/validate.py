@@ -103,7 +103,8 @@ def _show(found: Validation, console: Console) -> None:
     if found.truth:
         console.print(_truth(found))
         console.print()
-    console.print(_statistics(found))
+    if found.statistics:
+        console.print(_statistics(found))
 
 
 def _trajectory(found: Validation) -> Table:

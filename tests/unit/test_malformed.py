@@ -265,7 +265,10 @@ CASES = [
     Case("view rate", ("record", "-o", "x.mcap", "--view-rate-hz", "-1"), "--view-rate-hz", "between 0 (none) and 1e6"),
     # Files.
     Case(
-        "output of another suffix", ("simulate", "drop", "-o", "out.txt"), "output", "ends in .mcap, .parquet or .csv"
+        "output of another suffix",
+        ("simulate", "drop", "-o", "out.txt"),
+        "output",
+        "ends in .mcap, .parquet, .csv or .wav",
     ),
     Case("output in no folder", ("simulate", "drop", "-o", "nodir/out.csv"), "output", "in a folder that exists"),
     Case("output exists", DROP, "output", "a new file (--force replaces one)", {"out.csv": "precious"}),

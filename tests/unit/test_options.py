@@ -19,6 +19,7 @@ from rig.cli.completion import SCENE_KEYS, complete
 from rig.cli.options import names_of, pairs
 from rig.engines import ENGINES
 from rig.errors import InputError
+from rig.generators import Generator
 from rig.scenes import Scene
 from tests.commands import said, shown
 
@@ -179,7 +180,8 @@ def test_what_may_follow_on_a_line() -> None:
 
 
 def test_keys_of_a_scene_that_are_completed_are_those_that_it_has() -> None:
-    inner = {name: getattr(field.annotation, "model_fields", None) for name, field in Scene.model_fields.items()}
+    tables = {name: field.annotation for name, field in Scene.model_fields.items()} | {"generator": Generator}
+    inner = {name: getattr(table, "model_fields", None) for name, table in tables.items()}
     keys = {f"{name}.{part}" for name, parts in inner.items() for part in parts or ()} | set(inner)
     others = {*("name", "title", "set", "commands", "pick"), *(name for name, parts in inner.items() if parts)}
     assert set(SCENE_KEYS) == {key for key in keys - others if not key.startswith("pick.")}

@@ -61,8 +61,11 @@ def validate(
     trajectory = residuals(again.parts, again.nominal, again.others, again.criteria, end_s=end)
     tables = recorded_truth(recording, longest_s=begin + criteria.window.longest_s)
     truth = judge_truth(tables, again.nominal, again.others[0], criteria, end_s=end)
-    step("statistics by phase, and their spread")
-    phases, judged = statistics(again.quick, again.parts, again.nominal, tables, criteria, again.members)
+    moves = experiment.scene.generator is None  # test signals have no phases of motion, and none of its causes
+    phases, judged = [], []
+    if moves:
+        step("statistics by phase, and their spread")
+        phases, judged = statistics(again.quick, again.parts, again.nominal, tables, criteria, again.members)
     validation = Validation(
         path=recording.path, scene=experiment.scene.name, criteria=criteria.title, changes=dict(changes or {}),
         bits=again.bits, bit_exact=bool(again.bits) and all(one.equal for one in again.bits.values()),
@@ -75,7 +78,7 @@ def validate(
         doubts=(*recording.doubts, *parameter_doubts(recording)), faults=again.faults,
     )  # fmt: skip
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
-    if validation.good or validation.doubts or not firsts:
+    if validation.good or validation.doubts or not firsts or not moves:
         return validation
     step("what explains the difference")
     if again.tuned is None:
@@ -125,6 +128,7 @@ def _done_again(
     recording: Recording, experiment: Experiment, criteria: Criteria, step: Callable[[str], None]
 ) -> _DoneAgain:
     if is_imported(recording):
+        experiment.scene.check_physics()
         return _log_done_again(recording, experiment, criteria, step)
     rules = criteria.window
     parts = measured(recording, experiment.scene, longest_s=rules.longest_s)

@@ -1,0 +1,158 @@
+"""What stands for engine, sensors and keyphasor in a scene of test signals (`rig.generators`): nothing is compiled."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from rig.channels import Group
+from rig.engines import Engine
+from rig.generators import Instants, Source, exact
+from rig.kernels.constants import Constants, Inputs
+from rig.kernels.signals import SPIN_RATE, THETA_RATE
+from rig.sampling import TICKS_HZ
+from rig.scenes import Scene
+from rig.sensors.keyphasor import FRACTIONS
+from rig.sensors.noise import noise_streams
+
+
+def _stand_still(
+    constants: Constants, inputs: Inputs, y: Any, memory: Any, tick: int, step: int, steps: int, stride: int, rows: Any
+) -> None:
+    """Rows in which nothing moves, and the shaft has the nominal speed."""
+    rows[:] = 0.0
+    rows[:, THETA_RATE] = rows[:, SPIN_RATE] = inputs.speed
+
+
+STILL = Engine(start=lambda *_: None, advance=_stand_still, order=0)
+"""In place of an engine."""
+
+
+class Calibrator:
+    """In place of the conditioning of all channels: volts of generators, noise, converter.
+
+    Args:
+        groups: What is measured.
+        sources: At the converter of each channel.
+        seed: Of the noise, which is that of the sensors: a stream of its own for every channel.
+        noise: Whether there is any.
+        row_ticks: Ticks a row.
+        tick: Of the first row.
+    """
+
+    def __init__(
+        self,
+        groups: Iterable[Group],
+        sources: dict[str, Source],
+        *,
+        seed: int,
+        noise: bool,
+        row_ticks: int,
+        tick: int = 0,
+    ) -> None:
+        self.groups = tuple(groups)
+        self._sources, self._row_ticks, self._tick = sources, row_ticks, tick
+        self._waves = {name: source.wave for name, source in sources.items()}
+        names = [name for group in self.groups for name in group.names]
+        self._noise = dict(zip(names, map(_normal, noise_streams(names, seed)), strict=True)) if noise else {}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Calibrator:
+        """With noise of its own to draw; what does not change is shared."""
+        other = copy.copy(self)
+        other.__dict__["_noise"] = copy.deepcopy(self._noise)
+        return other
+
+    def counts(self, rows: np.ndarray, made: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Samples from the first of these rows on that lie before the last one.
+
+        Args:
+            rows: That follow those of the call before, shape (n, N_ROW); only how many they are counts.
+            made: Nothing of it counts.
+
+        Returns:
+            ADC counts by group, int32, shape (samples, channels).
+        """
+        start, self._tick = self._tick, self._tick + (len(rows) - 1) * self._row_ticks
+        found, shapes = {}, dict[tuple[int, Any], np.ndarray]()
+        for group in self.groups:
+            rate = group.rate_hz
+            first, end = (-(-tick * rate // TICKS_HZ) for tick in (start, self._tick))
+            instants = Instants.of_samples(np.arange(first, end), rate)
+            counts = found[group.name] = np.empty((end - first, len(group.channels)), np.int32)
+            for c, channel in enumerate(group.channels):
+                source, key = self._sources[channel.name], (rate, self._waves[channel.name])
+                if key not in shapes:
+                    shapes[key] = source.shape(instants)
+                volts = source.at(shapes[key])
+                if self._noise:
+                    volts += channel.noise_v * self._noise[channel.name].standard_normal(end - first)
+                half = 2.0 ** (channel.adc_bits - 1)
+                counts[:, c] = np.clip(np.rint(volts / channel.lsb_v), -half, half - 1.0)
+        return found
+
+
+def _normal(stream: np.ndarray) -> np.random.Generator:
+    """What draws the numbers of one of the sensors' streams of noise."""
+    bits = np.random.SFC64(0)
+    state = bits.state
+    state["state"]["state"] = stream
+    bits.state = state
+    return np.random.Generator(bits)
+
+
+class Turns:
+    """In place of the keyphasor: edges at the whole turns of a nominal speed, none where that is 0.
+
+    Args:
+        speed_hz: The speed [Hz].
+        tick: Of the first row.
+    """
+
+    def __init__(self, speed_hz: float, tick: int = 0) -> None:
+        self.edges_seen = 0
+        self._speed, self._tick = exact(speed_hz), tick
+
+    def edges(self, rows: np.ndarray, row_ticks: int) -> np.ndarray:
+        """Edges from the first of these rows on, before the one that follows the last.
+
+        Args:
+            rows: That follow those of the call before, shape (n, N_ROW); only how many they are counts.
+            row_ticks: Ticks a row.
+
+        Returns:
+            Instants in ticks from the first of these rows, with their fraction, shape (edges,).
+        """
+        start, self._tick = self._tick, self._tick + len(rows) * row_ticks
+        if not self._speed:
+            return np.empty(0)
+        turn = TICKS_HZ / self._speed
+        first, end = (-(-Fraction(tick) // turn) for tick in (max(start, 1), self._tick))
+        self.edges_seen += end - first
+        return np.array([(round(n * turn * FRACTIONS) - start * FRACTIONS) / FRACTIONS for n in range(first, end)])
+
+
+def stand_ins(scene: Scene, *, row_ticks: int, tick: int) -> tuple[list[Any], Any]:
+    """In place of the conditioners, and of the keyphasor, in a scene with a generator.
+
+    Args:
+        scene: The scene.
+        row_ticks: Ticks a row.
+        tick: Of the first row.
+    """
+    sensors = scene.sensors
+    noise = sensors.noise and sensors.chain == "full"
+    groups = scene.table.groups.values()
+    calibrator = Calibrator(groups, scene.sources(), seed=scene.seed, noise=noise, row_ticks=row_ticks, tick=tick)
+    return [calibrator], Turns(scene.drive.speed_hz, tick)
+
+
+def health(scene: Scene) -> dict[str, Any]:
+    """What there is to say of a run with a generator: nominal speed, and who is driven beyond the converter."""
+    sources = scene.sources().items()
+    limited = [name for name, one in sources if one.largest_v > one.channel.adc_v + one.channel.lsb_v]
+    said = f"driven beyond the converter, which limits: {', '.join(limited)}"
+    return {"spin_hz": scene.drive.speed_hz, "contacts": 0, "warnings": [said] if limited else []}
