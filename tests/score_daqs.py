@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,6 @@ from rig.wire import CATALOGUE, PARAMETERS, SCENE, Block, encode_block, sensor_k
 from tests.unit.recorder_stream import TICK_RATE_HZ, documents
 
 RATE_HZ = 20_000
-Formula = Callable[[np.ndarray], np.ndarray]
 
 
 def write_session(path: Path, groups: dict[str, np.ndarray], *, index: int = 0) -> Path:
@@ -40,18 +39,27 @@ def counts_of(group: str, values: np.ndarray, generator: np.random.Generator | N
     return np.rint(volts / [c.lsb_v for c in channels]).astype(np.int64)
 
 
-def many_tones(
-    seed: int, amplitude: float, *, low_hz: float = 20.0, high_hz: float = 4000.0, tones: int = 40
-) -> Formula:
-    """A sum of sines of random frequencies and phases with this rms."""
-    generator = np.random.default_rng(seed)
-    hz, phase = generator.uniform(low_hz, high_hz, tones), generator.uniform(0.0, 2.0 * np.pi, tones)
-    size = amplitude * np.sqrt(2.0 / tones)
+class Tones:
+    """A sum of sines of random frequencies and phases."""
 
-    def signal(t: np.ndarray) -> np.ndarray:
-        return sum((size * np.sin(2.0 * np.pi * f * t + p) for f, p in zip(hz, phase, strict=True)), np.zeros(len(t)))
+    def __init__(self, seed: int, rms: float, *, low_hz: float = 20.0, high_hz: float = 4e3, tones: int = 25) -> None:
+        generator = np.random.default_rng(seed)
+        self.hz = generator.uniform(low_hz, high_hz, tones)
+        self.parts = rms * np.sqrt(2.0 / tones) * np.exp(2j * np.pi * generator.uniform(0.0, 1.0, tones))
 
-    return signal
+    def __call__(self, t: np.ndarray) -> np.ndarray:
+        found = np.zeros(len(t))
+        for hz, part in zip(self.hz, self.parts, strict=True):
+            phase = 2.0 * np.pi * hz * t
+            found += part.real * np.cos(phase) - part.imag * np.sin(phase)
+        return found
+
+    def behind(self, corner_hz: float, order: int) -> Tones:
+        """The same behind an analogue Butterworth low-pass, tone by tone, by the closed form of its poles."""
+        poles = np.exp(1j * np.pi * (2.0 * np.arange(1, order + 1) + order - 1.0) / (2.0 * order))
+        passed = copy(self)
+        passed.parts = self.parts / np.prod(1.0 - 1j * self.hz[:, None] / corner_hz / poles, axis=1)
+        return passed
 
 
 def chips(seed: int, seconds: float, *, rate_hz: float = RATE_HZ) -> np.ndarray:

@@ -135,11 +135,9 @@ def _fit(
 
 def _at_its_times(whole: Waveform, better: Waveform, times_s: np.ndarray, stimulus: Stimulus) -> Waveform:
     """The same record with the known signal at the times of a better fit."""
-    values = whole.gain * whole.known + whole.offset + whole.residual
     middle = 0.5 * (times_s[0] + times_s[-1])
     known, slope = stimulus(whole.times_s + better.late_s + better.drift * (whole.times_s - middle))
-    left = values - better.gain * known - better.offset
-    return replace(better, times_s=whole.times_s, known=known, slope=slope, residual=left)
+    return replace(better, times_s=whole.times_s, values=whole.values, known=known, slope=slope)
 
 
 def _about(value: float, spread: float, quantile: float, size: float = 1.0) -> tuple[float, float, float]:

@@ -21,7 +21,7 @@ from replays.score.wiring import Wire
 from rig import units
 from rig.channels import Channel
 
-_NEAR = 0.4
+_NEAR = 0.49
 """Part of a count by which a recovered one may be off a whole number: rounding of the file."""
 _PIECE = 512
 """Consecutive rows on which a scale is found."""
@@ -81,10 +81,9 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
         scale = Scale(float(each), float(zero), "fitted")
         if (scale.counts(y) == counts[p]).mean() >= _ENOUGH:
             near = min(candidates, key=lambda one: abs(math.log(abs(each / one.each))))
-            return Scale(
-                scale.each, scale.zero, f"fitted, beside {near.what}", 1e6 * (abs(each / near.each) - 1.0),
-                float((zero - near.zero * np.sign(each / near.each)) / each),
-            )  # fmt: skip
+            ratio = float(each / near.each)
+            zero_counts = float((zero - ratio * near.zero) / each)  # beside that gain, about a value of zero
+            return Scale(scale.each, scale.zero, f"fitted, beside {near.what}", 1e6 * (abs(ratio) - 1.0), zero_counts)
     return None
 
 
@@ -244,7 +243,7 @@ class Stamps:
         from scipy.stats import chi2
 
         true, late = np.array(self._means).T
-        since = true - true[0]
+        since = true - self._first_s
         matrix = np.column_stack([np.ones(len(since)), since])
         parts = np.linalg.lstsq(matrix, late, rcond=None)[0]
         left = late - matrix @ parts

@@ -15,6 +15,9 @@ from replays.score.signals import Recorded, Session, open_recorded, rate_of
 from replays.score.wiring import Wire, find_wires
 from rig.errors import InputError, Words
 
+_NEAR = 0.01
+"""Part by which the rate of a DAQ that took rows may be off by its stamps."""
+
 
 def judge(
     file: Path, against: Sequence[Path], *, limits: Limits | None = None,
@@ -43,12 +46,20 @@ def judge(
         sent |= {name: (early[:, n], session.rate_hz(group)) for n, name in enumerate(names)}
     rate = max(each for _, each in sent.values())
     taken = {name: (signal.values, rate_of(signal) or rate) for name, signal in recorded.items() if signal.rows > 1}
-    wires = find_wires(taken, sent) if taken else {}
+    wires: dict[str, Wire] = {}
+    scales: dict[str, Scale | None] = {}
+    if path != "analogue" and taken:
+        # Rows of counts come as they were sent, whatever their stamps say.
+        near = {name: rate if abs(each / rate - 1.0) < _NEAR else each for name, (_, each) in taken.items()}
+        wires = find_wires({name: (values, near[name]) for name, (values, _) in taken.items()}, sent)
+        scales = scales_of(recorded, wires, session)
+    if path is None:
+        told = sum(each is not None for each in scales.values())
+        path = "digital" if scales and 2 * told > len(scales) else "analogue"
+    if path == "analogue" and taken:
+        wires = find_wires(taken, sent)
     if not any(wire.channel for wire in wires.values()):
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
-    scales = {} if path == "analogue" else scales_of(recorded, wires, session)
-    if path is None:
-        path = "digital" if 2 * sum(each is not None for each in scales.values()) > len(scales) else "analogue"
     if path == "digital" and not any(scales.values()):
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title)

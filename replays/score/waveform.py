@@ -43,6 +43,7 @@ class Waveform:
         covariance: Of the four, shape (4, 4).
         freedom: Degrees of freedom of that covariance.
         times_s: Of the rows that were fitted, by the clock of the file, shape (n,).
+        values: As recorded [unit], shape (n,).
         known, slope: The signal and its slope there, without gain [unit, unit/s], shape (n,).
         residual: What is left [unit], shape (n,).
     """
@@ -54,6 +55,7 @@ class Waveform:
     covariance: np.ndarray
     freedom: int
     times_s: np.ndarray
+    values: np.ndarray
     known: np.ndarray
     slope: np.ndarray
     residual: np.ndarray
@@ -66,7 +68,7 @@ class Waveform:
     @property
     def likeness(self) -> float:
         """Part of the recorded power that the known signal explains."""
-        whole = float(np.var(self.residual + self.gain * self.known))
+        whole = float(np.var(self.values))
         return 1.0 - float(np.var(self.residual)) / whole if whole else 0.0
 
 
@@ -162,7 +164,7 @@ def _solve(
     covariance, freedom = _sandwich(jacobian, residual, inverse)
     return Waveform(
         float(gain + step[0] / scale), float(offset + step[1]), float(late), float(drift),
-        covariance / np.outer(units, units), freedom, t[use], s, ds, residual,
+        covariance / np.outer(units, units), freedom, t[use], y[use], s, ds, residual,
     )  # fmt: skip
 
 
@@ -257,7 +259,7 @@ def response(found: Waveform) -> Response | None:
     n = len(found.known)
     rate = (n - 1) / (found.times_s[-1] - found.times_s[0])
     length = int(min(2048, n // 16))
-    x, y = found.known, found.gain * found.known + found.residual
+    x, y = found.known, found.values
     told = {"fs": rate, "nperseg": length, "window": "hann", "detrend": "constant"}
     f, sxx = welch(x, **told)
     _, syy = welch(y, **told)
@@ -312,10 +314,9 @@ def through(found: Waveform) -> Waveform:
     from scipy.linalg import solve_toeplitz
 
     x = found.known - found.known.mean()
-    y = found.gain * found.known + found.residual
-    y = y - y.mean()
+    y = found.values - found.values.mean()
     n, half = len(x), _TAPS // 2
-    size = 1 << (2 * n).bit_length()
+    size = 1 << int(2 * n).bit_length()
     fx, fy = np.fft.rfft(x, size), np.fft.rfft(y, size)
     auto = np.fft.irfft(np.abs(fx) ** 2, size)[:_TAPS]
     cross = np.roll(np.fft.irfft(np.conj(fx) * fy, size), half)[:_TAPS]
@@ -326,8 +327,9 @@ def through(found: Waveform) -> Waveform:
     kept = slice(_TAPS, -_TAPS)
     left = (y - known)[kept]
     return replace(
-        found, gain=1.0, times_s=found.times_s[kept], known=known[kept], slope=slope[kept], residual=left - left.mean()
-    )
+        found, gain=1.0, times_s=found.times_s[kept], values=y[kept], known=known[kept], slope=slope[kept],
+        residual=left - left.mean(),
+    )  # fmt: skip
 
 
 def order_of(shown: Response) -> int:
@@ -355,7 +357,7 @@ def behind_filter(
     cut = math.ceil(_SETTLING / (corner_hz * step_s))
     if np.ptp(np.diff(found.times_s)) > 0.5 * step_s or n < 8 * cut + _LEAST:
         return None
-    y = found.gain * found.known + found.offset + found.residual
+    y = found.values
     # What the ends do to the filter is left out.
     spectra = [np.fft.rfft(values) for values in (found.known, found.slope)]
     f = np.fft.rfftfreq(n, step_s)
@@ -391,7 +393,8 @@ def behind_filter(
     covariance = covariance / np.outer(sizes, sizes)
     half = student(freedom) * math.sqrt(covariance[4, 4])
     fitted = Waveform(
-        float(parts[0]), float(parts[1]), found.late_s + float(late_s), found.drift + float(parts[3]) / (0.5 * span_s),
-        covariance[:4, :4], freedom, found.times_s[kept], s, ds, residual,
+        float(parts[0]), float(parts[1]), found.late_s + float(late_s or 0.0),
+        found.drift + float(parts[3]) / (0.5 * span_s),
+        covariance[:4, :4], freedom, found.times_s[kept], y[kept], s, ds, residual,
     )  # fmt: skip
     return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))

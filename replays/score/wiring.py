@@ -83,10 +83,9 @@ def _find(
     rate = min(rate, _MOST / taken_s, 8.0 * _MOST / length)
     behind = math.ceil(taken_s * rate) // 2
     there, even = _spectra(sent, rate, length, math.ceil((length + taken_s) * rate))
-    curves = {
-        name: _likeness(_even(values, each, rate, taken_s), behind, there, even)
-        for name, (values, each) in recorded.items()
-    }
+    taken = {name: _even(values, each, rate, taken_s) for name, (values, each) in recorded.items()}
+    lengths = {n: _lengths(even, behind, n) for n in {len(here) for here in taken.values()}}
+    curves = {name: _likeness(here, behind, there, lengths[len(here)]) for name, here in taken.items()}
     names = list(sent)
     # All signals of a file began together: the lag at which most of the best pairs are alike.
     best = {name: int(np.argmax(np.abs(curve).max(axis=1))) for name, curve in curves.items()}
@@ -132,21 +131,23 @@ def _spectra(
     return np.fft.rfft(rows, size, axis=1), np.array(rows)
 
 
-def _likeness(here: np.ndarray, before: int, there: np.ndarray, sent: np.ndarray) -> np.ndarray:
+def _lengths(sent: np.ndarray, before: int, n: int) -> np.ndarray:
+    """Length of each channel without its mean in stretches of n, from so many samples before the session on."""
+    padded = np.pad(sent, ((0, 0), (before + 1, n)))
+    sums, squares = np.cumsum(padded, axis=1), np.cumsum(padded**2, axis=1)
+    power = squares[:, n:] - squares[:, :-n] - (sums[:, n:] - sums[:, :-n]) ** 2 / n
+    power = power[:, : before + sent.shape[1]]
+    # Where next to nothing was sent, nothing is alike.
+    return np.sqrt(np.maximum(power, np.maximum(1e-2 * power.max(axis=1, keepdims=True), 1e-300)))
+
+
+def _likeness(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Correlation with each channel by lag, from so many samples before the session on."""
     size = 2 * (there.shape[1] - 1)
     here = here - here.mean()
-    energy = float(here @ here)
     whole = np.fft.irfft(np.conj(np.fft.rfft(here, size)) * there, size, axis=1)
-    curve = np.concatenate([whole[:, size - before :], whole[:, : sent.shape[1]]], axis=1)
-    padded = np.pad(sent, ((0, 0), (before, len(here))))
-    sums = np.cumsum(np.pad(padded, ((0, 0), (1, 0))), axis=1)
-    squares = np.cumsum(np.pad(padded**2, ((0, 0), (1, 0))), axis=1)
-    n = len(here)
-    power = (squares[:, n:] - squares[:, :-n]) - (sums[:, n:] - sums[:, :-n]) ** 2 / n
-    power = power[:, : curve.shape[1]]
-    floor = np.maximum(1e-2 * power.max(axis=1, keepdims=True), 1e-300)
-    return curve / np.sqrt(np.maximum(power, floor) * max(energy, 1e-300))
+    curve = np.concatenate([whole[:, size - before :], whole[:, : lengths.shape[1] - before]], axis=1)
+    return curve / (lengths * max(math.sqrt(float(here @ here)), 1e-150))
 
 
 def _nearest_peak(curve: np.ndarray, zero: int) -> int:

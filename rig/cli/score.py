@@ -78,7 +78,7 @@ def score(
     if as_json is not None:
         with whole_file(as_json) as draft:
             draft.write_text(json.dumps(finite(card.document()), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    _show(card, table_console(wide=wide))
+    _show(card, table_console(wide=wide), wide=wide)
     for made in (output, junit, as_json):
         if made is not None:
             echo(f"written  {made}")
@@ -86,7 +86,9 @@ def score(
         raise typer.Exit(1)
 
 
-def _show(card: Scorecard, console: Console) -> None:
+def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
+    from replays.score.scorecard import FAIL, NOT_SHOWN
+
     console.print(shown(f"{card.title}, limits {card.limits}"))
     console.print(shown(card.verdict_line))
     for remark in card.remarks:
@@ -95,7 +97,10 @@ def _show(card: Scorecard, console: Console) -> None:
         "", "quantity", "channel", ">value", "95 %", "unit", "limit", "verdict", "note", "to show it", "source",
         wrapped=("note", "to show it", "source"), spare=("source", "to show it", "note", "95 %"),
     )  # fmt: skip
-    for row in card.rows:
+    told = [row for row in card.rows if wide or row.verdict in (FAIL, NOT_SHOWN)]
+    for row in told:
         source = "" if row.limit is None else row.limit.source
         table.add_row(*row.cells(), row.note, row.run, source, style=_STYLES[row.verdict])
     console.print(table)
+    if len(told) < len(card.rows):
+        echo("what passes, or has no limit, is in --wide, and in the report, JUnit and JSON")
