@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from replays.score.waveform import (
     Waveform,
     behind_filter,
     fit_waveform,
-    order_of,
     response,
     split_noise,
     student,
@@ -120,24 +119,13 @@ def _fit(
     corner_hz, odd = None, False
     if shown is not None and shown.corner_hz is not None:
         corner_hz, odd, clean = shown.corner_hz, True, through(whole)
-        order = order_of(shown)
-        behind = behind_filter(whole, corner_hz[0], order)
-        if behind is not None:  # once more, with the signal at the times that are known now
-            near = _at_its_times(whole, behind[0], times_s, stimulus)
-            behind = behind_filter(near, behind[1][0], order, late_s=0.0)
+        behind = behind_filter(whole, stimulus, shown)
         if behind is not None and np.var(behind[0].residual) < _AS_WELL * np.var(clean.residual):
             (low, corner_hz), odd = behind, False
             clean = low
     if clean.likeness < _GOOD:
         return None
     return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact)
-
-
-def _at_its_times(whole: Waveform, better: Waveform, times_s: np.ndarray, stimulus: Stimulus) -> Waveform:
-    """The same record with the known signal at the times of a better fit."""
-    middle = 0.5 * (times_s[0] + times_s[-1])
-    known, slope = stimulus(whole.times_s + better.late_s + better.drift * (whole.times_s - middle))
-    return replace(better, times_s=whole.times_s, values=whole.values, known=known, slope=slope)
 
 
 def _about(value: float, spread: float, quantile: float, size: float = 1.0) -> tuple[float, float, float]:
@@ -183,9 +171,8 @@ def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire],
     first = found[0]
     turned = any(wires[one.name].turned for one in found)
     note = "a periodic signal: up to whole periods" if turned else ""
-    middle = 0.5 * float(first.low.times_s[0] + first.low.times_s[-1])
-    add("start", first.name, _about(first.low.late_s - first.low.drift * middle, first.low.spread[2], quantile),
-        first.channel, note)  # fmt: skip
+    begin_s = first.low.late_s - first.low.drift * first.low.middle_s
+    add("start", first.name, _about(begin_s, first.low.spread[2], quantile), first.channel, note)
     for one in found[1:]:
         apart = one.low.late_s - first.low.late_s
         both = math.hypot(one.low.spread[2], first.low.spread[2])

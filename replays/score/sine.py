@@ -121,18 +121,18 @@ def quality(fit: SineFit) -> Quality:
     sinad = (ratio, ratio + ends[0], ratio + ends[1])
     enob = ((sinad[0] - 1.76) / 6.02, (sinad[1] - 1.76) / 6.02, (sinad[2] - 1.76) / 6.02)
     rows = np.arange(n)
-    power, spread = 0.0, 0.0
-    line = 2.0 * nad**2 / n  # variance of one part of a line's amplitude
+    squares = []
     for harmonic in range(2, HARMONICS + 1):
         folded = abs((harmonic * fit.frequency[0] + 0.5) % 1.0 - 0.5)
         if not 2.0 / n < folded < 0.5 - 2.0 / n or abs(folded - fit.frequency[0]) < 2.0 / n:
             continue
         phase = 2.0 * math.pi * folded * rows
-        squared = (2.0 / n * float(np.cos(phase) @ fit.residual)) ** 2
-        squared += (2.0 / n * float(np.sin(phase) @ fit.residual)) ** 2
-        power += squared
-        spread += 4.0 * line * squared + 4.0 * line**2
-    half = 1.96 * math.sqrt(spread)
+        parts = 2.0 / n * np.array([np.cos(phase) @ fit.residual, np.sin(phase) @ fit.residual])
+        squares.append(float(parts @ parts))
+    power = sum(squares)
+    # Variance of one part of a line's amplitude, by what is neither the sine nor a harmonic.
+    line = 2.0 * max(nad**2 - 0.5 * power, 1e-6 * nad**2) / n
+    half = 1.96 * math.sqrt(sum(4.0 * line * each + 4.0 * line**2 for each in squares))
     thd = _db(power / amplitude**2, half / amplitude**2)
     window = np.blackman(n)
     spectrum = (np.abs(np.fft.rfft(fit.residual * window)) * 2.0 / window.sum()) ** 2

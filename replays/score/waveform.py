@@ -24,6 +24,8 @@ _MOST_DRIFT = 0.02
 _LEAST = 400
 """Fewest samples that are fitted."""
 _TAPS = 96
+_PASSES = 3
+"""Rounds in which a fit behind a filter takes the signal at the times that the last one found."""
 _ORDERS = 8
 """Of the Butterworth low-passes that are tried."""
 _SETTLING = 8.0
@@ -42,6 +44,7 @@ class Waveform:
         gain, offset, late_s, drift: The four [1, unit, s, s/s], `late_s` in the middle of the record.
         covariance: Of the four, shape (4, 4).
         freedom: Degrees of freedom of that covariance.
+        middle_s: The middle of the record by the clock of the file [s].
         times_s: Of the rows that were fitted, by the clock of the file, shape (n,).
         values: As recorded [unit], shape (n,).
         known, slope: The signal and its slope there, without gain [unit, unit/s], shape (n,).
@@ -54,6 +57,7 @@ class Waveform:
     drift: float
     covariance: np.ndarray
     freedom: int
+    middle_s: float
     times_s: np.ndarray
     values: np.ndarray
     known: np.ndarray
@@ -164,7 +168,7 @@ def _solve(
     covariance, freedom = _sandwich(jacobian, residual, inverse)
     return Waveform(
         float(gain + step[0] / scale), float(offset + step[1]), float(late), float(drift),
-        covariance / np.outer(units, units), freedom, t[use], y[use], s, ds, residual,
+        covariance / np.outer(units, units), freedom, middle, t[use], y[use], s, ds, residual,
     )  # fmt: skip
 
 
@@ -342,14 +346,38 @@ def order_of(shown: Response) -> int:
     return int(np.argmin(left)) + 1
 
 
-def behind_filter(
-    found: Waveform, corner_hz: float, order: int, *, late_s: float | None = None
-) -> tuple[Waveform, tuple[float, float, float]] | None:
+Corner = tuple[float, float, float]
+
+
+def behind_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple[Waveform, Corner] | None:
     """The fit anew with a Butterworth low-pass between signal and record, and its corner with its interval.
 
-    Gain is then that at low frequencies, and time without the filter's delay. None where values miss, or no corner
-    fits.
+    Gain is then that at low frequencies, time without the filter's delay. None where values miss, or no corner fits.
+
+    Args:
+        found: The fit without it.
+        stimulus: The known signal.
+        shown: The response by that fit, with a corner.
     """
+    assert shown.corner_hz is not None
+    order, corner_hz, near, late_s = order_of(shown), shown.corner_hz[0], found, None
+    better = None
+    for _ in range(_PASSES):
+        better = _behind(near, corner_hz, order, late_s)
+        if better is None:
+            return None
+        # Once more, with the signal at the times that are known now.
+        fit, (corner_hz, _, _) = better
+        known, slope = stimulus(found.times_s + fit.late_s + fit.drift * (found.times_s - found.middle_s))
+        near, late_s = replace(fit, times_s=found.times_s, values=found.values, known=known, slope=slope), 0.0
+    assert better is not None
+    fit, (corner_hz, low, high) = better
+    true = 1.0 / (1.0 + fit.drift)  # seconds of the file are not those of the session
+    return fit, (true * corner_hz, true * low, true * high)
+
+
+def _behind(found: Waveform, corner_hz: float, order: int, late_s: float | None) -> tuple[Waveform, Corner] | None:
+    """The same about a corner and a delay that are nearly known; without a delay, about that of low frequencies."""
     n, span_s = len(found.times_s), found.times_s[-1] - found.times_s[0]
     step_s = span_s / (n - 1)
     if late_s is None:  # by as much as the filter delays low frequencies
@@ -369,7 +397,7 @@ def behind_filter(
         loss = np.prod([1.0 - s / pole for pole in poles], axis=0)
         return np.fft.irfft(spectrum * np.exp(2j * np.pi * f * late_s) / loss, n)[kept]
 
-    u, ones = (2.0 * (found.times_s - found.times_s[0]) / span_s - 1.0)[kept], np.ones(n)[kept]
+    u, ones = (2.0 * (found.times_s - found.middle_s) / span_s)[kept], np.ones(n)[kept]
     solved = None
     for _ in range(2 * _ROUNDS):
         s, ds = (passed(spectrum, log) for spectrum in spectra)
@@ -395,6 +423,6 @@ def behind_filter(
     fitted = Waveform(
         float(parts[0]), float(parts[1]), found.late_s + float(late_s or 0.0),
         found.drift + float(parts[3]) / (0.5 * span_s),
-        covariance[:4, :4], freedom, found.times_s[kept], y[kept], s, ds, residual,
+        covariance[:4, :4], freedom, found.middle_s, found.times_s[kept], y[kept], s, ds, residual,
     )  # fmt: skip
     return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))
