@@ -18,6 +18,8 @@ from rig.errors import InputError, Words
 from rig.wire import sensor_key
 
 _PART = 1 << 16
+_MOST = 1e30
+"""Values that a measurement can have, in any unit."""
 _EARLY_S = 30.0
 """So much of a session is looked through for where a recording begins [s]."""
 
@@ -131,8 +133,10 @@ class Recorded:
 
     @cached_property
     def values(self) -> np.ndarray:
-        """Values in its unit, shape (rows,)."""
-        return self.read()[0]
+        """Values in its unit, nan where there is none that a measurement can have, shape (rows,)."""
+        values = self.read()[0]
+        with np.errstate(invalid="ignore"):
+            return np.where(np.abs(values) <= _MOST, values, np.nan)
 
     @cached_property
     def times_s(self) -> np.ndarray | None:

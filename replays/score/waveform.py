@@ -269,7 +269,7 @@ def response(found: Waveform) -> Response | None:
     _, syy = welch(y, **told)
     _, sxy = csd(x, y, **told)
     with np.errstate(divide="ignore", invalid="ignore"):
-        coherence = np.abs(sxy) ** 2 / (sxx * syy)
+        coherence = np.minimum(1.0, np.abs(sxy) ** 2 / (sxx * syy))
         gain = np.abs(sxy) / sxx / abs(found.gain)
     shown = (coherence > _SEEN) & (sxx > 1e-5 * sxx.max()) & (f > 0.0)
     if shown.sum() < 16:

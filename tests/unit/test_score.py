@@ -361,7 +361,9 @@ def test_wrong_inputs_are_one_line(
     sent: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     session, counts = sent
-    other = write_parquet(tmp_path / "other.parquet", {"x": np.random.default_rng(1).standard_normal(5000)})
+    noise = np.random.default_rng(1).standard_normal(5000)
+    noise[::7], noise[1::7] = np.inf, 1e300
+    other = write_parquet(tmp_path / "other.parquet", {"x": noise, "one": np.ones(5000), "none": np.full(5000, np.nan)})
     few = write_parquet(tmp_path / "few.parquet", {"disk_x [mm]": in_units(counts)["disk_x [mm]"].astype(np.float16)})
     (tmp_path / "mine.toml").write_text('title = "x"\n[analogue.gian]\nhigh = 1\nkind = "assumed"\nsource = "me"\n')
     for arguments, told in (
