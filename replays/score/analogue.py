@@ -23,7 +23,7 @@ from replays.score.waveform import (
     split_noise,
     student,
     through,
-)  # fmt: skip
+)
 from replays.score.wiring import Wire
 from rig import units
 from rig.channels import Channel
