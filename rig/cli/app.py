@@ -64,6 +64,7 @@ COMMANDS = {
     "Recordings against the model": {
         "validate": "Do a recording again and hold it against the model",
         "identify": "Fit numbers of the rig to a recording",
+        "score": "Judge a DAQ by what it recorded, against what the rig sent",
         "sessions": "Make the reference sessions anew",
     },
     "Without a clock": {
@@ -91,7 +92,7 @@ GROUPS = {
 
 NEED_FULL = (
     "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
-    "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
+    "score", "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
 )  # fmt: skip
 """The commands that a lean install does without; of `keys` it has `init`."""
 

@@ -54,6 +54,7 @@ def test_what_needs_the_whole_rig_says_how_to_get_it() -> None:
 
 
 NEEDING = {
+    "score": "{rec} --against {rec}",
     "import": "{rec} --template x.toml", "validate": "{rec}", "identify": "{rec} --fit contact.friction",
     "view": "{rec}", "sessions": "-o {folder}", "run": "hammer", "simulate": "hammer -o {folder}/x.mcap",
     "can": "hub c0", "ladder": "hammer -q whirl_frequency -t 0.1", "paper": "-o {folder}/x.html",

@@ -7,7 +7,7 @@ of the residual each explains, so that two that explain it alike are seen to do 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ from replays.recordings.validation.explanation import (
     smooth_columns,
     vector,
 )
-from replays.recordings.validation.faults import Clock, sensor_faults
+from replays.recordings.validation.faults import MOST, Clock, channels_in, cured_by, sensor_faults
 from replays.recordings.validation.numbers import numbers_of_the_model
 from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import scaled
@@ -54,8 +54,6 @@ _AT_ODDS = 10.0
 """Where this is left of the middle channel, over its noise, most are wrong, or what is held against them."""
 _BESIDE = 1e-3
 """A change that explains less than this part of what the largest one does is not told beside it."""
-_MOST = 0.9
-"""Changes of channels that together explain this part of all are it, though the model leaves something."""
 _MOST_TIED = 3
 """Of causes that explain the beginning equally, so many are tried with a second one behind it."""
 _OFF = 7.0
@@ -114,7 +112,7 @@ def attribute(
         step(f"sensors and time, to {until_s:.3f} s")
         sensors = sensor_faults(parts, nominal, until_s, from_s=from_s)
         timed = Clock(parts, nominal, until_s).faults(shift_s)
-        cured = bool(sensors) and all(one.at_floor for one in sensors)
+        cured = cured_by(sensors, parts)
         if cured or any(one.at_floor for one in timed):
             break
     else:
@@ -191,13 +189,10 @@ def explain_log(
     sensors = [one for one in sensors if one.explained > _BESIDE * most]
     trigger = any(one.name == "hammer delay" for one in sensors)
     far = [one for one in tuned.fitted if one.beyond and not (trigger and one.key == "clock.offset_s")]
-    cured = bool(sensors) and (
-        all(one.at_floor for one in sensors)
-        or (sum(one.explained for one in sensors) > _MOST and not _whole_kind(sensors, parts))
-    )
+    cured = cured_by(sensors, parts)
     numbers = numbers_of_the_model(parts, nominal, others, tuned, rules, end_s=end_s) if sensors or far else []
     # One that explains no more than the sensors do is not told beside them.
-    numbers = [one for one in numbers if one.at_floor or one.explained > _MOST]
+    numbers = [one for one in numbers if one.at_floor or one.explained > MOST]
     conclusion, best = conclude([*sensors, *numbers], sensors if cured else [], rules, end_s=end_s)
     if far:
         also = f"; {conclusion}" if best else ""
@@ -217,7 +212,7 @@ def explain_log(
         conclusion = (
             f"nearest are {_listed(sensors)}: {part:.0%} of the difference; the rest is another fault, or the model"
         )
-    elif not best and 0 < len(few := _channels_in(sensors, tuned.scales)) < _FEW * len(tuned.scales):
+    elif not best and 0 < len(few := channels_in(sensors, tuned.scales)) < _FEW * len(tuned.scales):
         conclusion = f"of {len(tuned.scales)} channels {_and(few)} alone: a fault that has no name here, as hum, "
         conclusion += "cross-talk or drift, or a number of the model that moves no other; this log cannot tell"
     elif not best:
@@ -471,25 +466,6 @@ def conclude(
     if len(equal) == 1:
         return f"{short}{single.kind}: {single.name} {single.change} ({part})", names
     return f"{short}{_listed(equal)} explain it equally ({part}); this recording cannot tell them apart", names
-
-
-def _channels_in(found: list[Explanation], names: Iterable[str]) -> list[str]:
-    """Channels that explanations are about."""
-    words = {word for one in found for word in one.name.replace(",", " ").split()}
-    return [name for name in names if name in words]
-
-
-def _whole_kind(found: list[Explanation], parts: dict[str, Measured]) -> bool:
-    """Whether all channels of a kind are off, and not alike: then it is what they show, and none of them."""
-    kinds: dict[str, list[str]] = {}
-    for channel in (channel for part in parts.values() for channel in part.channels):
-        kinds.setdefault(channel.unit, []).append(channel.name)
-    return any(
-        len(names) > 2
-        and _channels_in(found, names) == names
-        and sum(bool(_channels_in([one], names)) for one in found) > 1
-        for names in kinds.values()
-    )
 
 
 def _and(names: list[str]) -> str:

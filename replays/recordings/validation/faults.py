@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -37,6 +37,8 @@ _SETTLES_S = 2e-3
 """Filters have forgotten a jump by then."""
 _LATEST_S = 4e-3
 """How late a channel is looked for [s]."""
+MOST = 0.9
+"""Changes of channels that together explain this part of all are it, though the model leaves something."""
 _ALIKE = 0.2
 """Changes that differ by less than this part of them may be the same one."""
 _SLIGHT = 0.01
@@ -164,6 +166,33 @@ def _onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end
         onsets += [float(part.times_s[rows][firsts.min()])] if len(firsts) else []
     onset_s = min(onsets)
     return onset_s + _SETTLES_S if end_s - onset_s > 3.0 * _SETTLES_S else onset_s
+
+
+def cured_by(sensors: list[Explanation], parts: dict[str, Measured]) -> bool:
+    """Whether sensors are it: they leave noise, or nearly all is theirs."""
+    return bool(sensors) and (
+        all(one.at_floor for one in sensors)
+        or (sum(one.explained for one in sensors) > MOST and not _whole_kind(sensors, parts))
+    )
+
+
+def channels_in(found: list[Explanation], names: Iterable[str]) -> list[str]:
+    """Channels that explanations are about."""
+    words = {word for one in found for word in one.name.replace(",", " ").split()}
+    return [name for name in names if name in words]
+
+
+def _whole_kind(found: list[Explanation], parts: dict[str, Measured]) -> bool:
+    """Whether all channels of a kind are off, and not alike: then it is what they show, and none of them."""
+    kinds: dict[str, list[str]] = {}
+    for channel in (channel for part in parts.values() for channel in part.channels):
+        kinds.setdefault(channel.unit, []).append(channel.name)
+    return any(
+        len(names) > 2
+        and channels_in(found, names) == names
+        and sum(bool(channels_in([one], names)) for one in found) > 1
+        for names in kinds.values()
+    )
 
 
 def late_together(found: Sequence[Explanation], parts: Mapping[str, Measured]) -> dict[str, float]:

@@ -1,0 +1,105 @@
+"""The report of a scorecard: its rows, and pictures of what is left over, of the response, and of the time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from replays.report import Mark, Report, Row
+from replays.report.canvas import BLUE, ORANGE, RED, draw_signals, house_style, label_of, new_figure
+from replays.score.analogue import Fitted
+from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, Scorecard, Verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MARKS: dict[Verdict, Mark] = {PASS: "good", FAIL: "bad", NOT_SHOWN: "open", NO_LIMIT: "plain"}
+_STRETCHES = 100
+"""Parts of a record of which the lateness is shown."""
+
+
+def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> Report:
+    """All of a scorecard as a report.
+
+    Args:
+        card: The scorecard.
+        origin: What the report is made by, each by name.
+    """
+    verdict = card.verdict_line
+    failed = any(row.verdict == FAIL for row in card.rows)
+    mark: Mark = "bad" if failed else "good" if card.good else "open"
+    report = Report(f"Scorecard of {card.title}", f"{verdict[0].upper()}{verdict[1:]}.", origin=origin, mark=mark)
+    for remark in card.remarks:
+        report.text(remark)
+    report.heading("Scorecard")
+    report.table(
+        ("quantity", "channel", "value", "95 % interval", "unit", "limit", "verdict", "note"),
+        [Row((*row.cells(), row.note), _MARKS[row.verdict]) for row in card.rows],
+        caption="A row passes, or fails, with its whole interval; one that reaches over its limit shows neither.",
+    )
+    unshown = {row.quantity: row.run for row in card.rows if row.verdict == NOT_SHOWN}
+    if unshown:
+        report.heading("What this run does not show")
+        report.table(("quantity", "what to run"), list(unshown.items()))
+    report.heading("Limits and methods")
+    told = {(row.quantity, row.method, row.limit.source if row.limit else "nothing asks") for row in card.rows}
+    report.table(("quantity", "method of the interval", "source of the limit"), sorted(told))
+    for name, about in card.pictures.items():
+        if isinstance(about, Fitted):
+            report.heading(about.name)
+            report.picture(
+                _channel(about),
+                "What is left of the record once the known signal is taken away, in time and by the values that were "
+                "recorded; how late each stretch is against the fitted clock; and the response over that of the lowest "
+                "frequencies, where the signal shows it.",
+            )
+        elif len(about):
+            report.heading(name)
+            report.picture(_stamps(about), "Time stamps less the time of the rows that they stand beside.")
+    return report
+
+
+@house_style()
+def _channel(one: Fitted) -> Figure:
+    clean, unit = one.clean, one.channel.unit
+    figure = new_figure(6.0)
+    ((left, values), (time, gain)) = figure.subplots(2, 2)
+    draw_signals(left, clean.times_s, (clean.residual, BLUE, "residual"))
+    left.set(title="Residual", xlabel="time [s]", ylabel=label_of("residual", unit))
+    good = one.values[np.isfinite(one.values)]
+    values.hist(good, bins=256, color=BLUE)
+    values.set(
+        title="How often each value was recorded", xlabel=label_of(one.name, unit), ylabel="samples", yscale="log"
+    )
+    middle, late_s = lateness(one)
+    time.plot(middle, 1e9 * late_s, ".", color=ORANGE, ms=4)
+    time.set(title="Time error", xlabel="time [s]", ylabel="late [ns]")
+    if one.shown is not None:
+        gain.semilogx(one.shown.frequency_hz, 20.0 * np.log10(one.shown.gain), color=BLUE)
+        gain.axhline(-3.0103, color=RED, lw=0.8)
+    gain.set(title="Response", xlabel="frequency [Hz]", ylabel="gain [dB]")
+    return figure
+
+
+def lateness(one: Fitted) -> tuple[np.ndarray, np.ndarray]:
+    """Time [s] and lateness against the fitted clock [s] of stretches of a record, each shape (stretches,)."""
+    clean = one.clean
+    edges = np.linspace(0, len(clean.residual), _STRETCHES + 1).astype(int)[:-1]
+    steep = clean.gain * clean.slope
+    power = np.add.reduceat(steep**2, edges)
+    late_s = np.divide(
+        np.add.reduceat(steep * clean.residual, edges), power, out=np.zeros(len(edges)), where=power > 0.0
+    )
+    return clean.times_s[edges], late_s
+
+
+@house_style()
+def _stamps(means: np.ndarray) -> Figure:
+    figure = new_figure(2.6)
+    axes = figure.subplots()
+    late = means[:, 1] - means[0, 1]
+    axes.plot(means[:, 0], 1e6 * late, ".", color=ORANGE, ms=4)
+    axes.set(xlabel="time in the session [s]", ylabel=f"late [µs], from {means[0, 1]:.9g} s on")
+    return figure

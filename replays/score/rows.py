@@ -1,0 +1,268 @@
+"""Which row of what was sent each recorded row is: missing, doubled, swapped and altered ones, of any number of rows.
+
+A row is known by the hash of its counts, alone or with the next three, where that is unique among the rows near by; the
+others by their neighbours. Where all is as it was sent, rows are only compared. Kept are the rows near by and one byte
+for each row that was sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+NO_COUNT = np.iinfo(np.int64).min
+"""Stands where a recorded value is none that was sent, whatever the count."""
+_BACK, _PART = 1 << 14, 1 << 12
+"""Rows behind the one that is due among which a row is looked for, and rows that are looked up at a time."""
+_AHEAD, _MOST_AHEAD = 1 << 13, 1 << 22
+"""Rows ahead among which they are looked for at first, and at most."""
+_GRAM = 4
+"""Consecutive rows that are known together where one alone is not."""
+
+
+def row_hashes(counts: np.ndarray) -> np.ndarray:
+    """A number of each row that hardly another row has, uint64, shape (n,); of counts, int64, shape (n, channels)."""
+    found = np.zeros(len(counts), dtype=np.uint64)
+    for c in range(counts.shape[1]):
+        # splitmix64 (Steele, Lea & Flood 2014), with the column as its step.
+        z = counts[:, c].astype(np.int64).view(np.uint64) + np.uint64((c + 1) * 0x9E3779B97F4A7C15 % (1 << 64))
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        found += z ^ (z >> np.uint64(31))
+    return found
+
+
+def _grams(hashes: np.ndarray) -> np.ndarray:
+    """A number of each row with those behind it; the last ones have fewer."""
+    found = hashes.copy()
+    for step in range(1, _GRAM):
+        found[:-step] += hashes[step:] * np.uint64(2 * step + 1) ^ np.uint64(step)
+    return found
+
+
+@dataclass
+class Followed:
+    """What became of the rows.
+
+    Attributes:
+        sent: Number of rows that were sent.
+        recorded: Number of rows that were recorded.
+        first, last: The earliest and the latest row that came, by its place among those sent; -1 if none did.
+        doubled: Places of rows that came once more, and numbers of the recorded rows, int64, shape (n, 2).
+        swapped: Places of rows that came behind later ones, and numbers of the recorded rows, shape (n, 2).
+        altered: Places of rows of which some value is another, and numbers of the recorded rows, shape (n, 2).
+        foreign: Numbers of recorded rows that are none of those sent, shape (n,).
+        times: How often each row came, uint8, shape (sent,).
+        wrong: Number of altered values of each channel, shape (channels,).
+    """
+
+    sent: int = 0
+    recorded: int = 0
+    first: int = -1
+    last: int = -1
+    doubled: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+    swapped: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+    altered: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+    foreign: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    times: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.uint8))
+    wrong: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    @property
+    def missing(self) -> np.ndarray:
+        """Places of rows between the first and the last that did not come, shape (n,)."""
+        if self.first < 0:
+            return np.empty(0, dtype=np.int64)
+        return np.flatnonzero(self.times[self.first : self.last + 1] == 0) + self.first
+
+
+class _Sent:
+    """The rows near by, of those that were sent."""
+
+    def __init__(self, chunks: Iterable[np.ndarray]) -> None:
+        self._chunks = iter(chunks)
+        self.start = self.end = 0
+        self.ended = False
+        self.counts = np.empty((0, 0), dtype=np.int64)
+        self.hashes = np.empty(0, dtype=np.uint64)
+
+    def hold(self, begin: int, end: int) -> None:
+        """Have rows from one place to another, as far as there are any; those before are let go."""
+        fresh = []
+        while self.end < end and not self.ended:
+            chunk = next(self._chunks, None)
+            if chunk is None:
+                self.ended = True
+            elif len(chunk):
+                fresh.append(chunk)
+                self.end += len(chunk)
+        if fresh or begin - self.start > 1 << 18:
+            begin = min(max(begin, self.start), self.end)
+            cut = begin - self.start
+            kept = [self.counts[cut:]] if len(self.counts) > cut else []
+            held = max(0, len(self.counts) - cut)
+            whole = [*kept, *fresh]
+            joined = np.concatenate(whole) if whole else self.counts[:0]
+            skip = len(joined) - (self.end - begin)  # rows that came and are let go at once
+            self.counts = joined[skip:]
+            new = row_hashes(self.counts[max(0, held - skip) :])
+            self.hashes = np.concatenate(
+                [self.hashes[len(self.hashes) - held + skip :] if held > skip else new[:0], new]
+            )
+            self.start = begin
+
+
+def follow(sent: Iterable[np.ndarray], recorded: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, Followed]]:
+    """Follow recorded rows among those sent.
+
+    Args:
+        sent: Counts in chunks, int64, shape (n, channels).
+        recorded: The same of the recorded ones; `NO_COUNT` where a value is no count.
+
+    Yields:
+        Place of each recorded row among those sent, -1 of a foreign one, shape (n,), chunk by chunk; and what has been
+        found up to there, whose arrays are complete with the last chunk, which has no rows.
+    """
+    window, found = _Sent(sent), Followed()
+    events: dict[str, list[np.ndarray]] = {"doubled": [], "swapped": [], "altered": [], "foreign": []}
+    due, highest = 0, -1
+    for chunk in recorded:
+        if not found.wrong.size:
+            found.wrong = np.zeros(chunk.shape[1], dtype=np.int64)
+        hashes = row_hashes(chunk)
+        places = np.empty(len(chunk), dtype=np.int64)
+        at, low = 0, due - _BACK
+        while at < len(chunk):
+            window.hold(low, due + len(chunk) - at)
+            near = window.hashes[due - window.start : due - window.start + len(chunk) - at]
+            same = near == hashes[at : at + len(near)]
+            equal = len(near) if same.all() else int(np.argmin(same))
+            places[at : at + equal] = due + np.arange(equal)
+            at, due = at + equal, due + equal
+            if at < len(chunk):
+                part = slice(at, at + _PART)
+                places[part] = _look_up(window, hashes[part], due, low)
+                at = min(at + _PART, len(chunk))
+                known = places[part][places[part] >= 0]
+                due = int(known[-1]) + 1 if len(known) else due + at - part.start
+        highest = _note(found, events, places, chunk, window, highest)
+        yield places, found
+    while not window.ended:
+        window.hold(window.end, window.end + 1)
+    found.sent = window.end
+    found.times = _longer(found.times, found.sent)[: found.sent]
+    for name, parts in events.items():
+        if parts:
+            setattr(found, name, np.concatenate(parts))
+    yield np.empty(0, dtype=np.int64), found
+
+
+def _look_up(window: _Sent, hashes: np.ndarray, due: int, low: int) -> np.ndarray:
+    """Places of rows; looks farther ahead as long as hardly one of the last is found."""
+    ahead = _AHEAD
+    while True:
+        window.hold(low, due + len(hashes) + ahead)
+        places, known = _places(window, hashes, due, due + len(hashes) + ahead)
+        if known[-len(hashes) // 2 :].mean() > 0.5 or window.ended or ahead >= _MOST_AHEAD:
+            return places
+        ahead *= 8
+
+
+def _places(window: _Sent, hashes: np.ndarray, due: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+    """Place of each row among those near by, up to one, and whether it is known by itself; -1 if it is none of them."""
+    start = max(window.start, due - _BACK)
+    nearby = window.hashes[start - window.start : high - window.start]
+    end = start + len(nearby)
+    n, rows = len(hashes), np.arange(len(hashes))
+    places = np.full(n, -1, dtype=np.int64)
+    ranks = {}
+    for level, (there, here) in enumerate(((nearby, hashes), (_grams(nearby), _grams(hashes)))):
+        order = np.argsort(there, kind="stable")
+        ordered = there[order]
+        left, right = np.searchsorted(ordered, here), np.searchsorted(ordered, here, side="right")
+        alone = (right - left == 1) & (places < 0)
+        if level:
+            alone &= rows <= n - _GRAM
+        places[alone] = order[left[alone]] + start
+        if not level:
+            ranks = {"order": order, "ordered": ordered, "left": left, "right": right}
+    known = places >= 0
+    open_ = np.flatnonzero(~known)
+    if not len(open_):
+        return places, known
+    behind = np.maximum.accumulate(np.where(known, rows, -1))[open_]
+    next_ = np.minimum.accumulate(np.where(known, rows, n)[::-1])[::-1][open_]
+    forward = np.where(behind >= 0, places[behind] + open_ - behind, due + open_)
+    backward = np.where(next_ < n, places[np.minimum(next_, n - 1)] - (next_ - open_), -1)
+    for guess in (forward, backward):
+        inside = (guess >= start) & (guess < end) & (places[open_] < 0)
+        at = np.where(inside, guess - start, 0)
+        right_one = inside & (nearby[at] == hashes[open_])
+        places[open_[right_one]] = guess[right_one]
+    left = np.flatnonzero(places[open_] < 0)
+    if len(left):
+        _by_nearest(places, open_[left], forward[left], ranks, start)
+    left = np.flatnonzero(places[open_] < 0)
+    # What is none of the rows near by and stands where one is due is that one, altered.
+    stop = np.where(next_[left] < n, places[np.minimum(next_[left], n - 1)], end)
+    fits = (forward[left] < stop) & (forward[left] < end)
+    places[open_[left[fits]]] = forward[left[fits]]
+    return places, known
+
+
+def _by_nearest(places: np.ndarray, rows: np.ndarray, guess: np.ndarray, ranks: dict, start: int) -> None:
+    """Rows that several are equal to: the one that is nearest to where it is due."""
+    left, right, order = ranks["left"][rows], ranks["right"][rows], ranks["order"]
+    several = right > left
+    rows, guess, left, right = rows[several], guess[several] - start, left[several], right[several]
+    if not len(rows):
+        return
+    # Places ascend among equal hashes: one search for all in numbers that have hash and place.
+    ordered = ranks["ordered"]
+    group = np.cumsum(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    whole = group * (len(order) + 1) + order
+    found = np.searchsorted(whole, group[left] * (len(order) + 1) + np.clip(guess, 0, len(order)))
+    low, high = np.clip(found - 1, left, right - 1), np.clip(found, left, right - 1)
+    nearer = np.abs(order[low] - guess) < np.abs(order[high] - guess)
+    places[rows] = np.where(nearer, order[low], order[high]) + start
+
+
+def _longer(times: np.ndarray, length: int) -> np.ndarray:
+    if length <= len(times):
+        return times
+    return np.concatenate([times, np.zeros(max(length, 2 * len(times)) - len(times), dtype=np.uint8)])
+
+
+def _note(
+    found: Followed, events: dict[str, list[np.ndarray]], places: np.ndarray, counts: np.ndarray, window: _Sent,
+    highest: int,
+) -> int:  # fmt: skip
+    """Count what has come of a chunk; returns the latest place of all."""
+    numbers = found.recorded + np.arange(len(places))
+    found.recorded += len(places)
+    real = places >= 0
+    events["foreign"].append(numbers[~real])
+    came, numbers, counts = places[real], numbers[real], counts[real]
+    if not len(came):
+        return highest
+    found.times = _longer(found.times, int(came.max()) + 1)
+    tops = np.maximum.accumulate(np.concatenate([[highest], came]))
+    if (np.diff(tops) > 0).all():  # each later than all before: neither doubled nor swapped
+        found.times[came] += 1
+    else:
+        again = found.times[came] > 0
+        order = np.argsort(came, kind="stable")
+        again[order[1:]] |= came[order[1:]] == came[order[:-1]]
+        events["doubled"].append(np.column_stack([came, numbers])[again])
+        late = (came < tops[:-1]) & ~again
+        events["swapped"].append(np.column_stack([came, numbers])[late])
+        np.add.at(found.times, came, np.minimum(1, 255 - found.times[came]).astype(np.uint8))
+    inside = came >= window.start
+    there = window.counts[came[inside] - window.start]
+    different = there != counts[inside]
+    found.wrong += different.sum(axis=0)
+    events["altered"].append(np.column_stack([came, numbers])[inside][different.any(axis=1)])
+    found.first = int(came.min()) if found.first < 0 else min(found.first, int(came.min()))
+    found.last = max(found.last, int(came.max()))
+    return int(tops[-1])

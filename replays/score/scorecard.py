@@ -1,0 +1,274 @@
+"""A scorecard: a row for each quantity and channel, with interval, limit and verdict; as a document and as JUnit."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from rig.errors import UnknownNameError, whole_file
+from rig.text import finite
+
+PASS, FAIL, NOT_SHOWN, NO_LIMIT = "pass", "fail", "this run does not show it", "no limit"
+Verdict = Literal["pass", "fail", "this run does not show it", "no limit"]
+Path_ = Literal["digital", "analogue"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What is scored.
+
+    Attributes:
+        unit: Its unit; empty: that of the channel.
+        method: How its interval is made.
+        run: What to run so that it is shown.
+    """
+
+    unit: str
+    method: str
+    run: str
+
+
+_EXACT = "exact, row by row"
+_SANDWICH = "least squares, block sandwich of 64 blocks, Student's t"
+_SPLIT = "weighted least squares of squared residuals on squared slope, block sandwich, Student's t"
+_LONGER = "a longer run"
+_RICH = "a signal of many frequencies on every channel (test-prbs, 2 s)"
+_BEYOND = "a signal beyond the corner (test-chirp, test-prbs)"
+_SINE = "a sine near full scale on the channel (test-sine, 10 s)"
+_DIGITS = "a recording that keeps every digit of the counts"
+_STAMPED = "a recording that keeps time stamps"
+DIGITAL = {
+    "mapping": Quantity("1", "cross-correlation, then equal counts", _RICH),
+    "scale": Quantity("ppm", "least squares, then every count equal", _DIGITS),
+    "offset": Quantity("counts", "least squares, then every count equal", _DIGITS),
+    "altered values": Quantity("1", _EXACT, _LONGER),
+    "missing rows": Quantity("1", _EXACT, _LONGER),
+    "doubled rows": Quantity("1", _EXACT, _LONGER),
+    "swapped rows": Quantity("1", _EXACT, _LONGER),
+    "foreign rows": Quantity("1", _EXACT, _LONGER),
+    "rows before the first": Quantity("1", _EXACT, _LONGER),
+    "rows after the last": Quantity("1", _EXACT, _LONGER),
+    "stamp offset": Quantity("s", "straight line through means of batches, Student's t", _STAMPED),
+    "stamp rate": Quantity("ppm", "straight line through means of batches, Student's t", _STAMPED),
+    "stamp jitter": Quantity("s", "rms within batches, chi squared", _STAMPED),
+    "stamps that go back": Quantity("1", _EXACT, _STAMPED),
+    "latency": Quantity("s", "-", "the DAQ beside a rig that runs: a file does not tell when its rows came"),
+    "trigger row": Quantity("1", "-", "a triggered recording of a scene with a hammer or a step"),
+}
+ANALOGUE = {
+    "mapping": Quantity("1", "cross-correlation of all pairs", _RICH),
+    "polarity": Quantity("1", "cross-correlation of all pairs", _RICH),
+    "gain": Quantity("ppm", _SANDWICH, _LONGER),
+    "offset": Quantity("", _SANDWICH, _LONGER),
+    "skew": Quantity("ns", _SANDWICH, _RICH),
+    "start": Quantity("s", _SANDWICH, _RICH),
+    "clock": Quantity("ppm", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"),
+    "noise": Quantity("", _SPLIT, _LONGER),
+    "jitter": Quantity("ns", _SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
+    "effective bits": Quantity("bit", "of the noise, log2(range / (noise sqrt 12))", _LONGER),
+    "dynamic range": Quantity("dB", "of the noise, full-scale sine over it", _LONGER),
+    "corner": Quantity("Hz", "least squares behind a Butterworth low-pass, else cross spectra", _BEYOND),
+    "SINAD": Quantity("dB", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
+    "ENOB": Quantity("bit", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
+    "THD": Quantity("dB", "harmonics 2 to 10 of the sine fit, delta method", _SINE),
+    "SFDR": Quantity("dB", "largest line of the sine fit's residual, delta method", _SINE),
+    "alias rejection": Quantity("dB", "-", "tones above half of the DAQ's rate, from a session at a higher rate"),
+    "trigger row": DIGITAL["trigger row"],
+}  # fmt: skip
+QUANTITIES = {"digital": DIGITAL, "analogue": ANALOGUE}
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What a quantity must lie between.
+
+    Attributes:
+        low, high: The ends, in its unit.
+        source: Where they are from.
+    """
+
+    low: float
+    high: float
+    source: str
+
+    def __str__(self) -> str:
+        if math.isinf(self.low):
+            return f"<= {self.high:.6g}"
+        if math.isinf(self.high):
+            return f">= {self.low:.6g}"
+        return f"{self.low:.6g} to {self.high:.6g}"
+
+
+@dataclass(frozen=True)
+class ScoreRow:
+    """One row.
+
+    Attributes:
+        quantity: A key of `QUANTITIES`.
+        channel: Whose it is; empty: of all, or of a group.
+        value: What it is; nan where nothing is known, a text where it is no number.
+        low, high: Its 95 % interval; equal where it is exact.
+        unit: Of these.
+        method: How the interval is made.
+        limit: What it must lie between; None: nothing asks.
+        verdict: What comes out.
+        run: What to run to show it.
+        note: What else is to be known, such as which rows.
+    """
+
+    quantity: str
+    channel: str
+    value: float | str
+    low: float
+    high: float
+    unit: str
+    method: str
+    limit: Bounds | None
+    verdict: Verdict
+    run: str = ""
+    note: str = ""
+
+    def cells(self) -> tuple[str, ...]:
+        """Quantity, channel, value, interval, unit, limit, verdict."""
+        known = isinstance(self.value, str) or math.isfinite(self.value)
+        exact = self.low == self.high or not known
+        digits = 6
+        if not exact and math.isfinite(self.high - self.low):  # so many that the two ends differ
+            largest = max(abs(self.low), abs(self.high))
+            digits = min(15, max(6, math.ceil(math.log10(largest / (self.high - self.low))) + 2))
+        interval = "" if exact else f"{self.low:.{digits}g} to {self.high:.{digits}g}"
+        value = self.value if isinstance(self.value, str) else f"{self.value:.{digits}g}" if known else ""
+        return (
+            self.quantity, self.channel, value, interval, "" if self.unit == "1" else self.unit,
+            "" if self.limit is None else str(self.limit), self.verdict,
+        )  # fmt: skip
+
+
+def judge_row(
+    path: Path_, quantity: str, channel: str, estimate: tuple[float, float, float] | None, *, unit: str = "",
+    limit: Bounds | None = None, note: str = "",
+) -> ScoreRow:  # fmt: skip
+    """A row with its verdict: the whole interval decides, and one that reaches over a limit shows nothing.
+
+    Args:
+        path: Which of the two.
+        quantity: A key of `QUANTITIES`.
+        channel: Whose.
+        estimate: Value, low and high end of the 95 % interval; None: this run does not tell.
+        unit: Of a quantity that has the channel's.
+        limit: What asks.
+        note: What else is to be known.
+    """
+    about = QUANTITIES[path][quantity]
+    value, low, high = (math.nan,) * 3 if estimate is None else estimate
+    verdict: Verdict = NOT_SHOWN
+    if estimate is not None:
+        if limit is None:
+            verdict = NO_LIMIT
+        elif limit.low <= low and high <= limit.high:
+            verdict = PASS
+        elif high < limit.low or low > limit.high:
+            verdict = FAIL
+    run = about.run if verdict == NOT_SHOWN else ""
+    return ScoreRow(quantity, channel, value, low, high, about.unit or unit, about.method, limit, verdict, run, note)
+
+
+@dataclass
+class Scorecard:
+    """All rows of one path.
+
+    Attributes:
+        title: Of what.
+        path: Digital or analogue.
+        limits: Title of the limits.
+        rows: The rows.
+        remarks: What was assumed.
+        pictures: What pictures are made of, by kind and channel.
+        runs: Numbers of rows by what became of them, as pairs of first and last.
+    """
+
+    title: str
+    path: Path_
+    limits: str
+    rows: list[ScoreRow] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    pictures: dict[str, Any] = field(default_factory=dict)
+    runs: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing fails, and something is shown."""
+        verdicts = [row.verdict for row in self.rows]
+        return FAIL not in verdicts and PASS in verdicts
+
+    @property
+    def verdict_line(self) -> str:
+        """What comes out, in a line."""
+        counts = Counter(row.verdict for row in self.rows)
+        failed = list(dict.fromkeys(row.quantity for row in self.rows if row.verdict == FAIL))
+        told = f"{self.path} path: {'pass' if self.good else 'FAIL' if failed else 'nothing is shown'}"
+        parts = [f"{counts[PASS]} pass", f"{counts[FAIL]} fail" + (f" ({', '.join(failed)})" if failed else "")]
+        return f"{told}: {', '.join(parts)}, {counts[NOT_SHOWN]} not shown, {counts[NO_LIMIT]} without a limit"
+
+    def row(self, quantity: str, channel: str = "") -> ScoreRow:
+        """One of the rows.
+
+        Raises:
+            UnknownNameError: There is none.
+        """
+        for row in self.rows:
+            if (row.quantity, row.channel) == (quantity, channel):
+                return row
+        names = [f"{row.quantity} {row.channel}".strip() for row in self.rows]
+        raise UnknownNameError("row", "one of the scorecard's", f"{quantity} {channel}".strip(), names)
+
+    def document(self) -> dict[str, Any]:
+        """As a document for JSON."""
+        rows = [
+            {
+                "quantity": row.quantity, "channel": row.channel or None, "value": row.value, "low": row.low,
+                "high": row.high, "unit": row.unit, "method": row.method, "verdict": row.verdict,
+                "limit": None if row.limit is None
+                else {"low": row.limit.low, "high": row.limit.high, "source": row.limit.source},
+                "run": row.run or None, "note": row.note or None,
+            }
+            for row in self.rows
+        ]  # fmt: skip
+        return finite({
+            "title": self.title, "path": self.path, "good": self.good, "verdict": self.verdict_line,
+            "limits": self.limits, "rows": rows, "remarks": self.remarks, "runs": self.runs,
+        })  # fmt: skip
+
+
+def write_junit(card: Scorecard, path: Path) -> None:
+    """Write a scorecard as JUnit's XML: a case a row; what is not shown, or not asked, is skipped.
+
+    Raises:
+        DiskError: The disk refused.
+    """
+    from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
+
+    verdicts = Counter(row.verdict for row in card.rows)
+    skipped = verdicts[NOT_SHOWN] + verdicts[NO_LIMIT]
+    counts = {"tests": len(card.rows), "failures": verdicts[FAIL], "errors": 0, "skipped": skipped}
+    root = Element("testsuites")
+    told = {"name": f"rig score, {card.path}", **{name: str(count) for name, count in counts.items()}, "time": "0"}
+    suite = SubElement(root, "testsuite", told)
+    for row in card.rows:
+        name = f"{row.quantity} {row.channel}".strip()
+        case = SubElement(suite, "testcase", {"classname": f"score.{card.path}", "name": name, "time": "0"})
+        _, _, value, interval, unit, limit, verdict = row.cells()
+        line = f"{value} {unit} ({interval or 'exact'}); limit {limit or 'none'}"
+        if row.verdict == FAIL:
+            source = "" if row.limit is None else row.limit.source
+            SubElement(case, "failure", {"message": line}).text = f"{line}\nsource: {source}\n{row.note}"
+        elif row.verdict != PASS:
+            SubElement(case, "skipped", {"message": f"{verdict}{': ' if row.run else ''}{row.run}"})
+        else:
+            SubElement(case, "system-out").text = line
+    indent(root)
+    with whole_file(path) as draft:
+        ElementTree(root).write(draft, encoding="utf-8", xml_declaration=True)

@@ -1,0 +1,149 @@
+"""Sine fits of IEEE 1057 with three and four parameters, and what of a record is neither the sine nor its offset.
+
+Definitions are those of IEEE Std 1057-2017 as papers and tutorials give them; the standard itself was not at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+HARMONICS = 10
+"""The highest harmonic that counts for the total distortion."""
+_ROUNDS = 20
+_PURE = 0.98
+"""Part of a signal's power that one sine must hold for it to be taken for a sine."""
+
+
+@dataclass(frozen=True)
+class SineFit:
+    """A sine in a record: offset + amplitude cos(2 pi f t + phase).
+
+    Attributes:
+        frequency: [cycles a sample], and its standard deviation.
+        amplitude: [unit], and its standard deviation.
+        phase: At the first sample [rad].
+        offset: [unit], and its standard deviation.
+        residual: What is left, shape (n,).
+    """
+
+    frequency: tuple[float, float]
+    amplitude: tuple[float, float]
+    phase: float
+    offset: tuple[float, float]
+    residual: np.ndarray
+
+    @property
+    def nad(self) -> float:
+        """Noise and distortion, rms [unit]."""
+        return math.sqrt(float(self.residual @ self.residual) / (len(self.residual) - 4))
+
+
+def fit_sine(values: np.ndarray, frequency: float | None = None) -> SineFit:
+    """Fit a sine: four parameters, or three where the frequency [cycles a sample] is given; values shape (n,)."""
+    n = np.arange(len(values)) - 0.5 * (len(values) - 1)
+    w = 2.0 * math.pi * (_peak(values) if frequency is None else frequency)
+    columns = [np.cos(w * n), np.sin(w * n), np.ones(len(n))]
+    beta = np.linalg.lstsq(np.column_stack(columns), values, rcond=None)[0]
+    for _ in range(_ROUNDS if frequency is None else 0):
+        c, s = np.cos(w * n), np.sin(w * n)
+        columns = [c, s, np.ones(len(n)), n * (beta[1] * c - beta[0] * s)]
+        beta = np.linalg.lstsq(np.column_stack(columns), values, rcond=None)[0]
+        w += beta[3]
+        if abs(beta[3]) * len(n) < 1e-12:
+            break
+    c, s = np.cos(w * n), np.sin(w * n)
+    slope = [n * (beta[1] * c - beta[0] * s)] if frequency is None else []
+    matrix = np.column_stack([c, s, np.ones(len(n)), *slope])
+    beta = np.linalg.lstsq(matrix[:, :3], values, rcond=None)[0]
+    residual = values - matrix[:, :3] @ beta
+    variance = float(residual @ residual) / (len(n) - matrix.shape[1])
+    spread = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * variance)
+    amplitude = math.hypot(beta[0], beta[1])
+    return SineFit(
+        (w / (2.0 * math.pi), spread[3] / (2.0 * math.pi) if slope else 0.0),
+        (amplitude, float(max(spread[0], spread[1]))),
+        math.atan2(-beta[1], beta[0]) + w * n[0],
+        (float(beta[2]), float(spread[2])),
+        residual,
+    )
+
+
+def _peak(values: np.ndarray) -> float:
+    """Frequency of the largest line [cycles a sample]: with a Hann window, between two lines as the window has it."""
+    window = np.hanning(len(values) + 1)[:-1]
+    lines = np.abs(np.fft.rfft((values - values.mean()) * window))
+    k = int(np.argmax(lines[1:-1])) + 1
+    side = 1 if lines[k + 1] > lines[k - 1] else -1
+    ratio = lines[k + side] / lines[k] if lines[k] else 0.0
+    return (k + side * (2.0 * ratio - 1.0) / (1.0 + ratio)) / len(values)
+
+
+def is_sine(values: np.ndarray) -> bool:
+    """Whether a signal is a sine and little else."""
+    spread = float(np.var(values))
+    if len(values) < 64 or not spread > 0.0:
+        return False
+    fit = fit_sine(values)
+    return 0.5 * fit.amplitude[0] ** 2 > _PURE * spread and 2.0 / len(values) < fit.frequency[0] < 0.49
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What a sine record tells of a converter, each with its 95 % interval: value, low, high.
+
+    Attributes:
+        sinad_db: Sine over noise and distortion.
+        enob: Effective bits of that ratio, (SINAD - 1.76) / 6.02.
+        thd_db: Harmonics 2 to 10 over the sine; folded ones are counted where they fall.
+        sfdr_db: Sine over the largest line besides it.
+    """
+
+    sinad_db: tuple[float, float, float]
+    enob: tuple[float, float, float]
+    thd_db: tuple[float, float, float]
+    sfdr_db: tuple[float, float, float]
+
+
+def quality(fit: SineFit) -> Quality:
+    """Judge a converter by a sine.
+
+    Intervals: SINAD by chi squared of the residual's power; THD by the noise of the harmonics' fit (delta method, with
+    none the noise's own); SFDR by the noise of one line.
+    """
+    from scipy.stats import chi2
+
+    n, amplitude, nad = len(fit.residual), fit.amplitude[0], fit.nad
+    ratio = 20.0 * math.log10(amplitude / math.sqrt(2.0) / nad)
+    ends = [10.0 * math.log10(chi2.ppf(p, n - 4) / (n - 4)) for p in (0.025, 0.975)]
+    sinad = (ratio, ratio + ends[0], ratio + ends[1])
+    enob = ((sinad[0] - 1.76) / 6.02, (sinad[1] - 1.76) / 6.02, (sinad[2] - 1.76) / 6.02)
+    rows = np.arange(n)
+    squares = []
+    for harmonic in range(2, HARMONICS + 1):
+        folded = abs((harmonic * fit.frequency[0] + 0.5) % 1.0 - 0.5)
+        if not 2.0 / n < folded < 0.5 - 2.0 / n or abs(folded - fit.frequency[0]) < 2.0 / n:
+            continue
+        phase = 2.0 * math.pi * folded * rows
+        parts = 2.0 / n * np.array([np.cos(phase) @ fit.residual, np.sin(phase) @ fit.residual])
+        squares.append(float(parts @ parts))
+    power = sum(squares)
+    # Variance of one part of a line's amplitude, by what is neither the sine nor a harmonic.
+    line = 2.0 * max(nad**2 - 0.5 * power, 1e-6 * nad**2) / n
+    half = 1.96 * math.sqrt(sum(4.0 * line * each + 4.0 * line**2 for each in squares))
+    thd = _db(power / amplitude**2, half / amplitude**2)
+    window = np.blackman(n)
+    spectrum = (np.abs(np.fft.rfft(fit.residual * window)) * 2.0 / window.sum()) ** 2
+    largest = float(spectrum[3:].max()) if n > 8 else 0.0
+    # A window widens lines: of a line's noise it lets through 1.73 times as much power as none.
+    wide = 1.96 * math.sqrt(4.0 * 1.73 * line * largest)
+    value, low, high = _db(largest / amplitude**2, wide / amplitude**2)
+    return Quality(sinad, enob, thd, (-value, -high, -low))
+
+
+def _db(power: float, half: float) -> tuple[float, float, float]:
+    """A ratio of powers and its half interval in dB: value, low, high."""
+    least = 1e-30
+    return tuple(10.0 * math.log10(max(least, each)) for each in (power, power - half, power + half))  # type: ignore[return-value]

@@ -1,0 +1,78 @@
+"""The known signal at any time, with its slope: from the samples of a session, or exact from a formula."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+_FINER = 4
+_HALF_TAPS, _KAISER, _CUTOFF = 64, 10.0, 0.97
+EDGE = _HALF_TAPS + 4
+"""Samples at each end between which nothing is told."""
+_CHUNK = 1 << 18
+
+
+class Stimulus(Protocol):
+    """A signal that is known at all times in a span.
+
+    Attributes:
+        span_s: From when to when [s].
+    """
+
+    span_s: tuple[float, float]
+
+    def __call__(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values and slopes [unit, unit/s] at ascending times in the span, each shape (n,)."""
+        ...
+
+
+class Sampled:
+    """Samples with a band-limited signal between them.
+
+    Kaiser-windowed sinc to four times the rate, then quintic splines: `tests/unit/test_score.py` measures how
+    far off it is.
+    """
+
+    def __init__(self, values: np.ndarray, first_s: float, rate_hz: float) -> None:
+        """Take even samples, shape (n,), the first at a time [s]."""
+        self._values, self._first_s, self._rate_hz = values, first_s, rate_hz
+        last_s = first_s + (len(values) - 1) / rate_hz
+        self.span_s = (first_s + EDGE / rate_hz, last_s - EDGE / rate_hz)
+
+    def __call__(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `Stimulus`."""
+        from scipy.interpolate import make_interp_spline
+        from scipy.signal import firwin, upfirdn
+
+        taps = firwin(2 * _HALF_TAPS * _FINER + 1, _CUTOFF / _FINER, window=cast(Any, ("kaiser", _KAISER))) * _FINER
+        at = (times_s - self._first_s) * self._rate_hz
+        values, slopes = np.empty(len(at)), np.empty(len(at))
+        for begin in range(0, len(at), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            low = max(0, int(at[part].min()) - EDGE)
+            high = min(len(self._values), int(at[part].max()) + EDGE + 1)
+            finer = upfirdn(taps, self._values[low:high], up=_FINER)[_HALF_TAPS * _FINER : -_HALF_TAPS * _FINER or None]
+            spline = make_interp_spline(np.arange(len(finer)), finer, k=5)
+            place = (at[part] - low) * _FINER
+            values[part] = spline(place)
+            slopes[part] = spline(place, nu=1) * (_FINER * self._rate_hz)
+        return values, slopes
+
+
+class Exact:
+    """A formula of time, whose slope is taken over five points."""
+
+    def __init__(
+        self, formula: Callable[[np.ndarray], np.ndarray], span_s: tuple[float, float], rate_hz: float
+    ) -> None:
+        """Take a formula [unit] of times [s], when it holds, and the rate at which it is recorded [Hz]."""
+        self._formula, self.span_s, self._step_s = formula, span_s, 0.01 / rate_hz
+
+    def __call__(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `Stimulus`."""
+        f, h = self._formula, self._step_s
+        one = f(times_s + h) - f(times_s - h)
+        two = f(times_s + 2.0 * h) - f(times_s - 2.0 * h)
+        return f(times_s), (8.0 * one - two) / (12.0 * h)

@@ -1,0 +1,428 @@
+"""Least squares against the known signal: y = gain s(t + late + drift t) + offset, with what is left over.
+
+Intervals of these four are those of the block sandwich: scores of the fit are summed over consecutive blocks, whose
+spread is the covariance, so that noise may have any colour and be larger where the signal is steep. Errors of the known
+signal itself, as of samples between which it is interpolated, are part of what is left, and so of the intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from replays.score.stimulus import Stimulus
+
+_BLOCKS = 64
+_FIRST_S = 0.25
+"""Where the signal is steepest, a stretch this long is fitted first; it is doubled until it is all."""
+_ROUNDS, _FINAL = 4, 3
+_SETTLED = 1e-3
+"""A step below this part of its standard deviation is the last."""
+_MOST_DRIFT = 0.02
+_LEAST = 400
+"""Fewest samples that are fitted."""
+_TAPS = 96
+_PASSES = 3
+"""Rounds in which a fit behind a filter takes the signal at the times that the last one found."""
+_ORDERS = 8
+"""Of the Butterworth low-passes that are tried."""
+_SETTLING = 8.0
+"""Periods of the corner at each end of a record that are left out, until a filter has forgotten them."""
+_RISE, _FAR = 1e-4, 0.5
+"""Steps of the corner's logarithm: for its slope, and the farthest from where it was seen."""
+_SEEN = 0.8
+"""Coherence from which the response at a frequency counts as shown."""
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """What a fit of one channel comes to.
+
+    Attributes:
+        gain, offset, late_s, drift: The four [1, unit, s, s/s], `late_s` in the middle of the record.
+        covariance: Of the four, shape (4, 4).
+        freedom: Degrees of freedom of that covariance.
+        middle_s: The middle of the record by the clock of the file [s].
+        times_s: Of the rows that were fitted, by the clock of the file, shape (n,).
+        values: As recorded [unit], shape (n,).
+        known, slope: The signal and its slope there, without gain [unit, unit/s], shape (n,).
+        residual: What is left [unit], shape (n,).
+    """
+
+    gain: float
+    offset: float
+    late_s: float
+    drift: float
+    covariance: np.ndarray
+    freedom: int
+    middle_s: float
+    times_s: np.ndarray
+    values: np.ndarray
+    known: np.ndarray
+    slope: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviation of the four, shape (4,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def likeness(self) -> float:
+        """Part of the recorded power that the known signal explains."""
+        whole = float(np.var(self.values))
+        return 1.0 - float(np.var(self.residual)) / whole if whole else 0.0
+
+
+def fit_waveform(
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, *,
+    within_s: tuple[float, float] | None = None,
+) -> Waveform | None:  # fmt: skip
+    """Fit a channel; None where the known signal is not in it, or too little of it.
+
+    Args:
+        values: Recorded [unit], nan where one is missing, shape (n,).
+        times_s: By the clock of the file, even, shape (n,).
+        stimulus: The known signal.
+        late_s: Time of the stimulus less time of the file, to a part of a period of the signal [s].
+        within_s: Where in the file that is so [s]; None: anywhere.
+    """
+    middle = 0.5 * (times_s[0] + times_s[-1])
+    low, high = stimulus.span_s
+    moved = times_s + late_s
+    inside = np.isfinite(values) & (moved >= low) & (moved <= high)
+    if inside.sum() < _LEAST:
+        return None
+    first, last = np.flatnonzero(inside)[[0, -1]]
+    near = (first, last + 1)
+    if within_s is not None:
+        begin, end = np.searchsorted(times_s, within_s)
+        near = max(first, min(begin, last + 1 - _LEAST)), min(last + 1, max(end, first + _LEAST))
+    begin, end = _steepest(values, times_s, *near)
+    line = (late_s, 0.0)
+    while True:
+        whole = (begin, end) == (first, last + 1)
+        found = _solve(values, times_s, stimulus, line, slice(begin, end), final=whole)
+        if found is None or abs(found.drift) > _MOST_DRIFT:
+            return None
+        centre = 0.5 * (times_s[begin] + times_s[end - 1])
+        line = (found.late_s + found.drift * (middle - centre), found.drift)
+        if whole:
+            return replace(found, late_s=line[0])
+        wider = end - begin
+        begin, end = max(first, begin - wider // 2), min(last + 1, end + wider - wider // 2)
+
+
+def _steepest(values: np.ndarray, times_s: np.ndarray, first: int, last: int) -> tuple[int, int]:
+    rate = (len(times_s) - 1) / (times_s[-1] - times_s[0])
+    length = min(last - first, max(_LEAST, round(_FIRST_S * rate)))
+    steps = np.nan_to_num(np.diff(values[first:last], append=values[last - 1])) ** 2
+    sums = np.concatenate([[0.0], np.cumsum(steps)])
+    held = sums[length:] - sums[:-length]
+    begin = first + int(np.argmax(held))
+    return begin, begin + length
+
+
+def _solve(
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, line: tuple[float, float], rows: slice, *, final: bool
+) -> Waveform | None:
+    """Gauss and Newton's steps over some rows, about their own centre; `line` is about the centre of all."""
+    middle = 0.5 * (times_s[0] + times_s[-1])
+    y, t = values[rows], times_s[rows]
+    centre = 0.5 * (t[0] + t[-1])
+    late, drift = line[0] + line[1] * (centre - middle), line[1]
+    since = t - centre
+    low, high = stimulus.span_s
+    span = max(since[-1], 1e-300)
+    number = 0
+    while True:
+        at = t + late + drift * since
+        use = np.isfinite(y) & (at >= low) & (at <= high)
+        if use.sum() < _LEAST:
+            return None
+        s, ds = stimulus(at[use])
+        scale = max(float(np.std(s)), 1e-300)
+        steep = max(float(np.sqrt(np.mean(ds**2))), 1e-300)
+        ones, u = np.ones(len(s)), since[use] / span
+        # Gain and offset follow linearly; the step of time is taken about them.
+        gain, offset = np.linalg.lstsq(np.column_stack([s / scale, ones]), y[use], rcond=None)[0]
+        gain /= scale
+        if not gain:
+            return None
+        jacobian = np.column_stack([s / scale, ones, ds / steep, ds / steep * u])
+        residual = y[use] - gain * s - offset
+        inverse = np.linalg.pinv(jacobian.T @ jacobian)
+        step = inverse @ (jacobian.T @ residual)
+        units = np.array([scale, 1.0, gain * steep, gain * steep * span])
+        late, drift = late + step[2] / units[2], drift + step[3] / units[3]
+        small = (
+            np.abs(step[2:])
+            < (_SETTLED if final else 0.1) * np.sqrt(np.diag(inverse)[2:] * np.mean(residual**2)) + 1e-300
+        )
+        number += 1
+        if number > 1 and (small.all() or number >= _ROUNDS + (_FINAL if final else 0)):
+            break
+    residual = residual - jacobian @ step
+    covariance, freedom = _sandwich(jacobian, residual, inverse)
+    return Waveform(
+        float(gain + step[0] / scale), float(offset + step[1]), float(late), float(drift),
+        covariance / np.outer(units, units), freedom, middle, t[use], y[use], s, ds, residual,
+    )  # fmt: skip
+
+
+def _sandwich(jacobian: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, int]:
+    """Covariance of a linear fit, and its degrees of freedom."""
+    edges = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)[:-1]
+    sums = np.add.reduceat(jacobian * residual[:, None], edges, axis=0)
+    n, parts = jacobian.shape
+    correction = _BLOCKS / (_BLOCKS - 1) * n / (n - parts)
+    return correction * inverse @ (sums.T @ sums) @ inverse, _BLOCKS - 1
+
+
+def student(freedom: int) -> float:
+    """The 97.5 % quantile of Student's t."""
+    from scipy.stats import t
+
+    return float(t.ppf(0.975, freedom))
+
+
+@dataclass(frozen=True)
+class NoiseSplit:
+    """Noise of the voltage and of the sampling instants, each as value, low and high end of its 95 % interval.
+
+    Attributes:
+        noise: rms [unit].
+        jitter_s: rms [s]; None where the signal's slope does not vary.
+    """
+
+    noise: tuple[float, float, float]
+    jitter_s: tuple[float, float, float] | None
+
+
+def split_noise(found: Waveform, *, floor: float = 0.0) -> NoiseSplit:
+    """Tell jitter from noise: residual^2 = noise^2 + (gain slope)^2 jitter^2, by least squares with weights.
+
+    Args:
+        found: A fit.
+        floor: Noise that the known signal itself may have brought [unit rms]: widens its interval downward.
+    """
+    squared, steep = found.residual**2, (found.gain * found.slope) ** 2
+    typical = float(np.mean(steep))
+    total = float(np.mean(squared))
+    varied = typical > 0.0 and float(np.std(steep)) > 0.05 * typical
+    columns = [np.ones(len(squared)), steep / typical] if varied else [np.ones(len(squared))]
+    matrix, weights, rounds = np.column_stack(columns), np.ones(len(squared)), 3
+    while True:
+        weighted = matrix * weights[:, None]
+        inverse = np.linalg.inv(weighted.T @ matrix)
+        parts = inverse @ (weighted.T @ squared)
+        rounds -= 1
+        if not rounds:
+            break
+        # A square of normal noise spreads as its own mean.
+        weights = np.maximum(matrix @ parts, 0.05 * total) ** -2.0 * total**2
+    left = squared - matrix @ parts
+    covariance, freedom = _sandwich(weighted, left, inverse)
+    half = student(freedom) * np.sqrt(np.diag(covariance))
+    noise = _root(parts[0], half[0])
+    noise = (noise[0], math.sqrt(max(0.0, noise[1] ** 2 - floor**2)), noise[2])
+    return NoiseSplit(noise, _root(parts[1] / typical, half[1] / typical) if varied else None)
+
+
+def _root(power: float, half: float) -> tuple[float, float, float]:
+    return math.sqrt(max(0.0, power)), math.sqrt(max(0.0, power - half)), math.sqrt(max(0.0, power + half))
+
+
+@dataclass(frozen=True)
+class Response:
+    """Frequency response of a channel where the signal shows it.
+
+    Attributes:
+        frequency_hz: Shape (n,).
+        gain: Amount over the gain of the lowest frequencies, shape (n,).
+        spread: Standard deviation of its logarithm, shape (n,).
+        corner_hz: Where it has fallen by 3 dB, with its 95 % interval; None where it does not.
+    """
+
+    frequency_hz: np.ndarray
+    gain: np.ndarray
+    spread: np.ndarray
+    corner_hz: tuple[float, float, float] | None
+
+
+def response(found: Waveform) -> Response | None:
+    """The response, by Welch's cross spectra; None where the signal is at hardly a frequency.
+
+    Spread: sqrt((1 - coherence) / (2 coherence segments)) (Bendat & Piersol, Random Data, table 9.6). The corner is
+    where a parabola through the logarithms about it passes -3 dB.
+    """
+    from scipy.signal import csd, welch
+
+    n = len(found.known)
+    rate = (n - 1) / (found.times_s[-1] - found.times_s[0])
+    length = int(min(2048, n // 16))
+    x, y = found.known, found.values
+    told = {"fs": rate, "nperseg": length, "window": "hann", "detrend": "constant"}
+    f, sxx = welch(x, **told)
+    _, syy = welch(y, **told)
+    _, sxy = csd(x, y, **told)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        coherence = np.minimum(1.0, np.abs(sxy) ** 2 / (sxx * syy))
+        gain = np.abs(sxy) / sxx / abs(found.gain)
+    shown = (coherence > _SEEN) & (sxx > 1e-5 * sxx.max()) & (f > 0.0)
+    if shown.sum() < 16:
+        return None
+    f, gain, coherence = f[shown], gain[shown], coherence[shown]
+    segments = 2.0 * n / length * 0.9
+    spread = np.sqrt((1.0 - coherence) / (2.0 * coherence * segments)) + 1e-9
+    lowest = f <= max(f[7], 0.1 * f[-1])
+    weight = spread**-2.0
+    base = math.exp(float(np.sum(weight[lowest] * np.log(gain[lowest])) / np.sum(weight[lowest])))
+    gain = gain / base
+    return Response(f, gain, spread, _corner(f, np.log(gain), spread))
+
+
+def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, float, float] | None:
+    level = -0.5 * math.log(2.0)
+    below = log < level
+    # Where it stays below: single lines in the noise do not count.
+    runs = np.convolve(below, np.ones(5), mode="valid") >= 5
+    if not runs.any() or not runs.argmax():
+        return None
+    at = f[int(runs.argmax())]
+    near = (f > 0.7 * at) & (f < 1.4 * at)
+    if near.sum() < 8:
+        return None
+    x = np.log(f[near] / at)
+    matrix = np.column_stack([np.ones(len(x)), x, x**2])
+    weights = spread[near] ** -2.0
+    weighted = matrix * weights[:, None]
+    inverse = np.linalg.inv(weighted.T @ matrix)
+    parts = inverse @ (weighted.T @ log[near])
+    left = log[near] - matrix @ parts
+    inverse *= max(1.0, float(np.sum(weights * left**2)) / (len(x) - 3))
+    roots = [r.real for r in np.roots([parts[2], parts[1], parts[0] - level]) if abs(r.imag) < 1e-9]
+    if not roots:
+        return None
+    root = min(roots, key=abs)
+    row = np.array([1.0, root, root**2])
+    # Lines of a Hann window are not independent: 1.9 of them are one.
+    half = 1.96 * math.sqrt(1.9 * float(row @ inverse @ row)) / max(abs(parts[1] + 2.0 * parts[2] * root), 1e-300)
+    return at * math.exp(root), at * math.exp(root - half), at * math.exp(root + half)
+
+
+def through(found: Waveform) -> Waveform:
+    """The fit behind the linear response of the channel: 96 taps by least squares, so that what is left is noise."""
+    from scipy.linalg import solve_toeplitz
+
+    x = found.known - found.known.mean()
+    y = found.values - found.values.mean()
+    n, half = len(x), _TAPS // 2
+    size = 1 << int(2 * n).bit_length()
+    fx, fy = np.fft.rfft(x, size), np.fft.rfft(y, size)
+    auto = np.fft.irfft(np.abs(fx) ** 2, size)[:_TAPS]
+    cross = np.roll(np.fft.irfft(np.conj(fx) * fy, size), half)[:_TAPS]
+    auto[0] *= 1.0 + 1e-9
+    taps = solve_toeplitz(auto, cross)
+    known = np.convolve(x, taps)[half : half + n]
+    slope = np.convolve(found.slope, taps)[half : half + n]
+    kept = slice(_TAPS, -_TAPS)
+    left = (y - known)[kept]
+    return replace(
+        found, gain=1.0, times_s=found.times_s[kept], values=y[kept], known=known[kept], slope=slope[kept],
+        residual=left - left.mean(),
+    )  # fmt: skip
+
+
+def order_of(shown: Response) -> int:
+    """The order of the Butterworth low-pass that is most like a response with a corner."""
+    assert shown.corner_hz is not None
+    log, weights = np.log(shown.gain), np.maximum(shown.spread, 0.01) ** -2.0
+    # The corner may be off by a little, and more where the order is another.
+    ratios = shown.frequency_hz[:, None] / (shown.corner_hz[0] * np.linspace(0.9, 1.1, 41))
+    left = [np.min(weights @ (log[:, None] + 0.5 * np.log1p(ratios ** (2 * n))) ** 2) for n in range(1, _ORDERS + 1)]
+    return int(np.argmin(left)) + 1
+
+
+Corner = tuple[float, float, float]
+
+
+def behind_filter(found: Waveform, stimulus: Stimulus, shown: Response) -> tuple[Waveform, Corner] | None:
+    """The fit anew with a Butterworth low-pass between signal and record, and its corner with its interval.
+
+    Gain is then that at low frequencies, time without the filter's delay. None where values miss, or no corner fits.
+
+    Args:
+        found: The fit without it.
+        stimulus: The known signal.
+        shown: The response by that fit, with a corner.
+    """
+    assert shown.corner_hz is not None
+    order, corner_hz, near, late_s = order_of(shown), shown.corner_hz[0], found, None
+    better = None
+    for _ in range(_PASSES):
+        better = _behind(near, corner_hz, order, late_s)
+        if better is None:
+            return None
+        # Once more, with the signal at the times that are known now.
+        fit, (corner_hz, _, _) = better
+        known, slope = stimulus(found.times_s + fit.late_s + fit.drift * (found.times_s - found.middle_s))
+        near, late_s = replace(fit, times_s=found.times_s, values=found.values, known=known, slope=slope), 0.0
+    assert better is not None
+    fit, (corner_hz, low, high) = better
+    true = 1.0 / (1.0 + fit.drift)  # seconds of the file are not those of the session
+    return fit, (true * corner_hz, true * low, true * high)
+
+
+def _behind(found: Waveform, corner_hz: float, order: int, late_s: float | None) -> tuple[Waveform, Corner] | None:
+    """The same about a corner and a delay that are nearly known; without a delay, about that of low frequencies."""
+    n, span_s = len(found.times_s), found.times_s[-1] - found.times_s[0]
+    step_s = span_s / (n - 1)
+    if late_s is None:  # by as much as the filter delays low frequencies
+        late_s = 1.0 / (2.0 * math.pi * corner_hz * math.sin(math.pi / (2.0 * order)))
+    cut = math.ceil(_SETTLING / (corner_hz * step_s))
+    if np.ptp(np.diff(found.times_s)) > 0.5 * step_s or n < 8 * cut + _LEAST:
+        return None
+    y = found.values
+    # What the ends do to the filter is left out.
+    spectra = [np.fft.rfft(values) for values in (found.known, found.slope)]
+    f = np.fft.rfftfreq(n, step_s)
+    poles = np.exp(1j * np.pi * (2.0 * np.arange(1, order + 1) + order - 1.0) / (2.0 * order))
+    kept, log = slice(cut, n - cut), math.log(corner_hz)
+
+    def passed(spectrum: np.ndarray, log_corner: float) -> np.ndarray:
+        s = 1j * f / math.exp(log_corner)
+        loss = np.prod([1.0 - s / pole for pole in poles], axis=0)
+        return np.fft.irfft(spectrum * np.exp(2j * np.pi * f * late_s) / loss, n)[kept]
+
+    u, ones = (2.0 * (found.times_s - found.middle_s) / span_s)[kept], np.ones(n)[kept]
+    solved = None
+    for _ in range(2 * _ROUNDS):
+        s, ds = (passed(spectrum, log) for spectrum in spectra)
+        moved = (passed(spectra[0], log + _RISE) - passed(spectra[0], log - _RISE)) / (2.0 * _RISE)
+        gain = float(np.linalg.lstsq(np.column_stack([s, ones]), y[kept], rcond=None)[0][0])
+        matrix = np.column_stack([s, ones, gain * ds, gain * ds * u, gain * moved])
+        sizes = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-300)
+        jacobian = matrix / sizes
+        parts = np.linalg.lstsq(jacobian, y[kept], rcond=None)[0] / sizes
+        late_s, log = late_s + parts[2], log + float(np.clip(parts[4], -0.2, 0.2))
+        if abs(log - math.log(corner_hz)) > _FAR:
+            return None
+        solved = s, ds, matrix, jacobian, sizes, parts
+        if abs(parts[4]) < 1e-9 and abs(parts[2]) < 1e-13:
+            break
+    assert solved is not None
+    s, ds, matrix, jacobian, sizes, parts = solved
+    residual = y[kept] - matrix @ parts
+    covariance, freedom = _sandwich(jacobian, residual, np.linalg.pinv(jacobian.T @ jacobian))
+    sizes = sizes * np.array([1.0, 1.0, 1.0, 0.5 * span_s, 1.0])
+    covariance = covariance / np.outer(sizes, sizes)
+    half = student(freedom) * math.sqrt(covariance[4, 4])
+    fitted = Waveform(
+        float(parts[0]), float(parts[1]), found.late_s + float(late_s or 0.0),
+        found.drift + float(parts[3]) / (0.5 * span_s),
+        covariance[:4, :4], freedom, found.middle_s, found.times_s[kept], y[kept], s, ds, residual,
+    )  # fmt: skip
+    return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))

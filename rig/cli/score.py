@@ -1,0 +1,106 @@
+"""`rig score`: what a DAQ under test recorded against what the rig sent."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rig.cli.options import Force, Wide
+from rig.cli.origin import origin
+from rig.cli.tables import echo, new_table, shown, table_console
+from rig.errors import check_new_file, check_not_among, whole_file
+from rig.text import finite
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from replays.score.scorecard import Scorecard
+
+
+class _Way(StrEnum):
+    DIGITAL = "digital"
+    ANALOGUE = "analogue"
+
+
+_STYLES = {"pass": "", "fail": "red", "this run does not show it": "yellow", "no limit": ""}
+
+
+def score(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What the DAQ recorded: as `rig import`, or .mcap.")],
+    *,
+    against: Annotated[
+        list[Path], typer.Option("--against", metavar="SESSION.mcap", help="What the rig sent; its parts, repeated.")
+    ],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Report with pictures, .html or .pdf.")
+    ] = None,
+    junit: Annotated[Path | None, typer.Option(metavar="FILE.xml", help="JUnit's XML: a case a row.")] = None,
+    as_json: Annotated[Path | None, typer.Option("--json", metavar="FILE.json", help="All of it as JSON.")] = None,
+    limits: Annotated[
+        str | None, typer.Option(metavar="SET", help="as-calibrated, api-670, iso-20816, or a .toml file.")
+    ] = None,
+    path: Annotated[_Way | None, typer.Option(help="How the DAQ is fed, if not as the file looks.")] = None,
+    force: Force = False,
+    wide: Wide = False,
+) -> None:
+    """Judge a DAQ by what it recorded, against what the rig sent.
+
+    A DAQ that took counts is judged row by row, exactly; one that sampled by itself by least squares against the known
+    signal. Ends with 1 where a limit is not kept, or nothing is shown.
+    """
+    from replays.report import check_report
+    from replays.score.judgement import judge
+    from replays.score.limits import load_limits
+    from replays.score.scorecard import write_junit
+
+    if output is not None:
+        check_report(output, force=force, field="--output")
+    for made, field, suffix in ((junit, "--junit", ".xml"), (as_json, "--json", ".json")):
+        if made is not None:
+            check_new_file(made, field=field, suffixes=(suffix,), force=force)
+            check_not_among([file, *against], made, field=field)
+    card = judge(
+        file,
+        against,
+        limits=load_limits(limits),
+        path=None if path is None else "digital" if path is _Way.DIGITAL else "analogue",
+    )
+    if output is not None:
+        from replays.score.report import make_report
+
+        make_report(card, origin=origin(file=file.name, session=against[0].name, limits=card.limits)).write(output)
+    if junit is not None:
+        write_junit(card, junit)
+    if as_json is not None:
+        with whole_file(as_json) as draft:
+            draft.write_text(json.dumps(finite(card.document()), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    _show(card, table_console(wide=wide), wide=wide)
+    for made in (output, junit, as_json):
+        if made is not None:
+            echo(f"written  {made}")
+    if not card.good:
+        raise typer.Exit(1)
+
+
+def _show(card: Scorecard, console: Console, *, wide: bool) -> None:
+    from replays.score.scorecard import FAIL, NOT_SHOWN
+
+    console.print(shown(f"{card.title}, limits {card.limits}"))
+    console.print(shown(card.verdict_line))
+    for remark in card.remarks:
+        console.print(shown(remark))
+    table = new_table(
+        "", "quantity", "channel", ">value", "95 %", "unit", "limit", "verdict", "note", "to show it", "source",
+        wrapped=("note", "to show it", "source"), spare=("source", "to show it", "note", "95 %"),
+    )  # fmt: skip
+    told = [row for row in card.rows if wide or row.verdict in (FAIL, NOT_SHOWN)]
+    for row in told:
+        source = "" if row.limit is None else row.limit.source
+        table.add_row(*row.cells(), row.note, row.run, source, style=_STYLES[row.verdict])
+    console.print(table)
+    if len(told) < len(card.rows):
+        echo("what passes, or has no limit, is in --wide, and in the report, JUnit and JSON")

@@ -1,0 +1,437 @@
+"""Scorecards of synthetic DAQs whose defects are known: what they declare turns red, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from replays.score.judgement import judge
+from replays.score.limits import load_limits
+from replays.score.rows import NO_COUNT, follow
+from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, Scorecard, judge_row
+from replays.score.sine import fit_sine, is_sine, quality
+from replays.score.stimulus import EDGE, Exact, Sampled
+from replays.score.waveform import behind_filter, fit_waveform, order_of, response, split_noise, student
+from rig.channels import default_table
+from rig.errors import InputError
+from tests.commands import said
+from tests.score_daqs import RATE_HZ, Tones, chips, counts_of, write_parquet, write_session
+
+TABLE = default_table()
+PROBES = TABLE.groups["probes"].channels
+NAMES = TABLE.groups["probes"].names
+SIGNALS = {name: Tones(seed, 0.5, high_hz=6000.0, tones=12) for seed, name in enumerate(NAMES)}
+START_S, SECONDS = 0.05, 0.6
+
+
+def red(card: Scorecard) -> set[str]:
+    return {row.quantity for row in card.rows if row.verdict == FAIL}
+
+
+# Digital: what was sent is the counts of the probes.
+
+
+@pytest.fixture(scope="module")
+def sent(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A session and its counts."""
+    t = (400 + np.arange(RATE_HZ)) / RATE_HZ
+    values = np.column_stack([signal(t) for signal in SIGNALS.values()])
+    counts = counts_of("probes", values, np.random.default_rng(1))
+    return write_session(tmp_path_factory.mktemp("sent") / "session.mcap", {"probes": counts}, index=400), counts
+
+
+def in_units(counts: np.ndarray) -> dict[str, np.ndarray]:
+    values = TABLE.groups["probes"].engineering(counts)
+    return {f"{name} [mm]": values[:, n] for n, name in enumerate(NAMES)}
+
+
+def in_volts(counts: np.ndarray) -> dict[str, np.ndarray]:
+    return {f"{c.name} [V]": (counts[:, n] * c.lsb_v).astype(np.float32) for n, c in enumerate(PROBES)}
+
+
+def as_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
+    return {name: counts[:, n].astype(np.int32) for n, name in enumerate(NAMES)}
+
+
+@pytest.mark.parametrize("form", [in_units, in_volts, as_counts])
+def test_a_perfect_daq_has_every_row_once_with_every_count(
+    sent: tuple[Path, np.ndarray], tmp_path: Path, form: Callable[[np.ndarray], dict[str, np.ndarray]]
+) -> None:
+    session, counts = sent
+    card = judge(write_parquet(tmp_path / "daq.parquet", form(counts[500:])), [session])
+    assert (card.path, red(card)) == ("digital", set())
+    assert card.row("missing rows", "probes").verdict == PASS
+    assert card.row("rows before the first", "probes").value == 500
+    assert card.row("stamp rate", "probes").verdict == NOT_SHOWN  # there are no stamps in the file
+
+
+def test_the_session_itself_is_perfect_and_its_stamps_are_the_ticks(sent: tuple[Path, np.ndarray]) -> None:
+    card = judge(sent[0], [sent[0]])
+    assert (card.path, red(card)) == ("digital", set())
+    assert card.row("stamp offset", "probes").value == pytest.approx(0.0, abs=1e-12)
+
+
+def test_rows_that_are_lost_doubled_swapped_and_altered_are_named(
+    sent: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    session, counts = sent
+    rows = np.delete(np.arange(len(counts)), [5000, 5001, 12000])
+    rows = np.insert(rows, 7001, rows[7000])
+    rows[[15000, 15001]] = rows[[15001, 15000]]
+    columns = in_units(counts[rows])
+    columns["ring_x [mm]"][1234] += PROBES[2].scale
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
+    assert red(card) == {"missing rows", "doubled rows", "swapped rows", "altered values"}
+    # Numbers are the rig's own: the session begins with row 400.
+    assert card.runs == {
+        "missing rows probes": [(5400, 5401), (12400, 12400)],
+        "doubled rows probes": [(7402, 7402)],
+        "swapped rows probes": [(15402, 15402)],
+        "altered values ring_x": [(1634, 1634)],
+    }
+    assert [card.row("altered values", name).value for name in NAMES] == [0, 0, 1, 0]
+
+
+def test_a_scale_that_is_none_of_the_tables_is_found_and_told(sent: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    session, counts = sent
+    columns = in_units(counts)
+    columns["disk_y [mm]"] = 1.001 * columns["disk_y [mm]"]
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
+    assert red(card) == {"scale"}
+    assert card.row("scale", "disk_y").value == pytest.approx(1000.0, rel=1e-6)
+    assert card.row("altered values", "disk_y").verdict == PASS
+
+
+def test_offset_and_rate_of_stamps_are_two_numbers(sent: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    session, counts = sent
+    true_s = (400 + np.arange(len(counts))) / RATE_HZ
+    jitter = 2e-6 * np.random.default_rng(2).standard_normal(len(counts))
+    stamps = 1.7e3 + true_s + 150e-6 * (true_s - true_s[0]) + jitter
+    card = judge(write_parquet(tmp_path / "daq.parquet", {"time [s]": stamps, **in_units(counts)}), [session])
+    assert red(card) == set()
+    for quantity, true, width in (("stamp offset", 1.7e3, 2e-7), ("stamp rate", 150.0, 0.4)):
+        row = card.row(quantity, "probes")
+        assert row.low - width < true < row.high + width
+        assert row.high - row.low < width
+    assert card.row("stamp jitter", "probes").value == pytest.approx(2e-6, rel=0.02)
+
+
+@pytest.mark.parametrize("levels", [10_000, 150])
+def test_every_event_in_many_rows_is_found(levels: int) -> None:
+    generator = np.random.default_rng(levels)
+    total = 400_000
+    counts = (levels * generator.standard_normal((total, 1 if levels < 1000 else 4))).astype(np.int64)
+    spots = 1000 + 350 * generator.permutation(total // 350 - 10)[:300]
+    lost, again, late = np.split(np.sort(spots)[generator.permutation(300)], 3)
+    order = np.arange(total)
+    order[late], order[late + 1] = late + 1, late
+    order = np.repeat(order, 1 + np.isin(order, again) - np.isin(order, lost))
+    daq = counts[order]
+    parts = (
+        [counts[n : n + 7_000] for n in range(0, total, 7_000)],
+        [daq[n : n + 65_536] for n in range(0, total, 65_536)],
+    )
+    found = None
+    places = []
+    for place, found in follow(*parts):  # noqa: B007
+        places.append(place)
+    assert found is not None
+    assert np.array_equal(np.concatenate(places), order)
+    assert np.array_equal(found.missing, np.sort(lost))
+    assert np.array_equal(found.doubled[:, 0], np.sort(again))
+    assert np.array_equal(found.swapped[:, 0], np.sort(late))
+    assert not len(found.altered)
+    assert not len(found.foreign)
+
+
+def test_a_block_that_comes_late_and_rows_that_are_none_are_told() -> None:
+    counts = np.random.default_rng(5).integers(-9000, 9000, (6000, 2))
+    order = np.concatenate([np.arange(1000), np.arange(2000, 3000), np.arange(1000, 2000), np.arange(3000, 6000)])
+    daq = counts[order]
+    daq[4500] = NO_COUNT
+    daq = np.insert(daq, 5000, [1, 2], axis=0)
+    *_, (_, found) = follow([counts], [daq])
+    assert np.array_equal(found.swapped[:, 0], np.arange(1000, 2000))
+    assert found.altered.tolist() == [[4500, 4500]]
+    assert found.foreign.tolist() == [5000]
+    assert not len(found.missing)
+
+
+# Analogue: formulas of tones, sampled by the DAQ's own clock.
+
+
+def recorded(
+    generator: np.random.Generator, *, ppm: float = 0.0, jitter_s: float = 0.0, skew_s: float = 0.0, gain: float = 1.0,
+    offset: float = 0.0, noise: float = 1.0, step_v: float = 0.0, wires: tuple[int, ...] = (0, 1, 2, 3),
+    turned: int = -1, corner_hz: float = 0.0, seconds: float = SECONDS,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """What a DAQ with these defects makes of the tones, in volts; skew is that of the second channel."""
+    rows = round(seconds * RATE_HZ)
+    true_s = START_S + np.arange(rows) / RATE_HZ / (1.0 + 1e-6 * ppm)
+    columns = {"time [s]": np.arange(rows) / RATE_HZ}
+    for n, channel in enumerate(PROBES):
+        at_s = true_s + (skew_s if n == 1 else 0.0) + jitter_s * generator.standard_normal(rows)
+        signal = list(SIGNALS.values())[wires[n]]
+        value = signal(at_s) if not corner_hz else signal.behind(corner_hz, 4)(at_s)
+        value = gain * (-value if n == turned else value) + offset
+        volts = channel.bias_v + channel.sensitivity_v * value
+        volts = volts + noise * channel.noise_v * generator.standard_normal(rows)
+        step = step_v or channel.lsb_v
+        columns[f"{channel.name} [V]"] = np.rint(volts / step) * step
+    return columns
+
+
+@pytest.mark.parametrize(
+    ("defects", "declared"),
+    [
+        ({}, set()),
+        ({"gain": 1.002, "offset": 0.01}, {"gain", "offset"}),
+        ({"wires": (1, 0, 2, 2), "turned": 2}, {"mapping", "polarity"}),
+        ({"ppm": 260.0, "skew_s": 1.5e-6}, {"clock", "skew"}),
+        ({"jitter_s": 120e-9}, {"jitter"}),
+        ({"noise": 1.6}, {"noise", "effective bits", "dynamic range"}),
+        ({"step_v": 40.0 / 2**12}, {"noise", "effective bits", "dynamic range"}),
+        ({"corner_hz": 2000.0}, {"corner"}),
+    ],
+    ids=["perfect", "gain-offset", "swapped-polarity", "clock-skew", "jitter", "noise", "12-bit", "low-pass"],
+)
+def test_each_defect_turns_red_what_it_declares_and_nothing_else(
+    sent: tuple[Path, np.ndarray], tmp_path: Path, defects: dict[str, float], declared: set[str]
+) -> None:
+    columns = recorded(np.random.default_rng(3), **defects)  # type: ignore[arg-type]
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent[0]], formulas=SIGNALS)
+    assert card.path == "analogue"
+    assert red(card) == declared
+    true = {"gain": 2000.0, "offset": 0.01, "clock": 260.0, "skew": 1500.0, "jitter": 120.0, "corner": 2000.0}
+    for row in card.rows:
+        if row.verdict == FAIL and row.quantity in true and row.channel not in NAMES[2:]:
+            wide = row.high - row.low  # one interval in twenty does not hold: none may be off by its whole width
+            assert row.low - wide < true[row.quantity] < row.high + wide, row
+
+
+def test_without_a_formula_the_sessions_own_noise_leaves_open_what_it_hides(
+    sent: tuple[Path, np.ndarray], tmp_path: Path
+) -> None:
+    columns = recorded(np.random.default_rng(3))
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent[0]])
+    assert red(card) == set()
+    assert card.row("gain", "disk_x").verdict == PASS
+    assert card.row("noise", "disk_x").verdict == NOT_SHOWN
+    assert card.row("alias rejection").run
+
+
+def test_fifteen_channels_are_mapped_by_two_seconds_of_chips() -> None:
+    from replays.score.wiring import find_wires
+
+    generator = np.random.default_rng(8)
+    names = list(TABLE.channels)
+    sent = {name: (chips(n, 2.2) + 0.01 * generator.standard_normal(44_000), 20e3) for n, name in enumerate(names)}
+    order = generator.permutation(15)
+    order[3] = order[7]  # one is recorded twice
+    signs = generator.choice([-1, 1], 15)
+    taken = {
+        f"ai{n}": (signs[n] * sent[names[k]][0][2000:42_000] + 0.3 * generator.standard_normal(40_000), 20e3)
+        for n, k in enumerate(order)
+    }
+    wires = find_wires(taken, sent)
+    assert [wire.channel for wire in wires.values()] == [names[k] for k in order]
+    assert [wire.polarity for wire in wires.values()] == signs.tolist()
+    assert {wire.rivals for wire in wires.values()} == {()}
+    assert wires["ai0"].late_s == pytest.approx(0.1)
+
+
+def test_intervals_are_as_wide_as_cramer_and_rao_have_it() -> None:
+    # A sine of 5 V in 1 mV of noise, 80 Hz, for 10 s at 20 kHz.
+    amplitude, noise, hz, seconds = 5.0, 1e-3, 80.0, 10.0
+    t = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
+    signal = Exact(lambda at: amplitude * np.sin(2.0 * np.pi * hz * at), (-1.0, 11.0), RATE_HZ)
+    values = signal(t)[0] + noise * np.random.default_rng(4).standard_normal(len(t))
+    found = fit_waveform(values, t, signal, 0.0)
+    assert found is not None
+    one = noise / math.sqrt(len(t))
+    floors = [
+        one * math.sqrt(2.0) / amplitude, one, one * math.sqrt(2.0) / (amplitude * 2.0 * np.pi * hz),
+        one * math.sqrt(24.0) / (amplitude * 2.0 * np.pi * hz * seconds),
+    ]  # fmt: skip
+    assert found.spread == pytest.approx(floors, rel=0.35)
+    widths = student(found.freedom) * found.spread
+    # Gain 10 ppm, offset 20 uV, skew of two such 20 ns, clock 0.01 ppm.
+    assert (widths < [10e-6, 20e-6, 20e-9 / math.sqrt(2.0), 0.01e-6]).all()
+
+
+def test_jitter_of_five_nanoseconds_is_told_apart_from_noise() -> None:
+    t = np.arange(10 * RATE_HZ) / RATE_HZ
+    generator = np.random.default_rng(5)
+    signal = Exact(lambda at: 5.0 * np.sin(2.0 * np.pi * 1000.3 * at), (-1.0, 11.0), RATE_HZ)
+    late = 5e-9 * generator.standard_normal(len(t))
+    found = fit_waveform(signal(t + late)[0] + 1e-3 * generator.standard_normal(len(t)), t, signal, 0.0)
+    assert found is not None
+    split = split_noise(found)
+    assert split.jitter_s is not None
+    assert 0.0 < split.jitter_s[1] < 5e-9 < split.jitter_s[2] < 8e-9
+    assert split.noise[1] < 1e-3 < split.noise[2]
+
+
+def test_a_sine_record_tells_bits_and_distortion_as_closed_forms_have_them() -> None:
+    rows, amplitude, noise = 40_000, 4.0, 1e-3
+    phase = 2.0 * np.pi * 0.048713 * np.arange(rows) + 0.4
+    clean = amplitude * np.cos(phase) + 2e-3 * np.cos(2.0 * phase) + 1e-3 * np.cos(3.0 * phase + 1.0) + 0.2
+    fit = fit_sine(clean + noise * np.random.default_rng(6).standard_normal(rows))
+    found = quality(fit)
+    power = noise**2 + 0.5 * (2e-3**2 + 1e-3**2)
+    sinad = 10.0 * math.log10(0.5 * amplitude**2 / power)
+    assert fit.frequency[0] == pytest.approx(0.048713, abs=4.0 * fit.frequency[1])
+    assert fit.amplitude[0] == pytest.approx(amplitude, abs=4.0 * fit.amplitude[1])
+    assert found.enob[0] == pytest.approx((sinad - 1.76) / 6.02, abs=0.05)
+    assert found.thd_db[0] == pytest.approx(10.0 * math.log10(5e-6 / 16.0), abs=0.2)
+    assert found.sfdr_db[0] == pytest.approx(20.0 * math.log10(4.0 / 2e-3), abs=0.5)
+    assert is_sine(clean)
+    assert not is_sine(chips(1, 1.0))
+
+
+def test_what_lies_between_samples_is_off_by_a_millionth() -> None:
+    signal = Tones(9, 1.0, high_hz=0.4 * RATE_HZ)
+    samples = Sampled(signal(np.arange(4000) / RATE_HZ), 0.0, RATE_HZ)
+    t = np.sort(np.random.default_rng(9).uniform(*samples.span_s, 3000))
+    values, slopes = samples(t)
+    true, steep = Exact(signal, (0.0, 1.0), RATE_HZ)(t)
+    assert np.abs(values - true).max() < 3e-5
+    assert np.abs(slopes - steep).max() < 3e-4 * np.abs(steep).max()
+    assert samples.span_s[0] == EDGE / RATE_HZ
+
+
+# What is asked, and how it is told.
+
+
+def test_an_interval_that_reaches_over_its_limit_shows_nothing() -> None:
+    limit = load_limits().bounds("analogue", "gain")
+    assert [judge_row("analogue", "gain", "", each, limit=limit).verdict for each in (
+        (0.0, -5.0, 5.0), (200.0, 150.0, 250.0), (95.0, 80.0, 110.0), None,
+    )] == [PASS, FAIL, NOT_SHOWN, NOT_SHOWN]  # fmt: skip
+    assert judge_row("analogue", "start", "", (1.0, 0.0, 2.0)).verdict == NO_LIMIT
+
+
+def test_limits_say_where_they_are_from() -> None:
+    table = load_limits().bounds("analogue", "noise", PROBES[0])
+    assert table is not None
+    assert table.high == pytest.approx(1.1 * 1e-3 / 3.94, rel=1e-3)
+    quoted = load_limits("api-670").bounds("analogue", "gain", PROBES[0])
+    assert quoted is not None
+    assert quoted.source.endswith("quoted second-hand")
+    assert load_limits("api-670").bounds("analogue", "gain", TABLE.channels["P_E"]) is None  # of probes alone
+    assert load_limits("iso-20816").title
+
+
+def test_the_command_writes_report_junit_and_json(
+    sent: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, counts = sent
+    daq = write_parquet(tmp_path / "daq.parquet", in_units(np.delete(counts, 777, axis=0)))
+    made = [tmp_path / name for name in ("r.html", "r.xml", "r.json")]
+    files = ("-o", made[0], "--junit", made[1], "--json", made[2])
+    status, out, _ = said(capsys, "score", daq, "--against", session, *files)
+    assert status == 1
+    assert "FAIL: 19 pass, 1 fail (missing rows)" in out
+    suite = ElementTree.parse(made[1]).getroot()[0]
+    failed = [case.get("name") for case in suite if case.find("failure") is not None]
+    assert (suite.get("failures"), failed) == ("1", ["missing rows probes"])
+    told = json.loads(made[2].read_text(encoding="utf-8"))
+    assert told["runs"] == {"missing rows probes": [[1177, 1177]]}
+    assert made[0].read_text(encoding="utf-8").count("<img") == 0  # there are no stamps to draw
+
+
+def test_the_report_draws_the_channels_of_the_analogue_path(sent: tuple[Path, np.ndarray], tmp_path: Path) -> None:
+    from replays.score.report import make_report
+
+    columns = recorded(np.random.default_rng(3), seconds=0.3)
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [sent[0]], formulas=SIGNALS)
+    card.pictures = {name: card.pictures[name] for name in ("analogue disk_x",)}
+    make_report(card).write(tmp_path / "r.html")
+    assert (tmp_path / "r.html").read_text(encoding="utf-8").count("<img") == 1
+
+
+def test_wrong_inputs_are_one_line(
+    sent: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, counts = sent
+    noise = np.random.default_rng(1).standard_normal(5000)
+    noise[::7], noise[1::7] = np.inf, 1e300
+    other = write_parquet(tmp_path / "other.parquet", {"x": noise, "one": np.ones(5000), "none": np.full(5000, np.nan)})
+    few = write_parquet(tmp_path / "few.parquet", {"disk_x [mm]": in_units(counts)["disk_x [mm]"].astype(np.float16)})
+    (tmp_path / "mine.toml").write_text('title = "x"\n[analogue.gian]\nhigh = 1\nkind = "assumed"\nsource = "me"\n')
+    for arguments, told in (
+        (["--against", str(session), "--limits", "api-671"], "limits must be"),
+        (["--against", str(session), "--limits", str(tmp_path / "mine.toml")], "such as gain"),
+        (["--against", str(tmp_path / "none.mcap")], "none.mcap"),
+        (["--against", str(session), "--junit", "r.txt"], "--junit must be"),
+        (["--against", str(session)], "of which nothing is"),
+    ):
+        status, _, err = said(capsys, "score", other, *arguments)
+        assert (status, err.count("\n")) == (2, 1), err
+        assert told in err
+    with pytest.raises(InputError, match="no counts can be told"):
+        judge(few, [session], path="digital")
+
+
+LONG = pytest.mark.skipif("RIG_COVERAGE_SEEDS" not in os.environ, reason="RIG_COVERAGE_SEEDS=1000: ten minutes")
+
+
+@LONG
+@pytest.mark.timeout(3600)
+def test_intervals_hold_as_often_as_they_say() -> None:
+    """Of so many DAQs, each with defects of its own, 93 to 97 % of intervals hold what was put in."""
+    seeds, rows = int(os.environ["RIG_COVERAGE_SEEDS"]), RATE_HZ // 2
+    held: dict[str, list[bool]] = {}
+    for seed in range(seeds):
+        generator = np.random.default_rng([seed, 17])
+        signal = Tones(seed, 1.0, high_hz=3000.0, tones=12)
+        t = np.arange(rows) / RATE_HZ
+        true = np.array([
+            generator.uniform(0.9, 1.1), generator.normal(0.0, 0.1), generator.uniform(0.02, 0.03),
+            generator.normal(0.0, 50e-6),
+        ])  # fmt: skip
+        noise, jitter_s = generator.uniform(5e-4, 5e-3), generator.uniform(0.1e-6, 0.6e-6)
+        at_s = t + true[2] + true[3] * (t - 0.5 * t[-1])
+
+        def record(of: Callable[[np.ndarray], np.ndarray], shake: float = 0.0) -> np.ndarray:
+            late = shake * generator.standard_normal(rows)  # noqa: B023
+            return true[0] * of(at_s + late) + true[1] + noise * generator.standard_normal(rows)  # noqa: B023
+
+        known = Exact(signal, (0.0, 1.0), RATE_HZ)
+        found = fit_waveform(record(signal, jitter_s), t, known, true[2] + generator.normal(0.0, 1e-5))
+        assert found is not None
+        half = student(found.freedom) * found.spread
+        got = [found.gain, found.offset, found.late_s, found.drift]
+        for name, value, truth, wide in zip(("gain", "offset", "start", "clock"), got, true, half, strict=True):
+            held.setdefault(name, []).append(bool(abs(value - truth) <= wide))
+        split = split_noise(found)
+        assert split.jitter_s is not None
+        held.setdefault("noise", []).append(split.noise[1] <= noise <= split.noise[2])
+        held.setdefault("jitter", []).append(split.jitter_s[1] <= jitter_s <= split.jitter_s[2])
+        corner_hz = generator.uniform(900.0, 2000.0)
+        low = fit_waveform(record(signal.behind(corner_hz, 4)), t, known, true[2] - 0.3 / corner_hz)
+        shown = None if low is None else response(low)
+        if low is not None and shown is not None and shown.corner_hz is not None and order_of(shown) == 4:
+            behind = behind_filter(low, known, shown)
+            if behind is not None:
+                held.setdefault("corner", []).append(behind[1][1] <= corner_hz <= behind[1][2])
+        hz = generator.uniform(200.0, 4000.0)
+        told = quality(fit_sine(np.sin(2.0 * np.pi * hz * t) + noise * generator.standard_normal(rows)))
+        sinad = 10.0 * math.log10(0.5 / noise**2)
+        held.setdefault("SINAD", []).append(told.sinad_db[1] <= sinad <= told.sinad_db[2])
+        size = 10.0 * noise
+        sine = np.sin(2.0 * np.pi * hz * t) + size * np.sin(4.0 * np.pi * hz * t)
+        told = quality(fit_sine(sine + noise * generator.standard_normal(rows)))
+        if abs((3.0 * hz / RATE_HZ + 0.5) % 1.0 - 0.5) * RATE_HZ > 50.0:
+            held.setdefault("THD", []).append(told.thd_db[1] <= 20.0 * math.log10(size) <= told.thd_db[2])
+    for name, each in held.items():
+        print(f"{name}: {np.mean(each):.1%} of {len(each)}")
+    spread = 3.0 * math.sqrt(0.05 * 0.95 / seeds)
+    assert all(0.93 - spread < np.mean(each) < 0.97 + spread for each in held.values())
