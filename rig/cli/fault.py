@@ -8,11 +8,11 @@ import typer
 
 from rig.cli.connection import Connection, show
 from rig.cli.groups import panel
-from rig.cli.tables import echo, new_table, table_console
+from rig.cli.tables import Form, echo, echo_json, new_table
 from rig.errors import InputError, UnknownNameError, Words
 
 _numbers = panel("Numbers of the kinds")
-_OWN = ("channel", "kind", "for_s", "clear", "listed", "connection")
+_OWN = ("channel", "kind", "for_s", "clear", "listed", "connection", "form")
 
 
 def _of(kinds: str, *, metavar: str = "X") -> Any:
@@ -55,11 +55,12 @@ def fault(
     lost: Annotated[float | None, _of("bits")] = None,
     bit: Annotated[float | None, _of("stuck-bit")] = None,
     connection: Connection,
+    form: Form,
 ) -> None:
     """Make a channel of a running rig misbehave, or end that; the reply tells the first row that changes."""
     given = {name: _plain(value) for name, value in locals().items() if value is not None and name not in _OWN}
     if listed:
-        _show_kinds()
+        _show_kinds(form)
         return
     if (clear is None) == (channel is None):
         raise InputError("arguments", "CHANNEL and KIND, or --clear, or --list", Words("both" if clear else "none"))
@@ -85,11 +86,14 @@ def _plain(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _show_kinds() -> None:
+def _show_kinds(form: Form) -> None:
     from rig.faults import described
 
     headings = ("kind", "stage", "what it does", "numbers", "on")
+    if form.as_json:
+        echo_json([dict(zip(headings, row, strict=True)) for row in described()])
+        return
     table = new_table("", *headings, wrapped=("what it does", "numbers"), spare=("on", "stage"))
     for row in described():
         table.add_row(*row)
-    table_console().print(table)
+    form.console().print(table)

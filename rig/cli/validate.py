@@ -38,6 +38,9 @@ def validate(
     declared: Annotated[
         bool, typer.Option("--declared", help="Judge by the declared comparison even where every bit is equal.")
     ] = False,
+    blind: Annotated[
+        bool, typer.Option("--blind", help="As if nothing were known of faults that the rig was told to have.")
+    ] = False,
     report: ReportFile = None,
     force: Force = False,
     form: Form,
@@ -59,7 +62,7 @@ def validate(
     overrides = {key: read_value(value) for key, value in given.items()}
     recording = join(files)
     with reporting(compiles=True) as reporter:
-        found = hold(recording, criteria=rules, changes=overrides, declared=declared, step=reporter.step)
+        found = hold(recording, criteria=rules, changes=overrides, declared=declared, blind=blind, step=reporter.step)
         if report is not None:
             from replays.recordings.validation.report import make_report
 

@@ -72,7 +72,7 @@ def example(kind: str, channel: str) -> dict[str, Any]:
 def test_every_kind_has_an_example_and_its_options() -> None:
     assert set(EXAMPLES) == set(KINDS)
     numbers = {field for kind in KINDS.values() for field in kind.model_fields if field != "kind"}
-    own = {"channel", "kind", "for_s", "clear", "listed", "connection"}
+    own = {"channel", "kind", "for_s", "clear", "listed", "connection", "form"}
     assert {one for one in command.fault.__annotations__ if one != "return"} == numbers | own
 
 
