@@ -278,8 +278,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tmp_path: Path) -> None:
             force_n=rng.uniform(80.0, 120.0), duration_ms=rng.uniform(4.5, 5.5), settled_s=1.5 + rng.uniform(0.0, 0.2),
             after_s=0.1,
         )  # fmt: skip
+        (folder := tmp_path / str(seed)).mkdir()
         recording = whole(
-            tmp_path, motion, seed=seed, case=faulty_logs.Case("", "", ppm=rng.uniform(-80.0, 80.0))
+            folder, motion, seed=seed, case=faulty_logs.Case("", "", ppm=rng.uniform(-80.0, 80.0))
         )  # fmt: skip
         found = identify_log(
             recording, Experiment.of(recording), FIVE, variants=[one.set for one in rules.variants],
