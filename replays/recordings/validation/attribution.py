@@ -50,6 +50,8 @@ _TRIED = 3
 """... and from how many of these it does."""
 _FEW = 0.3
 """Less than this part of the channels may be off by themselves: of more it is the model."""
+_ALL = 0.9995
+"""What sensors explain of a recording of this rig, of which everything else is known, if they are it."""
 _AT_ODDS = 10.0
 """Where this is left of the middle channel, over its noise, most are wrong, or what is held against them."""
 _BESIDE = 1e-3
@@ -112,7 +114,7 @@ def attribute(
         step(f"sensors and time, to {until_s:.3f} s")
         sensors = sensor_faults(parts, nominal, until_s, from_s=from_s)
         timed = Clock(parts, nominal, until_s).faults(shift_s)
-        cured = cured_by(sensors, parts)
+        cured = cured_by(sensors, parts, _ALL)
         if cured or any(one.at_floor for one in timed):
             break
     else:

@@ -168,11 +168,11 @@ def _onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end
     return onset_s + _SETTLES_S if end_s - onset_s > 3.0 * _SETTLES_S else onset_s
 
 
-def cured_by(sensors: list[Explanation], parts: dict[str, Measured]) -> bool:
+def cured_by(sensors: list[Explanation], parts: dict[str, Measured], most: float = MOST) -> bool:
     """Whether sensors are it: they leave noise, or nearly all is theirs."""
     return bool(sensors) and (
         all(one.at_floor for one in sensors)
-        or (sum(one.explained for one in sensors) > MOST and not _whole_kind(sensors, parts))
+        or (sum(one.explained for one in sensors) > most and not _whole_kind(sensors, parts))
     )
 
 
