@@ -214,7 +214,7 @@ def test_faults_of_a_scene_are_recorded_and_done_again_bit_by_bit(tmp_path: Any)
     assert not blind.good
     assert blind.explained is not None
     # Of a preload that rests, a gain and an offset look alike; a hum has no name here.
-    assert "P_E offset +150 N" in blind.explained.conclusion
+    assert ("P_E offset", "+150 N") in [(one.name, one.change) for one in blind.explained.ranked]
 
 
 @pytest.mark.parametrize(("request_", "says"), [
