@@ -10,6 +10,7 @@ import math
 from bisect import insort
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,10 @@ from rig.errors import InputError, Words
 from rig.faults import At, Draws, Kind, NoFilter, Swap, channels_of
 from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.kernels.signals import COLUMN, N_ROW
+from rig.sampling import TICKS_HZ, first_row, lagrange
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import FRACTIONS, TURN
 
-_TICKS_HZ = 1_000_000
 _MOST = 64
 """Faults at a time."""
 _FINE = 8
@@ -63,7 +64,6 @@ class _Twin:
 
     conditioner: Conditioner
     channels: dict[str, Channel]
-    fine: bool
     first: int
     """Number of its first sample."""
     past: np.ndarray
@@ -96,12 +96,25 @@ class Faulty:
     ) -> None:
         self.table, self.conditioners, self._seed, self.row_ticks = table, conditioners, seed, row_ticks
         self._ideal, self._noisy = ideal, noisy
+        self.channels = table.channels
+        """All channels by name, ..."""
+        self._marks = {name for name, channel in self.channels.items() if channel.signal == "keyphasor"}
+        """... those that show pulses."""
         self.active: list[Active] = []
         self._begun = 0
         self._last_edge = math.nan
         self._held = np.empty(0)
         """Edges that come later than the ones that they stand for [ticks]."""
         self._twins: dict[tuple[int, bool], _Twin] = {}
+
+    @cached_property
+    def columns(self) -> dict[str, int]:
+        """Column of each channel's signal in the rows, or behind them."""
+        found = {}
+        for conditioner in self.conditioners:
+            names = (channel.name for group in conditioner.groups for channel in group.channels)
+            found |= zip(names, conditioner.columns.tolist(), strict=True)
+        return found
 
     def targets(self, command: FaultCommand) -> tuple[str, ...]:
         """Channels that a fault would change.
@@ -123,7 +136,7 @@ class Faulty:
             InputError: It cannot be carried out.
         """
         before = sum(isinstance(other, FaultCommand) for other in waiting)
-        known = [one.id for one in self.active if one.end == math.inf or one.end > tick]
+        known = [one.id for one in self.active if one.end > tick]
         if isinstance(command, FaultCommand):
             if len(known) + before >= _MOST:
                 raise InputError("fault", f"one of at most {_MOST} at a time", Words("another"))
@@ -145,7 +158,7 @@ class Faulty:
         Returns:
             Numbers, channels, and the first rows that it changes, by group.
         """
-        row = -(-tick // self.row_ticks) * self.row_ticks
+        row = self._row_at(tick)
         if isinstance(command, ClearCommand):
             ended = [one for one in self.active if command.id in ("all", one.id) and one.end > row]
             for one in ended:
@@ -154,20 +167,23 @@ class Faulty:
             return {**self._told(0, names, tick), "fault": [one.id for one in ended]}
         self._begun += 1
         names, what = self.targets(command), command.what
-        places = {name: n for n, name in enumerate(self.table.channels)}
+        places = {name: n for n, name in enumerate(self.channels)}
         # A hum, a clock and a loose plug are one for all channels of a group; noise is each channel's own.
         own = what.stage == "converter"
         draws = {name: Draws(self._seed, self._begun, places[name] + 1 if own else 0) for name in names}
         self.active.append(Active(self._begun, what, names, row, draws))
         if command.for_s is not None:
-            over = tick + max(1, round(command.for_s * _TICKS_HZ))
+            over = tick + max(1, round(command.for_s * TICKS_HZ))
             insort(pending, (over, ClearCommand(id=self._begun)), key=lambda entry: entry[0])
         return self._told(self._begun, names, tick)
 
+    def _row_at(self, tick: int) -> int:
+        return -(-tick // self.row_ticks) * self.row_ticks
+
     def _told(self, number: int, names: Sequence[str], tick: int) -> dict[str, Any]:
-        row = -(-tick // self.row_ticks) * self.row_ticks
+        row = self._row_at(tick)
         groups = {name: group for name, group in self.table.groups.items() if set(group.names) & set(names)}
-        first = {name: -(-row * group.rate_hz // _TICKS_HZ) for name, group in groups.items()}
+        first = {name: first_row(row, group.rate_hz) for name, group in groups.items()}
         return {"fault": number, "channels": list(names), "first_row": first}
 
     def counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
@@ -219,15 +235,15 @@ class Faulty:
             rows: Observed rows that they lie in.
             tick: Of the first row.
         """
-        real, end = edges + tick, tick + self.row_ticks * len(rows)
-        before = np.append(self._last_edge, real[:-1])
-        self._last_edge = float(real[-1]) if len(real) else self._last_edge
-        marks = {name for name, channel in self.table.channels.items() if channel.signal == "keyphasor"}
-        faults = [(one, mark) for one in self.active for mark in one.names if mark in marks]
+        before = self._last_edge
+        if len(edges):
+            self._last_edge = float(edges[-1] + tick)
+        faults = [(one, mark) for one in self.active for mark in one.names if mark in self._marks]
         if not faults and not len(self._held):
             return edges
+        real, end = edges + tick, tick + self.row_ticks * len(rows)
         # The rate that edges tell: what rows tell there depends on where a block begins.
-        rate = 2e6 * math.pi / (real - before[: len(real)])
+        rate = 2e6 * math.pi / np.diff(real, prepend=before)
         turns = np.rint(np.interp(edges, self.row_ticks * np.arange(len(rows)), rows[:, COLUMN["theta"]]) / TURN) * TURN
         found = real
         for one, mark in faults:
@@ -236,7 +252,7 @@ class Faulty:
                 continue
             here, nearest = found[inside], np.maximum(np.searchsorted(real, found[inside], side="right") - 1, 0)
             at = At(
-                (here - one.begin) / _TICKS_HZ, np.arange(len(here)), self.table.channels[mark], one.draws[mark], {},
+                (here - one.begin) / TICKS_HZ, np.arange(len(here)), self.channels[mark], one.draws[mark], {},
                 _nothing, turns[nearest], rate[nearest], _mark,
             )  # fmt: skip
             shown = np.rint(one.what.edges(here, at) * FRACTIONS) / FRACTIONS
@@ -252,7 +268,7 @@ class Faulty:
         shown: dict[str, np.ndarray] = {}
         span = (len(volts.rows) - 1) * self.row_ticks
         rate = conditioner.groups[0].rate_hz
-        n = np.arange(-(-tick * rate // _TICKS_HZ), -(-(tick + span) * rate // _TICKS_HZ))
+        n = np.arange(first_row(tick, rate), first_row(tick + span, rate))
         for fine in (False, True):
             names = [name for name, faults in faulty.items() if fine == any(_is_late(one.what) for one in faults)]
             channels = {name: self._channel(name, faulty[name]) for name in names}
@@ -262,7 +278,7 @@ class Faulty:
             signals = np.stack([volts.signal(name) for name in names], axis=1)
             (counts,) = twin.conditioner.counts(volts.rows, signals).values()
             for c, name in enumerate(names):
-                channel, faults = self.table.channels[name], faulty[name]
+                channel, faults = self.channels[name], faulty[name]
                 values = counts[:, c].astype(float)
                 if fine:
                     values = self._late(twin, values, c, n, channel, faults)
@@ -285,14 +301,14 @@ class Faulty:
             self._twins[key] = before
             return before
         rate = conditioner.groups[0].rate_hz * (_FINE if key[1] else 1)
-        first = -(-tick * rate // _TICKS_HZ)
+        first = first_row(tick, rate)
         made = conditioner.twin(channels, rate_hz=rate, first=first, row=tick // self.row_ticks, columns=N_ROW)
         if before is not None:
             made.take_over(
                 before.conditioner, [name for name in channels if channels[name] == before.channels.get(name)]
             )
-        twin = _Twin(made, channels, key[1], first, np.empty((0, len(channels)), np.int32), first)
-        if before is not None and before.fine and set(channels) <= set(before.channels):
+        twin = _Twin(made, channels, first, np.empty((0, len(channels)), np.int32), first)
+        if before is not None and key[1] and set(channels) <= set(before.channels):
             columns = [list(before.channels).index(name) for name in channels]
             twin.first, twin.past, twin.at = before.first, before.past[:, columns], before.at
         self._twins[key] = twin
@@ -300,7 +316,7 @@ class Faulty:
 
     def _channel(self, name: str, faults: Sequence[Active]) -> Channel:
         """A channel as its twin's chain has it: with another filter, limited by the converter alone."""
-        channel = self.table.channels[name]
+        channel = self.channels[name]
         for one in faults:
             channel = one.what.chain(channel)
         late = any(_is_late(one.what) for one in faults)
@@ -312,7 +328,7 @@ class Faulty:
         self, one: Active, channel: Channel, n: np.ndarray, times_s: np.ndarray, other: Callable[[str], np.ndarray]
     ) -> At:
         none = np.empty(0)
-        t = times_s - one.begin / _TICKS_HZ
+        t = times_s - one.begin / TICKS_HZ
         return At(t, n, channel, one.draws[channel.name], one.kept, other, none, none, _mark)
 
     def _late(
@@ -330,7 +346,7 @@ class Faulty:
         known = np.concatenate([twin.past[:, c], counts])
         whole = np.floor(wanted).astype(np.int64)
         places = (whole - (_NODES - 1) - twin.at)[:, None] + np.arange(_NODES)
-        weights = _lagrange(wanted - whole + _NODES - 1)
+        weights = lagrange(wanted - whole + _NODES - 1, range(_NODES)).T
         exact = wanted == whole
         values = np.where(
             exact, known[np.clip(whole - twin.at, 0, len(known) - 1)],
@@ -347,26 +363,18 @@ class _Volts:
 
     def __init__(self, faulty: Faulty, rows: np.ndarray, made: np.ndarray, tick: int, active: list[Active]) -> None:
         self.rows, self._made, self._active, self._faulty = rows, made, active, faulty
-        self._times_s = (tick + faulty.row_ticks * np.arange(len(rows))) / _TICKS_HZ
+        self._times_s = (tick + faulty.row_ticks * np.arange(len(rows))) / TICKS_HZ
         self._n = tick // faulty.row_ticks + np.arange(len(rows))
-        self._columns = {
-            name: column
-            for conditioner in faulty.conditioners
-            for name, column in zip(
-                (channel.name for group in conditioner.groups for channel in group.channels),
-                conditioner.columns.tolist(), strict=True,
-            )
-        }  # fmt: skip
         self._conditioned: dict[str, np.ndarray] = {}
 
     def _at(self, one: Active, channel: Channel) -> At:
-        t = self._times_s - one.begin / _TICKS_HZ
+        t = self._times_s - one.begin / TICKS_HZ
         angle, rate = self.rows[:, COLUMN["theta"]], self.rows[:, COLUMN["theta_rate"]]
         return At(t, self._n, channel, one.draws[channel.name], one.kept, self._beyond_bias, angle, rate, _mark)
 
     def _felt(self, name: str) -> np.ndarray:
         """What the sensor feels [its unit], with the faults of transducers."""
-        channel, column = self._faulty.table.channels[name], self._columns[name]
+        channel, column = self._faulty.channels[name], self._faulty.columns[name]
         x = self.rows[:, column] if column < N_ROW else self._made[:, column - N_ROW]
         x = x / channel.si
         for one in self._active:
@@ -377,17 +385,17 @@ class _Volts:
     def conditioned(self, name: str) -> np.ndarray:
         """What its conditioner puts out [V]."""
         if name not in self._conditioned:
-            channel = self._faulty.table.channels[name]
+            channel = self._faulty.channels[name]
             volts = channel.bias_v + channel.sensitivity_v * self._felt(name)
             self._conditioned[name] = np.clip(volts, *channel.range_v)
         return self._conditioned[name]
 
     def _beyond_bias(self, name: str) -> np.ndarray:
-        return self.conditioned(name) - self._faulty.table.channels[name].bias_v
+        return self.conditioned(name) - self._faulty.channels[name].bias_v
 
     def signal(self, name: str) -> np.ndarray:
         """A signal [SI] that gives what arrives at the converter's filter, shape (rows,)."""
-        channel = self._faulty.table.channels[name]
+        channel = self._faulty.channels[name]
         swapped = [one for one in self._active if name in one.names and isinstance(one.what, Swap)]
         source = name
         for one in swapped:
@@ -418,13 +426,3 @@ def _kept(twin: _Twin, counts: np.ndarray, rate: int) -> tuple[int, np.ndarray]:
     known = np.concatenate([twin.past, counts])
     most = round(rate * _FINE * 0.0201) + 2 * _NODES
     return twin.at + max(0, len(known) - most), known[-most:]
-
-
-def _lagrange(places: np.ndarray) -> np.ndarray:
-    """Weights of the nodes 0 to 5 at places between them, shape (n, 6)."""
-    nodes = np.arange(_NODES)
-    weights = np.ones((len(places), _NODES))
-    for k in nodes:
-        for m in nodes[nodes != k]:
-            weights[:, k] *= (places - m) / (k - m)
-    return weights

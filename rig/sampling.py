@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, field_validator
 
 from rig.channels import ChannelTable
@@ -102,3 +104,15 @@ def between(rate_hz: int, row_rate_hz: int) -> tuple[int, int]:
 def fits(rate_hz: int, row_rate_hz: int) -> bool:
     """Whether samples of a rate fall on few enough places between rows."""
     return between(rate_hz, row_rate_hz)[1] <= _MOST
+
+
+def first_row(tick: int, rate_hz: int) -> int:
+    """Number of the first of even rows at or behind a tick."""
+    return -(-tick * rate_hz // TICKS_HZ)
+
+
+def lagrange(places: np.ndarray, nodes: Sequence[int] | np.ndarray) -> np.ndarray:
+    """Weights of the polynomial through nodes, at places, shape (nodes, places)."""
+    return np.array(
+        [math.prod((places - other) / (node - other) for other in nodes if other != node) for node in nodes]
+    )

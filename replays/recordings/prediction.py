@@ -19,7 +19,7 @@ from rig.channels import Channel, Group, default_table
 from rig.errors import InputError
 from rig.formula import Formulas
 from rig.offline import frames
-from rig.sampling import between, fits
+from rig.sampling import between, fits, lagrange
 from rig.scenes import Scene, rig_table
 from rig.sensors.conditioning import Conditioner
 from rig.simulation import TICK_RATE_HZ, Frame, Simulation, Snapshot
@@ -132,9 +132,7 @@ class Measured:
 
 def _wide(channel: Channel) -> dict[str, Any]:
     """A range that holds what the rig's own channel of that name may show: of the log's, the unit may be wrong."""
-    own = next(
-        (one for group in default_table().groups.values() for one in group.channels if one.name == channel.name), None
-    )
+    own = default_table().channels.get(channel.name)
     reach_v = _BEYOND * channel.adc_v
     if own is not None and own.unit == channel.unit:
         ends = ((volts - own.bias_v) / own.sensitivity_v for volts in own.range_v)
@@ -261,13 +259,6 @@ def sampled(values: np.ndarray, places: np.ndarray) -> np.ndarray:
     for tap, weight in zip(taps, weights, strict=True):
         found += weight[:, None] * values[first + tap]
     return found
-
-
-def lagrange(places: np.ndarray, nodes: Sequence[int] | np.ndarray) -> np.ndarray:
-    """Weights of the polynomial through nodes, at places, shape (nodes, places)."""
-    return np.array(
-        [math.prod((places - other) / (node - other) for other in nodes if other != node) for node in nodes]
-    )
 
 
 def _channels(parts: dict[str, Measured], scene: Scene, *, row_rate_hz: int) -> list[_Channels]:

@@ -11,7 +11,7 @@ import math
 from typing import Annotated, Literal, get_args
 
 import numpy as np
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import AfterValidator, Field, FiniteFloat
 
 from rig.channels import Channel
 from rig.errors import InputError
@@ -30,6 +30,17 @@ def _grown(at: At, ramp_s: float) -> np.ndarray | float:
     return np.minimum(at.t / ramp_s, 1.0) if ramp_s else 1.0
 
 
+def _but(*values: float, must: str) -> AfterValidator:
+    """Refuse values that would change nothing, or that another kind is for."""
+
+    def other(value: float) -> float:
+        if value in values:
+            raise ValueError(must)
+        return value
+
+    return AfterValidator(other)
+
+
 # ---- transducer ----
 
 
@@ -38,14 +49,8 @@ class Gain(Kind):
 
     stage = "transducer"
     kind: Literal["gain"] = "gain"
-    factor: FiniteFloat
+    factor: Annotated[FiniteFloat, _but(1.0, -1.0, must="other than 1, and than -1, which is polarity")]
     ramp_s: NotNegative = 0.0
-
-    @model_validator(mode="after")
-    def _changes(self) -> Gain:
-        if self.factor in (1.0, -1.0):
-            raise InputError("factor", "other than 1, and than -1, which is polarity", self.factor)
-        return self
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         return x * (1.0 + (self.factor - 1.0) * _grown(at, self.ramp_s))
@@ -56,14 +61,8 @@ class Offset(Kind):
 
     stage = "transducer"
     kind: Literal["offset"] = "offset"
-    value: FiniteFloat
+    value: Annotated[FiniteFloat, _but(0.0, must="other than 0")]
     ramp_s: NotNegative = 0.0
-
-    @model_validator(mode="after")
-    def _changes(self) -> Offset:
-        if self.value == 0.0:
-            raise InputError("value", "other than 0", self.value)
-        return self
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         return x + self.value * _grown(at, self.ramp_s)
@@ -74,14 +73,8 @@ class Drift(Kind):
 
     stage = "transducer"
     kind: Literal["drift"] = "drift"
-    rate: FiniteFloat
+    rate: Annotated[FiniteFloat, _but(0.0, must="other than 0")]
     tau_s: Positive | None = None
-
-    @model_validator(mode="after")
-    def _changes(self) -> Drift:
-        if self.rate == 0.0:
-            raise InputError("rate", "other than 0", self.rate)
-        return self
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         far_s = at.t if self.tau_s is None else -self.tau_s * np.expm1(-at.t / self.tau_s)
