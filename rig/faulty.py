@@ -27,6 +27,8 @@ from rig.sensors.keyphasor import FRACTIONS, TURN
 
 _MOST = 64
 """Faults at a time."""
+_NO_CORNER_HZ = 1e9
+"""Above what rows can show there is no low-pass; an AC coupling stays."""
 _FINE = 8
 """Samples that are taken at times of their own are read off so many between two, ..."""
 _NODES = 6
@@ -208,8 +210,7 @@ class Faulty:
 
     def _counts(self, rows: np.ndarray, made: np.ndarray, tick: int) -> dict[str, np.ndarray]:
         """The same of rows between which no fault begins or ends."""
-        self.active = [one for one in self.active if one.end > tick]
-        active = [one for one in self.active if one.begin <= tick]
+        active = [one for one in self.active if one.begin <= tick < one.end]
         found: dict[str, np.ndarray] = {}
         volts = _Volts(self, rows, made, tick, active)
         for place, conditioner in enumerate(self.conditioners):
@@ -235,6 +236,8 @@ class Faulty:
             rows: Observed rows that they lie in.
             tick: Of the first row.
         """
+        # An edge may lie before the first row; what ended before that is over.
+        self.active = [one for one in self.active if one.end > tick - self.row_ticks]
         before = self._last_edge
         if len(edges):
             self._last_edge = float(edges[-1] + tick)
@@ -244,6 +247,9 @@ class Faulty:
         real, end = edges + tick, tick + self.row_ticks * len(rows)
         # The rate that edges tell: what rows tell there depends on where a block begins.
         rate = 2e6 * math.pi / np.diff(real, prepend=before)
+        # Before the first of all there is none: the row behind it tells, wherever the block begins.
+        behind = np.ceil(edges / self.row_ticks).astype(int)
+        rate = np.where(np.isnan(rate), rows[np.minimum(behind, len(rows) - 1), COLUMN["theta_rate"]], rate)
         turns = np.rint(np.interp(edges, self.row_ticks * np.arange(len(rows)), rows[:, COLUMN["theta"]]) / TURN) * TURN
         found = real
         for one, mark in faults:
@@ -322,7 +328,7 @@ class Faulty:
         late = any(_is_late(one.what) for one in faults)
         wide = {"range_v": (-_REACH_V, _REACH_V), **({"adc_bits": 32, "noise_v": 0.0} if late else {})}
         bare = any(type(one.what) is NoFilter for one in faults)
-        return channel.model_copy(update={**wide, **({"bandwidth_hz": math.inf} if bare else {})})
+        return channel.model_copy(update={**wide, **({"bandwidth_hz": _NO_CORNER_HZ} if bare else {})})
 
     def _at(
         self, one: Active, channel: Channel, n: np.ndarray, times_s: np.ndarray, other: Callable[[str], np.ndarray]

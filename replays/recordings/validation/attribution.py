@@ -29,7 +29,7 @@ from replays.recordings.validation.explanation import (
     smooth_columns,
     vector,
 )
-from replays.recordings.validation.faults import MOST, Clock, channels_in, cured_by, sensor_faults
+from replays.recordings.validation.faults import MOST, Clock, as_faults, channels_in, cured_by, sensor_faults
 from replays.recordings.validation.numbers import numbers_of_the_model
 from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import scaled
@@ -48,7 +48,7 @@ _STARTS = (0.0, *(sign * part for part in (0.005, 0.01, 0.02, 0.035, 0.06, 0.1, 
 """Where a fit may start on the first window, as parts of the farthest that it may go ..."""
 _TRIED = 3
 """... and from how many of these it does."""
-_FEW = 0.3
+FEW_CHANNELS = 0.3
 """Less than this part of the channels may be off by themselves: of more it is the model."""
 _ALL = 0.9995
 """What sensors explain of a recording of this rig, of which everything else is known, if they are it."""
@@ -90,6 +90,7 @@ def attribute(
     rules: Attribution,
     *,
     from_s: float,
+    own: Sequence[Explanation] = (),
     step: Callable[[str], None] = lambda _text: None,
 ) -> Explained:
     """Find what explains a difference.
@@ -100,6 +101,7 @@ def attribute(
         nominal: What was predicted, on the same rows.
         rules: Candidates and limits.
         from_s: First difference [s].
+        own: What channels have whose counts differ while others are the same to the bit.
         step: Told what is being done.
     """
     last_s = max(float(part.times_s[-1]) for part in parts.values())
@@ -110,15 +112,15 @@ def attribute(
     # What a sensor or the clock does, it does to the end; if the model is right for so long, no number of it is off.
     whole_s = min(last_s + 1e-9, from_s + _WHOLE_S)
     shift_s = Clock(parts, nominal, end_s).coarse_shift()
-    for until_s in (whole_s, end_s):
+    sensors, timed, cured, until_s = list(own), [], bool(own) and all(one.sure for one in own), end_s
+    for until_s in () if own else (whole_s, end_s):
         step(f"sensors and time, to {until_s:.3f} s")
         sensors = sensor_faults(parts, nominal, until_s, from_s=from_s)
         timed = Clock(parts, nominal, until_s).faults(shift_s)
         cured = cured_by(sensors, parts, _ALL)
         if cured or any(one.at_floor for one in timed):
             break
-    else:
-        until_s, cured = end_s, False
+        cured = False
     if until_s > end_s:  # then the model must say the same for as long
         fitted = [candidates[one.name].again(one, until_s) if one.at_floor else one for one in fitted]
     found = [*fitted, *sensors, *timed]
@@ -168,6 +170,15 @@ def _behind(
     )  # fmt: skip
 
 
+def own_explained(own: Sequence[Explanation]) -> Explained:
+    """What explains that channels differ whose motion is the same to the bit: nothing but what they have."""
+    from_s = min(one.from_s for one in own)
+    conclusion = "sensor: " + "; ".join(one.line for one in as_faults(own))
+    return Explained(
+        from_s, max(one.to_s for one in own), tuple(own), conclusion, tuple(one.name for one in own if one.sure)
+    )
+
+
 def explain_log(
     parts: dict[str, Measured], nominal: Prediction, others: Sequence[Prediction], tuned: Tuned, rules: Attribution,
     *, from_s: float, end_s: float, faults: Sequence[SignalFault] = (), touching: bool = False,
@@ -214,7 +225,7 @@ def explain_log(
         conclusion = (
             f"nearest are {_listed(sensors)}: {part:.0%} of the difference; the rest is another fault, or the model"
         )
-    elif not best and 0 < len(few := channels_in(sensors, tuned.scales)) < _FEW * len(tuned.scales):
+    elif not best and 0 < len(few := channels_in(sensors, tuned.scales)) < FEW_CHANNELS * len(tuned.scales):
         conclusion = f"of {len(tuned.scales)} channels {_and(few)} alone: a fault that has no name here, as hum, "
         conclusion += "cross-talk or drift, or a number of the model that moves no other; this log cannot tell"
     elif not best:

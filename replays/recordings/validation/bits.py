@@ -15,6 +15,9 @@ from rig.channels import ChannelTable
 from rig.simulation import TICK_RATE_HZ, Frame
 from rig.wire import EDGES, Block, encode_block, schema_of, sensor_key, truth_key
 
+_MOST = 400_000
+"""So many rows that differ are looked at."""
+
 
 @dataclass
 class StreamBits:
@@ -65,6 +68,8 @@ class Bits:
             made: The channels of the re-simulation.
         """
         keys = sorted(key for key in recording.messages if schema_of(key) is not None and key in recording.streams)
+        self._edges: list[np.ndarray] = []
+        self._names = {name: group.names for name, group in recording.table.groups.items()}
         self.streams = {key: _Follower(key, recording.blocks(key)) for key in keys}
         for name, group in recording.table.groups.items():
             follower = self.streams.get(sensor_key(name))
@@ -81,9 +86,26 @@ class Bits:
         blocks |= {truth_key(name): block for name, block in frame.truth.items()}
         if frame.edges is not None:
             blocks[EDGES] = frame.edges
+            self._edges.append(frame.edges.values[:, 0] + frame.edges.tick)
         for key, block in blocks.items():
             if key in self.streams:
                 self.streams[key].take(block)
+
+    def apart(self, group: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Rows in which a group's counts differ, shape (n,), and by channel, recorded less made again, shape (n,)."""
+        kept = self.streams[sensor_key(group)].apart if sensor_key(group) in self.streams else []
+        if not kept:
+            return np.empty(0, np.int64), {}
+        counts = np.concatenate([counts for _, counts in kept])
+        return np.concatenate([rows for rows, _ in kept]), dict(zip(self._names[group], counts.T, strict=True))
+
+    def off(self, group: str) -> list[str]:
+        """Channels of a group whose counts differ."""
+        return [name for name, counts in self.apart(group)[1].items() if counts.any()]
+
+    def edges_s(self) -> np.ndarray:
+        """Keyphasor edges that were made again [s]."""
+        return np.concatenate([np.empty(0), *self._edges]) / TICK_RATE_HZ
 
     def finish(self) -> dict[str, StreamBits]:
         """The outcome, by key."""
@@ -97,6 +119,8 @@ class _Follower:
     picked: list[int] | None = None
     """Columns of the re-simulation that were recorded, in that order; None for all."""
     found: StreamBits = field(default_factory=StreamBits)
+    apart: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
+    """Numbers of rows that differ, and by how much, of as many as are looked at."""
     _waiting: Block | None = None
     _rows: list[np.ndarray] = field(default_factory=list)
     _first: int = 0
@@ -150,6 +174,9 @@ class _Follower:
         else:
             off = np.abs(values.astype(float) - recorded.values)
             found.largest = max(found.largest, float(off.max()))
+            rows = np.flatnonzero(off.any(axis=1))
+            if sum(len(n) for n, _ in self.apart) < _MOST:
+                self.apart.append((recorded.index + rows, (recorded.values.astype(float) - values)[rows]))
             row, column = (int(k) for k in np.argwhere(values != recorded.values)[0]) if off.any() else (0, 0)
         if found.first_s is None:
             rate = recorded.rate_hz

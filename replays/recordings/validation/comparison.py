@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,16 +16,18 @@ from replays.recordings.experiment import Experiment, is_imported, parameter_dou
 from replays.recordings.identification.nuisance import Tuned, looks_from, tune
 from replays.recordings.identification.question import first_command_s
 from replays.recordings.prediction import Measured, Prediction, bare, measured, predict
-from replays.recordings.validation.attribution import Explained, attribute, explain_log
+from replays.recordings.validation.attribution import FEW_CHANNELS, Explained, attribute, explain_log, own_explained
 from replays.recordings.validation.bits import Bits, StreamBits
 from replays.recordings.validation.criteria import Criteria, load_criteria
-from replays.recordings.validation.faults import late_together
+from replays.recordings.validation.explanation import Explanation
+from replays.recordings.validation.faults import as_faults, late_together, own_faults
 from replays.recordings.validation.outcome import Validation
 from replays.recordings.validation.phases import PHASES
 from replays.recordings.validation.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.statistics import perturbed, statistics
 from replays.recordings.validation.trajectory import foreseeable_s, residuals
 from replays.recordings.validation.truth import judge_truth, recorded_truth
+from rig.wire import TRUTH
 
 
 def validate(
@@ -77,14 +80,17 @@ def validate(
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
         doubts=(*recording.doubts, *parameter_doubts(recording)), faults=again.faults,
     )  # fmt: skip
+    if again.own and again.same_motion:
+        return replace(validation, faults=as_faults(again.own), explained=own_explained(again.own))
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
     if validation.good or validation.doubts or not firsts or not moves:
         return validation
     step("what explains the difference")
     if again.tuned is None:
         explained = attribute(
-            again.quick, again.parts, again.nominal, again.criteria.attribution, from_s=min(firsts), step=step
-        )
+            again.quick, again.parts, again.nominal, again.criteria.attribution, from_s=min(firsts), own=again.own,
+            step=step,
+        )  # fmt: skip
         return replace(validation, explained=explained)
     touching = bool(phases) and phases[0].name not in (PHASES[0], PHASES[-1])
     explained = _log_explained(again, from_s=min(firsts), end_s=end, touching=touching)
@@ -111,6 +117,8 @@ class _DoneAgain:
         tuned: What was fitted before, of an imported log.
         faults: What its signals show by themselves, of an imported log.
         members: The ensemble of an imported log: fits as good, by models as right; else it is made of `quick`.
+        own: What single channels have whose counts differ while others are the same to the bit.
+        same_motion: Whether nothing else can be the reason, as the truth is the same.
     """
 
     quick: Experiment
@@ -122,6 +130,8 @@ class _DoneAgain:
     tuned: Tuned | None
     members: tuple[Prediction, ...] = ()
     faults: tuple[SignalFault, ...] = ()
+    own: tuple[Explanation, ...] = ()
+    same_motion: bool = False
 
 
 def _done_again(
@@ -141,7 +151,18 @@ def _done_again(
     quick = bare(experiment)
     step("perturbed, to see how far it can be predicted")
     moved = predict(perturbed(quick, rules.parameters, rules.perturbation), parts)
-    return _DoneAgain(quick, criteria, parts, nominal, (moved,), bits.finish(), None)
+    found = bits.finish()
+    truth = [one.equal for key, one in found.items() if key.startswith(TRUTH)]
+    same = all(truth) and (bool(truth) or experiment.scene.generator is not None)
+    names = [channel.name for part in parts.values() for channel in part.channels]
+    off = {name for part in parts for name in bits.off(part)}
+    own: list[Explanation] = []
+    if all(truth) and len(off) < (len(names) if same else FEW_CHANNELS * len(names)):
+        step("channels that differ alone")
+        own = own_faults(
+            parts, nominal, bits.apart, recording.edges(), bits.edges_s(), partial(predict, experiment)
+        )  # fmt: skip
+    return _DoneAgain(quick, criteria, parts, nominal, (moved,), found, None, own=tuple(own), same_motion=same)
 
 
 def _log_done_again(

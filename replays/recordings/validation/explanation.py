@@ -36,6 +36,8 @@ class Explanation:
         squares: Sum of squares of the same.
         n: Samples in it.
         to_s: End of the window that this is said of [s]; earlier than the others' where it was given up there.
+        sure: Whether what it leaves is as good as nothing.
+        from_s: Where it begins, where that is known [s].
     """
 
     kind: Kind
@@ -48,6 +50,8 @@ class Explanation:
     squares: float
     n: int
     to_s: float
+    sure: bool = True
+    from_s: float = -math.inf
 
     @classmethod
     def of(

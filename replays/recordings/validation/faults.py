@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,93 +20,40 @@ from replays.recordings.validation.explanation import (
     smooth_columns,
     vector,
 )
-from replays.recordings.validation.signals import steady_rows
+from replays.recordings.validation.laws import gain_words, law_of
+from replays.recordings.validation.shown import FEW, OFF, Shown
+from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import floors
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
+from rig.channels import Channel
 
 _TURNED_OFF = 0.02
 """By so much may two probes' signals differ from ones that are turned."""
-_FEW = 16
-"""Rows that tell no delay."""
 _SURE = 6.0
 """Times its noise, by which a sample, or the mean of some, is off."""
+_HELD_S = 0.011
+"""What comes late holds its first value for so long, ..."""
+_PERIODS = 6.0
+"""... and a filter has forgotten it behind so many periods of its corner."""
+_AT_END, _ENOUGH = 1e-3, 0.2
+"""Rows so near to an end of what its conditioner puts out tell nothing, where this part of the rows is not."""
+_NO_FILTER = 1e4
+"""A corner so many times its own is none."""
+_SOME = 100
+"""Rows that two channels must share to be a pair."""
+_EVEN_S = 1e-5
+"""Edges that move by less than this about their mean move alike."""
+_AROUND_S = 0.1
+"""What comes before a window tells what filters and delays make of it."""
+_MOST = 60_000
+"""Rows of a channel that are looked at, at most."""
 _SETTLES_S = 2e-3
 """Filters have forgotten a jump by then."""
-_LATEST_S = 4e-3
-"""How late a channel is looked for [s]."""
 MOST = 0.9
 """Changes of channels that together explain this part of all are it, though the model leaves something."""
 _ALIKE = 0.2
 """Changes that differ by less than this part of them may be the same one."""
-_SLIGHT = 0.01
-"""A second change of a channel that takes away no more than this part of the first is none."""
-_NEARLY = 0.05
-"""A change that takes away all but this part is it, though the model leaves something."""
-_UNITS = {
-    25.4: "as mm for inch", 1.0 / 25.4: "as inch for mm", 1e3: "a thousand", 1e-3: "a thousandth",
-    9.80665: "as m/s^2 for g", 1.0 / 9.80665: "as g for m/s^2", 4.4482: "as N for lbf", 1.0 / 4.4482: "as lbf for N",
-    60.0: "as 1/min for Hz", 1.0 / 60.0: "as Hz for 1/min", 2.0: "twice", 0.5: "half", 10.0: "tenfold",
-    0.1: "a tenth",
-}  # fmt: skip
-"""Gains that slips with units and ranges make."""
 _SEARCH = 400
 """Samples by which the time may be off in the first search, either way."""
-
-
-@dataclass(frozen=True)
-class _Shown:
-    """One channel in the window, over its floor: what it shows, what it should, and that of its neighbours.
-
-    Attributes:
-        name: Its name.
-        unit: Its unit.
-        times_s: Of its rows [s], shape (n,).
-        values: What it shows [its unit], shape (n,).
-        foretold: What it should show [its unit], shape (n,).
-        floor: Noise, and how far an equally right prediction may be off [its unit], shape (n,).
-        noise: Noise alone [its unit].
-    """
-
-    name: str
-    unit: str
-    times_s: np.ndarray
-    values: np.ndarray
-    foretold: np.ndarray
-    floor: np.ndarray
-    noise: float
-
-    @cached_property
-    def foretold_at(self) -> CubicSpline:
-        """What it should show at other times."""
-        from scipy.interpolate import CubicSpline
-
-        return CubicSpline(self.times_s, self.foretold)
-
-    @property
-    def apart(self) -> np.ndarray:
-        """Residuals over the floor, shape (n,)."""
-        return (self.values - self.foretold) / self.floor
-
-    @property
-    def price(self) -> float:
-        """What another number must take away: more than noise makes, and than what is wrong elsewhere brings along."""
-        return max(DECIDES, _SLIGHT * excess(self.apart))
-
-    @property
-    def moves(self) -> bool:
-        """Whether it should show more than noise."""
-        return float(self.foretold.std()) > self.noise
-
-    def left(self, columns: list[np.ndarray], aim: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Least squares of what it shows by some columns: their factors, and the residuals over the floor, (n,)."""
-        weights = 1.0 / self.floor
-        table = np.column_stack(columns) * weights[:, None]
-        goal = (self.values if aim is None else aim) * weights
-        size = np.sqrt(np.maximum((table**2).sum(axis=0), 1e-300))
-        found = np.linalg.lstsq(table / size, goal, rcond=None)[0] / size
-        return found, goal - table @ found
 
 
 def sensor_faults(
@@ -131,25 +77,170 @@ def sensor_faults(
         foretold, *shown_too = (one.values[name][rows] for one in (nominal, *others))
         floor = floors(part, foretold, shown_too)
         shown += [
-            _Shown(
-                part.channels[c].name, part.channels[c].unit, part.times_s[rows], part.values[rows, c],
-                foretold[:, c], floor[:, c], float(part.floor[c]),
+            Shown(
+                part.channels[c], part.times_s[rows], part.values[rows, c], foretold[:, c], floor[:, c],
+                float(part.floor[c]), beside=partial(_beside, parts, nominal, part.channels[c]),
+                around=_around(part, nominal.values[name][:, c], rows.start, rows.stop),
             )
             for c in smooth_columns(part)
         ]  # fmt: skip
+    return _told_of(shown, end_s)
+
+
+def own_faults(
+    parts: dict[str, Measured], nominal: Prediction, apart: Callable[[str], tuple[np.ndarray, dict[str, np.ndarray]]],
+    recorded_s: np.ndarray, made_s: np.ndarray, again: Callable[[dict[str, Measured]], Prediction],
+) -> list[Explanation]:  # fmt: skip
+    """What each channel has whose counts are other than those of the same motion done again, to the bit.
+
+    What a channel shows is taken without its noise: that is the same in both.
+
+    Args:
+        parts: What was recorded.
+        nominal: What was predicted.
+        apart: Of a group, numbers of the rows that differ, shape (n,), and by channel, by how many counts, shape (n,).
+        recorded_s: Edges of the keyphasor [s].
+        made_s: Edges made again [s].
+        again: Predicts other channels of the same motion.
+    """
+    shown = []
+    for name, part in parts.items():
+        index, counts = apart(name)
+        at = np.searchsorted(part.index, index)
+        there = at < len(part.index)
+        there[there] = part.index[at[there]] == index[there]
+        for c, channel in enumerate(part.channels):
+            off = np.zeros(len(part.index))
+            if channel.name in counts:
+                off[at[there]] = counts[channel.name][there]
+            rows = np.flatnonzero(off)
+            if not len(rows):
+                continue
+            began_s = float(part.times_s[rows[0]])
+            settled = rows[0] + round(max(_HELD_S, _PERIODS / channel.bandwidth_hz) * channel.rate_hz)
+            first = settled if rows[-1] - settled > 2 * (settled - rows[0]) else rows[0]
+            rows = np.arange(first, min(int(rows[-1]) + 1, first + _MOST))
+            if len(rows) < _SOME:
+                rows = np.arange(max(0, first - _SOME), min(first + _SOME, len(off)))
+            foretold = nominal.values[name][:, c]
+            limits = np.array([*channel.range_v, -channel.adc_v, channel.adc_v])
+            ends = np.abs(
+                (channel.bias_v + channel.sensitivity_v * (foretold + channel.scale * off))[:, None] - limits
+            ).min(axis=1)
+            within = ~np.convolve(ends < _AT_END * np.ptp(channel.range_v), np.ones(2 * FEW + 1), "same").astype(bool)
+            if within[rows].mean() > _ENOUGH:
+                rows = rows[within[rows]]
+            said = np.rint((part.values[rows, c] - channel.offset) / channel.scale)
+            shown.append(
+                Shown(
+                    channel, part.times_s[rows], (foretold + channel.scale * off)[rows], foretold[rows],
+                    np.full(len(rows), 0.5 * abs(channel.scale)), channel.noise_v / abs(channel.sensitivity_v),
+                    partial(_bare, part, channel, again, rows),
+                    partial(_beside, parts, nominal, channel),
+                    np.column_stack([said, said - off[rows]]).astype(np.int64), began_s,
+                    _around(part, foretold, rows[0], rows[-1] + 1),
+                )
+            )  # fmt: skip
+    about = {one.name: one for one in shown}
+    found = []
+    for one in _told_of(shown, max((float(one.times_s[-1]) for one in shown), default=0.0)):
+        its = [about[name] for name in channels_in([one], about)]
+        # Over the noise, not over the steps of the converter.
+        steps = max(each.noise / float(each.floor[0]) for each in its)
+        begin, end = min(each.began_s for each in its), max(float(each.times_s[-1]) for each in its)
+        found.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
+    edges = _own_edges(recorded_s, made_s)
+    return found if edges is None else [*(one for one in found if not one.name.startswith("keyphasor")), edges]
+
+
+def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray) -> Explanation | None:
+    """What keyphasor edges lack, have too many, or how they move; None where the signal tells more."""
+    lacking, more = np.setdiff1d(made_s, recorded_s), np.setdiff1d(recorded_s, made_s)
+    off = np.sort(np.concatenate([lacking, more]))
+    moved_s = more - lacking if len(more) == len(lacking) else np.empty(0)
+    turns = np.count_nonzero((made_s >= off[0]) & (made_s <= off[-1])) if len(off) else 0
+    if len(moved_s) > 1 and moved_s.std() > _EVEN_S:
+        what, value, unit = "edge-jitter", float(moved_s.std()), "s"
+        change = f"{1e6 * value:.4g} µs about {1e6 * moved_s.mean():.4g} µs"
+    elif len(moved_s) or not len(off):
+        return None
+    elif len(lacking) < turns and not len(more):
+        what, value, unit, change = "miss-pulses", len(lacking) / turns, "", f"{len(lacking)} of {turns}"
+    elif len(more) > len(lacking):
+        what, value, unit, change = "extra-pulses", len(more) / max(1, turns), "", f"{len(more)} beside {turns}"
+    else:
+        what, value, unit, change = "open, short or miss-pulses", 1.0, "", f"{len(lacking)} of {turns}"
+    found = Explanation.of(
+        np.empty(0), kind="sensor", name=f"keyphasor {what}", change=change, value=value, unit=unit, explained=0.0,
+        to_s=float(off[-1]),
+    )  # fmt: skip
+    return replace(found, from_s=float(off[0]))
+
+
+def as_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
+    """What channels have by themselves, as faults that signals show."""
+    found = []
+    for one in own:
+        names, _, what = one.name.rpartition(" ")
+        text = one.change if one.sure else f"by no law that has a name here; nearest is {what} {one.change}"
+        text += f", from {one.from_s:.4f} to {one.to_s:.4f} s"
+        found.append(SignalFault(names, what if one.sure else "differs", one.from_s, one.to_s, text))
+    return tuple(found)
+
+
+def _told_of(shown: list[Shown], end_s: float) -> list[Explanation]:
+    """What channels have: pairs of them first, then each by itself, and what several share as one."""
     total = sum(excess(one.apart) for one in shown)
-    off = {one.name: one for one in shown if len(one.values) > _FEW and not is_noise(one.apart)}
+    off = {
+        one.name: one for one in shown if one.counts is not None or (len(one.values) > FEW and not is_noise(one.apart))
+    }
     told = _Telling(total, end_s)
     found, seen = [], set()
     for a, b in combinations(off.values(), 2):
-        if a.unit != b.unit or len(a.values) != len(b.values) or {a.name, b.name} & seen:
+        if {a.name, b.name} & seen:
             continue
-        pair = _swapped(a, b, told) or _turned(a, b, told)
+        if a.counts is not None:
+            times_s = np.intersect1d(a.times_s, b.times_s)
+            if len(times_s) < _SOME:
+                continue
+            a, b = a.at(times_s), b.at(times_s)
+        elif a.unit != b.unit or len(a.values) != len(b.values):
+            continue
+        pair = _swapped(a, b, told) or (_turned(a, b, told) if a.unit == b.unit else None)
         if pair is not None:
             found.append(pair)
             seen |= {a.name, b.name}
-    alone = [_one_sensor(one, told) for name, one in off.items() if name not in seen]
+    alone = [_alone(one, told) for name, one in off.items() if name not in seen]
     return found + _together(alone, told, [one.name for one in shown if one.moves])
+
+
+def _around(part: Measured, foretold: np.ndarray, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and what a channel should show, from shortly before some rows to shortly behind them."""
+    more = round(_AROUND_S * part.channels[0].rate_hz)
+    rows = slice(max(0, begin - more), min(end + more, len(foretold)))
+    return part.times_s[rows], foretold[rows]
+
+
+def _bare(
+    part: Measured, channel: Channel, again: Callable[[dict[str, Measured]], Prediction], rows: np.ndarray
+) -> np.ndarray:
+    """What a channel should show in some rows without its low-pass [its unit]."""
+    alone = part.first(int(rows[-1]) + 1).only([channel.name]).filtered(_NO_FILTER)
+    return again({part.group: alone}).values[part.group][rows, 0]
+
+
+def _beside(
+    parts: Mapping[str, Measured], nominal: Prediction, channel: Channel
+) -> dict[Channel, tuple[np.ndarray, np.ndarray]]:
+    """Times and what the other channels should show [their units], of those that move."""
+    found = {}
+    for name, part in parts.items():
+        values = nominal.values[name]
+        for c in smooth_columns(part):
+            other, shown = part.channels[c], values[:, c]
+            if other.name != channel.name and shown.std() > part.floor[c]:
+                found[other] = part.times_s[: len(shown)], shown
+    return found
 
 
 def _onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end_s: float) -> float:
@@ -159,10 +250,10 @@ def _onset_s(parts: dict[str, Measured], nominal: Prediction, from_s: float, end
         rows = slice(part.rows_until(from_s), part.rows_until(end_s))
         z = ((part.values - nominal.values[name][: len(part.values)]) / part.floor)[rows, smooth_columns(part)]
         sums = np.cumsum(np.vstack([np.zeros(z.shape[1]), z]), axis=0)
-        lasting = np.abs(sums[_FEW:] - sums[:-_FEW]) > _SURE * math.sqrt(_FEW)
+        lasting = np.abs(sums[FEW:] - sums[:-FEW]) > _SURE * math.sqrt(FEW)
         # A mean over some rows tells it when it has gone on for a part of them.
         firsts = np.concatenate([np.flatnonzero((np.abs(z) > _SURE).any(axis=1)),
-                                 np.flatnonzero(lasting.any(axis=1)) + _FEW - 1])  # fmt: skip
+                                 np.flatnonzero(lasting.any(axis=1)) + FEW - 1])  # fmt: skip
         onsets += [float(part.times_s[rows][firsts.min()])] if len(firsts) else []
     onset_s = min(onsets)
     return onset_s + _SETTLES_S if end_s - onset_s > 3.0 * _SETTLES_S else onset_s
@@ -225,20 +316,32 @@ class _Telling:
         )
 
 
-def _swapped(a: _Shown, b: _Shown, told: _Telling) -> Explanation | None:
+def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
     """Two channels that show each other's signal, each at what it shows at rest."""
-    crossed = np.concatenate([a.left([b.foretold, np.ones(len(b.foretold))])[1],
-                              b.left([a.foretold, np.ones(len(a.foretold))])[1]])  # fmt: skip
-    factors = [x.left([y.foretold, np.ones(len(y.foretold))])[0][0] for x, y in ((a, b), (b, a))]
-    own = min(excess(x.left([x.foretold, np.ones(len(x.foretold))])[1]) for x in (a, b))
-    if not (a.moves and b.moves) or max(abs(factor - 1.0) for factor in factors) > 0.1:
+    crossed, own, before = np.empty(0), np.inf, np.concatenate([a.apart, b.apart])
+    if not (a.moves or b.moves) or (a.counts is None and not (a.moves and b.moves)):
         return None
-    if not is_noise(crossed) and excess(crossed) > 0.01 * own:
+    for x, y in ((a, b), (b, a)):
+        # Of logs nobody knows which cable, conditioner or name it is; the rig's own cables carry volts.
+        volts = 1.0 if x.counts is None else y.channel.sensitivity_v / x.channel.sensitivity_v
+        times_s, foretold = y.around or (y.times_s, y.foretold)
+        shown = x.coupled(times_s, volts * foretold)
+        factors, left = x.left([shown, x.level])
+        if y.moves and abs(factors[0] - 1.0) > 0.1:
+            return None
+        if not y.moves:
+            rest = (y.channel.bias_v - x.channel.bias_v) / x.channel.sensitivity_v
+            (level,), left = x.left([x.level], x.values - shown)
+            if not x.channel.highpass_hz and abs(level - rest) > OFF * x.noise:
+                return None
+        own = min(own, excess(x.left([x.foretold, x.level])[1]))
+        crossed = np.concatenate([crossed, left])
+    if not is_noise(crossed) and excess(crossed) > 0.01 * (own if a.counts is None else excess(before)):
         return None
-    return told(f"{a.name} and {b.name}", "swapped", 0.0, crossed, np.concatenate([a.apart, b.apart]))
+    return told(f"{a.name} and {b.name}", "swapped", 0.0, crossed, before)
 
 
-def _turned(a: _Shown, b: _Shown, told: _Telling) -> Explanation | None:
+def _turned(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
     """Two probes that sit at another angle than is told: both signals are turned by it."""
     ones = np.ones(len(a.foretold))
     (aa, ab, _), left_a = a.left([a.foretold, b.foretold, ones])
@@ -265,10 +368,10 @@ class _Alone:
         numbers: Its gain less 1 and its delay [s], where it has one.
     """
 
-    shown: _Shown
+    shown: Shown
     told: Explanation
     cost: float
-    numbers: dict[str, float]
+    numbers: Mapping[str, float]
 
     def by(self, kind: str, value: float) -> tuple[float, np.ndarray]:
         """Cost of nothing but a gain or a delay that others pay for, with an offset or without, and what it leaves."""
@@ -280,83 +383,11 @@ class _Alone:
         return min(costs, key=lambda pair: pair[0])
 
 
-def _one_sensor(one: _Shown, told: _Telling) -> _Alone:
-    """The simplest change of a channel that leaves noise, else the one that leaves least."""
-    before, ones, e, held = one.apart, np.ones(len(one.values)), one.foretold, _steady(one)
-
-    def option(
-        name: str, change: str, value: float, left: np.ndarray, count: int = 1, unit: str = "", **numbers: float | None
-    ) -> _Alone:
-        found = told(f"{one.name} {name}", change, value, left, before, unit)
-        return _Alone(
-            one, found, found.squares + one.price * count, {k: v for k, v in numbers.items() if v is not None}
-        )
-
-    if held.any() and excess(before[held]) > 0.5 * excess(before):
-        return option("stuck", _for_how_long(one.times_s[held]), 0.0, before[~held])
-    (shift,), left = one.left([ones], one.values - e)
-    options = [option("offset", f"{shift:+.4g} {one.unit}", float(shift), left, unit=one.unit)]
-    if one.moves:
-        for columns, more in (([e], False), ([e, ones], True)):
-            factors, left = one.left(columns)
-            what, change = _gain_words(gain := float(factors[0]))
-            if more and what == "gain":
-                what, change = "gain and offset", f"{change}, {factors[1]:+.4g} {one.unit}"
-            options.append(
-                option(what, change, off := gain - 1.0, left, 1 + more, gain=off if "gain" in what else None)
-            )
-    if one.moves and len(e) > _FEW and (np.diff(one.times_s) > 0.0).all():
-        late_s, delayed, slope = _delayed(one)
-        if abs(late_s) <= _LATEST_S + 2.0 * float(np.diff(one.times_s).min()):  # else that is the search's end
-            (shift,), left = one.left([ones], one.values - delayed)
-            change = f"{late_s * 1e6:+.4g} µs"
-            options.append(option("delay", change, late_s, (one.values - delayed) / one.floor, unit="s", delay=late_s))
-            if abs(shift) > one.noise:
-                both = f"{change}, {shift:+.4g} {one.unit}"
-                options.append(option("delay and offset", both, late_s, left, 2, "s", delay=late_s))
-            factors, left = one.left([delayed, ones])
-            what, also = _gain_words(gain := float(factors[0]))
-            options.append(option(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 3, delay=late_s))
-        factors, left = one.left([slope, np.gradient(slope, one.times_s)], one.values - e)
-        lower = "lower" if factors[1] > 0.0 else "higher"
-        options.append(option("bandwidth", f"{lower} than told", float(factors[1]), left, 2))
-    best = min(options, key=lambda one: one.cost)
-    if best.told.at_floor or best.told.left < _NEARLY * min(1.0, math.sqrt(float(before @ before) / len(before))) + 1.0:
-        return best
-    rest = one.left([ones], one.values - e)[1]
-    white = abs(float(rest[1:] @ rest[:-1]) / float(rest @ rest)) < 0.1
-    tied = one.moves and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
-    if white and not tied:
-        ratio = float(rest.std())
-        return option("noise", f"x {ratio:.2f}", ratio, rest / ratio)
-    return best
-
-
-def _steady(one: _Shown) -> np.ndarray:
-    """Rows of stretches in which a channel with noise shows one and the same number, shape (n,)."""
-    return steady_rows(one.values) if one.noise > 0.0 else np.zeros(len(one.values), dtype=bool)
-
-
-def _for_how_long(times_s: np.ndarray) -> str:
-    return f"from {times_s[0]:.4f} s, {len(times_s)} rows"
-
-
-def _delayed(one: _Shown) -> tuple[float, np.ndarray, np.ndarray]:
-    """By how much a channel is late [s], what it should show then, and the slope of that [its unit/s]."""
-    spline = one.foretold_at
-    slope, period_s = spline.derivative(), float(np.diff(one.times_s).min())
-
-    def cost(late_s: float) -> float:
-        return float(np.sum(one.left([spline(one.times_s - late_s), np.ones(len(one.values))])[1] ** 2))
-
-    rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), np.linspace(-_LATEST_S, _LATEST_S, 81) / period_s])))
-    late_s = float(min(rows * period_s, key=cost))
-    for _ in range(6):
-        at = one.times_s - late_s
-        (_, step, _), _ = one.left([spline(at), -slope(at), np.ones(len(at))])
-        late_s = float(np.clip(late_s + np.clip(step, -period_s, period_s), -2.0 * _LATEST_S, 2.0 * _LATEST_S))
-    at = one.times_s - late_s
-    return late_s, spline(at), slope(at)
+def _alone(one: Shown, told: _Telling) -> _Alone:
+    law = law_of(one)
+    found = told(f"{one.name} {law.name}", law.change, law.value, law.left, one.apart, law.unit)
+    found = replace(found, sure=law.sure)
+    return _Alone(one, found, found.squares + one.price * law.count, law.numbers)
 
 
 def _together(alone: list[_Alone], told: _Telling, moving: list[str]) -> list[Explanation]:
@@ -380,7 +411,7 @@ def _together(alone: list[_Alone], told: _Telling, moving: list[str]) -> list[Ex
                 continue
             alone = [one for one in alone if one not in group]
             left = np.concatenate([one.by(kind, value)[1] for one in group])
-            change = _gain_words(1.0 + value)[1] if kind == "gain" else f"{value * 1e6:+.4g} µs"
+            change = gain_words(1.0 + value)[1] if kind == "gain" else f"{value * 1e6:+.4g} µs"
             names, unit = [one.shown.name for one in group], "s" if kind == "delay" else ""
             others = [name for name in moving if name not in names]
             if kind == "delay" and len(others) < len(names):
@@ -390,15 +421,6 @@ def _together(alone: list[_Alone], told: _Telling, moving: list[str]) -> list[Ex
             before = np.concatenate([one.shown.apart for one in group])
             found.append(told(f"{', '.join(names)} {kind}", change, value, left, before, unit))
     return found + [one.told for one in alone]
-
-
-def _gain_words(gain: float) -> tuple[str, str]:
-    known = next((text for factor, text in _UNITS.items() if abs(gain / factor - 1.0) < 0.02), "")
-    if abs(gain + 1.0) < 0.1:
-        return "polarity", "turned round"
-    if abs(gain) < 0.05 and not known:
-        return "signal", "missing"
-    return "gain", f"{100.0 * (gain - 1.0):+.3g} %" + (f" ({known})" if known else "")
 
 
 class Clock:

@@ -1,0 +1,166 @@
+"""Faults of channels that nobody is told of, found and named in recordings of this rig: each kind, and random ones."""
+
+from __future__ import annotations
+
+import math
+import os
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from recorder.reader import Recording
+from replays.recordings.experiment import Experiment
+from replays.recordings.prediction import measured, predict
+from replays.recordings.validation import validate
+from replays.recordings.validation.bits import Bits
+from replays.recordings.validation.explanation import Explanation
+from replays.recordings.validation.faults import own_faults
+from rig.faults import KINDS
+from tests.physics.test_identification import recorded
+
+PROBES, FORCES = ("disk_x", "disk_y", "ring_x", "ring_y"), ("P_N", "P_S", "P_E", "P_W")
+ACCELERATIONS = ("inner_x", "inner_y", "outer_x", "outer_y")
+FULL = {"disk": 0.25, "ring": 0.127, "P": 1000.0, "inner": 980.0, "outer": 980.0}
+"""What a volt is of a channel [its unit]."""
+REACH = {"disk": 1.5, "ring": 1.0, "P": 3500.0, "inner": 50.0, "outer": 50.0}
+"""What it shows at most, about."""
+CLASSES = {
+    # Names by which a kind goes that is right: what looks alike in what is recorded is one class.
+    "late": {"delay", "other noise"}, "clock": {"clock", "delay", "other noise"},
+    "wander": {"wander", "delay", "other noise"}, "jitter": {"jitter", "delay", "other noise"},
+    "open": {"open", "open or saturation", "open or short", "short", "open, short or stuck", "stuck"},
+    "short": {"open or short", "open", "short", "open, short or stuck"}, "stuck": {"stuck", "open, short or stuck"},
+    "saturation": {"saturation", "open or saturation"}, "clip": {"clip", "freeze"}, "freeze": {"freeze", "clip"},
+    "intermittent": {"intermittent", "open", "short", "open or short", "open, short or stuck"},
+    "miss-pulses": {"miss-pulses", "open, short or miss-pulses"}, "edge-jitter": {"edge-jitter", "delay"},
+    "crosstalk": {"crosstalk", "offset"}, "swap": {"swapped"},
+}  # fmt: skip
+RANDOM = ("intermittent", "spikes")
+"""Kinds that come at random."""
+SIZES: dict[str, tuple[str, list[dict[str, Any]]]] = {
+    "gain": ("P_E", [{"factor": 1.005}, {"factor": 1.5}]), "offset": ("ring_x", [{"value": 0.002}, {"value": 0.2}]),
+    "drift": ("P_N", [{"rate": 2.0}, {"rate": 200.0, "tau_s": 0.05}]), "polarity": ("inner_y", [{}]),
+    "stuck": ("P_S", [{}]), "nonlinear": ("disk_x", [{"end": 5.0}, {"end": 1.0}]), "open": ("disk_y", [{}]),
+    "short": ("P_S", [{}]), "intermittent": ("disk_x", [{"part": 0.2, "slot_s": 0.002}]),
+    "hum": ("ring_x", [{"amplitude_v": 0.005}, {"amplitude_v": 0.3, "frequency_hz": 60.0, "third": 0.5}]),
+    "crosstalk": ("disk_x", [{"source": "disk_y", "db": -60.0}]), "saturation": ("P_E", [{"part": 0.32}]),
+    "swap": ("P_N", [{"other": "P_S"}]), "no-filter": ("inner_x", [{}]),
+    "bandwidth": ("P_E", [{"corner_hz": 3000.0}, {"corner_hz": 200.0}]),
+    "late": ("P_E", [{"late_us": 5.0}, {"late_us": 500.0}]), "clock": ("disk_x", [{"ppm": 1000.0}]),
+    "jitter": ("disk_x", [{"rms_us": 5.0}]), "wander": ("disk_x", [{"amplitude_us": 50.0, "period_s": 0.1}]),
+    "noise": ("P_E", [{"factor": 1.2}]), "spikes": ("P_E", [{"rate_hz": 40.0, "size_v": 0.02}]),
+    "bits": ("disk_x", [{"lost": 2}]), "stuck-bit": ("disk_x", [{"bit": 12}]), "clip": ("P_E", [{"part": 0.32}]),
+    "freeze": ("ring_y", [{}]), "miss-pulses": ("keyphasor", [{"part": 0.5}]),
+    "extra-pulses": ("keyphasor", [{"part": 0.5}]), "edge-jitter": ("keyphasor", [{"rms_us": 300.0}]),
+}  # fmt: skip
+
+
+def found_in(recording: Recording) -> tuple[list[Explanation], set[str]]:
+    """What is told blind, and the channels that differ."""
+    experiment = Experiment.of(recording).without_faults()
+    parts, bits = measured(recording, experiment.scene), Bits(recording, experiment.simulation().table)
+    nominal = predict(experiment, parts, follow=bits.follow)
+    bits.finish()
+    told = own_faults(
+        parts, nominal, bits.apart, recording.edges(), bits.edges_s(), lambda other: predict(experiment, other)
+    )
+    return told, {name for part in parts for name in bits.off(part)}
+
+
+def right(told: list[Explanation], channel: str, kind: str) -> bool:
+    """Whether one thing is told with certainty, of the channel, by a name of the kind."""
+    if len(told) != 1 or not told[0].sure:
+        return False
+    if kind == "swap":
+        return told[0].change == "swapped" and channel in told[0].name.split()
+    name, _, what = told[0].name.partition(" ")
+    return name == channel and bool({what, *what.split(" or ")} & CLASSES.get(kind, {kind}))
+
+
+def test_every_kind_is_looked_at() -> None:
+    assert set(SIZES) == set(KINDS)
+
+
+@pytest.mark.parametrize(("kind", "numbers"), [(kind, n) for kind, (_, sizes) in SIZES.items() for n in sizes])
+def test_a_fault_has_its_name(kind: str, numbers: dict[str, Any], tmp_path: Path) -> None:
+    channel = SIZES[kind][0]
+    pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0, "duration_ms": 5.0, "direction": "x"}
+    fault = {"at_s": 0.05, "command": "fault", "channel": channel, "kind": kind, "for_s": 0.4, **numbers}
+    recording = recorded(tmp_path / "a.mcap", "hammer", duration_s=0.6, drive__speed_hz=12.0, commands=[pulse, fault])
+    told, differ = found_in(recording)
+    assert right(told, channel, kind), [(one.name, one.change, one.left) for one in told]
+    assert differ == {channel, *([numbers["other"]] if kind == "swap" else [])}
+    # A pulse comes once a turn; samples are there at once.
+    assert told[0].from_s == pytest.approx(0.05, abs=0.2 if channel == "keyphasor" or kind in RANDOM else 0.03)
+
+
+def test_a_validation_tells_it(tmp_path: Path) -> None:
+    commands = [
+        {"at_s": 0.05, "command": "fault", "channel": "ring_x", "kind": "hum", "amplitude_v": 0.01},
+        {"at_s": 0.1, "command": "fault", "channel": "P_W", "kind": "drift", "rate": 50.0, "for_s": 0.2},
+    ]
+    found = validate(recorded(tmp_path / "a.mcap", "hammer", duration_s=0.4, commands=commands), blind=True)
+    assert not found.good
+    lines = [one.line for one in found.faults]
+    assert lines[0].startswith("ring_x hum: 50 Hz, 0.001271 mm, from 0.0500 to ")
+    assert lines[1].startswith("P_W drift: +50 N/s, from 0.1")
+    assert found.explained is not None
+    assert found.explained.best == ("ring_x hum", "P_W drift")
+
+
+def some_fault(rng: random.Random) -> dict[str, Any]:
+    """A fault of random kind, size, channel and time."""
+
+    def between(low: float, high: float) -> float:
+        return math.exp(rng.uniform(math.log(low), math.log(high)))
+
+    kind = rng.choice(list(KINDS))
+    channel = "keyphasor" if KINDS[kind].channel_only else rng.choice(PROBES + FORCES + ACCELERATIONS)
+    full, sign = FULL.get(channel.partition("_")[0], 1.0), rng.choice((-1.0, 1.0))
+    other = rng.choice([name for name in PROBES + FORCES + ACCELERATIONS if name != channel])
+    numbers: dict[str, Any] = {
+        "gain": {"factor": 1.0 + sign * between(0.002, 0.8)}, "offset": {"value": sign * full * between(0.003, 1.0)},
+        "drift": {"rate": sign * full * between(0.05, 5.0), "tau_s": rng.choice((None, between(0.03, 0.3)))},
+        "nonlinear": {"end": REACH.get(channel.partition("_")[0], 1.0) * between(1.0, 8.0)},
+        "open": {"level_v": rng.uniform(-9.0, 9.0)},
+        "intermittent": {"part": rng.uniform(0.05, 0.7), "slot_s": between(0.002, 0.05)},
+        "hum": {"amplitude_v": between(0.003, 0.5), "frequency_hz": between(10.0, 400.0)},
+        "crosstalk": {"source": other, "db": rng.uniform(-60.0, -10.0)}, "swap": {"other": other},
+        "saturation": {"part": rng.uniform(0.02, 0.5)}, "bandwidth": {"corner_hz": between(50.0, 4000.0)},
+        "late": {"late_us": between(5.0, 3500.0)}, "clock": {"ppm": between(100.0, 20000.0)},
+        "jitter": {"rms_us": between(3.0, 200.0)}, "noise": {"factor": between(1.2, 30.0)},
+        "wander": {"amplitude_us": between(5.0, 1000.0), "period_s": between(0.05, 0.5)},
+        "spikes": {"rate_hz": between(10.0, 500.0), "size_v": between(0.01, 2.0)}, "bits": {"lost": rng.randint(2, 16)},
+        "stuck-bit": {"bit": rng.randint(2, 18), "value": rng.choice((0, 1))}, "clip": {"part": rng.uniform(0.02, 0.4)},
+        "miss-pulses": {"part": 0.3}, "extra-pulses": {"part": 0.3}, "edge-jitter": {"rms_us": between(20.0, 300.0)},
+    }.get(kind, {})  # fmt: skip
+    return {
+        "at_s": round(rng.uniform(0.0, 0.4), 6), "command": "fault", "channel": channel, "kind": kind,
+        **{key: value for key, value in numbers.items() if value is not None},
+        **({"for_s": round(rng.uniform(0.1, 0.5), 6)} if rng.random() < 0.7 else {}),
+    }  # fmt: skip
+
+
+@pytest.mark.skipif("RIG_BLIND_FAULTS" not in os.environ, reason="RIG_BLIND_FAULTS=250: four minutes")
+def test_random_faults_have_their_names(tmp_path: Path) -> None:
+    """Those that change a count: 95 of 100 by their name, and no other name for any."""
+    rng, seen, wrong, unnamed = random.Random(2027), 0, list[str](), list[str]()
+    for n in range(int(os.environ["RIG_BLIND_FAULTS"])):
+        pulse = {"at_s": 0.02, "command": "hammer", "force_n": rng.uniform(1.0, 150.0), "duration_ms": 5.0}
+        fault, speed = some_fault(rng), rng.choice((6.2, rng.uniform(4.0, 14.9)))
+        recording = recorded(
+            tmp_path / f"{n}.mcap", "hammer", duration_s=0.8, drive__speed_hz=speed, commands=[pulse, fault]
+        )
+        told, differ = found_in(recording)
+        (tmp_path / f"{n}.mcap").unlink()
+        if not differ:
+            continue
+        seen += 1
+        if not right(told, fault["channel"], fault["kind"]):
+            line = f"{n}: {speed:.4g} Hz, {pulse['force_n']:.4g} N, {fault}: {[(o.name, o.change) for o in told]}"
+            (wrong if any(one.sure for one in told) else unnamed).append(line)
+    print(f"{seen} faults: {len(wrong)} wrong, {len(unnamed)} unnamed", *wrong, *unnamed, sep="\n")
+    assert not wrong
+    assert len(unnamed) <= 0.05 * seen
