@@ -310,7 +310,7 @@ class _Telling:
     def __call__(
         self, name: str, change: str, value: float, left: np.ndarray, before: np.ndarray, unit: str = ""
     ) -> Explanation:
-        explained = (excess(before) - excess(left)) / self.total
+        explained = (excess(before) - excess(left)) / self.total if self.total > 0.0 else 0.0
         return Explanation.of(
             left, kind="sensor", name=name, change=change, value=value, unit=unit, explained=explained, to_s=self.to_s
         )

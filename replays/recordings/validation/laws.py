@@ -37,18 +37,26 @@ _SEGMENTS = 40
 """Into so many a channel is cut to see how its delay goes."""
 _SETTLES_S = 0.02
 """Behind this it is another filter's."""
+_ENDS_S = 1e-3
+"""Before the end of what is known, a filter cannot be taken back."""
 _HARDLY = 0.3
 """Where this part of what differs is left without the folding, that is looked at too."""
 _SETTLED = 5.0
 """Periods of its corner, behind which a filter has forgotten."""
+_HALF = 0.5
+"""What is left where noise was drawn again may be this part of what was there."""
 _SAME = 0.8
 """Of the noise, below which what is left has none of its own."""
+_ANOTHER = 1.6
+"""What noise beside another seems to be times itself, at least."""
 _DRAWN = 1.6
 """Of the noise, that the difference of two has at most."""
 _ALL = 0.95
 """More than this part of the rows is all of them."""
 _SLACK, _FADING = 1e-3, 0.02
 """Parts of its span by which a channel may be off a level."""
+_ROUNDED = 2
+"""Counts that rounding may make."""
 _SPARSE = 0.3
 """Fewer than this part of the samples are spikes."""
 
@@ -77,14 +85,17 @@ def law_of(one: Shown) -> Law:
         )
         best = replace(best, name=" or ".join([best.name, *(name for name in alike if name != best.name)]))
     rms = _rms(before)
-    if is_noise(best.left) or (one.counts is None and _rms(best.left) < _NEARLY * min(1.0, rms) + 1.0):
-        return best
-    if one.counts is not None:
+    if one.counts is None:
+        if is_noise(best.left) or _rms(best.left) < _NEARLY * min(1.0, rms) + 1.0:
+            return best
+    elif rms < _ROUNDED:
+        return replace(best, sure=False)
+    else:
         # Late samples have noise of their own, which is as good as none.
-        drawn = _rms(best.left) < _DRAWN * one.noise / float(one.floor[0]) and _white(best.left)
-        if _rms(best.left) < _EXACTLY * rms or (
-            drawn and one.cost(best.left, best.count) < one.cost(before, 0) - DECIDES
-        ):
+        # Knocks are too sharp to be told between samples: most rows count.
+        typical = 1.48 * float(np.median(np.abs(best.left)))
+        drawn = typical < _DRAWN * one.noise / float(one.floor[0]) and _white(np.sign(best.left))
+        if is_noise(best.left) or _rms(best.left) < (_HALF if drawn else _EXACTLY) * rms:
             return best
     return next(_at_random(one), replace(best, sure=False))
 
@@ -119,7 +130,7 @@ def _by_counts(one: Shown) -> Iterator[Law]:
         yield Law("clip", f"at {part:.4g} of the converter's range", part, none)
     off = said != sound
     sizes = np.abs(said - sound)[off]
-    if off.mean() < _SPARSE and len(sizes) and sizes.min() == sizes.max():
+    if off.mean() < _SPARSE and len(sizes) and sizes.min() == sizes.max() > _ROUNDED:
         yield _spikes(one, off, none)
 
 
@@ -156,20 +167,23 @@ def _of_level(one: Shown) -> Iterator[Law]:
             what, change = "gain and offset", f"{change}, {factors[1]:+.4g} {unit}"
         numbers = {"gain": gain - 1.0} if "gain" in what else {}
         yield Law(what, change, gain - 1.0, left, len(columns), "", numbers)
-    (level,), left = one.left([ones])
-    volts = one.channel.bias_v + one.channel.sensitivity_v * level
-    if one.counts is None:
-        return
-    if coupled:
-        yield Law("open, short or stuck", "nothing", 0.0, left)
-    elif abs(volts) < 1e-3 * np.ptp(one.channel.range_v):
-        yield Law("open or short", "0 V", 0.0, left, 1, "V")
-    elif one.at_begin(float(level)):
-        yield Law("stuck", f"at {level:.5g} {unit}", float(level), left, 1, unit)
-    else:
-        middle = (np.mean(one.channel.range_v) - one.channel.bias_v) / one.channel.sensitivity_v
-        beyond = bool(((e - middle) / (level - middle) > 1.0).all())
-        yield Law("open or saturation" if beyond else "open", f"{volts:.4g} V", float(volts), left, 1, "V")
+    if one.counts is not None:
+        (level,), left = one.left([ones])
+        yield _level_law(one, float(level), left)
+
+
+def _level_law(one: Shown, level: float, left: np.ndarray) -> Law:
+    """Nothing but a level."""
+    e, volts = one.foretold, one.channel.bias_v + one.channel.sensitivity_v * level
+    if one.channel.highpass_hz > 0.0:
+        return Law("open, short or stuck", "nothing", 0.0, left)
+    if abs(volts) < 1e-3 * np.ptp(one.channel.range_v):
+        return Law("open or short", "0 V", 0.0, left, 1, "V")
+    if one.at_begin(level):
+        return Law("stuck", f"at {level:.5g} {one.unit}", level, left, 1, one.unit)
+    middle = (np.mean(one.channel.range_v) - one.channel.bias_v) / one.channel.sensitivity_v
+    beyond = bool(((e - middle) / (level - middle) > 1.0).all())
+    return Law("open or saturation" if beyond else "open", f"{volts:.4g} V", volts, left, 1, "V")
 
 
 def _of_time(one: Shown) -> Iterator[Law]:
@@ -232,7 +246,8 @@ def _bent(one: Shown) -> Iterator[Law]:
         return
     starts = [[reach * part] for part in (0.1, 0.3, 0.6, 1.0, 2.0, 5.0, 15.0)]
     (end,), left = one.fitted(lambda p: p[0] * np.tanh(e / p[0]), starts, [reach])
-    yield Law("nonlinear", f"end at {abs(end):.4g} {one.unit}", abs(float(end)), left, 2, one.unit)
+    count = 1 if one.counts is not None else 2
+    yield Law("nonlinear", f"end at {abs(end):.4g} {one.unit}", abs(float(end)), left, count, one.unit)
     low, high = float(one.values.min()), float(one.values.max())
     for _ in range(8):  # the ends of what it shows, less what noise adds to them
         over, under = e > high, e < low
@@ -247,6 +262,9 @@ def _late(one: Shown) -> Iterator[Law]:
     """A time that is not that of the others."""
     ones, spline, t = np.ones(len(one.values)), one.foretold_at, one.times_s - one.times_s[0]
     late_s, delayed, _ = _delayed(one)
+    if one.counts is not None:
+        (late_s,), _ = one.fitted(lambda p: spline(one.times_s - p[0]), [[late_s]], [1e-6])
+        delayed = spline(one.times_s - late_s)
     earliest_s, latest_s = (-_LATEST_S, _LATEST_S) if one.counts is None else (_EARLIEST_S, _HELD_S)
     if earliest_s <= late_s <= latest_s + 2.0 * one.period_s:  # else it is the search's end
         (shift,), left = one.left([ones], one.values - delayed)
@@ -361,7 +379,8 @@ def _filtered(one: Shown) -> Iterator[Law]:
     def left_by(other: np.ndarray | float) -> np.ndarray:
         left = one.values - np.fft.irfft(plain * other)[begin:][: len(one.values)]
         left = one.left([one.level], left)[1] if channel.highpass_hz else left / one.floor
-        left[:margin] = _rms(left[margin:])
+        known = slice(margin, -round(_ENDS_S / one.period_s))  # how it goes on tells of what is behind a filter
+        left[: known.start] = left[known.stop :] = _rms(left[known])
         return left
 
     def cost(log_hz: float) -> float:
@@ -395,9 +414,15 @@ def _at_random(one: Shown) -> Iterator[Law]:
         fades = one.counts is not None and one.channel.highpass_hz > 0.0
         slack = (_FADING if fades else _SLACK) * float(np.ptp(e)) + 2.0 * OFF * one.floor
         there = off & (np.abs(one.values - level) < slack)
-        varied = float(e[there].std()) > 5.0 * float(slack[0]) if there.any() else False
-        if varied and there.sum() > 0.5 * off.sum() and there.sum() > FEW and not there.mean() > _ALL:
-            part = float(there.mean())
+        varied = not fades or float(e[there].std()) > 5.0 * float(slack[0])
+        if varied and there.sum() > max(FEW, 0.5 * off.sum()):
+            if there.mean() > _ALL and one.counts is not None:  # the rest is on the way
+                yield _level_law(one, level, ((one.values - level) / one.floor)[there])
+                return
+            part, beyond = float(there.mean()), (e - level) * np.sign(float((e - level)[there].mean()))
+            if (beyond[there] > -slack[there]).all() and (beyond[~off] < slack[~off]).all():
+                yield Law("saturation", f"at {level:.4g} {one.unit}", level, one.apart[~off], 2, one.unit)
+                return
             volts = one.channel.bias_v + one.channel.sensitivity_v * level
             change = f"{part:.2g} of the time at {level:.4g} {one.unit} ({volts:.3g} V)"
             yield Law("intermittent", change, part, one.apart[~off], 2)
@@ -412,7 +437,8 @@ def _at_random(one: Shown) -> Iterator[Law]:
         z, plain = (timed - bend / math.sqrt(2.0)) / width, float(rest.std()) * one.floor
         # The more likely of the two; each has a number of its own.
         gain = float(np.sum(np.log(plain / width))) + 0.5 * float(rest @ rest / rest.var() - z @ z)
-        if gain > DECIDES and _white(z):
+        seen = one.counts is None or rms_s * _rms(slope) > 2.0 * one.noise
+        if gain > DECIDES and seen and _white(z):
             yield Law("jitter", f"{1e6 * rms_s:.4g} µs about {1e6 * late_s:.4g} µs", rms_s, z / z.std(), 2, "s")
             return
     tied = one.moves and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1
@@ -422,10 +448,10 @@ def _at_random(one: Shown) -> Iterator[Law]:
             yield Law("noise", f"x {ratio:.2f}", ratio, rest / ratio)
             return
         said = (one.channel.scale * one.counts[:, 0] + one.channel.offset - one.foretold).std() / one.noise
-        if said < 1.0 + OFF / math.sqrt(2.0 * len(d)) and ratio * one.floor[0] > one.noise:
+        times = math.hypot(1.0, ratio * float(one.floor[0]) / one.noise)
+        if abs(said - 1.0) < abs(said - times) and times > _ANOTHER:
             yield Law("other noise", "as loud as told: samples are taken at other times", float(said), rest / ratio)
         else:
-            times = math.hypot(1.0, ratio * float(one.floor[0]) / one.noise)
             yield Law("noise", f"x {times:.2f}", times, rest / ratio)
 
 

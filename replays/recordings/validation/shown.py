@@ -14,7 +14,7 @@ from replays.recordings.validation.explanation import DECIDES, excess
 from rig.channels import Channel
 
 if TYPE_CHECKING:
-    from scipy.interpolate import CubicSpline
+    from scipy.interpolate import BSpline
 
 FEW = 16
 """Rows that tell no delay."""
@@ -70,11 +70,11 @@ class Shown:
         return self.channel.unit
 
     @cached_property
-    def foretold_at(self) -> CubicSpline:
+    def foretold_at(self) -> BSpline:
         """What it should show at other times."""
-        from scipy.interpolate import CubicSpline
+        from scipy.interpolate import make_interp_spline
 
-        return CubicSpline(*(self.around or (self.times_s, self.foretold)))
+        return make_interp_spline(*(self.around or (self.times_s, self.foretold)), k=5)
 
     @property
     def apart(self) -> np.ndarray:
@@ -135,8 +135,8 @@ class Shown:
 
     @property
     def moves(self) -> bool:
-        """Whether it should show more than noise."""
-        return float(self.foretold.std()) > self.noise
+        """Whether it should show more than noise, or than rounding where its noise is known."""
+        return float(self.foretold.std()) > (self.noise if self.counts is None else OFF * float(self.floor[0]))
 
     @property
     def even(self) -> bool:
