@@ -87,7 +87,8 @@ def _show(found: Validation, console: Console) -> None:
     if found.explained is not None:
         console.print(f"first difference at {found.explained.from_s:.4f} s; {found.explained.conclusion}")
     for fault in found.faults:
-        console.print(shown(f"signal: {fault.line}"))
+        if found.explained is None or fault.line not in found.explained.conclusion:
+            console.print(shown(f"signal: {fault.line}"))
     console.print(found.bits_line)
     for one in found.fitted:
         console.print(one.line)

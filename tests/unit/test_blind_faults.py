@@ -16,7 +16,7 @@ from replays.recordings.prediction import measured, predict
 from replays.recordings.validation import validate
 from replays.recordings.validation.bits import Bits
 from replays.recordings.validation.explanation import Explanation
-from replays.recordings.validation.faults import own_faults
+from replays.recordings.validation.own import own_faults
 from rig.faults import KINDS
 from tests.physics.test_identification import recorded
 

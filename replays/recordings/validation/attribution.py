@@ -29,8 +29,9 @@ from replays.recordings.validation.explanation import (
     smooth_columns,
     vector,
 )
-from replays.recordings.validation.faults import MOST, Clock, as_faults, channels_in, cured_by, sensor_faults
+from replays.recordings.validation.faults import MOST, Clock, channels_in, cured_by, sensor_faults
 from replays.recordings.validation.numbers import numbers_of_the_model
+from replays.recordings.validation.own import as_faults
 from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import scaled
 from rig.errors import InputError, SimulationError

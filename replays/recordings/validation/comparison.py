@@ -20,8 +20,9 @@ from replays.recordings.validation.attribution import FEW_CHANNELS, Explained, a
 from replays.recordings.validation.bits import Bits, StreamBits
 from replays.recordings.validation.criteria import Criteria, load_criteria
 from replays.recordings.validation.explanation import Explanation
-from replays.recordings.validation.faults import as_faults, late_together, own_faults
+from replays.recordings.validation.faults import late_together
 from replays.recordings.validation.outcome import Validation
+from replays.recordings.validation.own import as_faults, own_faults
 from replays.recordings.validation.phases import PHASES
 from replays.recordings.validation.signals import SignalFault, edge_faults, signal_faults
 from replays.recordings.validation.statistics import perturbed, statistics
@@ -158,9 +159,8 @@ def _done_again(
     off = {name for part in parts for name in bits.off(part)}
     own: list[Explanation] = []
     if all(truth) and len(off) < (len(names) if same else FEW_CHANNELS * len(names)):
-        step("channels that differ alone")
         own = own_faults(
-            parts, nominal, bits.apart, recording.edges(), bits.edges_s(), partial(predict, experiment)
+            parts, nominal, bits.apart, recording.edges(), bits.edges_s(), partial(predict, experiment), step
         )  # fmt: skip
     return _DoneAgain(quick, criteria, parts, nominal, (moved,), found, None, own=tuple(own), same_motion=same)
 

@@ -43,7 +43,7 @@ class Shown:
         beside: Of other channels that move, times and what they should show [their units], by channel.
         counts: What its converter said and should have said, noise and all, shape (n, 2); none where that is not known.
             Then `values` are those that it would show without its noise.
-        began_s: When it began to differ [s], where that is known.
+        lasted_s: When it began to differ, and when it last did [s], where that is known.
         around: Times and what it should show, from before its rows to behind them, each shape (m,); none: its rows.
     """
 
@@ -56,7 +56,7 @@ class Shown:
     bare: Callable[[], np.ndarray] | None = None
     beside: Callable[[], Mapping[Channel, tuple[np.ndarray, np.ndarray]]] = field(default=dict)
     counts: np.ndarray | None = None
-    began_s: float = 0.0
+    lasted_s: tuple[float, float] = (0.0, math.inf)
     around: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
@@ -97,12 +97,12 @@ class Shown:
     def level(self) -> np.ndarray:
         """What it shows of something constant, shape (n,): where it is AC-coupled, that goes away."""
         held = 2.0 * math.pi * self.channel.highpass_hz if self.counts is not None else 0.0
-        return np.exp(-held * (self.times_s - self.began_s))
+        return np.exp(-held * (self.times_s - self.lasted_s[0]))
 
     def at_begin(self, value: float) -> bool:
         """Whether it should have shown this about when it began to differ."""
         times_s, foretold = self.around or (self.times_s, self.foretold)
-        rows = np.abs(times_s - self.began_s) < _ABOUT / self.channel.rate_hz
+        rows = np.abs(times_s - self.lasted_s[0]) < _ABOUT / self.channel.rate_hz
         near = foretold[rows] if rows.any() else foretold[:1]
         slack = OFF * self.noise + 1e-3 * float(np.ptp(self.foretold))
         return bool(near.min() - slack < value < near.max() + slack)
@@ -118,9 +118,9 @@ class Shown:
         if held:
             from scipy.integrate import cumulative_trapezoid
 
-            seen = (times_s >= self.began_s) & (times_s <= self.times_s[-1])
+            seen = (times_s >= self.lasted_s[0]) & (times_s <= self.times_s[-1])
             times_s, signal = times_s[seen], signal[seen]
-            grown = np.exp(held * (times_s - self.began_s))
+            grown = np.exp(held * (times_s - self.lasted_s[0]))
             signal = signal - held * cumulative_trapezoid(grown * signal, times_s, initial=0.0) / grown
         return np.interp(self.times_s, times_s, signal)
 

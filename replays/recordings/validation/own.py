@@ -1,0 +1,140 @@
+"""What single channels have in a recording of this rig, whose counts differ while the motion is the same to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from replays.recordings.prediction import Measured, Prediction
+from replays.recordings.validation.explanation import Explanation
+from replays.recordings.validation.faults import SOME, around, beside, channels_in, told_of
+from replays.recordings.validation.shown import FEW, Shown
+from replays.recordings.validation.signals import SignalFault
+from rig.channels import Channel
+
+_HELD_S = 0.011
+"""What comes late holds its first value for so long, ..."""
+_PERIODS = 6.0
+"""... and a filter has forgotten it behind so many periods of its corner."""
+_MOST = 20_000
+"""Rows of a channel that are looked at, at most."""
+_AT_END, _ENOUGH = 1e-3, 0.2
+"""Rows so near to an end of what its conditioner puts out tell nothing, where this part of the rows is not."""
+_NO_FILTER = 1e4
+"""A corner so many times its own is none."""
+_EVEN_S = 1e-5
+"""Edges that move by less than this about their mean move alike."""
+
+
+def own_faults(
+    parts: dict[str, Measured], nominal: Prediction, apart: Callable[[str], tuple[np.ndarray, dict[str, np.ndarray]]],
+    recorded_s: np.ndarray, made_s: np.ndarray, again: Callable[[dict[str, Measured]], Prediction],
+    step: Callable[[str], None] = lambda _text: None,
+) -> list[Explanation]:  # fmt: skip
+    """What each channel has whose counts are other than those of the same motion done again, to the bit.
+
+    What a channel shows is taken without its noise: that is the same in both.
+
+    Args:
+        parts: What was recorded.
+        nominal: What was predicted.
+        apart: Of a group, numbers of the rows that differ, shape (n,), and by channel, by how many counts, shape (n,).
+        recorded_s: Edges of the keyphasor [s].
+        made_s: Edges made again [s].
+        again: Predicts other channels of the same motion.
+        step: Told what is being done.
+    """
+    shown = []
+    for name, part in parts.items():
+        index, counts = apart(name)
+        at = np.searchsorted(part.index, index)
+        there = at < len(part.index)
+        there[there] = part.index[at[there]] == index[there]
+        for c, channel in enumerate(part.channels):
+            off = np.zeros(len(part.index))
+            if channel.name in counts:
+                off[at[there]] = counts[channel.name][there]
+            rows = np.flatnonzero(off)
+            if not len(rows):
+                continue
+            lasted_s = float(part.times_s[rows[0]]), float(part.times_s[rows[-1]])
+            settled = rows[0] + round(max(_HELD_S, _PERIODS / channel.bandwidth_hz) * channel.rate_hz)
+            first = settled if rows[-1] - settled > 2 * (settled - rows[0]) else rows[0]
+            rows = np.arange(first, min(int(rows[-1]) + 1, first + _MOST))
+            if len(rows) < SOME:
+                rows = np.arange(max(0, first - SOME), min(first + SOME, len(off)))
+            foretold = nominal.values[name][:, c]
+            limits = np.array([*channel.range_v, -channel.adc_v, channel.adc_v])
+            ends = np.abs(
+                (channel.bias_v + channel.sensitivity_v * (foretold + channel.scale * off))[:, None] - limits
+            ).min(axis=1)
+            within = ~np.convolve(ends < _AT_END * np.ptp(channel.range_v), np.ones(2 * FEW + 1), "same").astype(bool)
+            if within[rows].mean() > _ENOUGH:
+                rows = rows[within[rows]]
+            said = np.rint((part.values[rows, c] - channel.offset) / channel.scale)
+            shown.append(
+                Shown(
+                    channel, part.times_s[rows], (foretold + channel.scale * off)[rows], foretold[rows],
+                    np.full(len(rows), 0.5 * abs(channel.scale)), channel.noise_v / abs(channel.sensitivity_v),
+                    partial(_bare, part, channel, again, rows),
+                    partial(beside, parts, nominal, channel),
+                    np.column_stack([said, said - off[rows]]).astype(np.int64), lasted_s,
+                    around(part, foretold, rows[0], rows[-1] + 1),
+                )
+            )  # fmt: skip
+    about = {one.name: one for one in shown}
+    found = []
+    for one in told_of(shown, max((float(one.times_s[-1]) for one in shown), default=0.0), step):
+        its = [about[name] for name in channels_in([one], about)]
+        # Over the noise, not over the steps of the converter.
+        steps = max(each.noise / float(each.floor[0]) for each in its)
+        begin, end = min(each.lasted_s[0] for each in its), max(each.lasted_s[1] for each in its)
+        found.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
+    edges = _own_edges(recorded_s, made_s)
+    return found if edges is None else [*(one for one in found if not one.name.startswith("keyphasor")), edges]
+
+
+def _bare(
+    part: Measured, channel: Channel, again: Callable[[dict[str, Measured]], Prediction], rows: np.ndarray
+) -> np.ndarray:
+    """What a channel should show in some rows without its low-pass [its unit]."""
+    alone = part.first(int(rows[-1]) + 1).only([channel.name]).filtered(_NO_FILTER)
+    return again({part.group: alone}).values[part.group][rows, 0]
+
+
+def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray) -> Explanation | None:
+    """What keyphasor edges lack, have too many, or how they move; None where the signal tells more."""
+    lacking, more = np.setdiff1d(made_s, recorded_s), np.setdiff1d(recorded_s, made_s)
+    off = np.sort(np.concatenate([lacking, more]))
+    moved_s = more - lacking if len(more) == len(lacking) else np.empty(0)
+    turns = np.count_nonzero((made_s >= off[0]) & (made_s <= off[-1])) if len(off) else 0
+    if len(moved_s) > 1 and moved_s.std() > _EVEN_S:
+        what, value, unit = "edge-jitter", float(moved_s.std()), "s"
+        change = f"{1e6 * value:.4g} µs about {1e6 * moved_s.mean():.4g} µs"
+    elif len(moved_s) or not len(off):
+        return None
+    elif len(lacking) < turns and not len(more):
+        what, value, unit, change = "miss-pulses", len(lacking) / turns, "", f"{len(lacking)} of {turns}"
+    elif len(more) > len(lacking):
+        what, value, unit, change = "extra-pulses", len(more) / max(1, turns), "", f"{len(more)} beside {turns}"
+    else:
+        what, value, unit, change = "open, short or miss-pulses", 1.0, "", f"{len(lacking)} of {turns}"
+    found = Explanation.of(
+        np.empty(0), kind="sensor", name=f"keyphasor {what}", change=change, value=value, unit=unit, explained=0.0,
+        to_s=float(off[-1]),
+    )  # fmt: skip
+    return replace(found, from_s=float(off[0]))
+
+
+def as_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
+    """What channels have by themselves, as faults that signals show."""
+    found = []
+    for one in own:
+        names, _, what = one.name.rpartition(" ")
+        text = one.change if one.sure else f"by no law that has a name here; nearest is {what} {one.change}"
+        text += f", from {one.from_s:.4f} to {one.to_s:.4f} s"
+        found.append(SignalFault(names, what if one.sure else "differs", one.from_s, one.to_s, text))
+    return tuple(found)
