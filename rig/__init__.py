@@ -15,7 +15,7 @@ what is plotted of a rotor.
 
 Recordings are opened by `recorder.reader.Recording`, whose samples are of the
 same kind, and written by `replays.recordings.export.write_run`; a running rig
-is read by `drivers.daq.Daq` and commanded by `drivers.console.Console`. The
+is read and commanded by `rig.connect`, which is `drivers.client.Rig.open`. The
 same objects carry the commands of `rig`.
 """
 
@@ -24,6 +24,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from drivers.client import Rig
     from rig.errors import InputError, UnknownNameError
     from rig.offline import Run, simulate
     from rig.orbit import full_spectrum, synchronous, waterfall, whirl_frequency
@@ -32,9 +33,11 @@ if TYPE_CHECKING:
     from rig.scenes import Scene, load_scene
     from rig.simulation import Simulation
 
+    connect = Rig.open
+
 __all__ = [
-    "InputError", "ParameterSet", "Run", "Samples", "Scene", "Simulation", "UnknownNameError", "full_spectrum",
-    "load_parameters", "load_scene", "simulate", "synchronous", "waterfall", "whirl_frequency",
+    "InputError", "ParameterSet", "Run", "Samples", "Scene", "Simulation", "UnknownNameError", "connect",
+    "full_spectrum", "load_parameters", "load_scene", "simulate", "synchronous", "waterfall", "whirl_frequency",
 ]  # fmt: skip
 
 _HOMES = {
@@ -53,6 +56,8 @@ if not TYPE_CHECKING:  # a type checker knows all names by the imports above
         # Loaded on first use: `rig --help` must not wait for compiled code.
         from importlib import import_module, metadata
 
+        if name == "connect":
+            return import_module("drivers.client").Rig.open
         if name == "__version__":
             return metadata.version("rotor-stator-rig")
         home = next((home for home, names in _HOMES.items() if name in names), None)

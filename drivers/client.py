@@ -1,0 +1,422 @@
+"""One client of a rig: its commands, its channels as they come, its events and its turns, in real time or in lockstep.
+
+    import rig
+
+    with rig.connect(channels=["disk_x", "disk_y", "keyphasor"]) as machine:
+        machine.hammer(force_n=120.0)
+        hit = machine.until(lambda samples: np.hypot(samples["disk_x"], samples["disk_y"]) > 1.2, within_s=2.0)
+        print(hit.time_s, machine.event("hammer")["tick"])
+
+What is read goes on from row to row: each call takes up where the last one ended, and times are simulated ones, exact
+to the row. A rig in lockstep is stepped as far as a call needs: the same program has the same rows, however loaded the
+machine is.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Self
+
+import numpy as np
+
+from drivers.console import Console
+from drivers.daq import Daq
+from drivers.link import LinkTimeoutError
+from drivers.samples import Samples, StreamEndedError
+from drivers.sources.rig import RigSource
+from rig import wire
+from rig.errors import InputError, RefusedError, UnknownNameError, Words
+from rig.intake import Catalogue, event_in
+from rig.orbit import synchronous
+from rig.transport import DEFAULT_ENDPOINT, Client
+
+_PATIENCE_S = 10.0
+"""How long a rig that runs may send nothing [s]."""
+_HALF = 0.5
+"""A keyphasor's pulse begins where its signal, 0 to 1, rises through this."""
+
+
+class NotSeenError(TimeoutError):
+    """What was waited for did not come; the message says until when."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One row that met a condition.
+
+    Attributes:
+        time_s: Its simulated time [s].
+        tick: The same, to the nearest [ticks].
+        index: Its number at the rate that is read.
+        values: Of each channel, in its unit.
+    """
+
+    time_s: float
+    tick: int
+    index: int
+    values: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One turn of the shaft, from pulse to pulse of the keyphasor.
+
+    Attributes:
+        begin_s: Simulated time at which it begins [s].
+        speed_hz: Turns a second in it [Hz].
+        peak_to_peak: Largest less smallest value of each channel, in its unit.
+        gap: Mean of each channel, in its unit.
+        once: What goes once around with the shaft (1X) of each channel: amplitude in its unit, with the phase from the
+            pulse on (negative lags).
+        samples: Its rows.
+    """
+
+    begin_s: float
+    speed_hz: float
+    peak_to_peak: dict[str, float]
+    gap: dict[str, float]
+    once: dict[str, complex]
+    samples: Samples
+
+
+class Rig(Console):
+    """One rig, for one program: what `Console` commands, and what comes back.
+
+    Args:
+        client: Transport to the rig; closed with this.
+        channels: Channels that are read, from now on; none: none, and commands and events alone.
+        rate_hz: Rows per second [Hz]: a whole fraction of the channels' own, which is taken unless given.
+        buffer_s: Rows that wait to be read [s]; beyond, the oldest are dropped, and the next rows tell of the gap.
+        truth: Tables of the truth that come too, such as `contact`: a device under test must not see it, and so none
+            comes unasked.
+        name: Who asks; appears in the stream's events.
+
+    Raises:
+        ConnectionError: No rig answers.
+        InputError: There is no such channel, rate or table.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        *,
+        channels: Sequence[str] = (),
+        rate_hz: float | None = None,
+        buffer_s: float = 60.0,
+        truth: Sequence[str] = (),
+        name: str | None = None,
+    ) -> None:
+        super().__init__(client, name=name)
+        status, document = self.status(), wire.decode_document(client.request(wire.CATALOGUE))
+        self.pace: str = status["pace"]
+        """real-time, lockstep or free."""
+        catalogue = Catalogue.read(document)
+        self._tick_rate_hz = catalogue.tick_rate_hz
+        self._block_ticks = round(1e-3 * status["block_ms"] * catalogue.tick_rate_hz)
+        self._at: int = status["tick"]
+        """Up to where a rig in lockstep was stepped [ticks]."""
+        self._events: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._seen: list[dict[str, Any]] = []
+        client.subscribe(wire.EVENTS, self._on_event)
+        self._truth: dict[str, queue.SimpleQueue[Samples]] = {}
+        for table in truth:
+            known = document.get("truth", {})
+            if table not in known:
+                raise UnknownNameError("truth", "one of the rig's tables", table, known)
+            self._truth[table] = queue.SimpleQueue()
+            columns = known[table]["columns"]
+            self._listen_to(table, [one["name"] for one in columns], [one["unit"] for one in columns])
+        self._daq: Daq | None = None
+        if channels:
+            source = RigSource(client)
+            try:
+                self._daq = Daq(source, channels=channels, rate_hz=rate_hz, buffer_s=buffer_s)
+            except BaseException:
+                source.close()
+                raise
+        self._back: Samples | None = None
+        """Rows that were read, and not taken."""
+        self._next = math.ceil(self._at * self.daq.rate_hz / self._tick_rate_hz) if channels else 0
+
+    @classmethod
+    def open(
+        cls,
+        url: str = "zenoh:" + DEFAULT_ENDPOINT,
+        *,
+        channels: Sequence[str] = (),
+        rate_hz: float | None = None,
+        buffer_s: float = 60.0,
+        truth: Sequence[str] = (),
+        name: str | None = None,
+        wait_s: float = 3.0,
+    ) -> Self:
+        """The rig at a URL, as for `Daq.open`; close it, or use it as a context manager.
+
+        Raises:
+            InputError: The URL is malformed, or there is no such channel or rate.
+            ConnectionError: Nothing is there.
+        """
+        from rig.transport.zenoh import client_at
+
+        kind, _, address = url.partition(":")
+        if kind != "zenoh" or not address:
+            raise InputError("url", "zenoh:HOST:PORT[?tls=DIR]", url)
+        client = client_at(address, wait_s=wait_s)
+        try:
+            return cls(client, channels=channels, rate_hz=rate_hz, buffer_s=buffer_s, truth=truth, name=name)
+        except BaseException:
+            client.close()
+            raise
+
+    def close(self) -> None:
+        """End, and leave the rig running."""
+        if self._daq is not None:
+            self._daq.close()
+        super().close()
+
+    # ---- rows ----
+
+    @property
+    def daq(self) -> Daq:
+        """What reads the channels: its losses, its rate.
+
+        Raises:
+            InputError: The client was opened without channels.
+        """
+        if self._daq is None:
+            raise InputError("channels", "named where the rig is connected to", Words("none"))
+        return self._daq
+
+    def advance(self, duration_s: float) -> Samples:
+        """Let the rig go on, and take the rows of that time: of real time when it comes, of lockstep at once.
+
+        Raises:
+            InputError: No time above 0 with a row in it.
+            NotSeenError: The rig sent nothing for long, or fewer rows before a gap.
+            StreamEndedError: The run is over.
+        """
+        rows = round(duration_s * self.daq.rate_hz) if duration_s > 0.0 else 0
+        if rows < 1:
+            raise InputError("duration_s", f"at least a row, {1.0 / self.daq.rate_hz:g} s", duration_s)
+        return self._take(rows)
+
+    def until(self, condition: Callable[[Samples], Any], *, within_s: float, piece_s: float = 0.05) -> Row:
+        """Read to the first row that meets a condition; the rows behind it stay to be read.
+
+        Args:
+            condition: Given rows, whether each meets it, shape (rows,); rows come in pieces, each row once.
+            within_s: In how much simulated time from the next row on [s].
+            piece_s: Length of a piece [s].
+
+        Raises:
+            InputError: What the condition returns is no truth of each row.
+            NotSeenError: No row met it.
+            StreamEndedError: The run was over before.
+        """
+        rate = self.daq.rate_hz
+        left, piece = max(1, round(within_s * rate)), max(1, round(piece_s * rate))
+        first_s = last_s = None
+        while left > 0:
+            samples = self._take(min(piece, left), whole=False)
+            left -= len(samples)
+            first_s = samples.times_s[0] if first_s is None else first_s
+            last_s = samples.times_s[-1]
+            met = np.asarray(condition(samples))
+            if met.shape != (len(samples),):
+                raise InputError(
+                    "condition", f"one truth value a row, shape ({len(samples)},)", Words(f"shape {met.shape}")
+                )
+            if met.any():
+                at = int(np.flatnonzero(met)[0])
+                found = samples.rows(at, at + 1)
+                self._give_back(samples.rows(at + 1, len(samples)))
+                values = {name: float(found[name][0]) for name in found.names}
+                return Row(float(found.times_s[0]), found.tick, found.index, values)
+        raise NotSeenError(f"no row met the condition from {first_s:.6f} to {last_s:.6f} s")
+
+    def turns(self, *, timeout_s: float = 60.0) -> Iterator[Turn]:
+        """Whole turns of the shaft, one by one, with what machinery protection shows of each; to the end of the run.
+
+        Args:
+            timeout_s: Simulated time without a pulse that ends it [s].
+
+        Raises:
+            InputError: The channels are without the keyphasor.
+            NotSeenError: No pulse came.
+        """
+        daq = self.daq
+        if "keyphasor" not in daq.channels:
+            raise InputError("channels", "with the keyphasor, which turns are told by", list(daq.channels))
+        piece, most = max(1, round(0.1 * daq.rate_hz)), round(timeout_s * daq.rate_hz)
+        held, told = None, 0
+        try:
+            while True:
+                fresh = self._take(piece, whole=False)
+                held, told = (fresh, 0) if held is None or fresh.gap else (_joined(held, fresh), told)
+                edges_s = _edges(held)
+                for begin_s, end_s in pairwise(edges_s):
+                    told = int(np.searchsorted(held.times_s, end_s))
+                    yield _turn(held, begin_s, end_s)
+                if len(edges_s):
+                    kept = max(0, int(np.searchsorted(held.times_s, edges_s[-1])) - 1)
+                    held, told = held.rows(kept, len(held)), max(0, told - kept)
+                if len(held) > most:
+                    begin_s, end_s = held.times_s[[0, -1]]
+                    raise NotSeenError(f"no pulse of the keyphasor from {begin_s:.6f} to {end_s:.6f} s")
+        except StreamEndedError:
+            return
+        finally:
+            # What is behind the last turn that was told is read by the next call.
+            if held is not None:
+                self._give_back(held.rows(told, len(held)))
+
+    def _take(self, rows: int, *, whole: bool = True) -> Samples:
+        """The next rows; of a rig in lockstep, stepped as far as that needs. Fewer where they need not be whole."""
+        daq = self.daq
+        taken, self._back = self._back, None
+        if taken is not None and len(taken) >= rows:
+            self._give_back(taken.rows(rows, len(taken)))
+            return taken.rows(0, rows)
+        while taken is None or (whole and len(taken) < rows):
+            missing = rows - (0 if taken is None else len(taken))
+            refused = self._step_to(self._next + missing)
+            try:
+                fresh = daq.read(missing, timeout_s=_PATIENCE_S)
+            except LinkTimeoutError as error:
+                raise refused or NotSeenError(f"the rig sent no rows: {error}") from error
+            self._next = fresh.index + len(fresh)
+            if taken is not None and fresh.gap:
+                self._give_back(fresh)
+                raise NotSeenError(f"{fresh.gap} rows are missing behind {taken.times_s[-1]:.6f} s")
+            taken = fresh if taken is None else _joined(taken, fresh)
+        return taken
+
+    def _step_to(self, row: int) -> RefusedError | None:
+        """Step a rig in lockstep until the rows before one are made: no further, whatever has arrived.
+
+        Returns:
+            Why it refused: a run that is over tells that by its rows.
+        """
+        ticks = row * self._tick_rate_hz / self.daq.rate_hz - self._at
+        if self.pace == "lockstep" and ticks > 0.0:
+            try:
+                self._at = self.step(math.ceil(ticks / self._block_ticks - 1e-9) * self._block_ticks).tick
+            except RefusedError as error:
+                return error
+        return None
+
+    def _give_back(self, samples: Samples) -> None:
+        self._back = samples if len(samples) else None
+
+    # ---- events ----
+
+    def event(self, what: str | Callable[[dict[str, Any]], bool], *, timeout_s: float = 10.0) -> dict[str, Any]:
+        """The next event of a kind since the rig was connected to, or since the last one that was asked for.
+
+        Args:
+            what: Its name, or what says whether it is the one.
+            timeout_s: How long to wait for it [s].
+
+        Raises:
+            NotSeenError: It did not come.
+        """
+        wanted = (lambda event: event["event"] == what) if isinstance(what, str) else what
+        deadline = time.monotonic() + timeout_s
+        for place, event in enumerate(self._seen):
+            if wanted(event):
+                return self._seen.pop(place)
+        while True:
+            try:
+                event = self._events.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                others = ", ".join(dict.fromkeys(event["event"] for event in self._seen)) or "none"
+                raise NotSeenError(f"no such event in {timeout_s:g} s; what came: {others}") from None
+            if wanted(event):
+                return event
+            self._seen.append(event)
+
+    def _on_event(self, _: str, payload: bytes) -> None:
+        try:
+            self._events.put(event_in(payload))
+        except ValueError:
+            return
+
+    # ---- the truth, by name ----
+
+    def truth(self, table: str, *, to_s: float | None = None, timeout_s: float = 10.0) -> Samples:
+        """Rows of a table of the truth, in SI, that came since the rig was connected to, or since the last call.
+
+        Args:
+            table: One of those that were named when the rig was connected to.
+            to_s: Wait until they reach this simulated time [s].
+            timeout_s: How long [s].
+
+        Raises:
+            InputError: That table was not asked for.
+            NotSeenError: They did not come in time.
+        """
+        if table not in self._truth:
+            raise UnknownNameError(
+                "table", "one that was named in `truth` when the rig was connected to", table, self._truth
+            )
+        deadline, made = time.monotonic() + timeout_s, self._truth[table]
+        found: Samples | None = None
+        while found is None or (to_s is not None and found.times_s[-1] + 1.0 / found.rate_hz < to_s - 1e-9):
+            if to_s is not None and self.pace == "lockstep" and to_s * self._tick_rate_hz > self._at:
+                blocks = math.ceil((to_s * self._tick_rate_hz - self._at) / self._block_ticks - 1e-9)
+                self._at = self.step(blocks * self._block_ticks).tick
+            try:
+                fresh = made.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                raise NotSeenError(f"no truth of {table} came in {timeout_s:g} s") from None
+            found = fresh if found is None else _joined(found, fresh)
+            while to_s is None and not made.empty():
+                found = _joined(found, made.get())
+        return found
+
+    def _listen_to(self, table: str, columns: Sequence[str], units: Sequence[str]) -> None:
+        made, key = self._truth[table], wire.truth_key(table)
+        schema = wire.schema_of(key)
+        assert schema is not None
+
+        def take(_: str, payload: bytes) -> None:
+            block = wire.decode_block(payload, schema)
+            made.put(
+                Samples(
+                    block.index, block.tick, block.rate_hz, block.tick_rate_hz, tuple(columns), tuple(units),
+                    block.values,
+                )
+            )  # fmt: skip
+
+        self._client.subscribe(key, take)
+
+
+def _joined(first: Samples, second: Samples) -> Samples:
+    return replace(first, values=np.concatenate([first.values, second.values]))
+
+
+def _edges(samples: Samples) -> np.ndarray:
+    """When the keyphasor's pulses begin [s], between rows by a straight line, shape (edges,)."""
+    signal, times_s = samples["keyphasor"], samples.times_s
+    rows = np.flatnonzero((signal[:-1] < _HALF) & (signal[1:] >= _HALF))
+    part = (_HALF - signal[rows]) / (signal[rows + 1] - signal[rows])
+    return times_s[rows] + part / samples.rate_hz
+
+
+def _turn(samples: Samples, begin_s: float, end_s: float) -> Turn:
+    first, last = np.searchsorted(samples.times_s, [begin_s, end_s])
+    rows = samples.rows(int(first), int(last))
+    once = {}
+    for name in rows.names:
+        _, vector = synchronous(rows[name], rows.times_s, [begin_s, end_s])
+        once[name] = complex(vector[0]) if len(vector) else complex(math.nan, math.nan)
+    return Turn(
+        begin_s=float(begin_s), speed_hz=float(1.0 / (end_s - begin_s)),
+        peak_to_peak={name: float(np.ptp(rows[name])) for name in rows.names},
+        gap={name: float(rows[name].mean()) for name in rows.names}, once=once, samples=rows,
+    )  # fmt: skip

@@ -1,0 +1,99 @@
+"""One client of a rig: the same program on a rig in lockstep has the same rows, and turns as the shaft turns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+import rig
+from drivers.client import NotSeenError, Rig
+from drivers.samples import StreamEndedError
+from rig.errors import InputError, UnknownNameError
+from tests import processes
+
+CHANNELS = ("disk_x", "disk_y", "keyphasor")
+
+
+@contextmanager
+def connected(pace: str = "lockstep", **settings: object) -> Iterator[Rig]:
+    endpoint = processes.free_endpoint()
+    changes = ("--set", "drive.speed_hz=12", "--set", "commands=[]", "--duration-s", "4")
+    with processes.rig("run", "hammer", "--pace", pace, "--listen", endpoint, *changes) as child:
+        with rig.connect(f"zenoh:{endpoint}", wait_s=processes.COMPILE_S, **settings) as machine:  # pyright: ignore[reportArgumentType]
+            yield machine
+        child.terminate()
+        child.communicate(timeout=30.0)
+
+
+def test_a_program_reads_the_same_rows_as_the_model_makes() -> None:
+    with connected(channels=CHANNELS, truth=["contact"]) as machine:
+        before = machine.advance(0.3)
+        assert (before.index, len(before), before.gap) == (0, 6000, 0)
+        pulse = machine.hammer(force_n=150.0)
+        assert pulse.tick == 300_000  # at the row behind the last one that was read, whatever had been sent
+        hit = machine.until(lambda rows: np.hypot(rows["disk_x"], rows["disk_y"]) > 1.2, within_s=0.5)
+        assert machine.event("hammer")["tick"] == pulse.tick
+        behind = machine.advance(0.01)
+        assert behind.index == hit.index + 1
+        contact = machine.truth("contact", to_s=0.4)
+        with pytest.raises(NotSeenError, match=r"no row met the condition from 0\.\d+ to 0\.\d+ s"):
+            machine.until(lambda rows: rows["disk_x"] > 99.0, within_s=0.1)
+        with pytest.raises(NotSeenError, match="no such event in 0 s; what came: "):
+            machine.event("nothing", timeout_s=0.0)
+        with pytest.raises(InputError, match="condition must be one truth value a row"):
+            machine.until(lambda rows: True, within_s=0.1)
+        machine.stop()
+        with pytest.raises(StreamEndedError, match="stopped"):
+            machine.advance(1.0)
+    command = {"at_s": 0.3, "command": "hammer", "force_n": 150.0, "duration_ms": 5.0, "direction": "x"}
+    run = rig.simulate("hammer", {"drive.speed_hz": 12.0, "commands": [command], "duration_s": 0.5})
+    np.testing.assert_array_equal(before["disk_x"], run.samples["disk_x"][:6000])
+    np.testing.assert_array_equal(behind["disk_y"], run.samples["disk_y"][behind.index :][:200])
+    deflection = np.hypot(run.samples["disk_x"], run.samples["disk_y"])
+    assert hit.index == int(np.argmax(deflection > 1.2))
+    assert hit.time_s == hit.index / 20_000.0
+    assert contact["normal_force"].max() > 0.0
+
+
+def test_turns_are_those_of_the_shaft() -> None:
+    with connected(channels=CHANNELS) as machine:
+        turns = []
+        for turn in machine.turns():
+            turns.append(turn)
+            if len(turns) == 4:
+                break
+        next_row = machine.advance(1e-3).index
+        assert not any(machine.daq.lost.values())
+    assert next_row == turns[-1].samples.index + len(turns[-1].samples)
+    for turn in turns:
+        assert turn.speed_hz == pytest.approx(12.0, rel=2e-3)
+        x, times_s = turn.samples["disk_x"], turn.samples.times_s
+        assert turn.peak_to_peak["disk_x"] == np.ptp(x)
+        assert turn.gap["disk_x"] == pytest.approx(x.mean())
+        # The same by the closed form of a Fourier coefficient over the turn.
+        angle = 2.0 * math.pi * (times_s - turn.begin_s) * turn.speed_hz
+        once = 2.0 * np.mean(x * np.exp(-1j * angle))
+        assert abs(turn.once["disk_x"] - once) < 0.02 * abs(once) + 1e-4
+
+
+@pytest.mark.parametrize(("settings", "says"), [
+    ({"channels": ["disk_z"]}, "channel must be one of the source's"),
+    ({"channels": ["disk_x"], "truth": ["contacts"]}, "truth must be one of the rig's tables, such as contact"),
+    ({"channels": ["disk_x"], "rate_hz": 3000.0}, "rate_hz must be 20000 divided by a whole number"),
+])  # fmt: skip
+def test_what_the_rig_does_not_have_is_told(settings: dict[str, object], says: str) -> None:
+    with pytest.raises((InputError, UnknownNameError)) as caught, connected(**settings):
+        pass
+    assert says in str(caught.value)
+
+
+def test_a_client_without_channels_says_so() -> None:
+    with connected("free") as machine:
+        with pytest.raises(InputError, match="channels must be named where the rig is connected to"):
+            machine.advance(0.1)
+        with pytest.raises(UnknownNameError, match="table must be one that was named"):
+            machine.truth("contact")
