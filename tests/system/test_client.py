@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +20,11 @@ CHANNELS = ("disk_x", "disk_y", "keyphasor")
 
 
 @contextmanager
-def connected(pace: str = "lockstep", **settings: object) -> Iterator[Rig]:
+def connected(pace: str = "lockstep", **settings: Any) -> Iterator[Rig]:
     endpoint = processes.free_endpoint()
     changes = ("--set", "drive.speed_hz=12", "--set", "commands=[]", "--duration-s", "4")
     with processes.rig("run", "hammer", "--pace", pace, "--listen", endpoint, *changes) as child:
-        with rig.connect(f"zenoh:{endpoint}", wait_s=processes.COMPILE_S, **settings) as machine:  # pyright: ignore[reportArgumentType]
+        with rig.connect(f"zenoh:{endpoint}", wait_s=processes.COMPILE_S, **settings) as machine:
             yield machine
         child.terminate()
         child.communicate(timeout=30.0)
@@ -85,7 +86,7 @@ def test_turns_are_those_of_the_shaft() -> None:
     ({"channels": ["disk_x"], "truth": ["contacts"]}, "truth must be one of the rig's tables, such as contact"),
     ({"channels": ["disk_x"], "rate_hz": 3000.0}, "rate_hz must be 20000 divided by a whole number"),
 ])  # fmt: skip
-def test_what_the_rig_does_not_have_is_told(settings: dict[str, object], says: str) -> None:
+def test_what_the_rig_does_not_have_is_told(settings: dict[str, Any], says: str) -> None:
     with pytest.raises((InputError, UnknownNameError)) as caught, connected(**settings):
         pass
     assert says in str(caught.value)
