@@ -165,9 +165,9 @@ def _documents() -> list[str]:
         "converter's counts, t the time since it began [s], u(n) and g(n) uniform and normal numbers by row, sample, "
         "slot or turn, of the scene's seed.",
         "",
-        "| kind | stage | what it does | numbers | channels |",
-        "|---|---|---|---|---|",
-        *(f"| `{name}` | {' | '.join(rest)} |" for name, *rest in described()),
+        "| kind | stage | what it does | numbers | on | at |",
+        "|---|---|---|---|---|---|",
+        *(f"| `{name}` | {' | '.join(rest)} |" for name, *rest in described(rig_table())),
         "",
         f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.",
         "",

@@ -8,6 +8,7 @@ makes it. A file is written beside its place and moved there when it is whole.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -266,9 +267,12 @@ class McapRun:
     def _write(self, frame: Frame) -> None:
         for event in frame.events:
             self._event(event)
-        for key, block in frame.blocks():
-            self._writer.write(key, wire.encode_block(block), self._wall(frame.tick))
-            self._rows.follow(key, block.index, len(block.values))
+        for told in frame.told:
+            self._writer.write(wire.FAULTS, wire.encode_document(told), self._wall(frame.tick))
+        for message in frame.messages:
+            if "zenoh" in message.doors:
+                self._writer.write(message.key, wire.encode_block(message.block), self._wall(frame.tick))
+                self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
 
     def _event(self, event: dict[str, Any]) -> None:
         tick = int(event.get("tick", self.simulation.tick))  # a frame's own: the simulation is further on by now
