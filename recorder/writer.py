@@ -293,6 +293,7 @@ class _Topics:
             "last_time_s": f"{counts.last_time_ns / NS:.9f}",
             "rows": json.dumps(counts.rows),
             "lost_rows": json.dumps({key: lost for key, lost in counts.lost.items() if lost}),
+            "declared_rows": json.dumps({key: rows for key, rows in counts.declared.items() if rows}),
             "gaps": str(counts.gaps),
             "missed_messages": json.dumps(counts.missed),
             "malformed": str(counts.malformed),

@@ -280,6 +280,8 @@ def tell(summary: Summary) -> None:
         echo(f"{summary.removed} older files were removed to make room")
     for line in summary.losses or ("nothing",):
         echo(f"lost: {line}")
+    for key, rows in summary.declared.items():
+        echo(f"not lost: {rows} rows of {key}, which a fault took before they were sent, or sent late")
     if summary.lost or summary.missed:
         inside = ", those inside a capture," if summary.fired is not None else ""
         echo(f"the gaps ({summary.gaps}){inside} are recorded in the file on recorder/gaps")
