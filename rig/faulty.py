@@ -141,13 +141,16 @@ class Faulty:
         Raises:
             InputError: It cannot be carried out.
         """
-        before = sum(isinstance(other, FaultCommand) for other in waiting)
-        known = [one.id for one in self._all() if one.end > tick]
+        begun, known = self._begun, [one.id for one in self._all() if one.end > tick]
+        for other in waiting:
+            if isinstance(other, FaultCommand):
+                known.append(begun := begun + 1)
+            elif isinstance(other, ClearCommand):
+                known = [number for number in known if other.id not in ("all", number)]
         if isinstance(command, FaultCommand):
-            if len(known) + before >= _MOST:
+            if len(known) >= _MOST:
                 raise InputError("fault", f"one of at most {_MOST} at a time", Words("another"))
-            return self._told(self._begun + before + 1, self.targets(command, tick), tick)
-        known += range(self._begun + 1, self._begun + before + 1)
+            return self._told(begun + 1, self.targets(command, tick), tick)
         if command.id != "all" and command.id not in known:
             there = ", ".join(map(str, known)) or "none"
             raise InputError("clear.id", f"the number of a fault that there is ({there}), or all", command.id)

@@ -245,13 +245,14 @@ class Intake:
         found = list[Taken]()
         if not self._rows.declare(document):
             return found
-        for each in [one for rest in (*self._left_out.values(), *self._waiting.values()) for one in rest]:
-            if self._rows.knows(each.key, each.block):
-                for rest in (self._left_out.get(each.key, ()), self._waiting.get(each.key, ())):
-                    if each in rest:
-                        self.refused -= rest is self._left_out.get(each.key)
-                        rest.remove(each)
-                found += self._believe([each])
+        for rest in (*self._left_out.values(), *self._waiting.values()):
+            for each in list(rest):
+                if self._rows.knows(each.key, each.block):
+                    found += self._believe([each])
+            left = [each for each in rest if all(each is not one for one in found)]
+            self.refused -= len(rest) - len(left) if isinstance(rest, deque) else 0
+            rest.clear()
+            rest.extend(left)
         return found
 
     def rest(self, rows: Mapping[str, int] | None, key: str | None = None) -> list[Taken]:

@@ -92,6 +92,8 @@ class Kind(Written):
     stage: ClassVar[str]
     channel_only: ClassVar[str] = ""
     """Signal of the only channels that it is for."""
+    first: ClassVar[tuple[str, ...]] = ()
+    """Its main number, where that is not the first."""
     of_blocks: ClassVar[bool] = False
     """It is about blocks, not about what stands in them (`rig.faults.blocks`)."""
 
@@ -99,6 +101,13 @@ class Kind(Written):
     def name(cls) -> str:
         """As it is called."""
         return get_args(cls.model_fields["kind"].annotation)[0]
+
+    @classmethod
+    def main(cls) -> str:
+        """The number that says most, for where there is room for one; empty where it has none."""
+        own = [(key, field) for key, field in cls.model_fields.items() if key not in ("kind", "door", "block_s")]
+        required = [key for key, field in own if field.is_required()]
+        return next(iter((*required, *cls.first, *(key for key, _ in own))), "")
 
     @property
     def reads(self) -> tuple[str, ...]:

@@ -175,6 +175,7 @@ class Short(Open):
 class Intermittent(Open):
     """A loose contact: v' = level_v in those slots of slot_s whose u(slot) < part."""
 
+    first = ("part",)
     kind: Literal["intermittent"] = "intermittent"  # pyright: ignore[reportIncompatibleVariableOverride]
     part: Part = 0.2
     slot_s: Annotated[FiniteFloat, Field(ge=1e-4, le=100.0)] = 0.01

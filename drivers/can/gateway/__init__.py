@@ -121,7 +121,9 @@ class Gateway:
         self._falling_behind = Rising("CAN: {} blocks were dropped: the gateway does not keep up")
         room = math.ceil(_WAIT_S * sum(1.0 / period_s for period_s in schedule.messages().values()))
         self.outbox = Outbox(bus, room=room, paced=paced, now=now)
-        self.commands = Commands(client, self._acknowledge, timeout_s=command_timeout_s, now=now, guard=self.guard)
+        self.commands = Commands(
+            client, self._acknowledge, timeout_s=command_timeout_s, now=now, guard=self.guard, table=schedule.table
+        )
         self._threads = [
             threading.Thread(target=target, name=f"can gateway {name}", daemon=True)
             for name, target in (
@@ -285,7 +287,8 @@ class Gateway:
     def _sync(self, block: wire.Block) -> None:
         every = round(_SYNC_S * self._rate_hz)
         for index in range(-(-block.index // every) * every, block.index + len(block.values), every):
-            time_s = index / self._rate_hz
+            # As the block says: whoever ties bus time to the stream meets stamps that do not go on.
+            time_s = block.start_s + (index - block.index) / self._rate_hz
             self.outbox.put_one(
                 self._messages["Sync"], time_s, index=index & _WORD_32, time=round(1e6 * time_s) & _WORD_32
             )
@@ -307,7 +310,7 @@ class Gateway:
         kind = EventKind[name.upper()] if name.upper() in EventKind.__members__ else EventKind.OTHER
         self._ended |= kind is EventKind.END
         time_us = round(1e6 * float(event.get("time_s", 0.0)))
-        value = event.get("force_n" if kind is EventKind.HAMMER else "speed_hz", 0.0)
+        value = event.get({EventKind.HAMMER: "force_n", EventKind.FAULT: "fault"}.get(kind, "speed_hz"), 0.0)
         value = value if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
         # With the samples of its time; its identifier loses against theirs, so that the end comes last.
         self.outbox.put_one(
