@@ -129,23 +129,28 @@ class Resonance(Kind):
     quality: Annotated[FiniteFloat, Field(gt=0.5, le=1000.0)] = 10.0
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        w, names = 2.0 * math.pi * self.frequency_hz, (f"{at.channel.name} re", f"{at.channel.name} im")
+        w, names = 2.0 * math.pi * self.frequency_hz, [f"{at.channel.name} {part}" for part in ("re", "im", "x", "t")]
         # x' = 2 Re(z) with dz/dt = p z + r x, of one pole p and its residue r.
         p = complex(-0.5 / self.quality, math.sqrt(1.0 - 0.25 / self.quality**2)) * w
         r = -0.5j * w * w / p.imag
-        z = complex(*(at.kept[name] for name in names)) if names[0] in at.kept else -r / p * float(x[0])
+        re, im, before, t = (at.kept.get(name) for name in names)
+        values, times = x.tolist(), at.t.tolist()
+        z = -r / p * values[0] if re is None or im is None else complex(re, im)
+        # Rows begin with the last one of those before; samples do not.
+        goes_on = before is not None and t is not None and times[0] > t + 1e-9
+        if goes_on:
+            values, times = [before, *values], [t, *times]
         found = [z]
-        if len(x) > 1:
-            step = p * round(1e9 * (at.t[1] - at.t[0])) * 1e-9
+        if len(values) > 1:
+            step = p * round(1e9 * (times[1] - times[0])) * 1e-9
             turn = cmath.exp(step)
             second = r / p * ((turn - 1.0) / step - 1.0)
             first = r / p * (turn - 1.0) - second
-            values = x.tolist()
-            for before, now in pairwise(values):
-                z = turn * z + first * before + second * now
+            for one, other in pairwise(values):
+                z = turn * z + first * one + second * other
                 found.append(z)
-        at.kept.update(zip(names, (z.real, z.imag), strict=True))
-        return 2.0 * np.real(found)
+        at.kept.update(zip(names, (z.real, z.imag, values[-1], times[-1]), strict=True))
+        return 2.0 * np.real(found[1:] if goes_on else found)
 
 
 # ---- cable and conditioner ----
