@@ -50,16 +50,22 @@ class Frame:
     @property
     def messages(self) -> list[Message]:
         """What is sent, in this order."""
-        if self.sent is not None:
-            return self.sent
-        blocks = {sensor_key(group): block for group, block in self.samples.items() if len(block.values)}
-        blocks |= {EDGES: self.edges} if self.edges is not None else {}
-        blocks |= {truth_key(table): block for table, block in self.truth.items()}
-        return [Message(key, block, block.index) for key, block in blocks.items()]
+        return [Message(key, block, block.index) for key, block in self._plain()] if self.sent is None else self.sent
 
     def blocks(self) -> Iterator[tuple[str, Block]]:
         """Keys and blocks as they are published, but on CAN."""
-        return ((message.key, message.block) for message in self.messages if "zenoh" in message.doors)
+        if self.sent is None:
+            return self._plain()
+        return ((message.key, message.block) for message in self.sent if "zenoh" in message.doors)
+
+    def _plain(self) -> Iterator[tuple[str, Block]]:
+        for group, block in self.samples.items():
+            if len(block.values):
+                yield sensor_key(group), block
+        if self.edges is not None:
+            yield EDGES, self.edges
+        for table, block in self.truth.items():
+            yield truth_key(table), block
 
 
 @dataclass
@@ -118,7 +124,7 @@ class Sending:
             frame: The frame.
             last: It is the last of the run: nothing is held back any more.
         """
-        told = [event for event in frame.events if event["event"] in ("fault", "clear")]
+        told = [event for event in frame.events if event["event"] in ("fault", "clear")] if frame.events else []
         if not (self.active or self._gathered or self._held):
             return replace(frame, told=told) if told else frame
         end, sent, blocks = frame.tick + frame.ticks, list[Message](), list[dict[str, Any]]()
@@ -183,9 +189,9 @@ def _through(message: Message, faults: list[Active]) -> list[_Held]:
                 tuple(door for door in held.message.doors if (door in one.what.doors) == acts) for acts in (True, False)
             )
             if outside:
-                found.append(replace(held, message=replace(held.message, doors=outside)))
+                found.append(replace(held, message=held.message._replace(doors=outside)))
             if inside:
-                made = one.what.sent(replace(held.message, doors=inside), u, first)
+                made = one.what.sent(held.message._replace(doors=inside), u, first)
                 found += [_Held(each, (*held.by, one) if each.due != held.message.due else held.by) for each in made]
     return found
 

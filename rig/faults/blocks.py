@@ -6,8 +6,8 @@ number of such a block, and u(n) a uniform number of the fault's own. Counts are
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from dataclasses import replace
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, FiniteFloat
 
@@ -22,8 +22,7 @@ MOST_LATE_S = 10.0
 Some = Annotated[FiniteFloat, Field(gt=0.0, le=1.0)]
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(NamedTuple):
     """A block on its way.
 
     Attributes:
@@ -111,7 +110,7 @@ class ReorderBlocks(OfBlocks):
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         later = message.due + self.ticks
-        return [replace(message, due=later, behind=True) if u < self.part else message]
+        return [message._replace(due=later, behind=True) if u < self.part else message]
 
 
 class LateBlocks(OfBlocks):
@@ -121,7 +120,7 @@ class LateBlocks(OfBlocks):
     delay_s: Annotated[FiniteFloat, Field(gt=0.0, le=MOST_LATE_S)]
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
-        return [replace(message, due=message.due + round(1e6 * self.delay_s))]
+        return [message._replace(due=message.due + round(1e6 * self.delay_s))]
 
 
 class StaleStamps(OfBlocks):
@@ -135,7 +134,7 @@ class StaleStamps(OfBlocks):
             raise InputError("fault.channel", must, group)
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
-        return [replace(message, block=replace(message.block, tick=first[1]))]
+        return [message._replace(block=replace(message.block, tick=first[1]))]
 
 
 class Restart(OfBlocks):
@@ -146,7 +145,7 @@ class Restart(OfBlocks):
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         row, tick = first
         block = replace(message.block, index=message.block.index - row, tick=max(0, message.block.tick - tick))
-        return [replace(message, block=block)]
+        return [message._replace(block=block)]
 
 
 BlockKind = Dropout | LoseBlocks | DuplicateBlocks | ReorderBlocks | LateBlocks | StaleStamps | Restart

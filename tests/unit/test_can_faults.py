@@ -24,8 +24,13 @@ from drivers.can.signals import (
 )
 from rig.errors import InputError
 from rig.faults import KINDS
+from rig.pacing import FreeRun
 from rig.scenes import load_scene, parse_scene, scene_document
+from rig.service import Service
 from rig.simulation import Simulation
+from rig.transport.fanout import Fanout
+from rig.transport.memory import MemoryClient, MemoryServer
+from rig.wire import SAMPLE_SCHEMA, decode_block, sensor_key
 from tests.unit.test_can_gateway import rig
 from tests.unit.test_channel_faults import BLOCKS, EXAMPLES
 from tests.waiting import until
@@ -109,6 +114,7 @@ def frames(*faults: dict[str, Any]) -> dict[str, list[bytes]]:
         setup.start()
         setup.join()
         until(lambda: any(row["event"] == EventKind.END for row in setup.tap.decoded("Event")))
+        assert setup.gateway.dropped == 0  # what a fault took is not what the bus did not
         return {name: setup.tap.of(name) for name in ("Probes", "Forces", "Samples_1", "Sync")}
 
 
@@ -126,3 +132,22 @@ def test_faults_of_blocks_show_on_the_bus_and_on_their_stream_alone(kind: str, s
         assert all(there[name] != sound[name] for name in shown)
     whole = {"dropout": 0.5, "lose-blocks": 0.8}.get(kind, 2.0)
     assert len(there["Probes"]) <= whole * len(sound["Probes"])
+
+
+def test_at_one_door_only() -> None:
+    """What a fault does on CAN, those on zenoh do not see, and the other way round."""
+    faults = [
+        {"at_s": at_s, "channel": "probes", "kind": "dropout", "for_s": 0.1, "door": door}
+        for at_s, door in ((0.0, "can"), (0.2, "zenoh"))
+    ]
+    simulation = Simulation(parse_scene({**scene_document(SCENE), "commands": [], "faults": faults}))
+    servers, came = {door: MemoryServer() for door in ("zenoh", "can")}, dict[str, list[int]]()
+    for door, server in servers.items():
+        MemoryClient(server).subscribe(
+            sensor_key("probes"),
+            lambda _, payload, door=door: came.setdefault(door, []).append(decode_block(payload, SAMPLE_SCHEMA).index),
+        )
+    Service(simulation, Fanout([*servers.values()], doors=servers), FreeRun(), block_ticks=10_000).run()
+    assert came == {"can": [*range(2000, 8000, 200)], "zenoh": [*range(0, 4000, 200), *range(6000, 8000, 200)]}
+    with pytest.raises(InputError, match="door must be one that this rig has: zenoh"):
+        Service(Simulation(simulation.scene), MemoryServer(), FreeRun(), block_ticks=10_000)

@@ -50,6 +50,18 @@ class _Catalogue(Outside, extra="ignore"):
     table: dict[str, Any]
 
 
+class _Stretch(Outside, extra="ignore"):
+    key: str
+    row: int
+    rows: int
+
+
+class _Told(Outside, extra="ignore"):
+    """What the rig tells of its faults: rows whose blocks they met."""
+
+    blocks: list[_Stretch] = pydantic.Field(default=[])
+
+
 class Gateway:
     """Sends what a rig publishes as CAN messages, and gives it the commands that come from the bus.
 
@@ -114,6 +126,10 @@ class Gateway:
 
         self.blocks_dropped = 0
         """Blocks that the sender had no time for."""
+        self.taken = 0
+        """Frames that were never made because a fault of blocks took their samples, or sent them out of turn."""
+        self._told: dict[str, int] = {}
+        """Number of the row behind the last one that such a fault met, by group."""
         self.bus_errors = 0
         """Calls of the bus that failed while receiving."""
         self.guard = Guard("the CAN gateway")
@@ -140,7 +156,7 @@ class Gateway:
         self._bus.set_filters([{"can_id": each, "can_mask": STANDARD_MASK, "extended": False} for each in IDENTIFIERS])
         for group in self._groups:
             self._client.subscribe(wire.sensor_key(group), self._take)
-        for key in (wire.EDGES, wire.EVENTS, wire.STATUS):
+        for key in (wire.EDGES, wire.EVENTS, wire.STATUS, wire.FAULTS):
             self._client.subscribe(key, self._take)
         for thread in self._threads:
             thread.start()
@@ -190,7 +206,7 @@ class Gateway:
     @property
     def dropped(self) -> int:
         """Frames that the bus did not take, or that were never made because samples were missing."""
-        return self.outbox.dropped + sum(each.skipped for each in self._samples)
+        return self.outbox.dropped + sum(each.skipped for each in self._samples) - self.taken
 
     # On the publisher's thread.
 
@@ -199,7 +215,7 @@ class Gateway:
             if not self._paced:
                 while len(self._queue) >= self._capacity and not self._stopping:
                     self._changed.wait(0.1)
-            while len(self._queue) >= self._capacity and key not in (wire.EVENTS, wire.STATUS):
+            while len(self._queue) >= self._capacity and key not in (wire.EVENTS, wire.STATUS, wire.FAULTS):
                 self._queue.popleft()
                 self.blocks_dropped += 1
             self._queue.append((key, payload))
@@ -255,6 +271,9 @@ class Gateway:
         """
         if key == wire.EVENTS:
             self._on_event(wire.decode_document(payload))
+        elif key == wire.FAULTS:
+            told = check(_Told, payload, field="faults", most_bytes=DOCUMENT_BYTES)
+            self._told |= {one.key.rpartition("/")[2]: one.row + one.rows for one in told.blocks}
         elif key == wire.STATUS:
             self._status = wire.decode_document(payload)
         elif key == wire.EDGES:
@@ -269,10 +288,15 @@ class Gateway:
         if self.state == State.PREPARING:
             self.state = State.RUNNING
         for each in self._samples:
-            if group in each.columns and (complete := each.take(group, block)) is not None:
+            if group not in each.columns:
+                continue
+            skipped = each.skipped
+            if (complete := each.take(group, block)) is not None:
                 # A frame is due with its last instant.
                 last, data = complete
                 self.outbox.put(each.message, data, last / self._rate_hz)
+            if any(block.index <= self._told.get(name, -1) for name in each.columns):
+                self.taken += each.skipped - skipped
         if group == self._groups[0]:
             self._sync(block)
 
