@@ -7,7 +7,6 @@ sample n: the same in every run with the same seed, however it is cut into block
 
 from __future__ import annotations
 
-import cmath
 import math
 from itertools import pairwise
 from typing import Annotated, Literal, get_args
@@ -143,7 +142,7 @@ class Resonance(Kind):
         found = [z]
         if len(values) > 1:
             step = p * round(1e9 * (times[1] - times[0])) * 1e-9
-            turn = cmath.exp(step)
+            turn = math.exp(step.real) * complex(math.cos(step.imag), math.sin(step.imag))
             second = r / p * ((turn - 1.0) / step - 1.0)
             first = r / p * (turn - 1.0) - second
             for one, other in pairwise(values):
