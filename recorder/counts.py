@@ -113,6 +113,11 @@ class Tally:
             return start_ns, start_ns
         return start_ns, start_ns + round((len(block.values) - 1) * NS / block.rate_hz)
 
+    def true(self, payload: Payload) -> Payload:
+        """A block that has not been taken, with its own number and tick where a fault gave it others."""
+        block = payload.block
+        return payload if block is None else replace(payload, block=self._continuity.true(payload.key, block))
+
     def take(self, payload: Payload) -> Gap | None:
         """Count a payload; give the step of the row numbers before it, if there is one."""
         self.malformed += payload.malformed
@@ -121,7 +126,7 @@ class Tally:
             if key == FAULTS and payload.document is not None:
                 self._continuity.declare(payload.document)
             return None
-        start_ns, end_ns = self.extent_ns(replace(payload, block=self._continuity.true(key, block)))
+        start_ns, end_ns = self.extent_ns(self.true(payload))
         if self._from_start and key not in self.next:
             self._continuity.follow(key, 0, 0)
         gap = self._continuity.take(key, block)

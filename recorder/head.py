@@ -201,7 +201,6 @@ rig/sensors/GROUP: rig_msgs/msg/SampleBlock (ROS 2 CDR, its definition is in the
     value = counts * scale + offset, from the channel's metadata (JSON lists in column order) or the table below.
 rig/sensors/keyphasor_edges: rig_msgs/msg/TruthBlock of one column; edges at (`tick` + value) / `tick_rate_hz` seconds.
 rig/truth/TABLE: rig_msgs/msg/TruthBlock, float64 rows of the model's true state; units in the channel's metadata.
-rig/truth/faults: JSON, what faults of the rig did: to channels from which rows on, to which blocks of a stream.
 rig/events, rig/status: JSON, as the rig published them.
 recorder/gaps: JSON, what never arrived: `size` rows from number `index` on, or `size` messages (kind "messages").
     No message there means that nothing was lost.

@@ -30,6 +30,7 @@ class Stream:
         rows: Number of rows in them.
         lost: Number of rows missing between them, counted anew from the row numbers.
         declared: Of these, those that a fault has taken, as the rig told.
+        around: The same before the first row and behind the last: number of the first, and how many.
         first_time_s: Simulated time of the first row [s].
         last_time_s: Simulated time of the last row [s].
         start_s: Simulated time of the first tick that a block names, which edges lie behind [s].
@@ -56,6 +57,7 @@ class Stream:
     misplaced: int = 0
     missing: int = 0
     declared: int = 0
+    around: tuple[tuple[int, int], ...] = ()
 
     def then(self, later: Stream) -> Stream:
         """The same stream with what it goes on with in another file."""
@@ -64,9 +66,14 @@ class Stream:
             for name in ("messages", "rows", "lost", "odd", "back", "off", "misplaced", "missing", "declared")
         }
         if not (self.rows and later.rows):
-            return replace(self if self.rows else later, **sums)
+            return replace(self if self.rows else later, **sums, around=(*self.around, *later.around))
         sums["lost"] += max(0, later.first - self.due)
-        return replace(self, **sums, last_time_s=later.last_time_s, due=later.due)
+        reached = self.due
+        for row, rows in sorted((*self.around, *later.around)):
+            end = min(row + rows, later.first)
+            sums["declared"] += max(0, end - max(row, reached))
+            reached = max(reached, end)
+        return replace(self, **sums, last_time_s=later.last_time_s, due=later.due, around=later.around)
 
 
 class Survey:
@@ -150,7 +157,7 @@ class Survey:
             return None
         here, block = block, self._continuity.true(key, block)
         gap = self._continuity.take(key, here)
-        if not stream.messages:
+        if not stream.messages or (gap is None and block.index < stream.first):
             stream.first, stream.start_s = block.index, block.tick / block.tick_rate_hz
         if gap is not None:
             self._steps.setdefault(key, []).append(gap)
@@ -188,10 +195,10 @@ class Survey:
         stated, continuity = self.file.stated_rows, self._continuity
         # A file that does not go to the end of a run ends where it was to end.
         whole = not {"trigger", "cut"} & set(self.file.metadata)
-        for key in set(self.streams) | {key for key, rows in stated.items() if rows}:
+        for key in {*self.streams, *continuity.faulty} | {key for key, rows in stated.items() if rows}:
             stream = self.streams.setdefault(key, Stream())
             stream.rows, stream.lost = continuity.received.get(key, 0), continuity.lost.get(key, 0)
-            stream.declared = continuity.declared.get(key, 0)
+            stream.declared, stream.around = continuity.declared.get(key, 0), continuity.around(key)
             stream.due = continuity.next.get(key, 0)
             end = self._published.get(key, stream.due)
             short = end - stream.due if whole and key in continuity.next and (key, end) not in self._noted else 0

@@ -52,6 +52,7 @@ class Declared(Continuity):
         self._first: dict[str, int] = {}
         self._known: dict[str, dict[tuple[int, int, int], list[int]]] = {}
         """True row of what was told, and how many are to come, by number, tick and length."""
+        self._before: dict[str, list[tuple[int, int]]] = {}
         self._holes: dict[str, deque[tuple[int, int]]] = {}
         self._never: dict[str, deque[tuple[int, int]]] = {}
 
@@ -112,7 +113,10 @@ class Declared(Continuity):
         holes = self._holes.get(key, deque())
         hole = next((each for each in reversed(holes) if each[0] <= row and row + rows <= each[1]), None)
         if hole is None:
-            self.stale += rows
+            early = row + rows <= self._first[key]
+            self.received[key] += rows if early else 0
+            self.stale += 0 if early else rows
+            self._first[key] = row if early else self._first[key]
             return
         holes.remove(hole)
         holes.extend(part for part in ((hole[0], row), (row + rows, hole[1])) if part[0] < part[1])
@@ -129,3 +133,14 @@ class Declared(Continuity):
                 never.appendleft((row + here, rows - here))
             if row >= self._first.get(key, 0):
                 self.declared[key] = self.declared.get(key, 0) + here
+            else:
+                self._before.setdefault(key, []).append((row, here))
+
+    @property
+    def faulty(self) -> set[str]:
+        """Streams that blocks were never sent of."""
+        return {*self._never}
+
+    def around(self, key: str) -> tuple[tuple[int, int], ...]:
+        """Rows that were never sent before the first block of a stream, and behind its last: first and number."""
+        return (*self._before.get(key, ()), *self._never.get(key, ()))

@@ -61,7 +61,7 @@ class Triggers:
     trigger: Annotated[
         list[str] | None,
         _triggers(
-            "Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
+            "Record only around this: an event (hammer, speed, release, fault, note, warning) or a level such as "
             "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
             "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
             metavar="EVENT|LEVEL",

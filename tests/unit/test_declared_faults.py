@@ -10,9 +10,11 @@ from typing import Any
 import pytest
 
 import recorder.session
-from recorder.reader import Recording
+from recorder.reader import Recording, join
+from recorder.room import Limits
 from recorder.session import RecordingSession
 from recorder.summary import Summary
+from recorder.trigger import Capture, Trigger
 from replays.recordings.export import write_run
 from rig import wire
 from rig.scenes import parse_scene
@@ -44,7 +46,7 @@ def published(kind: str) -> list[tuple[str, bytes]]:
     return [*items, (wire.EVENTS, wire.encode_document(rows.tell(end)))]
 
 
-def recorded(path: Path, kind: str, items: list[tuple[str, bytes]]) -> Summary:
+def recorded(path: Path, kind: str, items: list[tuple[str, bytes]], **options: Any) -> Summary:
     simulation, client = Simulation(scene(kind)), ScriptedClient()
     for key, document in (
         (wire.CATALOGUE, simulation.catalogue()),
@@ -62,7 +64,7 @@ def recorded(path: Path, kind: str, items: list[tuple[str, bytes]]) -> Summary:
     thread = threading.Thread(target=publish)
     thread.start()
     try:
-        return RecordingSession(client, path).run()
+        return RecordingSession(client, path, **options).run()
     finally:
         thread.join()
 
@@ -130,3 +132,17 @@ def test_who_is_told_nothing_of_faults_believes_none_of_it(tmp_path: Path) -> No
     items = [item for item in published("dropout") if item[0] != wire.FAULTS]
     summary = recorded(tmp_path / "untold.mcap", "dropout", items)
     assert summary.lost == {PROBES: 4000}
+
+
+@pytest.mark.parametrize("kind", BLOCKS)
+def test_so_it_is_in_several_files_and_around_triggers(kind: str, tmp_path: Path) -> None:
+    items = published(kind)
+    summary = recorded(tmp_path / "parts.mcap", kind, items, limits=Limits(rotate_s=0.13))
+    assert summary.good
+    parts = join(list(summary.files))
+    assert len(summary.files) == 4
+    assert (parts.doubts, parts.streams[PROBES].lost - parts.streams[PROBES].declared) == ((), 0)
+    capture = Capture((Trigger.parse("fault"),), pre_s=0.03, post_s=0.1)
+    summary = recorded(tmp_path / "around.mcap", kind, items, capture=capture)
+    assert summary.good
+    assert Recording.open(summary.files[0]).doubts == ()
