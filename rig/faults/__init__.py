@@ -92,7 +92,7 @@ def stream_of(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str
         InputError: There is no such group, or no such door; the message says what there is.
     """
     known = supported(type(what), table)
-    if target in table.channels:
+    if target in table.channels and target not in known:
         must = f"a group for {what.name()}, as a block is of all its channels, such as {table.channels[target].group}"
         raise InputError("fault.channel", must, target)
     if target not in known:

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from rig.errors import InputError
-from rig.faults import Draws
+from rig.faults import KINDS, Draws, supported
 from rig.faults.blocks import LoseBlocks, ReorderBlocks
 from rig.scenes import load_scene
 from rig.sending import Active, Frame, Sending
 from rig.simulation import Simulation
 from rig.wire import Block, sensor_key
-from tests.unit.test_channel_faults import BLOCKS
+from tests.unit.test_channel_faults import BLOCKS, EXAMPLES
 
 SCENE = load_scene("hammer", {"duration_s": 0.4, "sensors.groups": ["probes", "forces"]})
 PROBES, FORCES = sensor_key("probes"), sensor_key("forces")
@@ -169,3 +169,29 @@ def test_a_door_that_is_not_there_is_refused() -> None:
     simulation.serve(("zenoh",))
     with pytest.raises(InputError, match=r"door must be one that this rig has: zenoh \(a CAN bus: rig run --can\)"):
         simulation.submit("fault", {"channel": "probes", "kind": "dropout", "door": "can"})
+
+
+@pytest.mark.parametrize("scene", ["hammer", "test-sine"])
+def test_what_is_listed_is_what_is_taken(scene: str) -> None:
+    """Every kind on every channel and group: taken where the list has it, refused where not."""
+    simulation = Simulation(load_scene(scene))
+    simulation.advance(10_000)
+    table, setting = simulation.table, simulation.scene.setting
+    for kind, cls in KINDS.items():
+        listed = supported(cls, table, setting)
+        for target in (*table.channels, *table.groups):
+            number = {"swap": {"other": "P_N"}, "crosstalk": {"source": "P_N"}}.get(kind, (EXAMPLES | BLOCKS)[kind])
+            if kind in ("swap", "crosstalk") and target in ("P_N", "forces"):
+                number = dict.fromkeys(number, "disk_x")
+            if kind == "swap" and target in table.groups:
+                continue
+            inside = table.groups[target].names if target in table.groups else (target,)
+            names = (target,) if cls.of_blocks else inside
+            fits = any if cls.channel_only else all
+            try:
+                simulation.submit("fault", {"channel": target, "kind": kind, **number})
+                taken = True
+                simulation.submit("clear", {})
+            except InputError:
+                taken = False
+            assert taken == fits(listed.get(name, "not there") == "" for name in names), (kind, target)
