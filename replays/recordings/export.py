@@ -25,6 +25,7 @@ from replays.recordings.formats import columnar, delimited
 from replays.recordings.formats.export import check_output, export
 from replays.recordings.formats.selection import select
 from rig import wire
+from rig.commands import FaultCommand
 from rig.errors import PART_SUFFIX, InputError, Words, whole_file
 from rig.kernels.signals import ROW
 from rig.offline import frames
@@ -101,8 +102,12 @@ def table_columns(simulation: Simulation) -> list[str]:
     """Column headings of a table of a run.
 
     Raises:
-        InputError: Groups have rates of their own.
+        InputError: Groups have rates of their own, or the scene has faults of blocks.
     """
+    for timed in simulation.scene.commands:
+        if isinstance(timed.request, FaultCommand) and timed.request.what.of_blocks:
+            must = "an .mcap file where a scene has faults of blocks, of which a table has none"
+            raise InputError("output", must, Words(timed.request.what.name()))
     rates = {name: group.rate_hz for name, group in simulation.table.groups.items()}
     if len(set(rates.values())) > 1:
         told = ", ".join(f"{name} {rate} Hz" for name, rate in rates.items())

@@ -134,9 +134,9 @@ def through(what: Any, blocks: int, seed: int = 5) -> list[int]:
     return found
 
 
-@pytest.mark.parametrize("part", [0.03, 0.4, 0.9])
+@pytest.mark.parametrize("part", [0.1, 0.6])
 def test_random_ones_are_as_often_as_they_say_and_independent(part: float) -> None:
-    n = 4000
+    n = 2000
     came = np.isin(np.arange(n), through(LoseBlocks(part=part), n))
     sigma = math.sqrt(part * (1.0 - part) / n)
     assert abs(1.0 - came.mean() - part) < 4.0 * sigma

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from recorder.summary import Summary
 from recorder.trigger import Capture, Trigger
 from replays.recordings.export import write_run
 from rig import wire
+from rig.errors import InputError
 from rig.scenes import parse_scene
 from rig.simulation import Simulation
 from tests.unit.recorder_stream import ScriptedClient
@@ -25,11 +27,13 @@ from tests.unit.test_channel_faults import BLOCKS
 PROBES = wire.sensor_key("probes")
 
 
+@cache
 def scene(kind: str) -> Any:
     fault = {"at_s": 0.1, "channel": "probes", "kind": kind, "for_s": 0.2, **BLOCKS[kind]}
-    return parse_scene({"duration_s": 0.4, "drive": {"speed_hz": 6.2}, "faults": [fault]})
+    return parse_scene({"duration_s": 0.4, "sensors": {"groups": ["probes", "drive"]}, "faults": [fault]})
 
 
+@cache
 def published(kind: str) -> list[tuple[str, bytes]]:
     """What a rig says, in its order."""
     simulation, rows = Simulation(scene(kind)), wire.Continuity()
@@ -146,3 +150,10 @@ def test_so_it_is_in_several_files_and_around_triggers(kind: str, tmp_path: Path
     summary = recorded(tmp_path / "around.mcap", kind, items, capture=capture)
     assert summary.good
     assert Recording.open(summary.files[0]).doubts == ()
+
+
+def test_a_table_of_rows_has_no_blocks_and_refuses_their_faults(tmp_path: Path) -> None:
+    for suffix in ("csv", "wav"):
+        with pytest.raises(InputError, match=r"output must be an \.mcap file where a scene has faults of blocks"):
+            write_run(Simulation(scene("dropout")), tmp_path / f"x.{suffix}")
+    assert list(tmp_path.iterdir()) == []
