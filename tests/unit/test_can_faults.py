@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,7 +18,6 @@ from drivers.can.signals import (
     Kind,
     Result,
     clear_frame,
-    default_messages,
     fault_frame,
     messages_for,
     parse_command,
@@ -36,6 +36,7 @@ from tests.unit.test_channel_faults import BLOCKS, EXAMPLES
 from tests.waiting import until
 
 pytestmark = pytest.mark.wallclock
+ROOT = Path(__file__).parents[2]
 SCENE = load_scene("hammer", {"duration_s": 0.4})
 SIMULATION = Simulation(SCENE)
 SIMULATION.tick = 10_000  # a restart is none at the first row
@@ -79,8 +80,11 @@ def test_clear_and_what_is_none() -> None:
 
 
 def test_a_channel_table_of_ones_own_has_its_own_targets() -> None:
-    table = SCENE.table.model_copy(update={"groups": {"forces": SCENE.table.groups["forces"]}})
-    assert messages_for(table).by_name["Fault"] is default_messages().by_name["Fault"]
+    table = messages_for(load_scene("stable-run", {"channels": str(ROOT / "docs/daq24.toml")}).table)
+    frame = fault_frame("end_u", "freeze", 1, table=table)
+    assert parse_command(*frame, 0, table) == Command(FaultKind.FAULT, 1, {"channel": "end_u", "kind": "freeze"})
+    with pytest.raises(InputError, match=r"fault\.channel must be one of the channels"):
+        fault_frame("end_u", "freeze", 1)
 
 
 def test_a_fault_is_acknowledged_with_its_number_and_ends() -> None:
