@@ -99,7 +99,8 @@ def stream_of(what: OfBlocks, target: str, table: ChannelTable, doors: tuple[str
         raise UnknownNameError("fault.channel", f"one of the groups for {what.name()}", target, known)
     if not set(what.doors) & set(doors):
         raise InputError("door", f"one that this rig has: {', '.join(doors)} (a CAN bus: rig run --can)", what.door)
-    what.refuse_stream(target, tuple(known))
+    if must := what.needs_at(what.door, target, tuple(known)):
+        raise InputError("fault.channel", must, target)
     return target
 
 
@@ -122,7 +123,13 @@ def described(table: ChannelTable, setting: Setting = Setting()) -> list[tuple[s
         many = "groups" if kind.of_blocks else "channels"
         where = f"all {len(on)} {many}" if len(on) == len(places) else ", ".join(on) or "none"
         doc = " ".join((kind.__doc__ or "").split())
-        doors = f"{', '.join(DOORS)}, or one" if kind.of_blocks else ", ".join(DOORS)
+        doors = ", ".join(DOORS)
+        if issubclass(kind, OfBlocks):
+            groups = tuple(table.groups)
+            some = {door: [one for one in groups if not kind.needs_at(door, one, groups)] for door in DOORS}
+            doors += ", or one" + "".join(
+                f" ({door} alone: {', '.join(there)})" for door, there in some.items() if len(there) < len(groups)
+            )
         found.append((name, kind.stage, doc, ", ".join(numbers) or "none", where, doors))
     return found
 

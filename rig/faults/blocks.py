@@ -11,7 +11,6 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, FiniteFloat
 
-from rig.errors import InputError
 from rig.faults.kind import Kind
 from rig.wire import Block
 
@@ -61,6 +60,11 @@ class OfBlocks(Kind):
     def ticks(self) -> int:
         """Length of its blocks."""
         return round(1e6 * self.block_s)
+
+    @classmethod
+    def needs_at(cls, door: str, group: str, groups: tuple[str, ...]) -> str:
+        """What would have to be given in place of a group, out of all, at one door; empty where it shows there."""
+        return ""
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         """What becomes of a block.
@@ -128,10 +132,10 @@ class StaleStamps(OfBlocks):
 
     kind: Literal["stale-stamps"] = "stale-stamps"
 
-    def refuse_stream(self, group: str, groups: tuple[str, ...]) -> None:
-        if self.door == "can" and group != groups[0]:
-            must = f"{groups[0]}, whose time Sync tells, for stale-stamps on CAN (dropout is for all)"
-            raise InputError("fault.channel", must, group)
+    @classmethod
+    def needs_at(cls, door: str, group: str, groups: tuple[str, ...]) -> str:
+        away = f"{groups[0]}, whose time Sync tells, for {cls.name()} on CAN (dropout is for all)"
+        return away if door == "can" and group != groups[0] else ""
 
     def sent(self, message: Message, u: float, first: tuple[int, int]) -> list[Message]:
         return [message._replace(block=replace(message.block, tick=first[1]))]

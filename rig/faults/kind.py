@@ -128,9 +128,6 @@ class Kind(Written):
     def refuse(self, channel: Channel) -> None:
         """Raise InputError where with these numbers it would change nothing, or nothing that makes sense."""
 
-    def refuse_stream(self, group: str, groups: tuple[str, ...]) -> None:
-        """The same of one that is about blocks, of a group out of all."""
-
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         """What the sensor feels [its unit], shape (n,)."""
         return x
