@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from recorder import documents, schemas
@@ -57,7 +57,7 @@ class Stream:
     misplaced: int = 0
     missing: int = 0
     declared: int = 0
-    around: tuple[tuple[int, int], ...] = ()
+    around: list[list[int]] = field(default_factory=list)
 
     def then(self, later: Stream) -> Stream:
         """The same stream with what it goes on with in another file."""
@@ -66,10 +66,10 @@ class Stream:
             for name in ("messages", "rows", "lost", "odd", "back", "off", "misplaced", "missing", "declared")
         }
         if not (self.rows and later.rows):
-            return replace(self if self.rows else later, **sums, around=(*self.around, *later.around))
+            return replace(self if self.rows else later, **sums, around=[*self.around, *later.around])
         sums["lost"] += max(0, later.first - self.due)
         reached = self.due
-        for row, rows in sorted((*self.around, *later.around)):
+        for row, rows in sorted([*self.around, *later.around]):
             end = min(row + rows, later.first)
             sums["declared"] += max(0, end - max(row, reached))
             reached = max(reached, end)

@@ -141,6 +141,6 @@ class Declared(Continuity):
         """Streams that blocks were never sent of."""
         return {*self._never}
 
-    def around(self, key: str) -> tuple[tuple[int, int], ...]:
+    def around(self, key: str) -> list[list[int]]:
         """Rows that were never sent before the first block of a stream, and behind its last: first and number."""
-        return (*self._before.get(key, ()), *self._never.get(key, ()))
+        return [list(each) for each in (*self._before.get(key, ()), *self._never.get(key, ()))]

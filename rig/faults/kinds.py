@@ -308,7 +308,7 @@ class Late(Kind):
 class Clock(Kind):
     """A clock that is fast: a sample of time t since it began is taken at t / (1 + ppm 1e-6), 10 ms late at most.
 
-    One that is slow, with ppm below 0, begins 10 ms late, as none can be early, and is right 10 ms / (1e-6 |ppm|) on.
+    One that is slow, with ppm below 0, begins 10 ms late, as none can be early, and is right 10 ms / (-1e-6 ppm) on.
     """
 
     stage = "clock"

@@ -121,7 +121,7 @@ def test_every_kind_does_something_on_every_channel_or_is_refused(channel: str, 
         # A hammer that rests, and a spin that is all but even, show nothing of what acts on their motion.
         still = channel in ("hammer", "speed") and kind in (
             "gain", "polarity", "stuck", "nonlinear", "no-filter", "bandwidth", "saturation", "short", "clip",
-            "intermittent",
+            "intermittent", "resonance",
         )  # fmt: skip
         assert channel in differs(there, sound) or still or channel == "keyphasor"
     assert refused <= {"noise", *(kind for kind in KINDS if KINDS[kind].channel_only)}
