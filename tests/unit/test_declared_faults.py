@@ -12,6 +12,7 @@ import pytest
 
 import recorder.session
 from recorder.reader import Recording, join
+from recorder.rewrite import cut
 from recorder.room import Limits
 from recorder.session import RecordingSession
 from recorder.summary import Summary
@@ -157,3 +158,14 @@ def test_a_table_of_rows_has_no_blocks_and_refuses_their_faults(tmp_path: Path) 
         with pytest.raises(InputError, match=r"output must be an \.mcap file where a scene has faults of blocks"):
             write_run(Simulation(scene("dropout")), tmp_path / f"x.{suffix}")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", BLOCKS)
+def test_a_cut_keeps_what_was_told_and_goes_by_true_times(kind: str, tmp_path: Path) -> None:
+    write_run(Simulation(scene(kind)), tmp_path / "whole.mcap")
+    cut(Recording.open(tmp_path / "whole.mcap"), tmp_path / "part.mcap", from_s=0.15, to_s=0.35)
+    part = Recording.open(tmp_path / "part.mcap")
+    stream = part.streams[PROBES]
+    assert (part.doubts, stream.lost - stream.declared) == ((), 0)
+    if kind not in ("dropout", "lose-blocks"):
+        assert (stream.rows, stream.first_time_s) == (4000, 0.15)
