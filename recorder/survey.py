@@ -107,10 +107,8 @@ class Survey:
             self._counted[key] = self._counted.get(key, 0) + 1
             if schema_of(key) is None:
                 self._take_document(key, time_ns, payload)
-            elif (block := self._take_block(key, payload)) is not None:
-                self._agreement.timed(key, time_ns, block.tick)
-                if on_block is not None:
-                    on_block(key, block)
+            elif (block := self._take_block(key, time_ns, payload)) is not None and on_block is not None:
+                on_block(key, block)
         self._end()
 
     @cached_property
@@ -149,7 +147,7 @@ class Survey:
         found += self._agreement.doubts(self.streams, sound)
         return tuple(found)
 
-    def _take_block(self, key: str, payload: bytes) -> Block | None:
+    def _take_block(self, key: str, time_ns: int, payload: bytes) -> Block | None:
         stream = self.streams.setdefault(key, Stream())
         block, promise = self.file.block(key, payload), self.file.promises.get(key)
         if block is None:
@@ -157,6 +155,7 @@ class Survey:
             return None
         here, block = block, self._continuity.true(key, block)
         gap = self._continuity.take(key, here)
+        self._agreement.timed(key, time_ns, block.tick)
         if not stream.messages or (gap is None and block.index < stream.first):
             stream.first, stream.start_s = block.index, block.tick / block.tick_rate_hz
         if gap is not None:

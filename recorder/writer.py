@@ -251,7 +251,7 @@ class _Topics:
 
     def add(self, payload: Payload) -> None:
         """Write a payload as it came, and what derives from it; a malformed one is left to the reader to judge."""
-        start_ns, _ = self._tally.extent_ns(payload)
+        start_ns, _ = self._tally.extent_ns(self._tally.true(payload))
         self._register(payload.key)
         if (gap := self._tally.take(payload)) is not None:
             self.add_gap(gap, start_ns, payload.wall_ns)
