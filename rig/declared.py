@@ -19,6 +19,7 @@ from rig.wire import Block, Continuity, Gap
 
 _MOST = 10_000
 """Blocks of a stream that were told and have not come."""
+_MOST_STREAMS = 1000
 
 
 class _Sent(Outside, extra="ignore"):
@@ -63,6 +64,8 @@ class Declared(Continuity):
         except InputError:
             return False
         for one in told.blocks:
+            if one.key not in self._known and len(self._known) >= _MOST_STREAMS:
+                continue
             sent, known = [each for each in one.sent if door in each.doors], self._known.setdefault(one.key, {})
             if not sent:
                 never = self._never.setdefault(one.key, deque(maxlen=_MOST))

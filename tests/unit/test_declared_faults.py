@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import recorder.session
@@ -19,6 +20,7 @@ from recorder.summary import Summary
 from recorder.trigger import Capture, Trigger
 from replays.recordings.export import write_run
 from rig import wire
+from rig.declared import Declared
 from rig.errors import InputError
 from rig.scenes import parse_scene
 from rig.simulation import Simulation
@@ -139,7 +141,7 @@ def test_who_is_told_nothing_of_faults_believes_none_of_it(tmp_path: Path) -> No
     assert summary.lost == {PROBES: 4000}
 
 
-@pytest.mark.parametrize("kind", BLOCKS)
+@pytest.mark.parametrize("kind", ["dropout", "reorder-blocks", "stale-stamps", "restart"])
 def test_so_it_is_in_several_files_and_around_triggers(kind: str, tmp_path: Path) -> None:
     items = published(kind)
     summary = recorded(tmp_path / "parts.mcap", kind, items, limits=Limits(rotate_s=0.13))
@@ -169,3 +171,18 @@ def test_a_cut_keeps_what_was_told_and_goes_by_true_times(kind: str, tmp_path: P
     assert (part.doubts, stream.lost - stream.declared) == ((), 0)
     if kind not in ("dropout", "lose-blocks"):
         assert (stream.rows, stream.first_time_s) == (4000, 0.15)
+
+
+def test_nothing_that_is_told_can_end_or_swell_who_hears_it() -> None:
+    rng, rows = np.random.default_rng(7), Declared()
+    odd: list[Any] = [None, True, -1, 1.5, 1e300, 2**62, "", "x", [], {}, [[]], {"a": []}, "9" * 400]
+    for n in range(3000):
+        sent = [{"index": 0, "tick": 0, "doors": ["zenoh"]}] * int(rng.integers(3))
+        block: dict[str, Any] = {"key": f"rig/sensors/x{n}", "row": int(rng.integers(9000)), "rows": 200, "sent": sent}
+        document: dict[str, Any] = {"event": "blocks", "blocks": [block]}
+        for spoiled in (document, block, *sent[:1]) if n % 2 else ():
+            spoiled[str(rng.choice(list(spoiled)))] = odd[int(rng.integers(len(odd)))]
+        rows.declare(document)
+        rows.take("rig/sensors/x0", wire.Block(0, n, 2e4, 1e6, np.zeros((1, 4), np.int32)))
+    assert (rows.received, rows.lost) == ({"rig/sensors/x0": 3000}, {"rig/sensors/x0": 0})
+    assert len(rows.faulty) <= 1000
