@@ -226,7 +226,7 @@ class Agreement:
                 if gap not in noted:
                     self._doubt(f"{gap.size} rows of {key} from {gap.index} on: no gap is noted where they are missing")
             for gap in inside:
-                if gap not in found and gap.index >= streams[key].first:
+                if gap not in found and gap.index > streams[key].first:
                     self._doubt(f"{gap.size} rows of {key} from {gap.index} on: noted as missing, and they are there")
 
     def _cut(self, streams: Mapping[str, Any]) -> None:
@@ -300,11 +300,15 @@ class Agreement:
             given.setdefault(one.get("id"), one)
         for one in given.values():
             asked.setdefault((one["command"], one["tick"]), []).append(("its command", one["request"]))
-        effects = {(one["event"], one["tick"]): one for one in self._events if isinstance(one.get("tick"), int)}
-        for one in effects.values():
-            if one["event"] == "fault" and isinstance(one.get("for_s"), float | int):
-                over = one["tick"] + max(1, round(one["for_s"] * self._ticks_hz))
-                asked.setdefault(("clear", over), []).append(("its end", {"id": one.get("fault")}))
+        met = [(one["event"], one["tick"], one) for one in self._events if isinstance(one.get("tick"), int)]
+        effects = {at[:2]: at[2] for at in met}
+        # A fault with a time ends by itself, also where it began before this file does.
+        begun = [(*at, request) for at, causes in asked.items() for _, request in causes if at not in effects]
+        for name, tick, one in [*begun, *met]:
+            if name == "fault" and isinstance(one.get("for_s"), float | int):
+                over = tick + max(1, round(one["for_s"] * self._ticks_hz))
+                known = {"id": one["fault"]} if "fault" in one else None
+                asked.setdefault(("clear", over), []).append(("its end", known))
         for (name, tick), event in effects.items():
             if name not in COMMANDS or not self._scene:
                 continue
@@ -312,7 +316,7 @@ class Agreement:
             causes = asked.get((name, tick), [])
             if not causes and not self._file.scene.get("forgotten"):
                 self._doubt(f"{at} in {EVENTS} that neither the scene nor a command asks for")
-            for where, request in causes if len(causes) == 1 else ():
+            for where, request in causes if len(causes) == 1 and causes[0][1] is not None else ():
                 for field, value in _complete(name, request).items():
                     self._say(f"{at}, {field}", **{where: value, EVENTS: event.get(field)})
         if not self._events or {"series", "recovered"} & set(self._file.metadata):

@@ -22,7 +22,7 @@ from recorder.sink import Needs, Sink
 from recorder.trigger import Capture, Crossings, Trigger
 from recorder.writer import RecordingError, RecordingWriter
 from rig.errors import InputError
-from rig.wire import EDGES, EVENTS
+from rig.wire import EDGES, EVENTS, FAULTS
 
 _LATE_NS = NS // 2
 """For so long after its end a capture waits for streams that are behind the others, and the ring keeps more than it
@@ -106,16 +106,17 @@ class Captures(Sink):
 
     def take(self, payload: Payload) -> None:
         """Take one payload: into the ring, and into the capture that is open."""
+        true = self.tally.true(payload)
         self.tally.take(payload)
         if payload.block is None:
             start_ns = end_ns = self._time_of(payload)
         else:
-            start_ns, end_ns = self.tally.extent_ns(payload)
+            start_ns, end_ns = self.tally.extent_ns(true)
             if payload.key != EDGES:
                 self._reached_ns[payload.key] = max(self._reached_ns.get(payload.key, 0), end_ns)
         latest_ns = self.tally.last_time_ns
         self._ring.append(_Held(payload, start_ns, end_ns, latest_ns))
-        if self._open is not None and start_ns <= self._open.end_ns:
+        if self._open is not None and (start_ns <= self._open.end_ns or payload.key == FAULTS):
             self._write(self._open.writer, payload)
         # The ring's own scene: what was sent before the first thing that it still holds. It is emptied by the time at
         # which things came, as an event can name a tick that is far off.
@@ -206,7 +207,8 @@ class Captures(Sink):
         self._writer = writer
         self._open = _Open(writer, time_ns + self._post_ns, latest_end_ns, [about])
         for held in self._ring:
-            if held.end_ns >= start_ns and held.start_ns <= self._open.end_ns:
+            inside = held.end_ns >= start_ns and held.start_ns <= self._open.end_ns
+            if inside or held.payload.key == FAULTS:  # which may be about blocks that lie inside
                 self._write(writer, held.payload)
 
     def _scene_before(self, start_ns: int) -> dict[str, Any]:

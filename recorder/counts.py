@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from recorder.payload import Payload
-from rig.wire import EDGES, Continuity, Gap
+from rig.declared import Declared
+from rig.wire import EDGES, FAULTS, Gap
 
 NS = 1_000_000_000
 
@@ -19,6 +20,7 @@ class Counts:
         last_time_ns: Simulated time of the last row [ns].
         rows: Rows received by key.
         lost: Rows lost by key.
+        declared: Of these, those that a fault has taken, as the rig told; by key.
         gaps: Number of gaps that they are in.
         missed: Messages that the transport gave up, by key.
         malformed: Payloads that were not what their key promises.
@@ -35,6 +37,12 @@ class Counts:
     malformed: int = 0
     size_bytes: int = 0
     safe_time_ns: int = 0
+    declared: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def really_lost(self) -> int:
+        """Rows that were sent, and have not come."""
+        return sum(max(0, lost - self.declared.get(key, 0)) for key, lost in self.lost.items())
 
     @property
     def extent_ns(self) -> int:
@@ -53,6 +61,7 @@ class Counts:
             malformed=self.malformed + later.malformed,
             size_bytes=self.size_bytes + later.size_bytes,
             safe_time_ns=max(self.safe_time_ns, later.safe_time_ns),
+            declared=_sum(self.declared, later.declared),
         )
 
 
@@ -78,7 +87,7 @@ class Tally:
         self.gaps = self.malformed = self.last_time_ns = 0
         self.missed: dict[str, int] = {}
         self.first_time_ns: int | None = None
-        self._continuity = Continuity()
+        self._continuity = Declared()
         self._tick_rate_hz = tick_rate_hz
         self._from_start = from_start
         for key, index in (due or {}).items():
@@ -104,16 +113,23 @@ class Tally:
             return start_ns, start_ns
         return start_ns, start_ns + round((len(block.values) - 1) * NS / block.rate_hz)
 
+    def true(self, payload: Payload) -> Payload:
+        """A block that has not been taken, with its own number and tick where a fault gave it others."""
+        block = payload.block
+        return payload if block is None else replace(payload, block=self._continuity.true(payload.key, block))
+
     def take(self, payload: Payload) -> Gap | None:
         """Count a payload; give the step of the row numbers before it, if there is one."""
         self.malformed += payload.malformed
         block, key = payload.block, payload.key
         if block is None:
+            if key == FAULTS and payload.document is not None:
+                self._continuity.declare(payload.document)
             return None
-        start_ns, end_ns = self.extent_ns(payload)
+        start_ns, end_ns = self.extent_ns(self.true(payload))
         if self._from_start and key not in self.next:
             self._continuity.follow(key, 0, 0)
-        gap = self._continuity.follow(key, block.index, len(block.values))
+        gap = self._continuity.take(key, block)
         self.gaps += gap is not None
         self.first_time_ns = start_ns if self.first_time_ns is None else min(start_ns, self.first_time_ns)
         if key != EDGES:
@@ -155,4 +171,5 @@ class Tally:
             malformed=self.malformed,
             size_bytes=size_bytes,
             safe_time_ns=safe_time_ns,
+            declared=dict(self._continuity.declared),
         )

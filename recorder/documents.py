@@ -12,7 +12,7 @@ from recorder import schemas
 from rig.channels import ChannelTable
 from rig.errors import InputError
 from rig.outside import Count, input_error, read_json
-from rig.wire import EVENTS, STATUS, schema_of
+from rig.wire import EVENTS, FAULTS, STATUS, schema_of
 
 _MOST_KEPT = 64 << 20
 """Documents of one kind that are kept in memory [bytes]."""
@@ -153,6 +153,14 @@ class Command(Taken):
     time_s: _Finite | None = None
 
 
+class Faults(_Document):
+    """What the rig tells of its faults: one that begins or ends, or what has become of blocks."""
+
+    event: str
+    tick: int | None = None
+    time_s: _Finite | None = None
+
+
 class _Queue(_Document):
     dropped: Count = 0
 
@@ -231,6 +239,7 @@ class Kind(NamedTuple):
 
 KINDS = {
     EVENTS: Kind(Event, schemas.document_definition("rig.Event", event="string")),
+    FAULTS: Kind(Faults, schemas.document_definition("rig.Faults", event="string")),
     STATUS: Kind(Status, schemas.document_definition("rig.Status")),
     schemas.GAPS: Kind(
         Gap,

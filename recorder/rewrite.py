@@ -25,9 +25,10 @@ from recorder.payload import Payload, tick_in
 from recorder.reader import Recording
 from recorder.records import COPY
 from recorder.writer import RecordingWriter
+from rig.declared import Declared
 from rig.errors import PART_SUFFIX, InputError, Words, check_not_among
 from rig.outside import open_file, unreadable
-from rig.wire import EDGES, SENSORS, TRUTH, Block, encode_block, schema_of
+from rig.wire import EDGES, FAULTS, SENSORS, TRUTH, Block, encode_block, schema_of
 
 _TELL_EVERY = 5000
 """Messages between two reports of progress."""
@@ -169,14 +170,23 @@ def cut(
         if tick is not None and tick < from_tick:
             commands.follow(event)
 
+    told = Declared()
+
     def change(payload: Payload) -> Payload | None:
         key, tick, block = payload.key, payload.tick, payload.block
+        if key == FAULTS and payload.document is not None:
+            told.declare(payload.document)
+            return None if only == "sensors" else payload  # it may be about blocks of any time
         if schema_of(key) is None:
             return payload if tick is None or from_tick <= tick < to_tick else None
         if key not in columns:
             return None
         if block is None:
             return payload
+        true = told.true(key, block)
+        told.take(key, block)
+        if (true.index, true.tick) != (block.index, block.tick):  # stamped by a fault: as it came, or not at all
+            return payload if from_tick <= true.tick < to_tick else None
         kept = _trimmed(key, block, from_tick, to_tick, columns[key])
         if kept is None or kept is block:
             return payload if kept else None

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from pathlib import Path
 
 from recorder.counts import NS, Counts
@@ -20,12 +21,14 @@ from recorder.room import MB, Limits, check_files
 from recorder.sink import Needs, Sink
 from recorder.writer import RecordingError, RecordingWriter
 from rig.errors import InputError
-from rig.wire import EDGES, EVENTS
+from rig.wire import EDGES, EVENTS, FAULTS
 
 MOST_PARTS = 1_000_000
 _NUMBER = r"\d{4,}"
 _BEHIND_NS = NS
 """Simulated time by which streams may be apart at a seam: more, and one of them is still catching up [ns]."""
+_TOLD = 8
+"""Documents on faults that each file begins with."""
 _CATCH_UP_S = 5.0
 """Longest wait with a full file for a stream that may never come [s]."""
 
@@ -62,6 +65,8 @@ class Series(Sink):
         self._number = 0
         self._reached_ns: dict[str, int] = {}
         self._full_s: float | None = None
+        self._told: deque[Payload] = deque(maxlen=_TOLD)
+        """The latest that was told of faults."""
         self._series = f"{path.stem} {time.time_ns():x}"
         if needs.force and rotates:
             remove(files_like(path, _NUMBER))
@@ -76,6 +81,8 @@ class Series(Sink):
         self._file.take(payload)
         if payload.key == EVENTS:
             self._commands.follow(payload.document)
+        if payload.key == FAULTS:
+            self._told.append(payload)
         self._make_room(len(payload.data))
 
     def kept(self) -> list[Counts]:
@@ -137,6 +144,8 @@ class Series(Sink):
             self._file = self._writer = self._open(new, previous=old.path.name, due=dict(old.tally.next))
         except (InputError, RecordingError) as error:
             raise RecordingError(f"{error}; what was written before is kept, finished, in {old.path}") from None
+        for told in self._told:  # they may be about blocks that come behind the seam
+            self._file.take(told)
 
     def _make_room(self, payload_bytes: int) -> None:
         why = self._room.lack_after(payload_bytes, self._file)

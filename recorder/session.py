@@ -162,6 +162,7 @@ class RecordingSession:
         )
         """Payloads that wait to be written; a full one refuses blocks, for a transport that waits would stall the rig.
         What it refuses shows as a gap of the row numbers. Documents are small and rare, and have room of their own."""
+        self._order = threading.Lock()
         self._misses: deque[tuple[str, int, int]] = deque()
         self._wake = threading.Event()
         self._stop_reason = ""
@@ -258,9 +259,17 @@ class RecordingSession:
 
     def _on_message(self, key: str, payload: bytes) -> None:
         wall_ns = self._wall_ns()
+        if wire.schema_of(key) is None and not self._replaced:
+            self._inbox.offer((key, payload, wall_ns), room=self._inbox.room + _DOCUMENTS_BYTES)
+        with self._order:
+            self._take(key, payload, wall_ns)
+
+    def _take(self, key: str, payload: bytes, wall_ns: int) -> None:
+        """Take a block, or what is told of blocks: each on a thread of its own."""
         if wire.schema_of(key) is None:
-            if not self._replaced:
-                self._inbox.offer((key, payload, wall_ns), room=self._inbox.room + _DOCUMENTS_BYTES)
+            told = Payload.read(key, payload, wall_ns).document if key == wire.FAULTS else None
+            for each in self._intake.declare(told) if told is not None and not self._replaced else ():
+                self._inbox.offer((each.key, each.payload, each.wall_ns))
             return
         due = self._intake.next.get(key, 0)
         try:
@@ -377,7 +386,7 @@ class RecordingSession:
     def _report(self, writer: Sink, *, done: bool = False) -> None:
         groups = list(self._table.groups)
         first = wire.sensor_key("probes" if "probes" in groups or not groups else groups[0])
-        lost = sum(writer.counts().lost.values())
+        lost = writer.counts().really_lost
         self._reporter.tell(writer.tally.next.get(first, 0), lost=lost, done=done)
 
     def _progress(self, writer: Sink) -> Progress:
@@ -385,7 +394,7 @@ class RecordingSession:
         return Progress(
             time_s=0.0 if counts.first_time_ns is None else (counts.last_time_ns - counts.first_time_ns) / NS,
             rows=sum(rows for key, rows in counts.rows.items() if key.startswith(wire.SENSORS + "/")),
-            lost=sum(counts.lost.values()),
+            lost=counts.really_lost,
             size_bytes=counts.size_bytes,
             waiting=self.waiting,
             backlog_bytes=self._inbox.used,
@@ -434,7 +443,8 @@ class RecordingSession:
             first_time_s=(in_files.first_time_ns or 0) / NS,
             duration_s=sum(each.extent_ns for each in kept) / NS,
             rows=in_files.rows,
-            lost={key: lost for key, lost in counts.lost.items() if lost},
+            lost={key: more for key, lost in counts.lost.items() if (more := lost - counts.declared.get(key, 0)) > 0},
+            declared={key: rows for key, rows in counts.declared.items() if rows},
             gaps=counts.gaps,
             missed=counts.missed,
             dropped=self._inbox.dropped,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 
@@ -45,6 +45,7 @@ class Summary:
         duration_s: Simulated time from the first to the last row; of all captures in sum [s].
         rows: Rows in the files by key.
         lost: Rows that were lost, by key, only keys that lost some; of captures also those lost between them.
+        declared: Rows that a fault of the rig has taken, which told so, by key: none of the lost.
         gaps: Number of gaps that they are in.
         missed: Messages that the transport gave up, by key.
         dropped: Payloads that found the inbox full; they are among the lost.
@@ -80,6 +81,7 @@ class Summary:
     remarks: tuple[str, ...] = ()
     refused: int = 0
     ended_early: str = ""
+    declared: dict[str, int] = field(default_factory=dict)
 
     @property
     def losses(self) -> tuple[str, ...]:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from recorder import documents, schemas
 from recorder.agreement import Agreement
 from recorder.recording_file import RecordingFile
 from recorder.samples import row_times_s
-from rig.wire import EDGES, EVENTS, Block, Continuity, Gap, schema_of
+from rig.declared import Declared
+from rig.wire import EDGES, EVENTS, FAULTS, Block, Gap, schema_of
 
 _LEAST_SPAN_S = 0.5
 """A stream without rows raises doubt in a recording of this length; in a shorter one it may not have begun."""
@@ -28,6 +29,8 @@ class Stream:
         messages: Number of blocks.
         rows: Number of rows in them.
         lost: Number of rows missing between them, counted anew from the row numbers.
+        declared: Of these, those that a fault has taken, as the rig told.
+        around: The same before the first row and behind the last: number of the first, and how many.
         first_time_s: Simulated time of the first row [s].
         last_time_s: Simulated time of the last row [s].
         start_s: Simulated time of the first tick that a block names, which edges lie behind [s].
@@ -53,17 +56,24 @@ class Stream:
     off: int = 0
     misplaced: int = 0
     missing: int = 0
+    declared: int = 0
+    around: list[list[int]] = field(default_factory=list)
 
     def then(self, later: Stream) -> Stream:
         """The same stream with what it goes on with in another file."""
         sums = {
             name: getattr(self, name) + getattr(later, name)
-            for name in ("messages", "rows", "lost", "odd", "back", "off", "misplaced", "missing")
+            for name in ("messages", "rows", "lost", "odd", "back", "off", "misplaced", "missing", "declared")
         }
         if not (self.rows and later.rows):
-            return replace(self if self.rows else later, **sums)
+            return replace(self if self.rows else later, **sums, around=[*self.around, *later.around])
         sums["lost"] += max(0, later.first - self.due)
-        return replace(self, **sums, last_time_s=later.last_time_s, due=later.due)
+        reached = self.due
+        for row, rows in sorted([*self.around, *later.around]):
+            end = min(row + rows, later.first)
+            sums["declared"] += max(0, end - max(row, reached))
+            reached = max(reached, end)
+        return replace(self, **sums, last_time_s=later.last_time_s, due=later.due, around=later.around)
 
 
 class Survey:
@@ -85,7 +95,7 @@ class Survey:
             InputError: The file is damaged.
         """
         self.file = file
-        self._continuity, self._steps = Continuity(), dict[str, list[Gap]]()
+        self._continuity, self._steps = Declared(), dict[str, list[Gap]]()
         self._agreement = Agreement(file)
         self.streams: dict[str, Stream] = {}
         self._begun: dict[str, tuple[float, int]] = {}
@@ -97,10 +107,8 @@ class Survey:
             self._counted[key] = self._counted.get(key, 0) + 1
             if schema_of(key) is None:
                 self._take_document(key, time_ns, payload)
-            elif (block := self._take_block(key, payload)) is not None:
-                self._agreement.timed(key, time_ns, block.tick)
-                if on_block is not None:
-                    on_block(key, block)
+            elif (block := self._take_block(key, time_ns, payload)) is not None and on_block is not None:
+                on_block(key, block)
         self._end()
 
     @cached_property
@@ -139,14 +147,16 @@ class Survey:
         found += self._agreement.doubts(self.streams, sound)
         return tuple(found)
 
-    def _take_block(self, key: str, payload: bytes) -> Block | None:
+    def _take_block(self, key: str, time_ns: int, payload: bytes) -> Block | None:
         stream = self.streams.setdefault(key, Stream())
         block, promise = self.file.block(key, payload), self.file.promises.get(key)
         if block is None:
             stream.odd += 1
             return None
-        gap = self._continuity.follow(key, block.index, len(block.values))
-        if not stream.messages:
+        here, block = block, self._continuity.true(key, block)
+        gap = self._continuity.take(key, here)
+        self._agreement.timed(key, time_ns, block.tick)
+        if not stream.messages or (gap is None and block.index < stream.first):
             stream.first, stream.start_s = block.index, block.tick / block.tick_rate_hz
         if gap is not None:
             self._steps.setdefault(key, []).append(gap)
@@ -159,15 +169,18 @@ class Survey:
             stray_s = block.start_s - start_s - (block.index - index) / block.rate_hz
             stream.misplaced += abs(stray_s) * block.tick_rate_hz > 0.5
         if len(block.values):
-            first_s, stream.last_time_s = row_times_s(key, block)[[0, -1]].tolist()
+            first_s, last_s = row_times_s(key, block)[[0, -1]].tolist()
+            stream.last_time_s = max(stream.last_time_s, last_s)
             stream.first_time_s = stream.first_time_s if stream.rows else first_s
             stream.rows += len(block.values)
-        return block
+        return here
 
     def _take_document(self, key: str, time_ns: int, payload: bytes) -> None:
         """Follow what the rig says of the rows that it published, and the recorder of those that never arrived."""
         if key not in documents.KINDS or (document := documents.document_in(key, payload)) is None:
             return
+        if key == FAULTS:
+            self._continuity.declare(document)
         self._agreement.follow(key, time_ns, document)
         if key == schemas.GAPS:
             self._noted_bytes = documents.check_kept(self._noted_bytes + len(payload), key, self.file.path)
@@ -181,9 +194,10 @@ class Survey:
         stated, continuity = self.file.stated_rows, self._continuity
         # A file that does not go to the end of a run ends where it was to end.
         whole = not {"trigger", "cut"} & set(self.file.metadata)
-        for key in set(self.streams) | {key for key, rows in stated.items() if rows}:
+        for key in {*self.streams, *continuity.faulty} | {key for key, rows in stated.items() if rows}:
             stream = self.streams.setdefault(key, Stream())
             stream.rows, stream.lost = continuity.received.get(key, 0), continuity.lost.get(key, 0)
+            stream.declared, stream.around = continuity.declared.get(key, 0), continuity.around(key)
             stream.due = continuity.next.get(key, 0)
             end = self._published.get(key, stream.due)
             short = end - stream.due if whole and key in continuity.next and (key, end) not in self._noted else 0

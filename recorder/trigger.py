@@ -14,7 +14,7 @@ from rig.channels import ChannelTable
 from rig.errors import InputError
 from rig.wire import Block, sensor_key
 
-EVENT_NAMES = ("hammer", "speed", "release", "note", "warning")
+EVENT_NAMES = ("hammer", "speed", "release", "fault", "note", "warning")
 """Events of the stream that can be waited for."""
 _LEVEL = re.compile(r"\s*(\|?)([A-Za-z_]\w*)(\|?)\s*([<>])\s*([-+.\deE]+)\s*")
 MOST_CAPTURES = 1000

@@ -251,7 +251,7 @@ class _Topics:
 
     def add(self, payload: Payload) -> None:
         """Write a payload as it came, and what derives from it; a malformed one is left to the reader to judge."""
-        start_ns, _ = self._tally.extent_ns(payload)
+        start_ns, _ = self._tally.extent_ns(self._tally.true(payload))
         self._register(payload.key)
         if (gap := self._tally.take(payload)) is not None:
             self.add_gap(gap, start_ns, payload.wall_ns)
@@ -293,6 +293,7 @@ class _Topics:
             "last_time_s": f"{counts.last_time_ns / NS:.9f}",
             "rows": json.dumps(counts.rows),
             "lost_rows": json.dumps({key: lost for key, lost in counts.lost.items() if lost}),
+            "declared_rows": json.dumps({key: rows for key, rows in counts.declared.items() if rows}),
             "gaps": str(counts.gaps),
             "missed_messages": json.dumps(counts.missed),
             "malformed": str(counts.malformed),

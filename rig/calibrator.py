@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from typing import Any
 
@@ -11,11 +11,13 @@ import numpy as np
 
 from rig.channels import Group
 from rig.engines import Engine
+from rig.faults import At, Kind, Swap
 from rig.generators import Instants, Source, exact
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.signals import SPIN_RATE, THETA_RATE
 from rig.sampling import TICKS_HZ
 from rig.scenes import Scene
+from rig.sending import Active
 from rig.sensors.keyphasor import FRACTIONS
 from rig.sensors.noise import noise_streams
 
@@ -66,12 +68,25 @@ class Calibrator:
         other.__dict__["_noise"] = copy.deepcopy(self._noise)
         return other
 
-    def counts(self, rows: np.ndarray, made: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    @property
+    def columns(self) -> np.ndarray:
+        """Column of each channel's signal in the rows: none has one, shape (0,)."""
+        return np.empty(0, int)
+
+    def volts(self, name: str, instants: Instants) -> np.ndarray:
+        """What stands at the converter of a channel at any instants [V], shape (n,)."""
+        source = self._sources[name]
+        return source.at(source.shape(instants))
+
+    def counts(
+        self, rows: np.ndarray, made: np.ndarray | None = None, faults: Generated | None = None
+    ) -> dict[str, np.ndarray]:
         """Samples from the first of these rows on that lie before the last one.
 
         Args:
             rows: That follow those of the call before, shape (n, N_ROW); only how many they are counts.
             made: Nothing of it counts.
+            faults: What becomes of volts and counts on faulty channels.
 
         Returns:
             ADC counts by group, int32, shape (samples, channels).
@@ -81,18 +96,82 @@ class Calibrator:
         for group in self.groups:
             rate = group.rate_hz
             first, end = (-(-tick * rate // TICKS_HZ) for tick in (start, self._tick))
-            instants = Instants.of_samples(np.arange(first, end), rate)
+            n = np.arange(first, end)
+            instants = Instants.of_samples(n, rate)
             counts = found[group.name] = np.empty((end - first, len(group.channels)), np.int32)
             for c, channel in enumerate(group.channels):
                 source, key = self._sources[channel.name], (rate, self._waves[channel.name])
                 if key not in shapes:
                     shapes[key] = source.shape(instants)
                 volts = source.at(shapes[key])
+                if faults is not None and (changed := faults.volts(channel.name, n)) is not None:
+                    volts = changed
                 if self._noise:
-                    volts += channel.noise_v * self._noise[channel.name].standard_normal(end - first)
+                    volts = volts + channel.noise_v * self._noise[channel.name].standard_normal(end - first)
                 half = 2.0 ** (channel.adc_bits - 1)
-                counts[:, c] = np.clip(np.rint(volts / channel.lsb_v), -half, half - 1.0)
+                whole = np.rint(volts / channel.lsb_v)
+                if faults is not None:
+                    whole = faults.counts(channel.name, n, whole)
+                counts[:, c] = np.clip(whole, -half, half - 1.0)
         return found
+
+
+class Generated:
+    """What faults make of test signals: of volts at the very instants of samples, and of counts.
+
+    Args:
+        calibrator: What makes the sound ones.
+        faults: Those of faulty channels, by name.
+    """
+
+    def __init__(self, calibrator: Calibrator, faults: Mapping[str, list[Active]]) -> None:
+        self._calibrator, self._faults = calibrator, faults
+        self._channels = {channel.name: channel for group in calibrator.groups for channel in group.channels}
+
+    def _ats(self, name: str, n: np.ndarray) -> Iterator[tuple[Kind, At]]:
+        channel = self._channels[name]
+        none = np.empty(0)
+        for one in self._faults.get(name, []):
+            t = n / channel.rate_hz - one.begin / TICKS_HZ
+            draw, kept = one.draws[name], one.kept
+            yield one.what, At(t, n, channel, draw, kept, lambda x: self._beyond(x, n, name), none, none, lambda x: x)
+
+    def _conditioned(self, name: str, instants: Instants, ats: Iterable[tuple[Kind, At]]) -> np.ndarray:
+        """What comes from a sensor, with the faults of transducers [V]."""
+        channel = self._channels[name]
+        x = (self._calibrator.volts(name, instants) - channel.bias_v) / channel.sensitivity_v
+        for what, at in ats:
+            x = what.signal(x, at)
+        return channel.bias_v + channel.sensitivity_v * x
+
+    def _beyond(self, name: str, n: np.ndarray, at: str) -> np.ndarray:
+        channel = self._channels[name]
+        instants = Instants.of_samples(n, self._channels[at].rate_hz)
+        return self._conditioned(name, instants, ()) - channel.bias_v
+
+    def volts(self, name: str, n: np.ndarray) -> np.ndarray | None:
+        """At the converter in samples of these numbers [V], shape (n,); None of a sound channel."""
+        if name not in self._faults or not len(n):
+            return None
+        ats, late_s = list(self._ats(name, n)), np.zeros(len(n))
+        for what, at in ats:
+            more = what.late_s(at)
+            late_s += 0.0 if more is None else np.minimum(more, at.t)  # nothing from before the fault
+        source = name
+        for one in self._faults[name]:
+            if isinstance(one.what, Swap):
+                source = next(other for other in one.names if other != name)
+        instants = Instants.of_samples(n, self._channels[name].rate_hz).later(late_s)
+        volts = self._conditioned(source, instants, ats if source == name else self._ats(source, n))
+        for what, at in ats:
+            volts = what.volts(volts, at)
+        return volts
+
+    def counts(self, name: str, n: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        """What the converter says of that, before it is limited, shape (n,)."""
+        for what, at in self._ats(name, n):
+            counts = what.counts(counts, at) if len(n) else counts
+        return counts
 
 
 def _normal(stream: np.ndarray) -> np.random.Generator:

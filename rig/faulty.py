@@ -8,22 +8,37 @@ from __future__ import annotations
 
 import math
 from bisect import insort
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from rig.calibrator import Calibrator, Generated
 from rig.channels import Channel, ChannelTable
 from rig.commands import ClearCommand, FaultCommand
 from rig.errors import InputError, Words
-from rig.faults import At, Draws, Kind, NoFilter, Swap, channels_of
+from rig.faults import (
+    DOORS,
+    At,
+    Draws,
+    Kind,
+    NoFilter,
+    OfBlocks,
+    Restart,
+    Setting,
+    Swap,
+    channels_of,
+    stream_of,
+)  # fmt: skip
 from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
 from rig.kernels.signals import COLUMN, N_ROW
 from rig.sampling import TICKS_HZ, first_row, lagrange
+from rig.sending import Active, Sending
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import FRACTIONS, TURN
+from rig.wire import sensor_key
 
 _MOST = 64
 """Faults at a time."""
@@ -35,29 +50,6 @@ _NODES = 6
 """... by the polynomial through so many."""
 _REACH_V = 1e3
 """What a faulty cable carries is limited by the converter alone."""
-
-
-@dataclass
-class Active:
-    """One fault on its channels.
-
-    Attributes:
-        id: Its number.
-        what: The fault.
-        names: Its channels.
-        begin: First tick, a whole row.
-        draws: Its numbers, for each channel.
-        end: Tick from which on there is none, a whole row.
-        kept: What it keeps.
-    """
-
-    id: int
-    what: Kind
-    names: tuple[str, ...]
-    begin: int
-    draws: dict[str, Draws]
-    end: float = math.inf
-    kept: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -82,22 +74,18 @@ class Faulty:
         conditioners: Their chains.
         seed: Of the faults' own numbers.
         row_ticks: Ticks between rows.
-        ideal: Whether the scene leaves filters and noise out.
-        noisy: Whether its sensors are noisy.
+        setting: What else decides which make sense.
     """
 
     def __init__(
-        self,
-        table: ChannelTable,
-        conditioners: Sequence[Conditioner],
-        *,
-        seed: int,
-        row_ticks: int,
-        ideal: bool,
-        noisy: bool,
+        self, table: ChannelTable, conditioners: Sequence[Any], *, seed: int, row_ticks: int, setting: Setting
     ) -> None:
         self.table, self.conditioners, self._seed, self.row_ticks = table, conditioners, seed, row_ticks
-        self._ideal, self._noisy = ideal, noisy
+        self._setting = setting
+        self.sending = Sending()
+        """Where blocks go, and what befalls them."""
+        self.doors: tuple[str, ...] = DOORS
+        """Where they leave the rig."""
         self.channels = table.channels
         """All channels by name, ..."""
         self._marks = {name for name, channel in self.channels.items() if channel.signal == "keyphasor"}
@@ -118,13 +106,31 @@ class Faulty:
             found |= zip(names, conditioner.columns.tolist(), strict=True)
         return found
 
-    def targets(self, command: FaultCommand) -> tuple[str, ...]:
-        """Channels that a fault would change.
+    def targets(self, command: FaultCommand, tick: int) -> tuple[str, ...]:
+        """Channels that a fault would change, or whose blocks it is about.
 
         Raises:
             InputError: It makes no sense on them.
         """
-        return channels_of(command.what, command.channel, self.table, ideal=self._ideal, noisy=self._noisy)
+        what = command.what
+        if not isinstance(what, OfBlocks):
+            return channels_of(what, command.channel, self.table, **self._setting._asdict())
+        if isinstance(what, Restart) and self._row_at(tick) == 0:
+            raise InputError("kind", "one that shows from the first row on, such as dropout", what.name())
+        return self.table.groups[stream_of(what, command.channel, self.table, self.doors)].names
+
+    def check_all(self, timed: Iterable[tuple[int, object]]) -> None:
+        """Refuse what a scene asks for and cannot be.
+
+        Args:
+            timed: Ticks and commands.
+
+        Raises:
+            InputError: The first fault that makes no sense.
+        """
+        for tick, command in timed:
+            if isinstance(command, FaultCommand):
+                self.targets(command, tick)
 
     def check(self, command: FaultCommand | ClearCommand, tick: int, waiting: Sequence[object]) -> dict[str, Any]:
         """What a command that is given now will come to, as `take` tells it.
@@ -137,13 +143,16 @@ class Faulty:
         Raises:
             InputError: It cannot be carried out.
         """
-        before = sum(isinstance(other, FaultCommand) for other in waiting)
-        known = [one.id for one in self.active if one.end > tick]
+        begun, known = self._begun, [one.id for one in self._all() if one.end > tick]
+        for other in waiting:
+            if isinstance(other, FaultCommand):
+                known.append(begun := begun + 1)
+            elif isinstance(other, ClearCommand):
+                known = [number for number in known if other.id not in ("all", number)]
         if isinstance(command, FaultCommand):
-            if len(known) + before >= _MOST:
+            if len(known) >= _MOST:
                 raise InputError("fault", f"one of at most {_MOST} at a time", Words("another"))
-            return self._told(self._begun + before + 1, self.targets(command), tick)
-        known += range(self._begun + 1, self._begun + before + 1)
+            return self._told(begun + 1, self.targets(command, tick), tick)
         if command.id != "all" and command.id not in known:
             there = ", ".join(map(str, known)) or "none"
             raise InputError("clear.id", f"the number of a fault that there is ({there}), or all", command.id)
@@ -162,22 +171,29 @@ class Faulty:
         """
         row = self._row_at(tick)
         if isinstance(command, ClearCommand):
-            ended = [one for one in self.active if command.id in ("all", one.id) and one.end > row]
+            ended = [one for one in self._all() if command.id in ("all", one.id) and one.end > row]
             for one in ended:
                 one.end = row
             names = tuple(dict.fromkeys(name for one in ended for name in one.names))
             return {**self._told(0, names, tick), "fault": [one.id for one in ended]}
         self._begun += 1
-        names, what = self.targets(command), command.what
+        names, what = self.targets(command, tick), command.what
         places = {name: n for n, name in enumerate(self.channels)}
         # A hum, a clock and a loose plug are one for all channels of a group; noise is each channel's own.
         own = what.stage == "converter"
         draws = {name: Draws(self._seed, self._begun, places[name] + 1 if own else 0) for name in names}
-        self.active.append(Active(self._begun, what, names, row, draws))
+        if isinstance(what, OfBlocks):
+            draws = {"": Draws(self._seed, self._begun, 0)}
+            self.sending.active.append(Active(self._begun, what, names, row, draws, sensor_key(command.channel)))
+        else:
+            self.active.append(Active(self._begun, what, names, row, draws))
         if command.for_s is not None:
             over = tick + max(1, round(command.for_s * TICKS_HZ))
             insort(pending, (over, ClearCommand(id=self._begun)), key=lambda entry: entry[0])
         return self._told(self._begun, names, tick)
+
+    def _all(self) -> list[Active]:
+        return [*self.active, *self.sending.active]
 
     def _row_at(self, tick: int) -> int:
         return -(-tick // self.row_ticks) * self.row_ticks
@@ -217,6 +233,9 @@ class Faulty:
             names = [channel.name for group in conditioner.groups for channel in group.channels]
             faulty = {name: [one for one in active if name in one.names] for name in names}
             faulty = {name: faults for name, faults in faulty.items() if faults}
+            if isinstance(conditioner, Calibrator):
+                found |= conditioner.counts(rows, made, Generated(conditioner, faulty) if faulty else None)
+                continue
             shown = self._shown(place, conditioner, faulty, volts, tick) if faulty else {}
             if not faulty:
                 self._twins = {key: twin for key, twin in self._twins.items() if key[0] != place}
@@ -359,7 +378,7 @@ class Faulty:
             (known[np.clip(places, 0, len(known) - 1)] * weights).sum(axis=1),
         )  # fmt: skip
         values *= 2.0 ** (channel.adc_bits - 32)
-        if self._noisy and not self._ideal:
+        if self._setting.noisy and not self._setting.ideal:
             values += channel.noise_v / channel.lsb_v * Draws(self._seed, faults[0].id, -1 % 2**32).normal(n)
         return np.rint(values)
 

@@ -65,8 +65,8 @@ class Instants(NamedTuple):
         whole = np.floor(times_s)
         return cls(whole.astype(np.int64), times_s - whole)
 
-    def later(self, delay_s: float) -> Instants:
-        """The same of a clock that is behind by so much."""
+    def later(self, delay_s: float | np.ndarray) -> Instants:
+        """The same of a clock that is behind by so much, each by its own where it is an array, shape (n,)."""
         rest = self.rest - delay_s
         carry = np.floor(rest)
         return Instants(self.whole + carry.astype(np.int64), rest - carry)

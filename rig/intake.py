@@ -8,6 +8,7 @@ wait; where the old line goes on instead, they were none of it and are refused.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
@@ -16,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rig import wire
 from rig.channels import ChannelTable
+from rig.declared import Declared
 from rig.errors import InputError
 from rig.outside import Count, Name, Outside, check, read_json
 
@@ -28,6 +30,7 @@ _MOST_OTHERS = 16
 _BLOCK_BYTES = 64 << 20
 _MOST_WAITING = 8
 """Blocks of a stream that wait; with more, so much is lost that no block goes on from another, and they are taken."""
+_MOST_LEFT_OUT = 64
 _EVENT_BYTES = 1 << 20
 _Text = Annotated[str, Field(max_length=10_000)]
 _Rate = Annotated[float, Field(gt=0.0, le=1e12)]
@@ -84,7 +87,11 @@ class Promise:
                 f"{rows} rows of {columns} values at {block.rate_hz:g} Hz, {block.tick_rate_hz:g} ticks a second; "
                 f"the catalogue promises {self.columns} at {self.rate_hz:g} Hz, {self.tick_rate_hz:g} ticks a second"
             )
-        most = _MOST_S * self.tick_rate_hz
+        return ""
+
+    def untimely(self, block: wire.Block) -> str:
+        """What is wrong with its time, or its number; empty if nothing is."""
+        rows, most = len(block.values), _MOST_S * self.tick_rate_hz
         if not (abs(block.tick) <= most and block.index >= 0 and block.index + rows <= _MOST_S * (self.rate_hz or 1e3)):
             return f"row {block.index} at tick {block.tick} is beyond {_MOST_S:g} s"
         if self.rate_hz:
@@ -169,7 +176,9 @@ class Intake:
         self._most = len(self._promises) + _MOST_OTHERS
         self._waiting: dict[str, list[Taken]] = {}
         """Blocks behind a step, as they came, until another one tells whose line goes on."""
-        self._rows = wire.Continuity()
+        self._rows = Declared()
+        self._left_out: dict[str, deque[Taken]] = {}
+        """The latest blocks that were refused: what is told of them may come behind them."""
         self.next = self._rows.next
         """Number of the row that is due next, by key."""
         self.refused = 0
@@ -206,6 +215,10 @@ class Intake:
             return self._refuse(key, why)
         self._promises.setdefault(key, promise)
         new, due = Taken(key, block, payload, wall_ns), self.next.get(key, block.index)
+        if self._rows.knows(key, block):
+            return self._believe([new])
+        if why := promise.untimely(block):
+            return self._refuse(key, why, new)
         if block.index - due > _MOST_STEP:
             return self._refuse(key, f"row {block.index} is {block.index - due} rows ahead")
         waiting = self._waiting.setdefault(key, [])
@@ -223,6 +236,24 @@ class Intake:
                 self._refuse_step(each)
         waiting.clear()
         return self._believe(line)
+
+    def declare(self, document: Mapping[str, Any]) -> list[Taken]:
+        """Take note of a document on faults; gives the blocks that can be believed by it.
+
+        Blocks that a fault doubles, turns round or stamps anew are believed where that is told, and only there.
+        """
+        found = list[Taken]()
+        if not self._rows.declare(document):
+            return found
+        for rest in (*self._left_out.values(), *self._waiting.values()):
+            for each in list(rest):
+                if self._rows.knows(each.key, each.block):
+                    found += self._believe([each])
+            left = [each for each in rest if all(each is not one for one in found)]
+            self.refused -= len(rest) - len(left) if isinstance(rest, deque) else 0
+            rest.clear()
+            rest.extend(left)
+        return found
 
     def rest(self, rows: Mapping[str, int] | None, key: str | None = None) -> list[Taken]:
         """At the end: the blocks that still wait and are part of what was published.
@@ -257,16 +288,17 @@ class Intake:
 
     def _believe(self, line: list[Taken]) -> list[Taken]:
         for each in line:
-            self._rows.follow(each.key, each.block.index, len(each.block.values))
+            self._rows.take(each.key, each.block)
         return line
 
     def _refuse_step(self, waiting: Taken) -> None:
         due = self.next[waiting.key]
-        self._refuse(
-            waiting.key, f"row {waiting.block.index} came where row {due} was due, and nothing went on from it"
-        )
+        why = f"row {waiting.block.index} came where row {due} was due, and nothing went on from it"
+        self._refuse(waiting.key, why, waiting)
 
-    def _refuse(self, key: str, why: str) -> list[Taken]:
+    def _refuse(self, key: str, why: str, block: Taken | None = None) -> list[Taken]:
         self.refused += 1
+        if block is not None:
+            self._left_out.setdefault(key, deque(maxlen=_MOST_LEFT_OUT)).append(block)
         self.why = self.why or f"{key}: {why}"
         return []

@@ -18,8 +18,8 @@ from rig.transport.access import DOORS, PLAIN, ROLES, TRUTH, Verb
 
 _DOCUMENTS = {
     wire.EVENTS: (
-        "published: `event` (start, command, hammer, speed, release, note, warning, end), `tick`, `time_s`, `wall_s` "
-        "and the event's own fields; `end` carries `reason` and is the last"
+        "published: `event` (start, command, hammer, speed, release, fault, clear, note, warning, end), `tick`, "
+        "`time_s`, `wall_s` and the event's own fields; `end` carries `reason` and is the last"
     ),
     wire.STATUS: (
         "published twice a second and on request: state, pace, lateness, overruns, real-time factor, queue, clients, "
@@ -113,6 +113,15 @@ def _truth() -> list[str]:
         "What no instrument could know, on keys of its own: for method developers, never for a DAQ.",
         "",
     ]
+    lines += [
+        f"### `{wire.FAULTS}`",
+        "",
+        "JSON, before the blocks that it is about: `fault` and `clear` as among the events, and `blocks`, of each "
+        "stretch of a stream that a fault of blocks meets `key`, `row` (true number of its first row), `rows`, "
+        "`faults`, and `sent`: nothing where it is not sent, else of each time `index` and `tick` that it is sent "
+        "with, `due` (tick) and `doors`.",
+        "",
+    ]
     known = {signal.name: signal for signal in signals.ROW}
     for name, columns in signals.TRUTH.items():
         lines += [
@@ -161,13 +170,14 @@ def _documents() -> list[str]:
         "",
         "A fault begins at the first row at or behind its tick; the reply adds its number `fault`, its `channels` and "
         "`first_row` by group, as do the events `fault` and `clear`. Once it has ended, what comes is as if it had "
-        "never been. x is what the sensor feels [the channel's unit], v the conditioner's output [V], c the "
+        "never been. One of blocks asks for a group. x is what the sensor feels [the channel's unit], v the "
+        "conditioner's output [V], c the "
         "converter's counts, t the time since it began [s], u(n) and g(n) uniform and normal numbers by row, sample, "
         "slot or turn, of the scene's seed.",
         "",
-        "| kind | stage | what it does | numbers | channels |",
-        "|---|---|---|---|---|",
-        *(f"| `{name}` | {' | '.join(rest)} |" for name, *rest in described()),
+        "| kind | stage | what it does | numbers | on | at |",
+        "|---|---|---|---|---|---|",
+        *(f"| `{name}` | {' | '.join(rest)} |" for name, *rest in described(rig_table())),
         "",
         f"A liveliness token stands at `{wire.ALIVE}` while the rig runs.",
         "",

@@ -15,6 +15,7 @@ from rig.channels import ChannelTable, check_signals, default_table
 from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand, TimedCommand, with_faults
 from rig.engines import ENGINES
 from rig.errors import InputError, Words, such_as
+from rig.faults import Setting
 from rig.formula import Formulas
 from rig.generators import Generator, Source, sources
 from rig.kernels.signals import COLUMN
@@ -199,7 +200,8 @@ class Scene(Written):
     @model_validator(mode="after")
     def _possible_generator(self) -> Scene:
         if self.generator is not None:
-            for name, given in (("commands", self.commands), ("drive.profile", self.drive.profile)):
+            commands = [one for one in self.commands if one.request.command not in ("fault", "clear")]
+            for name, given in (("commands", commands), ("drive.profile", self.drive.profile)):
                 if given:
                     raise InputError(name, "left out with a [generator], which stands for the physics", Words("some"))
             if self.fidelity == "auto":
@@ -258,6 +260,11 @@ class Scene(Written):
         """Ticks between the rows that sensors and truth see: of the channels' making, whatever the engine's step."""
         sensors = self.sensors
         return row_ticks(self.table, truth_rate_hz=sensors.truth_rate_hz, ideal=sensors.chain == "ideal")
+
+    @property
+    def setting(self) -> Setting:
+        """What decides which faults make sense."""
+        return Setting(self.sensors.chain == "ideal", self.sensors.noise, self.generator is not None)
 
     def sources(self) -> dict[str, Source]:
         """What the generator puts at the converter of every channel that is on: `sources()["disk_x"].volts(times_s)`.

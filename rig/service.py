@@ -19,14 +19,16 @@ from rig import wire
 from rig.bounded_queue import BoundedQueue
 from rig.desk import Note, Pending, Step
 from rig.errors import InputError, Words
+from rig.faults import DOORS, Message
 from rig.pacing import Clock, Lockstep, RealTime
 from rig.served_run import ServedRun
 from rig.text import finite
-from rig.transport import Server
+from rig.transport import Server, doors_of
 from rig.transport.limit import CommandLimit
 
 if TYPE_CHECKING:
-    from rig.simulation import Frame, Simulation
+    from rig.sending import Frame
+    from rig.simulation import Simulation
 
 SIMULATION_COMMANDS = ("hammer", "speed", "release", "fault", "clear")
 """Commands that the simulation itself checks and carries out."""
@@ -104,6 +106,7 @@ class Service(ServedRun):
             linger_s=linger_s,
             limit=limit,
         )
+        simulation.serve(tuple(doors_of(server)))
         self._simulation = simulation
         self._block_ticks = block_ticks
         self._status_period_s = status_period_s
@@ -340,21 +343,31 @@ class Service(ServedRun):
         for event in entry.before:
             self._guarded("publishing events", self._publish_event, event)
         if entry.frame is not None:
-            for key, block in entry.frame.blocks():
-                self._guarded(f"publishing {key}", self._publish_block, key, block)
+            for told in entry.frame.told:
+                self._guarded(
+                    "publishing faults", self._server.publish, wire.FAULTS, wire.encode_document(finite(told))
+                )
+            for message in entry.frame.messages:
+                self._guarded(f"publishing {message.key}", self._publish_block, message)
             self._count_samples(entry.frame)
         for event in entry.after:
             self._guarded("publishing events", self._publish_event, event)
         self._answer(entry)
 
-    def _publish_block(self, key: str, block: wire.Block) -> None:
-        self._rows.follow(
-            key, block.index, len(block.values)
-        )  # whoever does not get it learns from the end what is missing
-        self._server.publish(key, wire.encode_block(block))
+    def _publish_block(self, message: Message) -> None:
+        # Whoever does not get it learns from the end what is missing.
+        self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
+        servers = [self._server]
+        if message.doors != DOORS:
+            servers = [server for door, server in doors_of(self._server).items() if door in message.doors]
+        for server in servers:
+            server.publish(message.key, wire.encode_block(message.block))
 
     def _publish_event(self, event: dict[str, Any]) -> None:
         self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
+
+    def _publish_told(self, told: dict[str, Any]) -> None:
+        self._server.publish(wire.FAULTS, wire.encode_document(finite(told)))
 
     def _publish_status(self) -> None:
         self._server.publish(wire.STATUS, wire.encode_document(self.status()))
@@ -364,7 +377,7 @@ class Service(ServedRun):
         group = "probes" if "probes" in frame.samples else next(iter(frame.samples), None)
         if group is not None:
             self._samples_rate_hz = frame.samples[group].rate_hz
-            self._samples_published = self._rows.next[wire.sensor_key(group)]
+            self._samples_published = self._rows.next.get(wire.sensor_key(group), 0)
 
     @staticmethod
     def _answer(entry: _Entry) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import math
 from bisect import insort
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate
@@ -32,45 +31,13 @@ from rig.kernels.signals import COLUMN
 from rig.model import build_model, describe
 from rig.motion import BRANCH_ALARM, FINER, Accuracy, Begin, Motion, energy_balance, initial_state
 from rig.scenes import Scene, load_scene, scene_document
+from rig.sending import Frame
 from rig.sensors.conditioning import Conditioner
 from rig.sensors.keyphasor import Keyphasor
 from rig.speed_target import Segment, segments
-from rig.wire import EDGES, ROOT, Block, sensor_key, truth_key
+from rig.wire import ROOT, Block
 
 TICK_RATE_HZ = 1_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """What one `advance` made.
-
-    Attributes:
-        tick: Start.
-        ticks: Length.
-        samples: ADC counts by sensor group.
-        edges: Keyphasor edges, ticks from the block's tick, or None where there was none.
-        truth: Truth tables by name.
-        events: What took effect, each with event, tick and time_s.
-        rows: Observed rows, shape (n, N_ROW); a view that the next `advance` overwrites.
-    """
-
-    tick: int
-    ticks: int
-    samples: dict[str, Block]
-    edges: Block | None
-    truth: dict[str, Block]
-    events: list[dict[str, Any]]
-    rows: np.ndarray = field(repr=False)
-
-    def blocks(self) -> Iterator[tuple[str, Block]]:
-        """Keys and blocks, in the order in which they are published."""
-        for group, block in self.samples.items():
-            if len(block.values):
-                yield sensor_key(group), block
-        if self.edges is not None:
-            yield EDGES, self.edges
-        for table, block in self.truth.items():
-            yield truth_key(table), block
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,9 +118,8 @@ class Simulation:
             self._conditioners, turns = calibrator.stand_ins(scene, row_ticks=self.row_ticks, tick=tick)
             self._keyphasor = turns if marked else None
         self._faulty = Faulty(
-            self.table, self._conditioners, seed=scene.seed, row_ticks=self.row_ticks, noisy=sensors.noise,
-            ideal=sensors.chain == "ideal",
-        )  # fmt: skip
+            self.table, self._conditioners, seed=scene.seed, row_ticks=self.row_ticks, setting=scene.setting
+        )
         self._truth_every = TICK_RATE_HZ // sensors.truth_rate_hz // self.row_ticks
         self._truth_columns = np.array([COLUMN[column] for columns in S.TRUTH.values() for column in columns])
         ends = accumulate(len(columns) for columns in S.TRUTH.values())
@@ -173,6 +139,7 @@ class Simulation:
         self._pending = sorted(
             ((round(timed.at_s * TICK_RATE_HZ), timed.request) for timed in scene.commands), key=lambda entry: entry[0]
         )
+        self._faulty.check_all(self._pending)
         choice, initial = scene.engine, initial_state(self.model, scene.initial, begin, spin=self._speed())
         self._motion = Motion(initial, self._step_ticks, self._stride, choice.tolerance)
         self._companion: Motion | None = None
@@ -236,15 +203,9 @@ class Simulation:
             )
         if self._companion is not None:
             events = sorted(events + self._doubts(rows, companion, start), key=lambda event: event["tick"])
-        return Frame(
-            tick=start,
-            ticks=ticks,
-            samples=self._sample(counts, start),
-            edges=self._edges(rows, start),
-            truth=self._truth(rows, start),
-            events=events,
-            rows=rows,
-        )
+        samples, edges, truth = self._sample(counts, start), self._edges(rows, start), self._truth(rows, start)
+        frame = Frame(start, ticks, samples, edges, truth, events, rows)
+        return self._faulty.sending.pass_on(frame, last=self.tick >= self.end_tick)
 
     def _lost_s(self, rows: np.ndarray, start: int) -> float:
         finite = np.isfinite(rows[:, : S.N_STATE]).all(axis=1)
@@ -269,10 +230,12 @@ class Simulation:
             InputError: Unknown, malformed, out of range, or not possible now.
         """
         command, self.told = check_command(name, request), {}
-        if self.scene.generator is not None:
-            raise InputError(name, "left out: signals of a [generator] stand for the physics", Words("a command to it"))
         waiting = [other for tick, other in self._pending if tick <= self.tick]
-        if isinstance(command, HammerCommand):
+        if isinstance(command, FaultCommand | ClearCommand):
+            self.told = self._faulty.check(command, self.tick, waiting)
+        elif self.scene.generator is not None:
+            raise InputError(name, "left out: signals of a [generator] stand for the physics", Words("a command to it"))
+        elif isinstance(command, HammerCommand):
             busy_until = self._pulse[2] if self._pulse is not None else 0
             if self.tick < busy_until or any(isinstance(other, HammerCommand) for other in waiting):
                 until = f"until {busy_until / TICK_RATE_HZ:.6f} s" if self.tick < busy_until else "from now on"
@@ -281,12 +244,19 @@ class Simulation:
             top = self.model.parameters.entries["drive.top_speed"].value
             if not isinstance(top, str) and command.speed_hz > top:
                 raise InputError("speed.speed_hz", f"at most drive.top_speed = {top:g} Hz", command.speed_hz)
-        elif isinstance(command, FaultCommand | ClearCommand):
-            self.told = self._faulty.check(command, self.tick, waiting)
         elif not self._engaged or any(isinstance(other, ReleaseCommand) for other in waiting):
             raise InputError("release", "given once (the magnets have let go already)", Words("another release"))
         insort(self._pending, (self.tick, command), key=lambda entry: entry[0])
         return self.tick
+
+    def serve(self, doors: tuple[str, ...]) -> None:
+        """Take note of where its blocks leave the rig.
+
+        Raises:
+            InputError: The scene has a fault at a door that is not there.
+        """
+        self._faulty.doors = doors
+        self._faulty.check_all(self._pending)
 
     def warm_up(self) -> None:
         """Compile (or load) every kernel that `advance` will call, without moving on."""

@@ -27,6 +27,8 @@ ALIVE = f"{ROOT}/alive"
 SENSORS = f"{ROOT}/sensors"
 EDGES = f"{SENSORS}/keyphasor_edges"
 TRUTH = f"{ROOT}/truth"
+FAULTS = f"{TRUTH}/faults"
+"""What is told of faults, row by row: documents, beside the blocks of truth."""
 COMMAND = f"{ROOT}/command"
 CLIENTS = f"{ROOT}/clients"
 
@@ -75,7 +77,7 @@ _MOST_BLOCK_S = 1e6
 
 def schema_of(key: str) -> str | None:
     """Block schema of a key's payloads, or None where they are JSON documents."""
-    if key == EDGES or key.startswith(TRUTH + "/"):
+    if key == EDGES or (key.startswith(TRUTH + "/") and key != FAULTS):
         return TRUTH_SCHEMA
     return SAMPLE_SCHEMA if key.startswith(SENSORS + "/") else None
 

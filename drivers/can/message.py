@@ -243,3 +243,28 @@ class MessageTable:
             if rate is not None:
                 rows |= {row: row.samples.rows / rate for row in messages if row.samples is not None}
         return rows
+
+
+def _crc_table() -> bytes:
+    rows = []
+    for value in range(256):
+        for _ in range(8):
+            value = (value << 1 ^ 0x1D) & 0xFF if value & 0x80 else value << 1
+        rows.append(value)
+    return bytes(rows)
+
+
+_CRC = _crc_table()
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8 SAE J1850: polynomial 0x1D, initial value and final xor 0xFF; 0x4B for b"123456789"."""
+    value = 0xFF
+    for byte in data:
+        value = _CRC[value ^ byte]
+    return value ^ 0xFF
+
+
+def checksum(identifier: int, data: bytes) -> int:
+    """What the last byte of a command must be, from its identifier and its first seven bytes."""
+    return crc8(identifier.to_bytes(2, "little") + data[:7])

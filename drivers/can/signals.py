@@ -12,8 +12,8 @@ folds back, which is the receiver's to know.
 
 A command must not arise from noise. It has a kind (4 of 256 values), a counter that goes on by 1 to 15 from that of
 the last command that reached the rig, a constant key, reserved bits at zero, and a CRC-8 over identifier and data; a
-hammer pulse is also limited in force and duration. Of random frames of 8 bytes on the very identifier of commands, one
-of `ODDS` passes all that.
+hammer pulse is also limited in force and duration; faults have an identifier of their own. Of random frames of 8 bytes
+on the very identifier of commands, one of `ODDS` passes all that.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
+from typing import Any
 
 from drivers.can.bus.frame import FD_LENGTHS
-from drivers.can.message import ABSENT, Message, MessageTable, Samples, Signal
+from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signals
+from drivers.can.message import ABSENT, Message, MessageTable, Samples, Signal, checksum
 from rig.channels import Channel, ChannelTable, default_table
 from rig.errors import InputError
 
@@ -101,6 +103,8 @@ class EventKind(IntEnum):
     RELEASE = 5
     WARNING = 6
     END = 7
+    FAULT = 8
+    CLEAR = 9
     OTHER = 15
 
 
@@ -167,7 +171,7 @@ def _other_messages() -> list[Message]:
                 Signal("result", 8, 4, label="What became of it", choices=_choices(Result)),
                 Signal("field", 12, 4, label="Value that was out of range", choices=_choices(Field)),
                 Signal("time", 16, 32, unit="us", label=f"When an accepted command takes effect, else now. {_TIME}"),
-                Signal("limit", 48, 16, scale=0.1, label="Limit that was passed, in the unit of the field"),
+                Signal("limit", 48, 16, scale=0.1, label="Limit passed, or number of the fault that began"),
             ),
         ),
         Message(
@@ -176,7 +180,7 @@ def _other_messages() -> list[Message]:
                 Signal("event", 0, 8, label="What", choices=_choices(EventKind)),
                 Signal("number", 8, 8, label="Running number, modulo 256"),
                 Signal("time", 16, 32, unit="us", label=_TIME),
-                Signal("value", 48, 16, scale=0.1, label="Peak force of a hammer pulse, N, or speed, Hz; else 0"),
+                Signal("value", 48, 16, scale=0.1, label="Force of a hammer pulse, N, speed, Hz, number of a fault"),
             ),
         ),
         Message(
@@ -251,6 +255,14 @@ def _sample_signals(samples: Samples, index_label: str) -> tuple[Signal, ...]:
     return tuple(rows)
 
 
+def _fault_message(table: ChannelTable) -> Message:
+    about = (
+        "A fault of a channel or a stream begins, or ends: 8 bytes, checked as those of Command. Acknowledge tells its "
+        "number, and when its first row is; rig/KEYS.md has the equations"
+    )
+    return Message("Fault", 0x022, 8, False, 0.1, False, CONTROLLER, about, (*fault_signals(table), *_HEAD))
+
+
 def _fd_messages(table: ChannelTable) -> list[Message]:
     found, taken = [], {row.name for row in _other_messages()}
     parts = [
@@ -309,7 +321,7 @@ def _classic_messages(table: ChannelTable) -> list[Message]:
 
 def make_table(channels: ChannelTable) -> MessageTable:
     """All messages for a channel table."""
-    rows = [*_other_messages(), *_fd_messages(channels), *_classic_messages(channels)]
+    rows = [*_other_messages(), _fault_message(channels), *_fd_messages(channels), *_classic_messages(channels)]
     return MessageTable(tuple(sorted(rows, key=lambda row: row.identifier)))
 
 
@@ -337,31 +349,6 @@ def default_messages() -> MessageTable:
     return make_table(default_table())
 
 
-def _crc_table() -> bytes:
-    rows = []
-    for value in range(256):
-        for _ in range(8):
-            value = (value << 1 ^ 0x1D) & 0xFF if value & 0x80 else value << 1
-        rows.append(value)
-    return bytes(rows)
-
-
-_CRC = _crc_table()
-
-
-def crc8(data: bytes) -> int:
-    """CRC-8 SAE J1850: polynomial 0x1D, initial value and final xor 0xFF; 0x4B for b"123456789"."""
-    value = 0xFF
-    for byte in data:
-        value = _CRC[value ^ byte]
-    return value ^ 0xFF
-
-
-def checksum(identifier: int, data: bytes) -> int:
-    """What the last byte of a command must be, from its identifier and its first seven bytes."""
-    return crc8(identifier.to_bytes(2, "little") + data[:7])
-
-
 @dataclass(frozen=True, slots=True)
 class Command:
     """A command as it travels.
@@ -370,12 +357,12 @@ class Command:
         kind: What to do.
         counter: 0 to 255.
         values: Values in the units of the rig's own commands: `force_n` [N], `duration_ms` [ms], `direction` [degrees],
-            `speed_hz` [Hz].
+            `speed_hz` [Hz]; of a fault the fields of `rig.commands.FaultCommand`, with its kind's main number.
     """
 
-    kind: Kind
+    kind: Kind | FaultKind
     counter: int
-    values: dict[str, float]
+    values: dict[str, Any]
 
 
 _REQUEST_FIELDS = {
@@ -426,17 +413,52 @@ def command_frame(
             raise InputError(name, f"left out: {kind.name} has no such value", value)
     if "direction" in raw:
         raw["direction"] %= _DIRECTIONS
-    data = message.encode(kind=int(kind), counter=counter & 0xFF, key=KEY, **raw)
+    return _signed(message, counter, kind=int(kind), **raw)
+
+
+def fault_frame(
+    channel: str, kind: str, counter: int, *, number: float | str | None = None, table: MessageTable | None = None
+) -> tuple[int, bytes]:
+    """Identifier and data of a command that begins a fault.
+
+    Args:
+        channel: A channel, or a group.
+        kind: What it does: `rig fault --list`.
+        counter: As of `command_frame`.
+        number: Its main number (`rig.dbc` names it), or the channel that it is with; None where it needs none.
+        table: Messages; those of the rig's own channel table unless given.
+
+    Raises:
+        InputError: There is no such fault or channel, or no room for the number.
+
+    Example:
+        >>> fault_frame("P_E", "gain", 1, number=1.05)[1].hex()
+        '6b0101090de89d4b'
+    """
+    message = (table or default_messages()).by_name["Fault"]
+    return _signed(message, counter, **fault_raw(message, channel, kind, number))
+
+
+def clear_frame(counter: int, *, number: int = 0) -> tuple[int, bytes]:
+    """Identifier and data of a command that ends a fault by its number, or all by 0."""
+    return _signed(default_messages().by_name["Fault"], counter, kind=int(FaultKind.CLEAR), id=number)
+
+
+def _signed(message: Message, counter: int, **raw: int) -> tuple[int, bytes]:
+    data = message.encode(counter=counter & 0xFF, key=KEY, **raw)
     return message.identifier, data[:7] + bytes([checksum(message.identifier, data)])
 
 
-def parse_command(identifier: int, data: bytes, last_counter: int) -> Command | Result:
+def parse_command(
+    identifier: int, data: bytes, last_counter: int, table: MessageTable | None = None
+) -> Command | Result:
     """A command from the bus, or why it is none.
 
     Args:
-        identifier: Of Stop or Command.
+        identifier: Of Stop, Command or Fault.
         data: What came.
         last_counter: Counter of the last command that reached the rig.
+        table: Messages; those of the rig's own channel table unless given.
     """
     if len(data) != 8:
         return Result.BAD_LENGTH
@@ -444,11 +466,11 @@ def parse_command(identifier: int, data: bytes, last_counter: int) -> Command | 
         return Result.BAD_CHECKSUM
     if data[6] != KEY:
         return Result.BAD_KEY
+    message = (table or default_messages()).by_identifier[identifier]
     try:
-        kind = Kind(data[0])
+        kind = FaultKind(data[0]) if message.name == "Fault" else Kind(data[0])
     except ValueError:
         return Result.BAD_KIND
-    message = default_messages().by_identifier[identifier]
     if (message.name == "Stop") != (kind is Kind.STOP):
         return Result.BAD_KIND
     raw = message.decode(data)
@@ -456,6 +478,9 @@ def parse_command(identifier: int, data: bytes, last_counter: int) -> Command | 
         return Result.RESERVED_BITS
     if not 1 <= (data[1] - last_counter) % 256 <= AHEAD:
         return Result.STALE_COUNTER
+    if isinstance(kind, FaultKind):
+        request = fault_request(message, raw)
+        return Result.OUT_OF_RANGE if request is None else Command(kind, data[1], request)
     scales = {signal.name: signal.scale for signal in message.signals}
     # Rounded to the steps of the wire, so that 0.1 N x 800 is 80 N.
     values = {name: round(raw[key] * scales[key], 6) for key, name in _REQUEST_FIELDS[kind].items()}

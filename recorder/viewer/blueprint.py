@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import rerun as rr
 import rerun.blueprint as rrb
 
-from recorder.viewer import canvas, contact, orbit, painter, scene3d, series, spectrum
+from recorder.viewer import canvas, contact, marks, orbit, painter, scene3d, series, spectrum
 from recorder.viewer.geometry import Geometry
 from rig.channels import ChannelTable
 
@@ -33,7 +33,7 @@ def layout(table: ChannelTable, geometry: Geometry, *, live: bool) -> rrb.Bluepr
         motion.append((_scene_view(), 5.0))
     if small:
         motion.append((rrb.Horizontal(*small), 2.6))
-    frequency.append((_events_view(), 2.6))
+    frequency += [(_marks_view(live=live), 1.8), (_events_view(), 2.6)]
     columns = [(motion, 5.2), ([(view, 1.0) for view in curves.values()], 5.0), (frequency, 4.6)]
     columns = [(views, share) for views, share in columns if views]
     return rrb.Blueprint(
@@ -152,6 +152,12 @@ def _contact_view(*, live: bool) -> rrb.StateTimelineView:
         contents=[f"+ {contact.SENSED}", f"+ {contact.TRUTH}"],
         name="Contact at the ring: by the probes, and by the model if it tells",
         time_view=_time_axis(live=live),
+    )
+
+
+def _marks_view(*, live: bool) -> rrb.StateTimelineView:
+    return rrb.StateTimelineView(
+        origin=marks.ROOT, contents=[f"+ {marks.ROOT}/**"], name="Commands and faults", time_view=_time_axis(live=live)
     )
 
 

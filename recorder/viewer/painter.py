@@ -14,6 +14,7 @@ from recorder.viewer import contact, orbit
 from recorder.viewer.canvas import Canvas
 from recorder.viewer.contact import ContactPlot, Touch
 from recorder.viewer.geometry import Geometry
+from recorder.viewer.marks import Marks
 from recorder.viewer.orbit import OrbitPlot
 from recorder.viewer.scene3d import Scene3D
 from recorder.viewer.series import REACTIONS, SeriesPlot, Span, reaction_of
@@ -125,6 +126,7 @@ class Painter:
             for name, group in table.groups.items()
         }
         self._groups = table.groups
+        self._marks = Marks(canvas)
         self._truth = ContactPlot(canvas, path=contact.TRUTH, touch=Touch(enter=1e-9, leave=1e-9))
         if geometry.assumed and planes_in(table):
             names = ", ".join(geometry.assumed)
@@ -179,6 +181,7 @@ class Painter:
         time_s = float(event.get("time_s") or 0.0)
         if name == "hammer":
             self._windows.append((time_s - AROUND_HAMMER_S, time_s + AROUND_HAMMER_S))
+        self._marks.take(event, time_s)
         level, text = schemas.event_text(dict(event))
         self.note(time_s, text, level=_LEVELS[level])
 

@@ -8,6 +8,7 @@ makes it. A file is written beside its place and moved there when it is whole.
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -24,6 +25,7 @@ from replays.recordings.formats import columnar, delimited
 from replays.recordings.formats.export import check_output, export
 from replays.recordings.formats.selection import select
 from rig import wire
+from rig.commands import FaultCommand
 from rig.errors import PART_SUFFIX, InputError, Words, whole_file
 from rig.kernels.signals import ROW
 from rig.offline import frames
@@ -100,8 +102,12 @@ def table_columns(simulation: Simulation) -> list[str]:
     """Column headings of a table of a run.
 
     Raises:
-        InputError: Groups have rates of their own.
+        InputError: Groups have rates of their own, or the scene has faults of blocks.
     """
+    for timed in simulation.scene.commands:
+        if isinstance(timed.request, FaultCommand) and timed.request.what.of_blocks:
+            must = "an .mcap file where a scene has faults of blocks, of which a table has none"
+            raise InputError("output", must, Words(timed.request.what.name()))
     rates = {name: group.rate_hz for name, group in simulation.table.groups.items()}
     if len(set(rates.values())) > 1:
         told = ", ".join(f"{name} {rate} Hz" for name, rate in rates.items())
@@ -266,9 +272,12 @@ class McapRun:
     def _write(self, frame: Frame) -> None:
         for event in frame.events:
             self._event(event)
-        for key, block in frame.blocks():
-            self._writer.write(key, wire.encode_block(block), self._wall(frame.tick))
-            self._rows.follow(key, block.index, len(block.values))
+        for told in frame.told:
+            self._writer.write(wire.FAULTS, wire.encode_document(told), self._wall(frame.tick))
+        for message in frame.messages:
+            if "zenoh" in message.doors:
+                self._writer.write(message.key, wire.encode_block(message.block), self._wall(frame.tick))
+                self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
 
     def _event(self, event: dict[str, Any]) -> None:
         tick = int(event.get("tick", self.simulation.tick))  # a frame's own: the simulation is further on by now

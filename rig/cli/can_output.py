@@ -165,7 +165,8 @@ class CanOutput:
         """The rig's server together with the bus."""
         from rig.transport.fanout import Fanout
 
-        return Fanout([server, self._memory], figures=self._figures, warnings=self._warnings)
+        doors: dict[str, Server] = {"zenoh": server, "can": self._memory}
+        return Fanout([*doors.values()], doors=doors, figures=self._figures, warnings=self._warnings)
 
     def start(self, *, paced: bool) -> None:
         """Begin, once the rig can be asked.

@@ -143,19 +143,26 @@ def _verdict(document: dict[str, Any]) -> list[tuple[str, str]]:
     """What is lost and what is in doubt, in a line each."""
     streams = document["streams"]
     noted = bool(document["gaps"])  # what is missing and not noted is told once
-    lost = sum(each["lost"] if noted else max(0, each["lost"] - each["missing"]) for each in streams.values())
+    lost = sum(_lost(each) - (0 if noted else min(_lost(each), each["missing"])) for each in streams.values())
+    declared = sum(each["declared"] for each in streams.values())
     health = document["health"]
     doubtful = [channel["name"] for channel in health["channels"] if channel["findings"]]
     doubts = len(health["findings"]) + len(health["warnings"])
     found = [f"doubts in {', '.join(doubtful)}"] if doubtful else []
     found += [f"{doubts} {'doubt' if doubts == 1 else 'doubts'} on the whole"] if doubts else []
-    gone = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or document["gaps"] else []
+    gone = [f"{lost} rows in {len(document['gaps'])} gaps"] if lost or (document["gaps"] and not declared) else []
     missing = {key: stream["missing"] for key, stream in streams.items() if stream["missing"]}
     gone += [f"{rows} rows of {key} are missing" for key, rows in missing.items()]
     return [
         ("lost", "; ".join(gone) or "nothing"),
+        *([("taken", f"{declared} rows by faults, or late by them, as the rig told")] if declared else []),
         ("health", "; ".join(found) or f"{len(health['channels'])} channels without a doubt"),
     ]
+
+
+def _lost(stream: dict[str, Any]) -> int:
+    """Rows that never came, less those that a fault took."""
+    return max(0, stream["lost"] - stream["declared"])
 
 
 def _number(value: float | None, noise: float) -> str:
@@ -182,7 +189,7 @@ def _streams_table(streams: dict[str, dict[str, Any]]) -> Table:
     for key, stream in streams.items():
         times = (f"{stream['first_time_s']:.4f}", f"{stream['last_time_s']:.4f}")
         counts = (str(stream["messages"]), str(stream["rows"]))
-        lost = max(stream["lost"], stream["missing"])
+        lost = max(_lost(stream), stream["missing"])
         table.add_row(key, *counts, *times, str(lost), style="red" if lost else "")
     return table
 

@@ -61,7 +61,7 @@ class Triggers:
     trigger: Annotated[
         list[str] | None,
         _triggers(
-            "Record only around this: an event (hammer, speed, release, note, warning) or a level such as "
+            "Record only around this: an event (hammer, speed, release, fault, note, warning) or a level such as "
             "'|disk_x|>0.5' or 'P_E>3200' (in the channel's unit, preload included); may be repeated. A level fires "
             "where it is crossed, and again after 0.25 s clear of it. One file each: NAME.hammer-001.mcap, ...",
             metavar="EVENT|LEVEL",
@@ -280,6 +280,8 @@ def tell(summary: Summary) -> None:
         echo(f"{summary.removed} older files were removed to make room")
     for line in summary.losses or ("nothing",):
         echo(f"lost: {line}")
+    for key, rows in summary.declared.items():
+        echo(f"not lost: {rows} rows of {key}, which a fault took before they were sent, or sent late")
     if summary.lost or summary.missed:
         inside = ", those inside a capture," if summary.fired is not None else ""
         echo(f"the gaps ({summary.gaps}){inside} are recorded in the file on recorder/gaps")

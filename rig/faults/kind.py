@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, get_args
+from typing import ClassVar, NamedTuple, get_args
 
 import numpy as np
 from pydantic import ConfigDict
 
 from rig.channels import Channel
 from rig.outside import Written
+
+SIGMAS = 4.0
+"""A jitter is late by so many of its deviations on the mean, and no sample by more than twice that."""
 
 
 class Draws:
@@ -67,6 +70,20 @@ class At:
     mark: Callable[[np.ndarray], np.ndarray]
 
 
+class Setting(NamedTuple):
+    """What of a scene decides which faults make sense.
+
+    Attributes:
+        ideal: It leaves filters and noise out.
+        noisy: Its sensors are noisy.
+        generated: Generators stand for the physics.
+    """
+
+    ideal: bool = False
+    noisy: bool = True
+    generated: bool = False
+
+
 class Kind(Written):
     """One kind of fault. What it does not change stays as it was."""
 
@@ -75,11 +92,22 @@ class Kind(Written):
     stage: ClassVar[str]
     channel_only: ClassVar[str] = ""
     """Signal of the only channels that it is for."""
+    first: ClassVar[tuple[str, ...]] = ()
+    """Its main number, where that is not the first."""
+    of_blocks: ClassVar[bool] = False
+    """It is about blocks, not about what stands in them (`rig.faults.blocks`)."""
 
     @classmethod
     def name(cls) -> str:
         """As it is called."""
         return get_args(cls.model_fields["kind"].annotation)[0]
+
+    @classmethod
+    def main(cls) -> str:
+        """The number that says most, for where there is room for one; empty where it has none."""
+        own = [(key, field) for key, field in cls.model_fields.items() if key not in ("kind", "door", "block_s")]
+        required = [key for key, field in own if field.is_required()]
+        return next(iter((*required, *cls.first, *(key for key, _ in own))), "")
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -90,14 +118,15 @@ class Kind(Written):
         """Channels that it changes, where it is asked for of some."""
         return names
 
-    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
-        """Raise InputError where it would change nothing, or nothing that makes sense.
+    @classmethod
+    def needs(cls, channel: Channel, setting: Setting) -> str:
+        """What would have to be given in its place on a channel; empty where it makes sense there."""
+        if setting.generated and (cls.stage == "filter" or cls.channel_only):
+            return "one that test signals can have, such as clip: they have no filter and no shaft"
+        return ""
 
-        Args:
-            channel: The channel.
-            ideal: Whether the scene leaves filters and noise out.
-            noisy: Whether its sensors are noisy.
-        """
+    def refuse(self, channel: Channel) -> None:
+        """Raise InputError where with these numbers it would change nothing, or nothing that makes sense."""
 
     def signal(self, x: np.ndarray, at: At) -> np.ndarray:
         """What the sensor feels [its unit], shape (n,)."""

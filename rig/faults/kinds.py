@@ -8,6 +8,7 @@ sample n: the same in every run with the same seed, however it is cut into block
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Annotated, Literal, get_args
 
 import numpy as np
@@ -15,15 +16,15 @@ from pydantic import AfterValidator, Field, FiniteFloat
 
 from rig.channels import Channel
 from rig.errors import InputError
-from rig.faults.kind import At, Kind
+from rig.faults.blocks import BlockKind
+from rig.faults.kind import SIGMAS, At, Kind, Setting
+from rig.faults.pulses import PulseKind
 
 Part = Annotated[FiniteFloat, Field(gt=0.0, lt=1.0)]
 Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0.0)]
 MOST_LATE_US = 10_000.0
 """Latest that a sample may be taken [us]."""
-_SIGMAS = 4.0
-"""A jitter is late by so many of its deviations on the mean, and no sample by more than twice that."""
 
 
 def _grown(at: At, ramp_s: float) -> np.ndarray | float:
@@ -115,6 +116,42 @@ class Nonlinear(Kind):
         return self.end * np.tanh(x / self.end)
 
 
+class Resonance(Kind):
+    """A transducer that rings: x'' = w^2 (x - x') - (w / quality) dx'/dt, w = 2 pi frequency_hz, at rest before.
+
+    Between rows of the model x is a straight line, over which this is solved exactly.
+    """
+
+    stage = "transducer"
+    kind: Literal["resonance"] = "resonance"
+    frequency_hz: Annotated[FiniteFloat, Field(ge=1.0, le=5000.0)]
+    quality: Annotated[FiniteFloat, Field(gt=0.5, le=1000.0)] = 10.0
+
+    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
+        w, names = 2.0 * math.pi * self.frequency_hz, [f"{at.channel.name} {part}" for part in ("re", "im", "x", "t")]
+        # x' = 2 Re(z) with dz/dt = p z + r x, of one pole p and its residue r.
+        p = complex(-0.5 / self.quality, math.sqrt(1.0 - 0.25 / self.quality**2)) * w
+        r = -0.5j * w * w / p.imag
+        re, im, before, t = (at.kept.get(name) for name in names)
+        values, times = x.tolist(), at.t.tolist()
+        z = -r / p * values[0] if re is None or im is None else complex(re, im)
+        # Rows begin with the last one of those before; samples do not.
+        goes_on = before is not None and t is not None and times[0] > t + 1e-9
+        if goes_on:
+            values, times = [before, *values], [t, *times]
+        found = [z]
+        if len(values) > 1:
+            step = p * round(1e9 * (times[1] - times[0])) * 1e-9
+            turn = math.exp(step.real) * complex(math.cos(step.imag), math.sin(step.imag))
+            second = r / p * ((turn - 1.0) / step - 1.0)
+            first = r / p * (turn - 1.0) - second
+            for one, other in pairwise(values):
+                z = turn * z + first * one + second * other
+                found.append(z)
+        at.kept.update(zip(names, (z.real, z.imag, values[-1], times[-1]), strict=True))
+        return 2.0 * np.real(found[1:] if goes_on else found)
+
+
 # ---- cable and conditioner ----
 
 
@@ -142,6 +179,7 @@ class Short(Open):
 class Intermittent(Open):
     """A loose contact: v' = level_v in those slots of slot_s whose u(slot) < part."""
 
+    first = ("part",)
     kind: Literal["intermittent"] = "intermittent"  # pyright: ignore[reportIncompatibleVariableOverride]
     part: Part = 0.2
     slot_s: Annotated[FiniteFloat, Field(ge=1e-4, le=100.0)] = 0.01
@@ -227,9 +265,10 @@ class NoFilter(Kind):
     stage = "filter"
     kind: Literal["no-filter"] = "no-filter"
 
-    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
-        if ideal:
-            raise InputError("kind", "one that a scene without filters can have, such as clip", self.name())
+    @classmethod
+    def needs(cls, channel: Channel, setting: Setting) -> str:
+        none = "one that a scene without filters can have, such as clip" if setting.ideal else ""
+        return none or super().needs(channel, setting)
 
 
 class Bandwidth(NoFilter):
@@ -238,8 +277,7 @@ class Bandwidth(NoFilter):
     kind: Literal["bandwidth"] = "bandwidth"  # pyright: ignore[reportIncompatibleVariableOverride]
     corner_hz: Annotated[FiniteFloat, Field(ge=1.0, le=1e6)]
 
-    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
-        super().refuse(channel, ideal=ideal, noisy=noisy)
+    def refuse(self, channel: Channel) -> None:
         if self.corner_hz > channel.bandwidth_hz:
             must = f"below its bandwidth of {channel.bandwidth_hz:g} Hz; no-filter takes the filter away"
             raise InputError("corner_hz", must, self.corner_hz)
@@ -268,14 +306,19 @@ class Late(Kind):
 
 
 class Clock(Kind):
-    """A clock that is fast: a sample of time t since it began is taken at t / (1 + ppm 1e-6), 10 ms late at most."""
+    """A clock that is fast: a sample of time t since it began is taken at t / (1 + ppm 1e-6), 10 ms late at most.
+
+    One that is slow, with ppm below 0, begins 10 ms late, as none can be early, and is right 10 ms / (-1e-6 ppm) on.
+    """
 
     stage = "clock"
     kind: Literal["clock"] = "clock"
-    ppm: Annotated[FiniteFloat, Field(gt=0.0, le=1e5)]
+    ppm: Annotated[FiniteFloat, Field(ge=-1e5, le=1e5), _but(0.0, must="other than 0")]
 
     def late_s(self, at: At) -> np.ndarray:
-        return np.minimum(at.t * (1.0 - 1.0 / (1.0 + 1e-6 * self.ppm)), 1e-6 * MOST_LATE_US)
+        most_s = 1e-6 * MOST_LATE_US
+        begun_s = 0.0 if self.ppm > 0.0 else most_s
+        return np.clip(begun_s + at.t * (1.0 - 1.0 / (1.0 + 1e-6 * self.ppm)), 0.0, most_s)
 
 
 class Jitter(Kind):
@@ -286,7 +329,7 @@ class Jitter(Kind):
     rms_us: Annotated[FiniteFloat, Field(gt=0.0, le=1000.0)]
 
     def late_s(self, at: At) -> np.ndarray:
-        return 1e-6 * self.rms_us * (_SIGMAS + np.clip(at.draw.normal(at.n), -_SIGMAS, _SIGMAS))
+        return 1e-6 * self.rms_us * (SIGMAS + np.clip(at.draw.normal(at.n), -SIGMAS, SIGMAS))
 
 
 class Wander(Kind):
@@ -311,11 +354,11 @@ class Noise(Kind):
     kind: Literal["noise"] = "noise"
     factor: Annotated[FiniteFloat, Field(gt=1.0, le=1e6)]
 
-    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
-        if ideal or not noisy or not channel.noise_v:
-            raise InputError(
-                "kind", f"one for a channel without noise, as {channel.name} here, such as spikes", "noise"
-            )
+    @classmethod
+    def needs(cls, channel: Channel, setting: Setting) -> str:
+        if setting.ideal or not setting.noisy or not channel.noise_v:
+            return f"one for a channel without noise, as {channel.name} here, such as spikes"
+        return ""
 
     def counts(self, c: np.ndarray, at: At) -> np.ndarray:
         more = math.sqrt(self.factor**2 - 1.0) * at.channel.noise_v / at.channel.lsb_v
@@ -343,7 +386,7 @@ class Bits(Kind):
     kind: Literal["bits"] = "bits"
     lost: Annotated[int, Field(ge=1, le=31)]
 
-    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
+    def refuse(self, channel: Channel) -> None:
         if self.lost >= channel.adc_bits:
             raise InputError("lost", f"below the converter's {channel.adc_bits} bits", self.lost)
 
@@ -359,7 +402,7 @@ class StuckBit(Kind):
     bit: Annotated[int, Field(ge=0, le=30)]
     value: Literal[0, 1] = 1
 
-    def refuse(self, channel: Channel, *, ideal: bool, noisy: bool) -> None:
+    def refuse(self, channel: Channel) -> None:
         if self.bit > channel.adc_bits - 2:
             raise InputError("bit", f"at most {channel.adc_bits - 2}, below the sign", self.bit)
 
@@ -393,74 +436,9 @@ class Freeze(Kind):
         return ticks[:0]
 
 
-# ---- keyphasor ----
-
-
-class MissPulses(Kind):
-    """No pulse in turns whose u(turn) < part."""
-
-    stage = "keyphasor"
-    channel_only = "keyphasor"
-    kind: Literal["miss-pulses"] = "miss-pulses"
-    part: Annotated[FiniteFloat, Field(gt=0.0, le=1.0)] = 0.2
-
-    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return np.where(_picked(at, self.part), 0.0, x)
-
-    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
-        return ticks[~_picked(at, self.part)] if len(ticks) else ticks
-
-
-class ExtraPulses(MissPulses):
-    """A pulse half a turn behind that of turns whose u(turn) < part."""
-
-    kind: Literal["extra-pulses"] = "extra-pulses"  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return np.maximum(x, np.where(_picked(at, self.part), at.mark(at.angle - math.pi), 0.0))
-
-    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
-        if not len(ticks):
-            return ticks
-        extra = ticks + 1e6 * math.pi / at.rate
-        return np.sort(np.concatenate([ticks, extra[_picked(at, self.part)]]))
-
-
-class EdgeJitter(Kind):
-    """The pulse of a turn is late by rms_us (4 + g(turn)), g within 4."""
-
-    stage = "keyphasor"
-    channel_only = "keyphasor"
-    kind: Literal["edge-jitter"] = "edge-jitter"
-    rms_us: Annotated[FiniteFloat, Field(gt=0.0, le=1000.0)]
-
-    def _late_s(self, at: At) -> np.ndarray:
-        turns, known = _turns(at)
-        late_s = 1e-6 * self.rms_us * (_SIGMAS + np.clip(at.draw.normal(known), -_SIGMAS, _SIGMAS))
-        return late_s[turns - known[0]]
-
-    def signal(self, x: np.ndarray, at: At) -> np.ndarray:
-        return at.mark(at.angle - at.rate * self._late_s(at))
-
-    def edges(self, ticks: np.ndarray, at: At) -> np.ndarray:
-        return ticks + 1e6 * self._late_s(at) if len(ticks) else ticks
-
-
-def _turns(at: At) -> tuple[np.ndarray, np.ndarray]:
-    """Number of each row's turn, counted from a quarter before its mark, shape (n,); and all that there are."""
-    turns = np.floor(at.angle / (2.0 * math.pi) + 0.25).astype(np.int64)
-    return turns, np.arange(turns.min(), turns.max() + 1)
-
-
-def _picked(at: At, part: float) -> np.ndarray:
-    """Whether rows are of turns that are hit, shape (n,)."""
-    turns, known = _turns(at)
-    return (at.draw.uniform(known)[:, 0] < part)[turns - known[0]]
-
-
 AnyKind = (
     Gain | Offset | Drift | Polarity | Stuck | Nonlinear | Open | Short | Intermittent | Hum | Crosstalk | Saturation
-    | Swap | NoFilter | Bandwidth | Late | Clock | Jitter | Wander | Noise | Spikes | Bits | StuckBit | Clip | Freeze
-    | MissPulses | ExtraPulses | EdgeJitter
+    | Swap | Resonance | NoFilter | Bandwidth | Late | Clock | Jitter | Wander | Noise | Spikes | Bits | StuckBit | Clip
+    | Freeze | PulseKind | BlockKind
 )  # fmt: skip
 KINDS: dict[str, type[Kind]] = {kind.name(): kind for kind in get_args(AnyKind)}

@@ -106,3 +106,8 @@ class Client(Protocol):
     def close(self) -> None:
         """Undeclare everything and close."""
         ...
+
+
+def doors_of(server: Server) -> dict[str, Server]:
+    """The ways out of a rig, "zenoh" and "can", each with its transport."""
+    return getattr(server, "doors", {"zenoh": server})

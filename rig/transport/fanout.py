@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 
 from rig.transport import Server
@@ -13,6 +13,7 @@ class Fanout:
 
     Args:
         servers: The transports, in the order in which they are given each payload; each stays its owner's to close.
+        doors: Which of them is which way out of the rig.
         figures: Further counts for the status, named as `congestion` names its own.
         warnings: What else a person should know of, while it is so.
     """
@@ -21,10 +22,12 @@ class Fanout:
         self,
         servers: Sequence[Server],
         *,
+        doors: Mapping[str, Server] | None = None,
         figures: Callable[[], dict[str, float]] | None = None,
         warnings: Callable[[], list[str]] = list,
     ) -> None:
         self._servers = tuple(servers)
+        self.doors = dict(doors or {"zenoh": self._servers[0]})
         self.warnings = warnings
         self._figures = figures
 

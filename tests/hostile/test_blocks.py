@@ -297,6 +297,7 @@ class Still:
         live.Painter.add_event(self, event)  # type: ignore[arg-type]
 
     _windows: list[tuple[float, float]] = []  # noqa: RUF012
+    _marks = type("Marks", (), {"take": lambda *_: None})()
 
     def note(self, time_s: float, text: str, *, level: str = "INFO") -> None:
         assert np.isfinite(time_s)

@@ -55,6 +55,9 @@ class FakeSimulation:
         self.warmed_up = False
         self._scheduled: list[dict[str, Any]] = []
 
+    def serve(self, doors: tuple[str, ...]) -> None:
+        assert doors
+
     def warm_up(self) -> None:
         self.warmed_up = True
 

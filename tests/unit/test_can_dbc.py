@@ -46,8 +46,8 @@ def test_the_load_command_shows_every_message(capsys: pytest.CaptureFixture[str]
     output = shown(capsys, "can", "load")
     for name in (row.name for row in (*TABLE.others, *TABLE.classic)):
         assert name in output
-    assert "load: at most 69.0 % of the bus" in output
-    assert "load: at most 125.9 % of the bus" in shown(capsys, "can", "load", "--can-fd", "--can-bitrate", "1M/5M")
+    assert "load: at most 69.2 % of the bus" in output
+    assert "load: at most 126.1 % of the bus" in shown(capsys, "can", "load", "--can-fd", "--can-bitrate", "1M/5M")
 
 
 def test_a_bus_that_gets_too_full_is_told_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,7 +56,7 @@ def test_a_bus_that_gets_too_full_is_told_in_one_line(tmp_path: Path, capsys: py
     path.write_text(f"[groups.forces]\nchannels = [{more}]")
     warning = (
         "rig: warning: CAN load must be at most 70 % of 1M with classic frames, so that others find room beside them; "
-        "instead received 80.5 % with 6 frames an instant (a lower --can-rate or --can-fd helps)\n"
+        "instead received 80.7 % with 6 frames an instant (a lower --can-rate or --can-fd helps)\n"
     )
     for command in (["can", "load"], ["can", "dbc"]):
         assert said(capsys, *command, "--channels", str(path))[2] == warning

@@ -10,6 +10,7 @@ import pytest
 
 from drivers.can import analysis
 from drivers.can.bus.timing import speed
+from drivers.can.message import checksum, crc8
 from drivers.can.schedule import Schedule, schedule_from
 from drivers.can.signals import (
     ABSENT,
@@ -21,9 +22,7 @@ from drivers.can.signals import (
     Kind,
     Message,
     Result,
-    checksum,
     command_frame,
-    crc8,
     default_messages,
     make_table,
     parse_command,
@@ -56,7 +55,7 @@ def test_signals_do_not_overlap_and_fit_their_message() -> None:
 
 def test_commands_win_the_bus_and_slow_messages_lose_it() -> None:
     order = [row.name for row in TABLE.messages]
-    assert order[:4] == ["Stop", "Command", "Acknowledge", "Sync"]
+    assert order[:5] == ["Stop", "Command", "Acknowledge", "Fault", "Sync"]
     # The end, an event, must not overtake samples.
     assert order[-5:] == ["Keyphasor", "Event", "Status", "Heartbeat", "Rates"]
     assert [row.identifier for row in TABLE.messages] == sorted(row.identifier for row in TABLE.messages)

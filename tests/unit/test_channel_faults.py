@@ -25,7 +25,11 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "clock": {"ppm": 5e4}, "jitter": {"rms_us": 100.0}, "wander": {"amplitude_us": 2000.0, "period_s": 0.05},
     "noise": {"factor": 3.0}, "spikes": {"rate_hz": 500.0, "size_v": 0.5}, "bits": {"lost": 6},
     "stuck-bit": {"bit": 8}, "clip": {"part": 1e-4}, "freeze": {}, "miss-pulses": {"part": 1.0},
-    "extra-pulses": {"part": 1.0}, "edge-jitter": {"rms_us": 300.0},
+    "extra-pulses": {"part": 1.0}, "edge-jitter": {"rms_us": 300.0}, "resonance": {"frequency_hz": 80.0},
+}  # fmt: skip
+BLOCKS: dict[str, dict[str, Any]] = {
+    "dropout": {}, "lose-blocks": {"part": 0.5}, "duplicate-blocks": {"part": 0.5}, "reorder-blocks": {"part": 0.5},
+    "late-blocks": {"delay_s": 0.033}, "stale-stamps": {}, "restart": {},
 }  # fmt: skip
 SCENE = load_scene("hammer", {"duration_s": 0.4, "drive.speed_hz": 15.0})
 FROM, TO = 0.1, 0.3
@@ -70,13 +74,14 @@ def example(kind: str, channel: str) -> dict[str, Any]:
 
 
 def test_every_kind_has_an_example_and_its_options() -> None:
-    assert set(EXAMPLES) == set(KINDS)
+    assert {*EXAMPLES, *BLOCKS} == set(KINDS)
+    assert len(KINDS) == 36
     numbers = {field for kind in KINDS.values() for field in kind.model_fields if field != "kind"}
     own = {"channel", "kind", "for_s", "clear", "listed", "connection", "form"}
     assert {one for one in command.fault.__annotations__ if one != "return"} == numbers | own
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EXAMPLES)
 def test_a_fault_is_on_its_channels_and_rows_alone(kind: str, sound: dict[str, np.ndarray]) -> None:
     """However the run is cut; once it is over, every count is what it would have been."""
     channel = "keyphasor" if KINDS[kind].channel_only else "disk_x"
@@ -116,7 +121,7 @@ def test_every_kind_does_something_on_every_channel_or_is_refused(channel: str, 
         # A hammer that rests, and a spin that is all but even, show nothing of what acts on their motion.
         still = channel in ("hammer", "speed") and kind in (
             "gain", "polarity", "stuck", "nonlinear", "no-filter", "bandwidth", "saturation", "short", "clip",
-            "intermittent",
+            "intermittent", "resonance",
         )  # fmt: skip
         assert channel in differs(there, sound) or still or channel == "keyphasor"
     assert refused <= {"noise", *(kind for kind in KINDS if KINDS[kind].channel_only)}

@@ -9,14 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recorder.reader import Recording
 from recorder.schemas import event_text
 from recorder.viewer import blueprint, file, spectrum
 from recorder.viewer.canvas import Canvas, new_stream
 from recorder.viewer.geometry import Geometry
 from recorder.viewer.painter import not_drawn
+from replays.recordings.export import write_run
 from rig import wire
 from rig.channels import ChannelTable, default_table
 from rig.cli.main import main
+from rig.scenes import parse_scene
+from rig.simulation import Simulation
 from tests.unit.player_recording import BLOCKS, write_recording
 from tests.unit.recorder_stream import stream
 from tests.unit.viewer_recording import (
@@ -324,3 +328,24 @@ def test_a_picture_has_its_name_only_when_it_is_whole(tmp_path: Path, monkeypatc
         assert sorted(path.name for path in tmp_path.iterdir()) == ["run.mcap", "run.rrd"]
         assert (target.read_bytes() == b"precious") == bool(code)
     assert seen == [["run.rrd", "run.rrd.part"]]
+
+
+def test_faults_and_commands_are_marks_from_begin_to_end(tmp_path: Path) -> None:
+    faults = [
+        {"at_s": 0.1, "channel": "P_E", "kind": "freeze", "for_s": 0.1},
+        {"at_s": 0.15, "channel": "P_E", "kind": "hum", "amplitude_v": 0.1},
+        {"at_s": 0.2, "channel": "probes", "kind": "dropout", "for_s": 0.05},
+    ]
+    hit = {"at_s": 0.05, "command": "hammer", "force_n": 80.0}
+    scene = parse_scene({"duration_s": 0.3, "drive": {"speed_hz": 6.2}, "commands": [hit], "faults": faults})
+    write_run(Simulation(scene), tmp_path / "faulty.mcap")
+    save(Recording.open(tmp_path / "faulty.mcap"), tmp_path / "faulty.rrd")
+    saved = Saved(tmp_path / "faulty.rrd")
+    for lane, expected in (
+        ("faults/P_E", [(0.1, "freeze"), (0.15, "freeze + hum"), (0.2, "hum")]),
+        ("faults/probes", [(0.2, "dropout"), (0.25, "sound")]),
+        ("commands", [(0.05, "hammer 80"), (0.1, "-")]),
+    ):
+        marks = saved[f"/marks/{lane}", "StateChange:state"]
+        found = [(round(time_s, 6), state) for time_s, (state,) in zip(marks.times_s, marks.values, strict=True)]
+        assert found == expected

@@ -50,6 +50,18 @@ class _Catalogue(Outside, extra="ignore"):
     table: dict[str, Any]
 
 
+class _Stretch(Outside, extra="ignore"):
+    key: str
+    row: int
+    rows: int
+
+
+class _Told(Outside, extra="ignore"):
+    """What the rig tells of its faults: rows whose blocks they met."""
+
+    blocks: list[_Stretch] = pydantic.Field(default=[])
+
+
 class Gateway:
     """Sends what a rig publishes as CAN messages, and gives it the commands that come from the bus.
 
@@ -114,6 +126,10 @@ class Gateway:
 
         self.blocks_dropped = 0
         """Blocks that the sender had no time for."""
+        self.taken = 0
+        """Frames that were never made because a fault of blocks took their samples, or sent them out of turn."""
+        self._told: dict[str, int] = {}
+        """Number of the row behind the last one that such a fault met, by group."""
         self.bus_errors = 0
         """Calls of the bus that failed while receiving."""
         self.guard = Guard("the CAN gateway")
@@ -121,7 +137,9 @@ class Gateway:
         self._falling_behind = Rising("CAN: {} blocks were dropped: the gateway does not keep up")
         room = math.ceil(_WAIT_S * sum(1.0 / period_s for period_s in schedule.messages().values()))
         self.outbox = Outbox(bus, room=room, paced=paced, now=now)
-        self.commands = Commands(client, self._acknowledge, timeout_s=command_timeout_s, now=now, guard=self.guard)
+        self.commands = Commands(
+            client, self._acknowledge, timeout_s=command_timeout_s, now=now, guard=self.guard, table=schedule.table
+        )
         self._threads = [
             threading.Thread(target=target, name=f"can gateway {name}", daemon=True)
             for name, target in (
@@ -138,7 +156,7 @@ class Gateway:
         self._bus.set_filters([{"can_id": each, "can_mask": STANDARD_MASK, "extended": False} for each in IDENTIFIERS])
         for group in self._groups:
             self._client.subscribe(wire.sensor_key(group), self._take)
-        for key in (wire.EDGES, wire.EVENTS, wire.STATUS):
+        for key in (wire.EDGES, wire.EVENTS, wire.STATUS, wire.FAULTS):
             self._client.subscribe(key, self._take)
         for thread in self._threads:
             thread.start()
@@ -188,7 +206,7 @@ class Gateway:
     @property
     def dropped(self) -> int:
         """Frames that the bus did not take, or that were never made because samples were missing."""
-        return self.outbox.dropped + sum(each.skipped for each in self._samples)
+        return self.outbox.dropped + sum(each.skipped for each in self._samples) - self.taken
 
     # On the publisher's thread.
 
@@ -197,7 +215,7 @@ class Gateway:
             if not self._paced:
                 while len(self._queue) >= self._capacity and not self._stopping:
                     self._changed.wait(0.1)
-            while len(self._queue) >= self._capacity and key not in (wire.EVENTS, wire.STATUS):
+            while len(self._queue) >= self._capacity and key not in (wire.EVENTS, wire.STATUS, wire.FAULTS):
                 self._queue.popleft()
                 self.blocks_dropped += 1
             self._queue.append((key, payload))
@@ -253,6 +271,9 @@ class Gateway:
         """
         if key == wire.EVENTS:
             self._on_event(wire.decode_document(payload))
+        elif key == wire.FAULTS:
+            told = check(_Told, payload, field="faults", most_bytes=DOCUMENT_BYTES)
+            self._told |= {one.key.rpartition("/")[2]: one.row + one.rows for one in told.blocks}
         elif key == wire.STATUS:
             self._status = wire.decode_document(payload)
         elif key == wire.EDGES:
@@ -267,10 +288,15 @@ class Gateway:
         if self.state == State.PREPARING:
             self.state = State.RUNNING
         for each in self._samples:
-            if group in each.columns and (complete := each.take(group, block)) is not None:
+            if group not in each.columns:
+                continue
+            skipped = each.skipped
+            if (complete := each.take(group, block)) is not None:
                 # A frame is due with its last instant.
                 last, data = complete
                 self.outbox.put(each.message, data, last / self._rate_hz)
+            if any(block.index <= self._told.get(name, -1) for name in each.columns):
+                self.taken += each.skipped - skipped
         if group == self._groups[0]:
             self._sync(block)
 
@@ -285,7 +311,8 @@ class Gateway:
     def _sync(self, block: wire.Block) -> None:
         every = round(_SYNC_S * self._rate_hz)
         for index in range(-(-block.index // every) * every, block.index + len(block.values), every):
-            time_s = index / self._rate_hz
+            # As the block says: whoever ties bus time to the stream meets stamps that do not go on.
+            time_s = block.start_s + (index - block.index) / self._rate_hz
             self.outbox.put_one(
                 self._messages["Sync"], time_s, index=index & _WORD_32, time=round(1e6 * time_s) & _WORD_32
             )
@@ -307,7 +334,7 @@ class Gateway:
         kind = EventKind[name.upper()] if name.upper() in EventKind.__members__ else EventKind.OTHER
         self._ended |= kind is EventKind.END
         time_us = round(1e6 * float(event.get("time_s", 0.0)))
-        value = event.get("force_n" if kind is EventKind.HAMMER else "speed_hz", 0.0)
+        value = event.get({EventKind.HAMMER: "force_n", EventKind.FAULT: "fault"}.get(kind, "speed_hz"), 0.0)
         value = value if isinstance(value, (int, float)) and math.isfinite(value) else 0.0
         # With the samples of its time; its identifier loses against theirs, so that the end comes last.
         self.outbox.put_one(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import pydantic
 
+from drivers.can.message import MessageTable
 from drivers.can.signals import FIELDS, LIMITS, Command, Field, Kind, Result, default_messages, parse_command
 from drivers.health import Guard
 from rig import wire
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 _PENDING = 16
 """Commands that may wait for the rig."""
-IDENTIFIERS = [default_messages().by_name[name].identifier for name in ("Stop", "Command")]
+IDENTIFIERS = [default_messages().by_name[name].identifier for name in ("Stop", "Command", "Fault")]
 _REFUSALS_A_SECOND = 50.0
 _REFUSALS_AT_ONCE = 20.0
 
@@ -44,6 +45,7 @@ class _Reply(Outside, extra="ignore"):
     accepted: bool
     time_s: Annotated[float, pydantic.Field(ge=0.0, le=1e9)] = 0.0
     field: str = ""
+    fault: Annotated[int, pydantic.Field(ge=0)] = 0
 
 
 class _Entry(Outside, extra="ignore"):
@@ -69,6 +71,7 @@ class Commands:
         timeout_s: How long the rig may take for a command [s].
         now: Clock [s].
         guard: Takes what fails.
+        table: Messages; those of the rig's own channel table unless given.
     """
 
     def __init__(
@@ -79,8 +82,10 @@ class Commands:
         timeout_s: float,
         now: Callable[[], float] = time.monotonic,
         guard: Guard,
+        table: MessageTable | None = None,
     ) -> None:
         self._client = client
+        self._table = table
         self._acknowledge = acknowledge
         self._timeout_s = timeout_s
         self._now = now
@@ -112,7 +117,7 @@ class Commands:
 
     def take(self, identifier: int, data: bytes) -> None:
         """A classic data frame with the identifier of a command."""
-        command = parse_command(identifier, data, self.counter)
+        command = parse_command(identifier, data, self.counter, self._table)
         if isinstance(command, Result):
             self._refuse(command, data[1] if len(data) > 1 else 0)
             return
@@ -159,7 +164,10 @@ class Commands:
         elif reply.accepted:
             self.accepted += 1
             self._acknowledge(
-                counter=command.counter, result=Result.ACCEPTED, time=round(1e6 * reply.time_s) & 0xFFFFFFFF
+                counter=command.counter,
+                result=Result.ACCEPTED,
+                time=round(1e6 * reply.time_s) & 0xFFFFFFFF,
+                limit=min(10 * reply.fault, 0xFFFF),
             )
         else:
             self._refuse_for(reply, command)

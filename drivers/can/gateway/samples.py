@@ -12,6 +12,9 @@ from rig import wire
 from rig.channels import ChannelTable
 from rig.errors import InputError
 
+_MOST_KEPT = 50_000
+"""Picked samples of a group that wait for those of another: 5 s at the usual rate."""
+
 
 class SampleFrames:
     """The samples of one message; only whole frames are made, so the last instants of a run may never be sent.
@@ -56,7 +59,8 @@ class SampleFrames:
         gap = self._rows.follow(group, first, len(counts))
         if gap is None and group in self._kept:
             counts = np.concatenate((self._kept[group], counts))
-        self._kept[group] = counts
+        # Where another group of the message is held back, or has stopped, its own does not pile up for ever.
+        self._kept[group] = counts[-_MOST_KEPT:]
         if len(self._kept) < len(self.columns):
             return None
         rows, ends = self._samples.rows, {name: self._rows.next[name] for name in self.columns}

@@ -1,0 +1,102 @@
+"""Faults in the four bytes of a CAN command: which, where, and its main number to three digits."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any
+
+from drivers.can.message import Message, Signal
+from rig.channels import ChannelTable
+from rig.errors import InputError, UnknownNameError
+from rig.faults import KINDS
+
+
+class FaultKind(IntEnum):
+    """What a command about faults asks for; it differs from every other kind of command in at least four bits."""
+
+    FAULT = 0x6B
+    CLEAR = 0x9A
+
+
+_FAULT, _CLEAR = (int(FaultKind.FAULT),), (int(FaultKind.CLEAR),)
+
+
+def fault_signals(channels: ChannelTable) -> tuple[Signal, ...]:
+    """What stands in the first six bytes, beside the counter."""
+    named = ", ".join(f"{name}: {kind.main()}" for name, kind in KINDS.items() if kind.main())
+    targets = [*channels.groups, *channels.channels]
+    return (
+        Signal(
+            "kind", 0, 8, label="What to do", selects=True,
+            choices={member.value: member.name.lower() for member in FaultKind},
+        ),
+        Signal(
+            "fault", 16, 8, label=f"Which; its main number is, of {named}", selected_by=_FAULT,
+            choices=dict(enumerate(KINDS, start=1)),
+        ),
+        Signal(
+            "target", 24, 8, label="Group or channel", selected_by=_FAULT, choices=dict(enumerate(targets, start=1))
+        ),
+        Signal(
+            "number", 32, 12, signed=True, selected_by=_FAULT,
+            label="Main number divided by 10^exponent; a channel by its target; 0: as it is without, if it may be",
+        ),
+        Signal("exponent", 44, 4, signed=True, label="Of ten", selected_by=_FAULT),
+        Signal("id", 16, 16, label="Number of the fault that ends; 0: all", selected_by=_CLEAR),
+        Signal("reserved", 32, 16, label="Always 0", selected_by=_CLEAR),
+    )  # fmt: skip
+
+
+def fault_raw(message: Message, channel: str, kind: str, number: float | str | None) -> dict[str, int]:
+    """Raw values that ask for a fault.
+
+    Raises:
+        InputError: There is none such, or its number finds no room.
+    """
+    if kind not in KINDS:
+        raise UnknownNameError("fault.kind", "one of the kinds", kind, KINDS)
+    targets = _targets(message)
+    raw = {"kind": int(FaultKind.FAULT), "fault": [*KINDS].index(kind) + 1, "target": _of(channel, targets)}
+    if number is None:
+        return raw
+    main = KINDS[kind].main()
+    if not main:
+        raise InputError("number", f"left out: {kind} has none", number)
+    if isinstance(number, str):
+        return raw | {"number": _of(number, targets)}
+    exponent = next((e for e in range(-8, 8) if abs(round(number / 10.0**e)) <= 2047), None)
+    if exponent is None:
+        raise InputError(main, "at most 2.047e10 in a CAN frame", number)
+    return raw | {"number": round(number / 10.0**exponent), "exponent": exponent}
+
+
+def fault_request(message: Message, raw: dict[str, int]) -> dict[str, Any] | None:
+    """The request in raw values, as the rig takes it; None where there is no such fault or target."""
+    if raw["kind"] == FaultKind.CLEAR:
+        return {"id": raw["id"] or "all"}
+    targets, kinds = _targets(message), dict(enumerate(KINDS, start=1))
+    if raw["fault"] not in kinds or raw["target"] not in targets:
+        return None
+    kind, value = KINDS[kinds[raw["fault"]]], raw["number"]
+    request: dict[str, Any] = {"channel": targets[raw["target"]], "kind": kind.name()}
+    main = kind.main()
+    if not main:
+        return None if value or raw["exponent"] else request
+    field = kind.model_fields[main]
+    if field.annotation is str:
+        return request | {main: targets.get(value, f"target {value}")}
+    if value or field.is_required():
+        number = float(f"{value}e{raw['exponent']}")
+        request[main] = int(number) if number.is_integer() else number
+    return request
+
+
+def _targets(message: Message) -> dict[int, str]:
+    return dict(next(signal for signal in message.signals if signal.name == "target").choices or {})
+
+
+def _of(name: str, targets: dict[int, str]) -> int:
+    found = next((value for value, other in targets.items() if other == name), None)
+    if found is None:
+        raise UnknownNameError("fault.channel", "one of the channels, or of their groups", name, targets.values())
+    return found

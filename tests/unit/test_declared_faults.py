@@ -1,0 +1,188 @@
+"""What a fault of blocks has taken is told apart from what is lost, live and in the file."""
+
+from __future__ import annotations
+
+import threading
+import time
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import recorder.session
+from recorder.reader import Recording, join
+from recorder.rewrite import cut
+from recorder.room import Limits
+from recorder.session import RecordingSession
+from recorder.summary import Summary
+from recorder.trigger import Capture, Trigger
+from replays.recordings.export import write_run
+from rig import wire
+from rig.declared import Declared
+from rig.errors import InputError
+from rig.scenes import parse_scene
+from rig.simulation import Simulation
+from tests.unit.recorder_stream import ScriptedClient
+from tests.unit.test_channel_faults import BLOCKS
+
+PROBES = wire.sensor_key("probes")
+
+
+@cache
+def scene(kind: str) -> Any:
+    fault = {"at_s": 0.1, "channel": "probes", "kind": kind, "for_s": 0.2, **BLOCKS[kind]}
+    return parse_scene({"duration_s": 0.4, "sensors": {"groups": ["probes", "drive"]}, "faults": [fault]})
+
+
+@cache
+def published(kind: str) -> list[tuple[str, bytes]]:
+    """What a rig says, in its order."""
+    simulation, rows = Simulation(scene(kind)), wire.Continuity()
+    found = [(wire.EVENTS, {"event": "start", "tick": 0, "time_s": 0.0})]
+    items = [(key, wire.encode_document(each)) for key, each in found]
+    while simulation.tick < simulation.end_tick:
+        frame = simulation.advance(10_000)
+        items += [(wire.FAULTS, wire.encode_document(each)) for each in frame.told]
+        for message in frame.messages:
+            rows.follow(message.key, message.row, len(message.block.values), late_rows=1e9)
+            items.append((message.key, wire.encode_block(message.block)))
+        items += [(wire.EVENTS, wire.encode_document(each)) for each in frame.events]
+    end = {"event": "end", "tick": simulation.tick, "time_s": simulation.tick / 1e6, "reason": "completed"}
+    return [*items, (wire.EVENTS, wire.encode_document(rows.tell(end)))]
+
+
+def recorded(path: Path, kind: str, items: list[tuple[str, bytes]], **options: Any) -> Summary:
+    simulation, client = Simulation(scene(kind)), ScriptedClient()
+    for key, document in (
+        (wire.CATALOGUE, simulation.catalogue()),
+        (wire.PARAMETERS, simulation.parameters_document()),
+        (wire.SCENE, simulation.scene_document()),
+    ):
+        client.replies[key] = wire.encode_document(document)
+
+    def publish() -> None:
+        while wire.STATUS not in client.subscribed:
+            time.sleep(0.002)
+        for item in items:
+            client.publish(*item)
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        return RecordingSession(client, path, **options).run()
+    finally:
+        thread.join()
+
+
+@pytest.fixture(autouse=True)
+def _short_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder.session, "QUIET_S", 0.05)
+    monkeypatch.setattr(recorder.session, "RECOVERY_S", 0.2)
+
+
+def rows(payloads: list[bytes]) -> list[int]:
+    blocks = [wire.decode_block(payload, wire.SAMPLE_SCHEMA) for payload in payloads]
+    return [block.index + n for block in blocks for n in range(len(block.values))]
+
+
+@pytest.mark.parametrize("kind", BLOCKS)
+def test_who_records_all_that_is_sent_ends_well_and_has_it_as_it_came(kind: str, tmp_path: Path) -> None:
+    items = published(kind)
+    summary = recorded(tmp_path / "live.mcap", kind, items)
+    assert (summary.good, summary.losses, summary.refused) == (True, (), 0)
+    write_run(Simulation(scene(kind)), tmp_path / "offline.mcap")
+    sent = [payload for key, payload in items if key == PROBES]
+    for name in ("live", "offline"):
+        recording = Recording.open(tmp_path / f"{name}.mcap")
+        assert recording.doubts == ()
+        stream = recording.streams[PROBES]
+        missing = 8000 - stream.rows
+        assert (stream.lost - stream.declared, stream.due) == (0, 8000)
+        assert rows([payload for _, payload in recording.payloads(PROBES)]) == rows(sent)
+        assert missing == {"dropout": 4000, "lose-blocks": 200 * (40 - len(sent))}.get(kind, 0)
+        assert recording.messages[wire.FAULTS] > 2
+
+
+@pytest.mark.parametrize(
+    ("kind", "behind"), [("duplicate-blocks", 5), ("reorder-blocks", 5), ("stale-stamps", 5), ("restart", 0)]
+)
+def test_what_is_told_late_counts_nevertheless(kind: str, behind: int, tmp_path: Path) -> None:
+    """Blocks and what is told of them come on threads of their own; `behind` so many blocks."""
+    items = published(kind)
+    told, held = [item for item in items if item[0] == wire.FAULTS], list[tuple[str, bytes]]()
+    blocks = 0
+    for item in items:
+        held += [item] if item[0] != wire.FAULTS else []
+        blocks += item[0] == PROBES
+        if item[0] == PROBES and blocks > 10 + behind:
+            held += told[:2]
+            told = [each for each in told if each not in held]
+    held += told
+    summary = recorded(tmp_path / "late.mcap", kind, held)
+    assert (summary.good, summary.losses) == (True, ())
+    assert summary.rows[PROBES] == 8000
+
+
+@pytest.mark.parametrize("kind", ["lose-blocks", "reorder-blocks"])
+def test_what_is_really_lost_beside_is_told_to_the_row(kind: str, tmp_path: Path) -> None:
+    items = published(kind)
+    places = [n for n, (key, _) in enumerate(items) if key == PROBES]
+    gone = {places[n] for n in (3, 14, 17)}
+    summary = recorded(tmp_path / "gone.mcap", kind, [item for n, item in enumerate(items) if n not in gone])
+    assert summary.lost == {PROBES: 3 * 200}
+    assert not summary.good
+
+
+def test_who_is_told_nothing_of_faults_believes_none_of_it(tmp_path: Path) -> None:
+    items = [item for item in published("dropout") if item[0] != wire.FAULTS]
+    summary = recorded(tmp_path / "untold.mcap", "dropout", items)
+    assert summary.lost == {PROBES: 4000}
+
+
+@pytest.mark.parametrize("kind", ["dropout", "reorder-blocks", "stale-stamps", "restart"])
+def test_so_it_is_in_several_files_and_around_triggers(kind: str, tmp_path: Path) -> None:
+    items = published(kind)
+    summary = recorded(tmp_path / "parts.mcap", kind, items, limits=Limits(rotate_s=0.13))
+    assert summary.good
+    parts = join(list(summary.files))
+    assert len(summary.files) == 4
+    assert (parts.doubts, parts.streams[PROBES].lost - parts.streams[PROBES].declared) == ((), 0)
+    capture = Capture((Trigger.parse("fault"),), pre_s=0.03, post_s=0.1)
+    summary = recorded(tmp_path / "around.mcap", kind, items, capture=capture)
+    assert summary.good
+    assert Recording.open(summary.files[0]).doubts == ()
+
+
+def test_a_table_of_rows_has_no_blocks_and_refuses_their_faults(tmp_path: Path) -> None:
+    for suffix in ("csv", "wav"):
+        with pytest.raises(InputError, match=r"output must be an \.mcap file where a scene has faults of blocks"):
+            write_run(Simulation(scene("dropout")), tmp_path / f"x.{suffix}")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", BLOCKS)
+def test_a_cut_keeps_what_was_told_and_goes_by_true_times(kind: str, tmp_path: Path) -> None:
+    write_run(Simulation(scene(kind)), tmp_path / "whole.mcap")
+    cut(Recording.open(tmp_path / "whole.mcap"), tmp_path / "part.mcap", from_s=0.15, to_s=0.35)
+    part = Recording.open(tmp_path / "part.mcap")
+    stream = part.streams[PROBES]
+    assert (part.doubts, stream.lost - stream.declared) == ((), 0)
+    if kind not in ("dropout", "lose-blocks"):
+        assert (stream.rows, stream.first_time_s) == (4000, 0.15)
+
+
+def test_nothing_that_is_told_can_end_or_swell_who_hears_it() -> None:
+    rng, rows = np.random.default_rng(7), Declared()
+    odd: list[Any] = [None, True, -1, 1.5, 1e300, 2**62, "", "x", [], {}, [[]], {"a": []}, "9" * 400]
+    for n in range(3000):
+        sent = [{"index": 0, "tick": 0, "doors": ["zenoh"]}] * int(rng.integers(3))
+        block: dict[str, Any] = {"key": f"rig/sensors/x{n}", "row": int(rng.integers(9000)), "rows": 200, "sent": sent}
+        document: dict[str, Any] = {"event": "blocks", "blocks": [block]}
+        for spoiled in (document, block, *sent[:1]) if n % 2 else ():
+            spoiled[str(rng.choice(list(spoiled)))] = odd[int(rng.integers(len(odd)))]
+        rows.declare(document)
+        rows.take("rig/sensors/x0", wire.Block(0, n, 2e4, 1e6, np.zeros((1, 4), np.int32)))
+    assert (rows.received, rows.lost) == ({"rig/sensors/x0": 3000}, {"rig/sensors/x0": 0})
+    assert len(rows.faulty) <= 1000
