@@ -41,25 +41,12 @@ from __future__ import annotations
 import math
 
 from rig.engines.memory import ONSET, PHASE
+from rig.engines.taylor.lanes import complex_power, is_wide, product, quotient, sum_below
 from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
 from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
-from rig.kernels.stage import kernel, stage
-
-
-@stage
-def product(A, B, acc, k, later, p, left, right):
-    """The k-th coefficient of a product, whose factors go into lane p; `later` is 0 for k = 0, else 1."""
-    A[k, p], B[k, p] = left, right
-    return acc[p] + A[0, p] * right + left * (later * B[0, p])
-
-
-@stage
-def quotient(A, B, acc, k, later, p, divisor, dividend, inverse):
-    """The k-th coefficient of a quotient, by the inverse of the divisor's first; both go into lane p, as factors."""
-    A[k, p], B[k, p] = divisor, (dividend - acc[p] - divisor * (later * B[0, p])) * inverse
-    return B[k, p]
+from rig.kernels.stage import kernel
 '''
 
 
@@ -121,21 +108,15 @@ class _Code:
             value = f"math.sin({begin}), math.cos({begin})" if angle == S.THETA else f"sines_of(levels, {begin})"
             lines.append(f"    Y[0, {TURNS[angle]}], Y[0, {TURNS[angle] + 1}] = {value}")
         lines += [
-            f"    wide = {_WIDE}",
+            "    wide = is_wide(constants, inputs)",
             f"    for p in range({wide}):",
             "        A[0, p] = B[0, p] = 0.0",
             "    z, later = 1.0, 0.0",
             "    for k in range(ORDER):",
-            f"        for p in range({wide}):",
-            "            acc[p] = 0.0",
             "        if wide:",
-            "            for j in range(1, k):",
-            f"                for p in range({wide}):",
-            "                    acc[p] += A[j, p] * B[k - j, p]",
+            f"            sum_below(A, B, acc, k, {wide})",
             "        else:",
-            "            for j in range(1, k):",
-            f"                for p in range({lanes}):",
-            "                    acc[p] += A[j, p] * B[k - j, p]",
+            f"            sum_below(A, B, acc, k, {lanes})",
             *(f"        {line}" for line in body),
             "        portion = 1.0 / (k + 1.0)",
         ]
@@ -217,9 +198,11 @@ class _Code:
         def place_in(branch: list[Node | Fork]) -> None:
             for item in branch:
                 if isinstance(item, Node):
-                    sources = {"sum": (1, 3), "shifted": (1,), "rate": (2,), "quotient": (0,)}.get(item.kind, ())
+                    sources = {"sum": (1, 3), "shifted": (1,), "rate": (2,), "quotient": (0,), "product": (0, 1)}.get(
+                        item.kind, ()
+                    )
                     inside = (item.arguments[source] for source in sources)
-                    self._inside |= {one.number for one in inside if one.kind in _SUMS and once(one, branch, item)}
+                    self._inside |= {one.number for one in inside if one.kind in _WRITTEN and once(one, branch, item)}
                     continue
                 for side, answer in enumerate((item.yes, item.no)):
                     for joined in item.joined:
@@ -228,7 +211,7 @@ class _Code:
                             continue
                         if value.coefficient == Known():
                             self._named[value.node.number] = self._name(joined)
-                        elif value.node.kind in _SUMS:
+                        elif value.node.kind in _WRITTEN:
                             self._inside.add(value.node.number)
                     place_in(answer)
 
@@ -248,7 +231,7 @@ class _Code:
         """A coefficient times a node; `first`: nothing stands before it, so that a sum needs no brackets."""
         if isinstance(factor, Node):
             bare = first and coefficient == Known()
-            factor = self._name(factor) if factor.number not in self._inside else self._sum(factor, bare=bare)
+            factor = self._name(factor) if factor.number not in self._inside else self._expression(factor, bare=bare)
         if coefficient == Known():
             return factor
         return f"-{factor}" if coefficient == Known(-1.0) else f"{self._constant(coefficient)} * {factor}"
@@ -258,7 +241,9 @@ class _Code:
             return self._term(value.coefficient, value.node, first=True)
         return "0.0" if value == 0.0 else self._term(known(value), "z")
 
-    def _sum(self, node: Node, *, bare: bool = True) -> str:
+    def _expression(self, node: Node, *, bare: bool = True) -> str:
+        if node.kind == "column":
+            return f"Y[k, {node.arguments[0]}]"
         coefficient, part, other, *rest = node.arguments
         before = self._term(coefficient, part, first=True)
         text = f"{before} + {self._term(other, rest[0] if rest else 'z')}".replace("+ -", "- ")
@@ -293,16 +278,14 @@ class _Code:
     def _node(self, node: Node, first: bool) -> Iterator[str]:
         name, arguments, p = self._name(node), node.arguments, self._lane_of.get(node.number, -1)
         match node.kind:
-            case "column":
-                yield f"{name} = Y[k, {arguments[0]}]"
             case "rate":
                 yield f"D[k, {arguments[0]}] = {self._term(arguments[1], arguments[2], first=True)}"
             case "unknown":
                 yield f"{name} = {'0.0' if first else 'friction'}"
-            case "sum" | "shifted":
-                yield f"{name} = {self._sum(node)}"
+            case "sum" | "shifted" | "column":
+                yield f"{name} = {self._expression(node)}"
             case "product":
-                left, right = self._name(arguments[0]), self._name(arguments[1])
+                left, right = (self._term(Known(), each, first=True) for each in arguments)
                 yield f"{name} = product(A, B, acc, k, later, {p}, {left}, {right})"
             case "quotient" | "reciprocal":
                 dividend = "z" if node.kind == "reciprocal" else self._term(Known(), arguments[0], first=True)
@@ -329,9 +312,10 @@ class _Code:
                 )
                 yield f"A[k, {p}], B[k, {p}], A[k, {p + 1}], B[k, {p + 1}] = k * {x}, {name}, k * {name}, {x}"
             case "complex_power":
-                yield from self._wave(node)
+                x, y, power = self._term(*arguments[:2]), self._term(*arguments[2:4]), f"int({arguments[4].text})"
+                yield f"power_x, power_y = complex_power(A, B, acc, k, later, WAVE, {x}, {y}, {power})"
             case "part":
-                yield f"{name} = wave_{arguments[1]}"
+                yield f"{name} = power_{arguments[1]}"
             case _:
                 raise AssertionError(node.kind)
 
@@ -339,48 +323,18 @@ class _Code:
         if line not in self._begin:
             self._begin.append(line)
 
-    def _wave(self, node: Node) -> Iterator[str]:
-        """By squaring, as in `rig.kernels.magnet.complex_power`."""
-        times_x, x, times_y, y, exponent = node.arguments
-        yield f"square_x, square_y = {self._term(times_x, x)}, {self._term(times_y, y)}"
-        yield "wave_x, wave_y = z, 0.0"
-        yield f"bits, lane, begun = int({exponent.text}), WAVE, False"
-        body = """while bits > 0:
-    if bits & 1:
-        if begun:
-            one = product(A, B, acc, k, later, lane, wave_x, square_x)
-            one -= product(A, B, acc, k, later, lane + 1, wave_y, square_y)
-            two = product(A, B, acc, k, later, lane + 2, wave_x, square_y)
-            two += product(A, B, acc, k, later, lane + 3, wave_y, square_x)
-            wave_x, wave_y = one, two
-            lane += 4
-        else:
-            wave_x, wave_y, begun = square_x, square_y, True
-    bits >>= 1
-    if bits > 0:
-        one = product(A, B, acc, k, later, lane, square_x, square_x)
-        one -= product(A, B, acc, k, later, lane + 1, square_y, square_y)
-        square_y = 2.0 * product(A, B, acc, k, later, lane + 2, square_x, square_y)
-        square_x = one
-        lane += 3"""
-        yield from body.splitlines()
 
-
+_INLINE = {"sum": (1, 3), "shifted": (1,), "rate": (2,), "quotient": (0,), "product": (0, 1)}
+"""Arguments, by kind, that may be written in place."""
 _RARE = {
     "contact.exponent == 1.0": False,
     "contact.gap_counts_outer == 0.0": False,
     "levels.friction == SMOOTHED": True,
     "magnet.terms == RADIAL": False,
 }
-"""Conditions by which few scenes go, and the answer then."""
-_WIDE = """(
-        contact.gap_counts_outer != 0.0
-        or (contact.exponent != 1.5 and contact.exponent != 1.0)
-        or levels.friction == SMOOTHED
-        or (inputs.magnet_engaged and magnet.terms == RIPPLED)
-    )"""
-"""Whether a scene is one of these."""
-_SUMS = ("sum", "shifted")
+"""Conditions by which few scenes go, and the answer then: what `rig.engines.taylor.lanes.is_wide` asks for."""
+_WRITTEN = ("sum", "shifted", "column")
+"""What needs no name where it is used once."""
 _LANES = {"product": 1, "quotient": 1, "reciprocal": 1, "root": 1, "tanh": 2, "power": 2}
 
 

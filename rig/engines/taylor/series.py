@@ -10,25 +10,12 @@ from __future__ import annotations
 import math
 
 from rig.engines.memory import ONSET, PHASE
+from rig.engines.taylor.lanes import complex_power, is_wide, product, quotient, sum_below
 from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
 from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
-from rig.kernels.stage import kernel, stage
-
-
-@stage
-def product(A, B, acc, k, later, p, left, right):
-    """The k-th coefficient of a product, whose factors go into lane p; `later` is 0 for k = 0, else 1."""
-    A[k, p], B[k, p] = left, right
-    return acc[p] + A[0, p] * right + left * (later * B[0, p])
-
-
-@stage
-def quotient(A, B, acc, k, later, p, divisor, dividend, inverse):
-    """The k-th coefficient of a quotient, by the inverse of the divisor's first; both go into lane p, as factors."""
-    A[k, p], B[k, p] = divisor, (dividend - acc[p] - divisor * (later * B[0, p])) * inverse
-    return B[k, p]
+from rig.kernels.stage import kernel
 
 
 LANES = 128
@@ -76,13 +63,13 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
     c32 = inputs.speed_slope
     c33 = aim
     c34 = shaft.unbalance
-    c35 = inputs.hammer_force * inputs.hammer_x
+    c35 = inputs.hammer_force * inputs.hammer_y
     c36 = shaft.arm_disk
-    c37 = inputs.hammer_force * inputs.hammer_y
-    c38 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
-    c39 = -1.0 * shaft.polar_inertia
-    c40 = 1.0 / shaft.transverse_inertia
-    c41 = 2.0 * (1.0 if levels.euler else 0.0)
+    c37 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
+    c38 = -1.0 * shaft.polar_inertia
+    c39 = 1.0 / shaft.transverse_inertia
+    c40 = 2.0 * (1.0 if levels.euler else 0.0)
+    c41 = inputs.hammer_force * inputs.hammer_x
     c42 = shaft.polar_inertia
     c43 = constants.torque_gain / shaft.polar_inertia
     c44 = constants.torque_gain
@@ -94,26 +81,15 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
     Y[0, 32], Y[0, 33] = sines_of(levels, Y[0, 0])
     Y[0, 34], Y[0, 35] = sines_of(levels, Y[0, 1])
     Y[0, 36], Y[0, 37] = math.sin(Y[0, 2] + shaft.unbalance_phase), math.cos(Y[0, 2] + shaft.unbalance_phase)
-    wide = (
-        contact.gap_counts_outer != 0.0
-        or (contact.exponent != 1.5 and contact.exponent != 1.0)
-        or levels.friction == SMOOTHED
-        or (inputs.magnet_engaged and magnet.terms == RIPPLED)
-    )
+    wide = is_wide(constants, inputs)
     for p in range(96):
         A[0, p] = B[0, p] = 0.0
     z, later = 1.0, 0.0
     for k in range(ORDER):
-        for p in range(96):
-            acc[p] = 0.0
         if wide:
-            for j in range(1, k):
-                for p in range(96):
-                    acc[p] += A[j, p] * B[k - j, p]
+            sum_below(A, B, acc, k, 96)
         else:
-            for j in range(1, k):
-                for p in range(48):
-                    acc[p] += A[j, p] * B[k - j, p]
+            sum_below(A, B, acc, k, 48)
         v3 = Y[k, 3]
         v4 = Y[k, 4]
         v5 = Y[k, 5]
@@ -122,7 +98,6 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
         v8 = Y[k, 8]
         v9 = Y[k, 9]
         v10 = Y[k, 10]
-        v11 = Y[k, 11]
         v12 = Y[k, 12]
         v13 = Y[k, 13]
         v29 = Y[k, 35]
@@ -159,10 +134,8 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
                 v95 = product(A, B, acc, k, later, 13, v37, v37)
                 v96 = product(A, B, acc, k, later, 14, v45, v45)
                 v97 = c7 * v95 + c7 * v96
-                v98 = c8 * v97 + c9 * z
-                v99 = product(A, B, acc, k, later, 15, v97, v98)
-                v100 = v99 + c10 * z
-                v101 = product(A, B, acc, k, later, 16, v97, v100)
+                v99 = product(A, B, acc, k, later, 15, v97, c8 * v97 + c9 * z)
+                v101 = product(A, B, acc, k, later, 16, v97, v99 + c10 * z)
                 v102 = v101 + z
                 v109 = product(A, B, acc, k, later, 17, v37, v102)
                 v110 = product(A, B, acc, k, later, 18, v45, v102)
@@ -172,33 +145,11 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
                 v111 = product(A, B, acc, k, later, 48, v37, v37)
                 v112 = product(A, B, acc, k, later, 49, v45, v45)
                 v113 = c7 * v111 + c7 * v112
-                v114 = c8 * v113 + c9 * z
-                v115 = product(A, B, acc, k, later, 50, v113, v114)
-                v116 = v115 + c10 * z
-                v117 = product(A, B, acc, k, later, 51, v113, v116)
-                square_x, square_y = c11 * v45, c11 * v37
-                wave_x, wave_y = z, 0.0
-                bits, lane, begun = int((magnet.number + -1.0)), 58, False
-                while bits > 0:
-                    if bits & 1:
-                        if begun:
-                            one = product(A, B, acc, k, later, lane, wave_x, square_x)
-                            one -= product(A, B, acc, k, later, lane + 1, wave_y, square_y)
-                            two = product(A, B, acc, k, later, lane + 2, wave_x, square_y)
-                            two += product(A, B, acc, k, later, lane + 3, wave_y, square_x)
-                            wave_x, wave_y = one, two
-                            lane += 4
-                        else:
-                            wave_x, wave_y, begun = square_x, square_y, True
-                    bits >>= 1
-                    if bits > 0:
-                        one = product(A, B, acc, k, later, lane, square_x, square_x)
-                        one -= product(A, B, acc, k, later, lane + 1, square_y, square_y)
-                        square_y = 2.0 * product(A, B, acc, k, later, lane + 2, square_x, square_y)
-                        square_x = one
-                        lane += 3
-                v126 = wave_x
-                v127 = wave_y
+                v115 = product(A, B, acc, k, later, 50, v113, c8 * v113 + c9 * z)
+                v117 = product(A, B, acc, k, later, 51, v113, v115 + c10 * z)
+                power_x, power_y = complex_power(A, B, acc, k, later, 58, c11 * v45, c11 * v37, int((magnet.number + -1.0)))
+                v126 = power_x
+                v127 = power_y
                 v128 = product(A, B, acc, k, later, 52, v45, v126)
                 v129 = product(A, B, acc, k, later, 53, v37, v127)
                 v131 = c12 * v113 + z
@@ -217,10 +168,8 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
             v150 = 0.0
             v151 = 0.0
         v154 = Y[k, 30]
-        v155 = Y[k, 36]
-        v156 = Y[k, 37]
-        v157 = product(A, B, acc, k, later, 19, v9, v156)
-        v158 = product(A, B, acc, k, later, 20, v9, v155)
+        v157 = product(A, B, acc, k, later, 19, v9, Y[k, 37])
+        v158 = product(A, B, acc, k, later, 20, v9, Y[k, 36])
         D[k, 36] = v157
         D[k, 37] = -v158
         v161 = product(A, B, acc, k, later, 21, v9, v157)
@@ -263,20 +212,18 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
             v199 = 0.0
             v201 = 0.0
             v202 = 0.0
-        v203 = Y[k, 29]
-        v205 = c32 * v203 + c33 * z - v9
-        v208 = c11 * (v147 + v150) + c36 * (c34 * v161 + c35 * v154)
-        v212 = c11 * (v148 + v151) + c36 * (c34 * v162 + c37 * v154) + c38 * z
+        v205 = c32 * Y[k, 29] + c33 * z - v9
+        v212 = c11 * (v148 + v151) + c36 * (c34 * v162 + c35 * v154) + c37 * z
         v214 = product(A, B, acc, k, later, 23, v32, v212)
         v215 = product(A, B, acc, k, later, 24, v8, v44)
         v217 = product(A, B, acc, k, later, 25, v8, v43)
         i219 = 1.0 / v29 if k == 0 else i219
-        v219 = quotient(A, B, acc, k, later, 26, v29, c40 * (-v214 + c39 * v215) + c41 * v217, i219)
-        v220 = product(A, B, acc, k, later, 27, v29, v208)
+        v219 = quotient(A, B, acc, k, later, 26, v29, c39 * (-v214 + c38 * v215) + c40 * v217, i219)
+        v220 = product(A, B, acc, k, later, 27, v29, c11 * (v147 + v150) + c36 * (c34 * v161 + c41 * v154))
         v221 = product(A, B, acc, k, later, 28, v42, v212)
         v224 = product(A, B, acc, k, later, 29, v30, v44)
         v228 = product(A, B, acc, k, later, 30, v30, v43)
-        v229 = c40 * (v220 + c1 * v221 + c42 * v224) + c0 * v228
+        v229 = c39 * (v220 + c1 * v221 + c42 * v224) + c0 * v228
         v230 = product(A, B, acc, k, later, 31, v37, v219)
         v231 = product(A, B, acc, k, later, 32, v8, v30)
         v232 = c1 * v230 + c1 * v231
@@ -301,8 +248,7 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
             v248 = c22 * z
             v249 = 0.0
         v250 = product(A, B, acc, k, later, 33, v44, v235)
-        v253 = c35 * v38 + c37 * v49
-        v254 = product(A, B, acc, k, later, 34, v154, v253)
+        v254 = product(A, B, acc, k, later, 34, v154, c41 * v38 + c35 * v49)
         v255 = product(A, B, acc, k, later, 35, v38, v161)
         v256 = product(A, B, acc, k, later, 36, v49, v162)
         v257 = c34 * v255 + c34 * v256
@@ -328,7 +274,7 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
         D[k, 1] = v8
         D[k, 2] = v9
         D[k, 3] = v10
-        D[k, 4] = v11
+        D[k, 4] = Y[k, 11]
         D[k, 5] = v12
         D[k, 6] = v13
         D[k, 7] = v219
@@ -419,13 +365,13 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     c40 = inputs.speed_slope
     c41 = aim
     c42 = shaft.unbalance
-    c43 = inputs.hammer_force * inputs.hammer_x
+    c43 = inputs.hammer_force * inputs.hammer_y
     c44 = shaft.arm_disk
-    c45 = inputs.hammer_force * inputs.hammer_y
-    c46 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
-    c47 = -1.0 * shaft.polar_inertia
-    c48 = 1.0 / shaft.transverse_inertia
-    c49 = 2.0 * (1.0 if levels.euler else 0.0)
+    c45 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
+    c46 = -1.0 * shaft.polar_inertia
+    c47 = 1.0 / shaft.transverse_inertia
+    c48 = 2.0 * (1.0 if levels.euler else 0.0)
+    c49 = inputs.hammer_force * inputs.hammer_x
     c50 = shaft.polar_inertia
     c51 = constants.torque_gain
     c52 = -1.0 * shaft.radius
@@ -441,26 +387,15 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     Y[0, 32], Y[0, 33] = sines_of(levels, Y[0, 0])
     Y[0, 34], Y[0, 35] = sines_of(levels, Y[0, 1])
     Y[0, 36], Y[0, 37] = math.sin(Y[0, 2] + shaft.unbalance_phase), math.cos(Y[0, 2] + shaft.unbalance_phase)
-    wide = (
-        contact.gap_counts_outer != 0.0
-        or (contact.exponent != 1.5 and contact.exponent != 1.0)
-        or levels.friction == SMOOTHED
-        or (inputs.magnet_engaged and magnet.terms == RIPPLED)
-    )
+    wide = is_wide(constants, inputs)
     for p in range(120):
         A[0, p] = B[0, p] = 0.0
     z, later = 1.0, 0.0
     for k in range(ORDER):
-        for p in range(120):
-            acc[p] = 0.0
         if wide:
-            for j in range(1, k):
-                for p in range(120):
-                    acc[p] += A[j, p] * B[k - j, p]
+            sum_below(A, B, acc, k, 120)
         else:
-            for j in range(1, k):
-                for p in range(64):
-                    acc[p] += A[j, p] * B[k - j, p]
+            sum_below(A, B, acc, k, 64)
         v3 = Y[k, 3]
         v4 = Y[k, 4]
         v5 = Y[k, 5]
@@ -553,10 +488,8 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
                 v115 = product(A, B, acc, k, later, 27, v37, v37)
                 v116 = product(A, B, acc, k, later, 28, v45, v45)
                 v117 = c15 * v115 + c15 * v116
-                v118 = c16 * v117 + c17 * z
-                v119 = product(A, B, acc, k, later, 29, v117, v118)
-                v120 = v119 + c18 * z
-                v121 = product(A, B, acc, k, later, 30, v117, v120)
+                v119 = product(A, B, acc, k, later, 29, v117, c16 * v117 + c17 * z)
+                v121 = product(A, B, acc, k, later, 30, v117, v119 + c18 * z)
                 v122 = v121 + z
                 v129 = product(A, B, acc, k, later, 31, v37, v122)
                 v130 = product(A, B, acc, k, later, 32, v45, v122)
@@ -566,33 +499,11 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
                 v131 = product(A, B, acc, k, later, 69, v37, v37)
                 v132 = product(A, B, acc, k, later, 70, v45, v45)
                 v133 = c15 * v131 + c15 * v132
-                v134 = c16 * v133 + c17 * z
-                v135 = product(A, B, acc, k, later, 71, v133, v134)
-                v136 = v135 + c18 * z
-                v137 = product(A, B, acc, k, later, 72, v133, v136)
-                square_x, square_y = c19 * v45, c19 * v37
-                wave_x, wave_y = z, 0.0
-                bits, lane, begun = int((magnet.number + -1.0)), 81, False
-                while bits > 0:
-                    if bits & 1:
-                        if begun:
-                            one = product(A, B, acc, k, later, lane, wave_x, square_x)
-                            one -= product(A, B, acc, k, later, lane + 1, wave_y, square_y)
-                            two = product(A, B, acc, k, later, lane + 2, wave_x, square_y)
-                            two += product(A, B, acc, k, later, lane + 3, wave_y, square_x)
-                            wave_x, wave_y = one, two
-                            lane += 4
-                        else:
-                            wave_x, wave_y, begun = square_x, square_y, True
-                    bits >>= 1
-                    if bits > 0:
-                        one = product(A, B, acc, k, later, lane, square_x, square_x)
-                        one -= product(A, B, acc, k, later, lane + 1, square_y, square_y)
-                        square_y = 2.0 * product(A, B, acc, k, later, lane + 2, square_x, square_y)
-                        square_x = one
-                        lane += 3
-                v146 = wave_x
-                v147 = wave_y
+                v135 = product(A, B, acc, k, later, 71, v133, c16 * v133 + c17 * z)
+                v137 = product(A, B, acc, k, later, 72, v133, v135 + c18 * z)
+                power_x, power_y = complex_power(A, B, acc, k, later, 81, c19 * v45, c19 * v37, int((magnet.number + -1.0)))
+                v146 = power_x
+                v147 = power_y
                 v148 = product(A, B, acc, k, later, 73, v45, v146)
                 v149 = product(A, B, acc, k, later, 74, v37, v147)
                 v151 = c20 * v133 + z
@@ -611,10 +522,8 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v170 = 0.0
             v171 = 0.0
         v174 = Y[k, 30]
-        v175 = Y[k, 36]
-        v176 = Y[k, 37]
-        v177 = product(A, B, acc, k, later, 33, v9, v176)
-        v178 = product(A, B, acc, k, later, 34, v9, v175)
+        v177 = product(A, B, acc, k, later, 33, v9, Y[k, 37])
+        v178 = product(A, B, acc, k, later, 34, v9, Y[k, 36])
         D[k, 36] = v177
         D[k, 37] = -v178
         v181 = product(A, B, acc, k, later, 35, v9, v177)
@@ -657,20 +566,18 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v219 = 0.0
             v221 = 0.0
             v222 = 0.0
-        v223 = Y[k, 29]
-        v225 = c40 * v223 + c41 * z - v9
-        v233 = c19 * (v167 + v170) + c44 * (c42 * v181 + c43 * v174) + c2 * v91
-        v234 = c19 * (v168 + v171) + c44 * (c42 * v182 + c45 * v174) + c46 * z + c2 * v94
+        v225 = c40 * Y[k, 29] + c41 * z - v9
+        v234 = c19 * (v168 + v171) + c44 * (c42 * v182 + c43 * v174) + c45 * z + c2 * v94
         v236 = product(A, B, acc, k, later, 37, v32, v234)
         v237 = product(A, B, acc, k, later, 38, v8, v44)
         v239 = product(A, B, acc, k, later, 39, v8, v43)
         i241 = 1.0 / v29 if k == 0 else i241
-        v241 = quotient(A, B, acc, k, later, 40, v29, c48 * (-v236 + c47 * v237) + c49 * v239, i241)
-        v242 = product(A, B, acc, k, later, 41, v29, v233)
+        v241 = quotient(A, B, acc, k, later, 40, v29, c47 * (-v236 + c46 * v237) + c48 * v239, i241)
+        v242 = product(A, B, acc, k, later, 41, v29, c19 * (v167 + v170) + c44 * (c42 * v181 + c49 * v174) + c2 * v91)
         v243 = product(A, B, acc, k, later, 42, v42, v234)
         v246 = product(A, B, acc, k, later, 43, v30, v44)
         v250 = product(A, B, acc, k, later, 44, v30, v43)
-        v251 = c48 * (v242 + c1 * v243 + c50 * v246) + c0 * v250
+        v251 = c47 * (v242 + c1 * v243 + c50 * v246) + c0 * v250
         v252 = product(A, B, acc, k, later, 45, v37, v241)
         v253 = product(A, B, acc, k, later, 46, v8, v30)
         v254 = c1 * v252 + c1 * v253
@@ -702,8 +609,7 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v281 = -v94
         v282 = v259 + c52 * v88
         v283 = product(A, B, acc, k, later, 47, v44, v259)
-        v286 = c43 * v38 + c45 * v49
-        v287 = product(A, B, acc, k, later, 48, v174, v286)
+        v287 = product(A, B, acc, k, later, 48, v174, c49 * v38 + c43 * v49)
         v288 = product(A, B, acc, k, later, 49, v38, v181)
         v289 = product(A, B, acc, k, later, 50, v49, v182)
         v290 = c42 * v288 + c42 * v289
@@ -719,8 +625,7 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v298 = product(A, B, acc, k, later, 53, v200, v200)
         v299 = product(A, B, acc, k, later, 54, v13, v13)
         v300 = c33 * v298 + c38 * v299
-        v301 = v83 - v79
-        v302 = product(A, B, acc, k, later, 55, v71, v301)
+        v302 = product(A, B, acc, k, later, 55, v71, v83 - v79)
         v303 = product(A, B, acc, k, later, 56, v75, v88)
         v304 = product(A, B, acc, k, later, 57, v29, v236)
         v305 = product(A, B, acc, k, later, 58, v37, v282)
@@ -833,13 +738,13 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     c38 = inputs.speed_slope
     c39 = aim
     c40 = shaft.unbalance
-    c41 = inputs.hammer_force * inputs.hammer_x
+    c41 = inputs.hammer_force * inputs.hammer_y
     c42 = shaft.arm_disk
-    c43 = inputs.hammer_force * inputs.hammer_y
-    c44 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
-    c45 = -1.0 * shaft.polar_inertia
-    c46 = 1.0 / shaft.transverse_inertia
-    c47 = 2.0 * (1.0 if levels.euler else 0.0)
+    c43 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
+    c44 = -1.0 * shaft.polar_inertia
+    c45 = 1.0 / shaft.transverse_inertia
+    c46 = 2.0 * (1.0 if levels.euler else 0.0)
+    c47 = inputs.hammer_force * inputs.hammer_x
     c48 = shaft.polar_inertia
     c49 = constants.torque_gain
     c50 = -1.0 * shaft.radius
@@ -856,26 +761,15 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     Y[0, 32], Y[0, 33] = sines_of(levels, Y[0, 0])
     Y[0, 34], Y[0, 35] = sines_of(levels, Y[0, 1])
     Y[0, 36], Y[0, 37] = math.sin(Y[0, 2] + shaft.unbalance_phase), math.cos(Y[0, 2] + shaft.unbalance_phase)
-    wide = (
-        contact.gap_counts_outer != 0.0
-        or (contact.exponent != 1.5 and contact.exponent != 1.0)
-        or levels.friction == SMOOTHED
-        or (inputs.magnet_engaged and magnet.terms == RIPPLED)
-    )
+    wide = is_wide(constants, inputs)
     for p in range(128):
         A[0, p] = B[0, p] = 0.0
     z, later = 1.0, 0.0
     for k in range(ORDER):
-        for p in range(128):
-            acc[p] = 0.0
         if wide:
-            for j in range(1, k):
-                for p in range(128):
-                    acc[p] += A[j, p] * B[k - j, p]
+            sum_below(A, B, acc, k, 128)
         else:
-            for j in range(1, k):
-                for p in range(76):
-                    acc[p] += A[j, p] * B[k - j, p]
+            sum_below(A, B, acc, k, 76)
         v3 = Y[k, 3]
         v4 = Y[k, 4]
         v5 = Y[k, 5]
@@ -940,8 +834,7 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v77 = v64 ** c9 if k == 0 else (c9 * (acc[76] + k * v64 * B[0, 76]) - acc[77]) / (k * B[0, 77])
             A[k, 76], B[k, 76], A[k, 77], B[k, 77] = k * v64, v77, k * v77, v64
             v79 = c10 * v77
-        v80 = c11 * v70 + z
-        v81 = product(A, B, acc, k, later, 22, v79, v80)
+        v81 = product(A, B, acc, k, later, 22, v79, c11 * v70 + z)
         v82 = v81 + c12 * v70
         v83 = 0.0 if slack else v82
         v84 = product(A, B, acc, k, later, 23, v66, v83)
@@ -954,10 +847,8 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
                 v106 = product(A, B, acc, k, later, 25, v37, v37)
                 v107 = product(A, B, acc, k, later, 26, v45, v45)
                 v108 = c13 * v106 + c13 * v107
-                v109 = c14 * v108 + c15 * z
-                v110 = product(A, B, acc, k, later, 27, v108, v109)
-                v111 = v110 + c16 * z
-                v112 = product(A, B, acc, k, later, 28, v108, v111)
+                v110 = product(A, B, acc, k, later, 27, v108, c14 * v108 + c15 * z)
+                v112 = product(A, B, acc, k, later, 28, v108, v110 + c16 * z)
                 v113 = v112 + z
                 v120 = product(A, B, acc, k, later, 29, v37, v113)
                 v121 = product(A, B, acc, k, later, 30, v45, v113)
@@ -967,33 +858,11 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
                 v122 = product(A, B, acc, k, later, 78, v37, v37)
                 v123 = product(A, B, acc, k, later, 79, v45, v45)
                 v124 = c13 * v122 + c13 * v123
-                v125 = c14 * v124 + c15 * z
-                v126 = product(A, B, acc, k, later, 80, v124, v125)
-                v127 = v126 + c16 * z
-                v128 = product(A, B, acc, k, later, 81, v124, v127)
-                square_x, square_y = c17 * v45, c17 * v37
-                wave_x, wave_y = z, 0.0
-                bits, lane, begun = int((magnet.number + -1.0)), 90, False
-                while bits > 0:
-                    if bits & 1:
-                        if begun:
-                            one = product(A, B, acc, k, later, lane, wave_x, square_x)
-                            one -= product(A, B, acc, k, later, lane + 1, wave_y, square_y)
-                            two = product(A, B, acc, k, later, lane + 2, wave_x, square_y)
-                            two += product(A, B, acc, k, later, lane + 3, wave_y, square_x)
-                            wave_x, wave_y = one, two
-                            lane += 4
-                        else:
-                            wave_x, wave_y, begun = square_x, square_y, True
-                    bits >>= 1
-                    if bits > 0:
-                        one = product(A, B, acc, k, later, lane, square_x, square_x)
-                        one -= product(A, B, acc, k, later, lane + 1, square_y, square_y)
-                        square_y = 2.0 * product(A, B, acc, k, later, lane + 2, square_x, square_y)
-                        square_x = one
-                        lane += 3
-                v137 = wave_x
-                v138 = wave_y
+                v126 = product(A, B, acc, k, later, 80, v124, c14 * v124 + c15 * z)
+                v128 = product(A, B, acc, k, later, 81, v124, v126 + c16 * z)
+                power_x, power_y = complex_power(A, B, acc, k, later, 90, c17 * v45, c17 * v37, int((magnet.number + -1.0)))
+                v137 = power_x
+                v138 = power_y
                 v139 = product(A, B, acc, k, later, 82, v45, v137)
                 v140 = product(A, B, acc, k, later, 83, v37, v138)
                 v142 = c18 * v124 + z
@@ -1012,10 +881,8 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v161 = 0.0
             v162 = 0.0
         v165 = Y[k, 30]
-        v166 = Y[k, 36]
-        v167 = Y[k, 37]
-        v168 = product(A, B, acc, k, later, 31, v9, v167)
-        v169 = product(A, B, acc, k, later, 32, v9, v166)
+        v168 = product(A, B, acc, k, later, 31, v9, Y[k, 37])
+        v169 = product(A, B, acc, k, later, 32, v9, Y[k, 36])
         D[k, 36] = v168
         D[k, 37] = -v169
         v172 = product(A, B, acc, k, later, 33, v9, v168)
@@ -1058,8 +925,7 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v210 = 0.0
             v212 = 0.0
             v213 = 0.0
-        v214 = Y[k, 29]
-        v216 = c38 * v214 + c39 * z - v9
+        v216 = c38 * Y[k, 29] + c39 * z - v9
         v228 = product(A, B, acc, k, later, 35, v8, v44)
         v230 = product(A, B, acc, k, later, 36, v8, v43)
         v237 = product(A, B, acc, k, later, 37, v30, v44)
@@ -1071,14 +937,13 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v256 = -v84 + v255
         v257 = product(A, B, acc, k, later, 42, v66, v254)
         v258 = -v85 - v257
-        v259 = c17 * (v158 + v161) + c42 * (c40 * v172 + c41 * v165) + c2 * v256
-        v260 = c17 * (v159 + v162) + c42 * (c40 * v173 + c43 * v165) + c44 * z + c2 * v258
+        v260 = c17 * (v159 + v162) + c42 * (c40 * v173 + c41 * v165) + c43 * z + c2 * v258
         v261 = product(A, B, acc, k, later, 43, v32, v260)
         i264 = 1.0 / v29 if k == 0 else i264
-        v264 = quotient(A, B, acc, k, later, 44, v29, c46 * (-v261 + c45 * v228) + c47 * v230, i264)
-        v265 = product(A, B, acc, k, later, 45, v29, v259)
+        v264 = quotient(A, B, acc, k, later, 44, v29, c45 * (-v261 + c44 * v228) + c46 * v230, i264)
+        v265 = product(A, B, acc, k, later, 45, v29, c17 * (v158 + v161) + c42 * (c40 * v172 + c47 * v165) + c2 * v256)
         v266 = product(A, B, acc, k, later, 46, v42, v260)
-        v269 = c46 * (v265 + c1 * v266 + c48 * v237) + c0 * v241
+        v269 = c45 * (v265 + c1 * v266 + c48 * v237) + c0 * v241
         v270 = product(A, B, acc, k, later, 47, v37, v264)
         v271 = c1 * v270 + c1 * v244
         if inputs.ideal_drive:
@@ -1098,8 +963,7 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v282 = v187 - v188
             v283 = 0.5 * v189 + c28 * z
             v284 = -0.5 * v189 + c28 * z
-        v303 = c41 * v38 + c43 * v49
-        v304 = product(A, B, acc, k, later, 49, v165, v303)
+        v304 = product(A, B, acc, k, later, 49, v165, c47 * v38 + c41 * v49)
         v305 = product(A, B, acc, k, later, 50, v38, v172)
         v306 = product(A, B, acc, k, later, 51, v49, v173)
         v307 = c40 * v305 + c40 * v306
@@ -1109,20 +973,16 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v315 = product(A, B, acc, k, later, 54, v191, v191)
         v316 = product(A, B, acc, k, later, 55, v13, v13)
         v317 = c31 * v315 + c36 * v316
-        v318 = v83 - v79
-        v319 = product(A, B, acc, k, later, 56, v70, v318)
+        v319 = product(A, B, acc, k, later, 56, v70, v83 - v79)
         v335 = product(A, B, acc, k, later, 65, v8, v8)
-        v336 = v239 + v335
         v337 = product(A, B, acc, k, later, 66, v29, v269)
         v338 = product(A, B, acc, k, later, 67, v37, v335)
         v340 = product(A, B, acc, k, later, 68, v46, v264)
         v341 = product(A, B, acc, k, later, 69, v42, v269)
-        v343 = product(A, B, acc, k, later, 70, v45, v336)
+        v343 = product(A, B, acc, k, later, 70, v45, v239 + v335)
         v346 = product(A, B, acc, k, later, 71, v33, v39)
-        v356 = c2 * (v337 + c0 * v338) - v279 + c3 * v212
-        v358 = c2 * (-v340 + c1 * v341 + c1 * v343 + c47 * v346) - v280 + c3 * v213
-        v359 = product(A, B, acc, k, later, 72, v66, v358)
-        v360 = product(A, B, acc, k, later, 73, v67, v356)
+        v359 = product(A, B, acc, k, later, 72, v66, c2 * (-v340 + c1 * v341 + c1 * v343 + c46 * v346) - v280 + c3 * v213)
+        v360 = product(A, B, acc, k, later, 73, v67, c2 * (v337 + c0 * v338) - v279 + c3 * v212)
         v362 = product(A, B, acc, k, later, 74, v70, v73)
         i363 = 1.0 / v63 if k == 0 else i363
         v363 = quotient(A, B, acc, k, later, 75, v63, v362, i363)
@@ -1134,14 +994,13 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v256 = -v84 + v255
         v257 = product(A, B, acc, k, later, 42, v66, v254)
         v258 = -v85 - v257
-        v259 = c17 * (v158 + v161) + c42 * (c40 * v172 + c41 * v165) + c2 * v256
-        v260 = c17 * (v159 + v162) + c42 * (c40 * v173 + c43 * v165) + c44 * z + c2 * v258
+        v260 = c17 * (v159 + v162) + c42 * (c40 * v173 + c41 * v165) + c43 * z + c2 * v258
         v261 = product(A, B, acc, k, later, 43, v32, v260)
         i264 = 1.0 / v29 if k == 0 else i264
-        v264 = quotient(A, B, acc, k, later, 44, v29, c46 * (-v261 + c45 * v228) + c47 * v230, i264)
-        v265 = product(A, B, acc, k, later, 45, v29, v259)
+        v264 = quotient(A, B, acc, k, later, 44, v29, c45 * (-v261 + c44 * v228) + c46 * v230, i264)
+        v265 = product(A, B, acc, k, later, 45, v29, c17 * (v158 + v161) + c42 * (c40 * v172 + c47 * v165) + c2 * v256)
         v266 = product(A, B, acc, k, later, 46, v42, v260)
-        v269 = c46 * (v265 + c1 * v266 + c48 * v237) + c0 * v241
+        v269 = c45 * (v265 + c1 * v266 + c48 * v237) + c0 * v241
         v270 = product(A, B, acc, k, later, 47, v37, v264)
         v271 = c1 * v270 + c1 * v244
         if inputs.ideal_drive:
@@ -1194,10 +1053,8 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v337 = product(A, B, acc, k, later, 66, v29, v269)
         v340 = product(A, B, acc, k, later, 68, v46, v264)
         v341 = product(A, B, acc, k, later, 69, v42, v269)
-        v356 = c2 * (v337 + c0 * v338) - v279 + c3 * v212
-        v358 = c2 * (-v340 + c1 * v341 + c1 * v343 + c47 * v346) - v280 + c3 * v213
-        v359 = product(A, B, acc, k, later, 72, v66, v358)
-        v360 = product(A, B, acc, k, later, 73, v67, v356)
+        v359 = product(A, B, acc, k, later, 72, v66, c2 * (-v340 + c1 * v341 + c1 * v343 + c46 * v346) - v280 + c3 * v213)
+        v360 = product(A, B, acc, k, later, 73, v67, c2 * (v337 + c0 * v338) - v279 + c3 * v212)
         v365 = v359 - v360 - v363 + c8 * v275
         D[k, 0] = v7
         D[k, 1] = v8
