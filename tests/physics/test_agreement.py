@@ -10,7 +10,6 @@
 | energy ledger                   | zero residual                           | first law                                |
 | momentum ledger                 | zero residual                           | Newton and Euler                         |
 | pivot reaction                  | static lever rule                       | statics                                  |
-| restitution of the exact factor | what was asked for                      | definition of e                          |
 | contact stiffness               | Hertz, 2.86e10 / 5.40e9 N/m^1.5         | elastostatics                            |
 | whirl                           | backward, rolling, -spin R_S/(r0+delta) | kinematics of rolling; paper's eq. 41    |
 | mean whirl force                | grows as spin squared                   | centrifugal force                        |
@@ -27,8 +26,7 @@ import pytest
 from replays.studies.peers import Setting, scipy_solvers
 from replays.studies.peers.solution import Manner
 from replays.studies.peers.window import cut_window
-from rig import InputError, Run, load_parameters, load_scene, simulate
-from rig.contacts import restitution_factor
+from rig import Run, load_parameters, load_scene, simulate
 from rig.kernels import signals as S
 from rig.kernels.contact import FORWARD, SMOOTHED, TOUCHING, ring_force
 from rig.model import build_model
@@ -183,28 +181,6 @@ def test_pivot_carries_its_share_at_rest() -> None:
     # Lever rule about the magnets: R l0B = M g (l0B - l0C).
     assert run["pivot_y"][-1] == pytest.approx(weight * (1 - shaft.arm_centre / shaft.arm_magnet), rel=1e-9)
     assert run["magnet_y"][-1] == pytest.approx(weight * shaft.arm_centre / shaft.arm_magnet, rel=1e-9)
-
-
-@pytest.mark.parametrize("restitution", [0.3, 0.5, 0.8, 0.9, 0.99])
-def test_exact_factor_returns_the_restitution_asked_for(restitution: float) -> None:
-    from scipy.integrate import solve_ivp
-
-    factor = restitution_factor(restitution)
-
-    def free_impact(_: float, y: np.ndarray) -> list[float]:
-        return [y[1], -(max(0.0, y[0]) ** 1.5) * (1.0 + factor * y[1])]
-
-    def apart(_: float, y: np.ndarray) -> float:
-        return y[0]
-
-    apart.terminal, apart.direction = True, -1  # pyright: ignore[reportFunctionMemberAccess]
-    impact = solve_ivp(free_impact, (0.0, 50.0), [1e-12, 1.0], events=apart, rtol=1e-10, atol=1e-13)
-    assert -impact.y[1, -1] == pytest.approx(restitution, rel=1e-5)
-
-
-def test_restitution_of_zero_is_refused() -> None:
-    with pytest.raises(InputError, match=r"contact\.restitution must be"):
-        restitution_factor(0.0)
 
 
 def test_contact_stiffness_and_effective_mass_are_the_papers() -> None:

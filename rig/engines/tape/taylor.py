@@ -187,32 +187,34 @@ class _Code:
         return lane
 
     def _place(self, items: list[Node | Fork], outputs: Iterable[Any]) -> None:
-        """What is used once, and in its own branch, needs no name of its own."""
+        """What is used once, and in its own branch, needs no name of its own; nor what a branch gives a name."""
         uses = Counter(source.number for item in _all(items) if item.number in self._needed for source in item.sources)
         uses.update(value.node.number for value in outputs if isinstance(value, Symbol))
 
+        def alike(source: Node, user: Node) -> bool:
+            return (source.number in self._unknown) == (user.number in self._unknown)
+
         def once(source: Node, branch: list[Node | Fork], user: Node) -> bool:
-            alike = (source.number in self._unknown) == (user.number in self._unknown)
-            return alike and uses[source.number] == 1 and any(source is each for each in _own(branch))
+            here = any(source is each for each in _own(branch))
+            return here and uses[source.number] == 1 and source.kind in _WRITTEN and alike(source, user)
 
         def place_in(branch: list[Node | Fork]) -> None:
             for item in branch:
                 if isinstance(item, Node):
-                    sources = {"sum": (1, 3), "shifted": (1,), "rate": (2,), "quotient": (0,), "product": (0, 1)}.get(
-                        item.kind, ()
-                    )
-                    inside = (item.arguments[source] for source in sources)
-                    self._inside |= {one.number for one in inside if one.kind in _WRITTEN and once(one, branch, item)}
+                    inside = (item.arguments[place] for place in _INLINE.get(item.kind, ()))
+                    self._inside |= {one.number for one in inside if once(one, branch, item)}
                     continue
                 for side, answer in enumerate((item.yes, item.no)):
+                    own = {node.number for node in _own(answer)}
                     for joined in item.joined:
                         value = joined.arguments[side]
-                        if not isinstance(value, Symbol) or not once(value.node, answer, joined):
+                        if not isinstance(value, Symbol) or joined.number not in self._needed:
                             continue
-                        if value.coefficient == Known():
-                            self._named[value.node.number] = self._name(joined)
-                        elif value.node.kind in _WRITTEN:
-                            self._inside.add(value.node.number)
+                        number = value.node.number
+                        if value.coefficient != Known():
+                            self._inside |= {number} if once(value.node, answer, joined) else set()
+                        elif number in own and alike(value.node, joined):
+                            self._named.setdefault(number, self._name(joined))
                     place_in(answer)
 
         place_in(items)

@@ -177,17 +177,13 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
         if levels.inner_house:
             v163 = v4 - v6
             v164 = c21 * v163 + c22 * z
-            v165 = 0.0 if north < 0.0 else v164
+            v176 = 0.0 if north < 0.0 else v164
             v166 = c23 * v163 + c22 * z
-            v167 = 0.0 if north > 0.0 else v166
-            v173 = v10 - v12
-            v174 = c24 * (v3 - v5) + c25 * v173
-            v176 = v165
-            v177 = v167
-            v178 = v174
-            v180 = v173
-            v182 = c26 * v174
-            v183 = c26 * (v165 - v167)
+            v177 = 0.0 if north > 0.0 else v166
+            v180 = v10 - v12
+            v178 = c24 * (v3 - v5) + c25 * v180
+            v182 = c26 * v178
+            v183 = c26 * (v176 - v177)
         else:
             v176 = c22 * z
             v177 = c22 * z
@@ -197,15 +193,12 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
             v183 = 0.0
         if levels.outer_house:
             v184 = c27 * v5 + c22 * z
-            v185 = 0.0 if east < 0.0 else v184
+            v197 = 0.0 if east < 0.0 else v184
             v186 = c28 * v5 + c22 * z
-            v187 = 0.0 if east > 0.0 else v186
-            v192 = c29 * v6 + c30 * v13
-            v197 = v185
-            v198 = v187
-            v199 = v192
-            v201 = c31 * (v178 - (v185 - v187))
-            v202 = c31 * (v176 - v177 - v192)
+            v198 = 0.0 if east > 0.0 else v186
+            v199 = c29 * v6 + c30 * v13
+            v201 = c31 * (v178 - (v197 - v198))
+            v202 = c31 * (v176 - v177 - v199)
         else:
             v197 = c22 * z
             v198 = c22 * z
@@ -228,9 +221,8 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
         v231 = product(A, B, acc, k, later, 32, v8, v30)
         v232 = c1 * v230 + c1 * v231
         if inputs.ideal_drive:
-            v233 = v232 + c32 * z
-            v234 = v233
-            v235 = c42 * v233
+            v234 = v232 + c32 * z
+            v235 = c42 * v234
         else:
             v234 = c43 * v205
             v235 = c44 * v205
@@ -531,17 +523,13 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         if levels.inner_house:
             v183 = v4 - v6
             v184 = c29 * v183 + c30 * z
-            v185 = 0.0 if north < 0.0 else v184
+            v196 = 0.0 if north < 0.0 else v184
             v186 = c31 * v183 + c30 * z
-            v187 = 0.0 if north > 0.0 else v186
-            v193 = v10 - v12
-            v194 = c32 * (v3 - v5) + c33 * v193
-            v196 = v185
-            v197 = v187
-            v198 = v194
-            v200 = v193
-            v202 = c34 * v194
-            v203 = c34 * (v185 - v187)
+            v197 = 0.0 if north > 0.0 else v186
+            v200 = v10 - v12
+            v198 = c32 * (v3 - v5) + c33 * v200
+            v202 = c34 * v198
+            v203 = c34 * (v196 - v197)
         else:
             v196 = c30 * z
             v197 = c30 * z
@@ -551,15 +539,12 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v203 = 0.0
         if levels.outer_house:
             v204 = c35 * v5 + c30 * z
-            v205 = 0.0 if east < 0.0 else v204
+            v217 = 0.0 if east < 0.0 else v204
             v206 = c36 * v5 + c30 * z
-            v207 = 0.0 if east > 0.0 else v206
-            v212 = c37 * v6 + c38 * v13
-            v217 = v205
-            v218 = v207
-            v219 = v212
-            v221 = c39 * (v198 - (v205 - v207))
-            v222 = c39 * (v196 - v197 - v212)
+            v218 = 0.0 if east > 0.0 else v206
+            v219 = c37 * v6 + c38 * v13
+            v221 = c39 * (v198 - (v217 - v218))
+            v222 = c39 * (v196 - v197 - v219)
         else:
             v217 = c30 * z
             v218 = c30 * z
@@ -582,9 +567,8 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v253 = product(A, B, acc, k, later, 46, v8, v30)
         v254 = c1 * v252 + c1 * v253
         if inputs.ideal_drive:
-            v255 = v254 + c40 * z
-            v259 = c50 * v255 + c7 * v88
-            v258 = v255
+            v258 = v254 + c40 * z
+            v259 = c50 * v258 + c7 * v88
         else:
             v258 = c53 * (c51 * v225 + c52 * v88)
             v259 = c51 * v225
@@ -890,17 +874,13 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         if levels.inner_house:
             v174 = v4 - v6
             v175 = c27 * v174 + c28 * z
-            v176 = 0.0 if north < 0.0 else v175
+            v187 = 0.0 if north < 0.0 else v175
             v177 = c29 * v174 + c28 * z
-            v178 = 0.0 if north > 0.0 else v177
-            v184 = v10 - v12
-            v185 = c30 * (v3 - v5) + c31 * v184
-            v187 = v176
-            v188 = v178
-            v189 = v185
-            v191 = v184
-            v193 = c32 * v185
-            v194 = c32 * (v176 - v178)
+            v188 = 0.0 if north > 0.0 else v177
+            v191 = v10 - v12
+            v189 = c30 * (v3 - v5) + c31 * v191
+            v193 = c32 * v189
+            v194 = c32 * (v187 - v188)
         else:
             v187 = c28 * z
             v188 = c28 * z
@@ -910,15 +890,12 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v194 = 0.0
         if levels.outer_house:
             v195 = c33 * v5 + c28 * z
-            v196 = 0.0 if east < 0.0 else v195
+            v208 = 0.0 if east < 0.0 else v195
             v197 = c34 * v5 + c28 * z
-            v198 = 0.0 if east > 0.0 else v197
-            v203 = c35 * v6 + c36 * v13
-            v208 = v196
-            v209 = v198
-            v210 = v203
-            v212 = c37 * (v189 - (v196 - v198))
-            v213 = c37 * (v187 - v188 - v203)
+            v209 = 0.0 if east > 0.0 else v197
+            v210 = c35 * v6 + c36 * v13
+            v212 = c37 * (v189 - (v208 - v209))
+            v213 = c37 * (v187 - v188 - v210)
         else:
             v208 = c28 * z
             v209 = c28 * z
@@ -947,8 +924,7 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v270 = product(A, B, acc, k, later, 47, v37, v264)
         v271 = c1 * v270 + c1 * v244
         if inputs.ideal_drive:
-            v272 = v271 + c38 * z
-            v275 = v272
+            v275 = v271 + c38 * z
         else:
             v275 = c51 * (c49 * v216 + c50 * v254)
         if levels.inner_house:
@@ -1004,9 +980,8 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v270 = product(A, B, acc, k, later, 47, v37, v264)
         v271 = c1 * v270 + c1 * v244
         if inputs.ideal_drive:
-            v272 = v271 + c38 * z
-            v276 = c48 * v272 + c8 * v254
-            v275 = v272
+            v275 = v271 + c38 * z
+            v276 = c48 * v275 + c8 * v254
         else:
             v275 = c51 * (c49 * v216 + c50 * v254)
             v276 = c49 * v216
