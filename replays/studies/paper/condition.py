@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -238,11 +239,7 @@ def start_thresholds(frictions: tuple[float, ...] = FRICTIONS) -> list[Threshold
     for mu in frictions:
         constants = bare_rig(mu)
         closed = critical_whirl(oscillator(constants), mu)
-
-        def holds(whirl: float, constants: Constants = constants) -> bool:
-            return gains_speed(constants, whirl)
-
-        bare = bisect(holds, 0.6 * closed, 2.0 * closed)
+        bare = bisect(partial(gains_speed, constants), 0.6 * closed, 2.0 * closed)
         found.append(Threshold(mu, math.nan, closed / (2 * math.pi), bare / (2 * math.pi), math.nan, math.nan, _NONE))
     return found
 
