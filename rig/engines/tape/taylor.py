@@ -79,10 +79,10 @@ class _Code:
             self._first = set(self._needed)
             self._depend(tape.items)
         self._mark(tape.items, [*outputs.values(), residual])
-        self._place(tape.items, [*outputs.values(), residual])
         self._number_lanes(tape.items, 0, rare=False)
         self.rarest = _whole(self.widest)
         self._number_lanes(tape.items, self.rarest, rare=True)
+        self._place(tape.items, [*outputs.values(), residual])
         body = list(self._lines(tape.items, first=residual is not None))
         if residual is not None:
             body += [f"friction = {self._value(residual)} * per_friction", *self._lines(tape.items, again=True)]
@@ -196,13 +196,19 @@ class _Code:
 
         def once(source: Node, branch: list[Node | Fork], user: Node) -> bool:
             here = any(source is each for each in _own(branch))
-            return here and uses[source.number] == 1 and source.kind in _WRITTEN and alike(source, user)
+            single = uses[source.number] == 1 and user.number in self._needed
+            return here and single and source.kind in _WRITTEN and alike(source, user)
 
         def place_in(branch: list[Node | Fork]) -> None:
             for item in branch:
                 if isinstance(item, Node):
-                    inside = (item.arguments[place] for place in _INLINE.get(item.kind, ()))
-                    self._inside |= {one.number for one in inside if once(one, branch, item)}
+                    for one in (item.arguments[place] for place in _INLINE.get(item.kind, ())):
+                        if not once(one, branch, item):
+                            continue
+                        self._inside.add(one.number)
+                        called = item.kind in _CALLS and _CALLS[0] in self._expression(one)
+                        if called or (item.kind in _WRITTEN and len(self._expression(item)) > _LONG):
+                            self._inside.remove(one.number)
                     continue
                 for side, answer in enumerate((item.yes, item.no)):
                     own = {node.number for node in _own(answer)}
@@ -227,6 +233,8 @@ class _Code:
     def _constant(self, value: Known) -> str:
         if not value.over and not value.under:
             return repr(value.number)
+        if abs(value.number) == 1.0 and len(value.over) == 1 and not value.under and "(" not in value.text:
+            return value.over[0] if value.number > 0.0 else f"-{value.over[0]}"
         return self._constants.setdefault(value.text, f"c{len(self._constants)}")
 
     def _term(self, coefficient: Known, factor: Node | str, *, first: bool = False) -> str:
@@ -246,6 +254,9 @@ class _Code:
     def _expression(self, node: Node, *, bare: bool = True) -> str:
         if node.kind == "column":
             return f"Y[k, {node.arguments[0]}]"
+        if node.kind == "product":
+            left, right = (self._term(Known(), each, first=True) for each in node.arguments)
+            return f"product(A, B, acc, k, later, {self._lane_of[node.number]}, {left}, {right})"
         coefficient, part, other, *rest = node.arguments
         before = self._term(coefficient, part, first=True)
         text = f"{before} + {self._term(other, rest[0] if rest else 'z')}".replace("+ -", "- ")
@@ -263,8 +274,10 @@ class _Code:
             yes, no = ([*self._lines(branch, first=first, again=again)] for branch in (item.yes, item.no))
             if len(joined) == 1 and not yes and not no:
                 one, two = map(self._value, joined[0].arguments)
-                yield f"{self._name(joined[0])} = {one} if {item.condition} else {two}"
-                continue
+                line = f"{self._name(joined[0])} = {one} if {item.condition} else {two}"
+                if len(line) <= _LONG:
+                    yield line
+                    continue
             for side, lines in enumerate((yes, no)):
                 given = ((self._name(each), self._value(each.arguments[side])) for each in joined)
                 lines += [f"{name} = {value}" for name, value in given if name != value]
@@ -284,11 +297,8 @@ class _Code:
                 yield f"D[k, {arguments[0]}] = {self._term(arguments[1], arguments[2], first=True)}"
             case "unknown":
                 yield f"{name} = {'0.0' if first else 'friction'}"
-            case "sum" | "shifted" | "column":
+            case "sum" | "shifted" | "column" | "product":
                 yield f"{name} = {self._expression(node)}"
-            case "product":
-                left, right = (self._term(Known(), each, first=True) for each in arguments)
-                yield f"{name} = product(A, B, acc, k, later, {p}, {left}, {right})"
             case "quotient" | "reciprocal":
                 dividend = "z" if node.kind == "reciprocal" else self._term(Known(), arguments[0], first=True)
                 divisor = self._name(arguments[-1])
@@ -315,7 +325,9 @@ class _Code:
                 yield f"A[k, {p}], B[k, {p}], A[k, {p + 1}], B[k, {p + 1}] = k * {x}, {name}, k * {name}, {x}"
             case "complex_power":
                 x, y, power = self._term(*arguments[:2]), self._term(*arguments[2:4]), f"int({arguments[4].text})"
-                yield f"power_x, power_y = complex_power(A, B, acc, k, later, WAVE, {x}, {y}, {power})"
+                yield "power_x, power_y = complex_power("
+                yield f"    A, B, acc, k, later, WAVE, {x}, {y}, {power}"
+                yield ")"
             case "part":
                 yield f"{name} = power_{arguments[1]}"
             case _:
@@ -335,7 +347,11 @@ _RARE = {
     "magnet.terms == RADIAL": False,
 }
 """Conditions by which few scenes go, and the answer then: what `rig.engines.taylor.lanes.is_wide` asks for."""
-_WRITTEN = ("sum", "shifted", "column")
+_CALLS = ("product", "quotient")
+"""What takes no product in place."""
+_LONG = 96
+"""Characters of an expression at the most."""
+_WRITTEN = ("sum", "shifted", "column", "product")
 """What needs no name where it is used once."""
 _LANES = {"product": 1, "quotient": 1, "reciprocal": 1, "root": 1, "tanh": 2, "power": 2}
 
