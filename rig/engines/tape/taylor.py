@@ -217,9 +217,13 @@ class _Code:
                         if not isinstance(value, Symbol) or joined.number not in self._needed:
                             continue
                         number = value.node.number
-                        if value.coefficient != Known():
-                            self._inside |= {number} if once(value.node, answer, joined) else set()
-                        elif number in own and alike(value.node, joined):
+                        scaled = value.coefficient != Known()
+                        inside = scaled and once(value.node, answer, joined)
+                        # A product fills its lane, whichever way the fork goes.
+                        before = once(value.node, branch, joined) and _CALLS[0] not in self._expression(value.node)
+                        if inside or before:
+                            self._inside.add(number)
+                        elif not scaled and number in own and alike(value.node, joined):
                             self._named.setdefault(number, self._name(joined))
                     place_in(answer)
 
@@ -228,6 +232,8 @@ class _Code:
     # Code.
 
     def _name(self, node: Node) -> str:
+        if node.kind == "column":
+            return f"Y[k, {node.arguments[0]}]"
         return self._named.get(node.number, f"v{node.number}")
 
     def _constant(self, value: Known) -> str:
@@ -252,8 +258,6 @@ class _Code:
         return "0.0" if value == 0.0 else self._term(known(value), "z")
 
     def _expression(self, node: Node, *, bare: bool = True) -> str:
-        if node.kind == "column":
-            return f"Y[k, {node.arguments[0]}]"
         if node.kind == "product":
             left, right = (self._term(Known(), each, first=True) for each in node.arguments)
             return f"product(A, B, acc, k, later, {self._lane_of[node.number]}, {left}, {right})"
@@ -267,7 +271,7 @@ class _Code:
             if not self._wanted(item, again):
                 continue
             if isinstance(item, Node):
-                if item.number not in self._inside:
+                if item.number not in self._inside and item.kind != "column":
                     yield from self._node(item, first)
                 continue
             joined = [each for each in item.joined if self._wanted(each, again)]
@@ -297,7 +301,7 @@ class _Code:
                 yield f"D[k, {arguments[0]}] = {self._term(arguments[1], arguments[2], first=True)}"
             case "unknown":
                 yield f"{name} = {'0.0' if first else 'friction'}"
-            case "sum" | "shifted" | "column" | "product":
+            case "sum" | "shifted" | "product":
                 yield f"{name} = {self._expression(node)}"
             case "quotient" | "reciprocal":
                 dividend = "z" if node.kind == "reciprocal" else self._term(Known(), arguments[0], first=True)
@@ -351,7 +355,7 @@ _CALLS = ("product", "quotient")
 """What takes no product in place."""
 _LONG = 96
 """Characters of an expression at the most."""
-_WRITTEN = ("sum", "shifted", "column", "product")
+_WRITTEN = ("sum", "shifted", "product")
 """What needs no name where it is used once."""
 _LANES = {"product": 1, "quotient": 1, "reciprocal": 1, "root": 1, "tanh": 2, "power": 2}
 
