@@ -239,8 +239,10 @@ class _Code:
     def _constant(self, value: Known) -> str:
         if not value.over and not value.under:
             return repr(value.number)
-        if abs(value.number) == 1.0 and len(value.over) == 1 and not value.under and "(" not in value.text:
-            return value.over[0] if value.number > 0.0 else f"-{value.over[0]}"
+        if value.number < 0.0:
+            return f"-{self._constant(-value)}"
+        if (value.number, len(value.over), value.under) == (1.0, 1, ()) and "(" not in value.text:
+            return value.text
         return self._constants.setdefault(value.text, f"c{len(self._constants)}")
 
     def _term(self, coefficient: Known, factor: Node | str, *, first: bool = False) -> str:

@@ -30,25 +30,21 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
     north, east = memory[NORTH], memory[EAST]
     c0 = (1.0 if levels.euler else 0.0)
     c1 = shaft.arm_magnet * shaft.arm_magnet
-    c2 = -2.0 * magnet.growth * magnet.ripple * magnet.stiffness
+    c2 = 2.0 * magnet.growth * magnet.ripple * magnet.stiffness
     c3 = magnet.number * magnet.ripple * magnet.stiffness
     c4 = 0.5 * house.pair_stiffness_vertical
-    c5 = -0.5 * house.pair_stiffness_vertical
-    c6 = 0.5 * house.pair_stiffness_horizontal
-    c7 = -0.5 * house.pair_stiffness_horizontal
-    c8 = inputs.hammer_force * inputs.hammer_x
-    c9 = inputs.hammer_force * inputs.hammer_y
-    c10 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
-    c11 = 1.0 / shaft.transverse_inertia
-    c12 = 2.0 * (1.0 if levels.euler else 0.0)
-    c13 = -1.0 * (1.0 if levels.euler else 0.0)
-    c14 = -1.0 * magnet.stiffness * shaft.arm_magnet
-    c15 = magnet.stiffness * shaft.arm_magnet
-    c16 = -1.0 * magnet.damping_x * shaft.arm_magnet
-    c17 = -1.0 * magnet.damping_y * shaft.arm_magnet
-    c18 = -1.0 / house.inner_mass
-    c19 = 1.0 / house.outer_mass
-    c20 = constants.torque_gain / shaft.polar_inertia
+    c5 = 0.5 * house.pair_stiffness_horizontal
+    c6 = inputs.hammer_force * inputs.hammer_x
+    c7 = inputs.hammer_force * inputs.hammer_y
+    c8 = shaft.arm_centre * shaft.gravity * shaft.mass
+    c9 = 1.0 / shaft.transverse_inertia
+    c10 = 2.0 * (1.0 if levels.euler else 0.0)
+    c11 = magnet.stiffness * shaft.arm_magnet
+    c12 = magnet.damping_x * shaft.arm_magnet
+    c13 = magnet.damping_y * shaft.arm_magnet
+    c14 = 1.0 / house.inner_mass
+    c15 = 1.0 / house.outer_mass
+    c16 = constants.torque_gain / shaft.polar_inertia
     i219 = 0.0
     Y[0, 29] = 0.0
     Y[0, 30], Y[0, 31] = math.sin(along), math.cos(along)
@@ -66,11 +62,11 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
             sum_below(A, B, acc, k, 48)
         v30 = product(A, B, acc, k, later, 0, Y[k, 7], Y[k, 35])
         D[k, 32] = product(A, B, acc, k, later, 1, Y[k, 7], Y[k, 33])
-        D[k, 33] = c13 * product(A, B, acc, k, later, 2, Y[k, 7], Y[k, 32])
+        D[k, 33] = -c0 * product(A, B, acc, k, later, 2, Y[k, 7], Y[k, 32])
         v38 = product(A, B, acc, k, later, 3, Y[k, 8], Y[k, 35])
         v39 = product(A, B, acc, k, later, 4, Y[k, 8], Y[k, 34])
         D[k, 34] = v38
-        D[k, 35] = c13 * v39
+        D[k, 35] = -c0 * v39
         v42 = product(A, B, acc, k, later, 5, Y[k, 32], Y[k, 34])
         v43 = product(A, B, acc, k, later, 6, Y[k, 7], Y[k, 34])
         v44 = Y[k, 9] + c0 * v43
@@ -83,15 +79,15 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
         v62 = product(A, B, acc, k, later, 11, v52, v52) + product(A, B, acc, k, later, 12, v55, v55)
         if inputs.magnet_engaged:
             if magnet.terms == LINEAR:
-                v147 = c14 * Y[k, 34]
-                v148 = c15 * v45
+                v147 = -c11 * Y[k, 34]
+                v148 = c11 * v45
             elif magnet.terms == RADIAL:
                 v96 = product(A, B, acc, k, later, 14, v45, v45)
                 v97 = c1 * product(A, B, acc, k, later, 13, Y[k, 34], Y[k, 34]) + c1 * v96
                 v100 = product(A, B, acc, k, later, 15, v97, magnet.a7 * v97 + magnet.a5 * z) + magnet.a3 * z
                 v102 = product(A, B, acc, k, later, 16, v97, v100) + z
-                v147 = c14 * product(A, B, acc, k, later, 17, Y[k, 34], v102)
-                v148 = c15 * product(A, B, acc, k, later, 18, v45, v102)
+                v147 = -c11 * product(A, B, acc, k, later, 17, Y[k, 34], v102)
+                v148 = c11 * product(A, B, acc, k, later, 18, v45, v102)
             else:
                 v112 = product(A, B, acc, k, later, 49, v45, v45)
                 v113 = c1 * product(A, B, acc, k, later, 48, Y[k, 34], Y[k, 34]) + c1 * v112
@@ -104,13 +100,13 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
                 v129 = product(A, B, acc, k, later, 53, Y[k, 34], v127)
                 v130 = shaft.arm_magnet * product(A, B, acc, k, later, 52, v45, v126) - shaft.arm_magnet * v129
                 v131 = magnet.growth * v113 + z
-                v132 = -magnet.stiffness * (product(A, B, acc, k, later, 51, v113, v116) + z) + c2 * v130
+                v132 = -magnet.stiffness * (product(A, B, acc, k, later, 51, v113, v116) + z) - c2 * v130
                 v134 = product(A, B, acc, k, later, 55, v127, v131)
                 v147 = shaft.arm_magnet * product(A, B, acc, k, later, 54, Y[k, 34], v132) + c3 * v134
                 v137 = product(A, B, acc, k, later, 57, v126, v131)
                 v148 = -shaft.arm_magnet * product(A, B, acc, k, later, 56, v45, v132) + c3 * v137
-            v150 = c16 * v38
-            v151 = c17 * v49
+            v150 = -c12 * v38
+            v151 = -c13 * v49
         else:
             v147 = 0.0
             v148 = 0.0
@@ -125,11 +121,11 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
         if levels.inner_house:
             v163 = Y[k, 4] - Y[k, 6]
             v176 = 0.0 if north < 0.0 else c4 * v163 + house.preload * z
-            v177 = 0.0 if north > 0.0 else c5 * v163 + house.preload * z
+            v177 = 0.0 if north > 0.0 else -c4 * v163 + house.preload * z
             v180 = Y[k, 10] - Y[k, 12]
             v178 = house.inner_beam_stiffness * (Y[k, 3] - Y[k, 5]) + house.inner_beam_damping * v180
-            v182 = c18 * v178
-            v183 = c18 * (v176 - v177)
+            v182 = -c14 * v178
+            v183 = -c14 * (v176 - v177)
         else:
             v176 = house.preload * z
             v177 = house.preload * z
@@ -138,11 +134,11 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
             v182 = 0.0
             v183 = 0.0
         if levels.outer_house:
-            v197 = 0.0 if east < 0.0 else c6 * Y[k, 5] + house.preload * z
-            v198 = 0.0 if east > 0.0 else c7 * Y[k, 5] + house.preload * z
+            v197 = 0.0 if east < 0.0 else c5 * Y[k, 5] + house.preload * z
+            v198 = 0.0 if east > 0.0 else -c5 * Y[k, 5] + house.preload * z
             v199 = house.outer_beam_stiffness * Y[k, 6] + house.outer_beam_damping * Y[k, 13]
-            v201 = c19 * (v178 - (v197 - v198))
-            v202 = c19 * (v176 - v177 - v199)
+            v201 = c15 * (v178 - (v197 - v198))
+            v202 = c15 * (v176 - v177 - v199)
         else:
             v197 = house.preload * z
             v198 = house.preload * z
@@ -150,25 +146,25 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
             v201 = 0.0
             v202 = 0.0
         v205 = inputs.speed_slope * Y[k, 29] + aim * z - Y[k, 9]
-        v208 = shaft.arm_magnet * (v147 + v150) + shaft.arm_disk * (shaft.unbalance * v161 + c8 * Y[k, 30])
-        v211 = shaft.arm_magnet * (v148 + v151) + shaft.arm_disk * (shaft.unbalance * v162 + c9 * Y[k, 30])
-        v212 = v211 + c10 * z
+        v208 = shaft.arm_magnet * (v147 + v150) + shaft.arm_disk * (shaft.unbalance * v161 + c6 * Y[k, 30])
+        v211 = shaft.arm_magnet * (v148 + v151) + shaft.arm_disk * (shaft.unbalance * v162 + c7 * Y[k, 30])
+        v212 = v211 - c8 * z
         v214 = product(A, B, acc, k, later, 23, Y[k, 33], v212)
-        v216 = -v214 - shaft.polar_inertia * product(A, B, acc, k, later, 24, Y[k, 8], v44)
-        v218 = c11 * v216 + c12 * product(A, B, acc, k, later, 25, Y[k, 8], v43)
+        v217 = product(A, B, acc, k, later, 25, Y[k, 8], v43)
+        v218 = c9 * (-v214 - shaft.polar_inertia * product(A, B, acc, k, later, 24, Y[k, 8], v44)) + c10 * v217
         i219 = 1.0 / Y[k, 35] if k == 0 else i219
         v219 = quotient(A, B, acc, k, later, 26, Y[k, 35], v218, i219)
         v220 = product(A, B, acc, k, later, 27, Y[k, 35], v208)
         v224 = product(A, B, acc, k, later, 29, v30, v44)
         v225 = v220 + c0 * product(A, B, acc, k, later, 28, v42, v212) + shaft.polar_inertia * v224
-        v229 = c11 * v225 + c13 * product(A, B, acc, k, later, 30, v30, v43)
+        v229 = c9 * v225 - c0 * product(A, B, acc, k, later, 30, v30, v43)
         v231 = product(A, B, acc, k, later, 32, Y[k, 8], v30)
         v232 = c0 * product(A, B, acc, k, later, 31, Y[k, 34], v219) + c0 * v231
         if inputs.ideal_drive:
             v234 = v232 + inputs.speed_slope * z
             v235 = shaft.polar_inertia * v234
         else:
-            v234 = c20 * v205
+            v234 = c16 * v205
             v235 = constants.torque_gain * v205
         v236 = v234 - v232
         if levels.outer_house:
@@ -184,7 +180,7 @@ def flight(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B, 
             v248 = house.preload * z
             v249 = 0.0
         v250 = product(A, B, acc, k, later, 33, v44, v235)
-        v254 = product(A, B, acc, k, later, 34, Y[k, 30], c8 * v38 + c9 * v49)
+        v254 = product(A, B, acc, k, later, 34, Y[k, 30], c6 * v38 + c7 * v49)
         v256 = product(A, B, acc, k, later, 36, v49, v162)
         v257 = shaft.unbalance * product(A, B, acc, k, later, 35, v38, v161) + shaft.unbalance * v256
         v260 = product(A, B, acc, k, later, 37, v38, v150) + product(A, B, acc, k, later, 38, v49, v151)
@@ -252,28 +248,24 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     north, east = memory[NORTH], memory[EAST]
     c0 = (1.0 if levels.euler else 0.0)
     c1 = shaft.arm_magnet * shaft.arm_magnet
-    c2 = -2.0 * magnet.growth * magnet.ripple * magnet.stiffness
+    c2 = 2.0 * magnet.growth * magnet.ripple * magnet.stiffness
     c3 = magnet.number * magnet.ripple * magnet.stiffness
     c4 = 0.5 * house.pair_stiffness_vertical
-    c5 = -0.5 * house.pair_stiffness_vertical
-    c6 = 0.5 * house.pair_stiffness_horizontal
-    c7 = -0.5 * house.pair_stiffness_horizontal
-    c8 = inputs.hammer_force * inputs.hammer_x
-    c9 = inputs.hammer_force * inputs.hammer_y
-    c10 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
-    c11 = 1.0 / shaft.transverse_inertia
-    c12 = 2.0 * (1.0 if levels.euler else 0.0)
-    c13 = -1.0 * (1.0 if levels.euler else 0.0)
-    c14 = 2.0 * contact.exponent
-    c15 = contact.damping_factor / onset
-    c16 = 1.0 / contact.smoothing_speed
-    c17 = -1.0 * magnet.stiffness * shaft.arm_magnet
-    c18 = magnet.stiffness * shaft.arm_magnet
-    c19 = -1.0 * magnet.damping_x * shaft.arm_magnet
-    c20 = -1.0 * magnet.damping_y * shaft.arm_magnet
-    c21 = -1.0 / house.inner_mass
-    c22 = 1.0 / house.outer_mass
-    c23 = 1.0 / shaft.polar_inertia
+    c5 = 0.5 * house.pair_stiffness_horizontal
+    c6 = inputs.hammer_force * inputs.hammer_x
+    c7 = inputs.hammer_force * inputs.hammer_y
+    c8 = shaft.arm_centre * shaft.gravity * shaft.mass
+    c9 = 1.0 / shaft.transverse_inertia
+    c10 = 2.0 * (1.0 if levels.euler else 0.0)
+    c11 = 2.0 * contact.exponent
+    c12 = contact.damping_factor / onset
+    c13 = 1.0 / contact.smoothing_speed
+    c14 = magnet.stiffness * shaft.arm_magnet
+    c15 = magnet.damping_x * shaft.arm_magnet
+    c16 = magnet.damping_y * shaft.arm_magnet
+    c17 = 1.0 / house.inner_mass
+    c18 = 1.0 / house.outer_mass
+    c19 = 1.0 / shaft.polar_inertia
     i67 = 0.0
     i68 = 0.0
     i241 = 0.0
@@ -293,11 +285,11 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             sum_below(A, B, acc, k, 64)
         v30 = product(A, B, acc, k, later, 0, Y[k, 7], Y[k, 35])
         D[k, 32] = product(A, B, acc, k, later, 1, Y[k, 7], Y[k, 33])
-        D[k, 33] = c13 * product(A, B, acc, k, later, 2, Y[k, 7], Y[k, 32])
+        D[k, 33] = -c0 * product(A, B, acc, k, later, 2, Y[k, 7], Y[k, 32])
         v38 = product(A, B, acc, k, later, 3, Y[k, 8], Y[k, 35])
         v39 = product(A, B, acc, k, later, 4, Y[k, 8], Y[k, 34])
         D[k, 34] = v38
-        D[k, 35] = c13 * v39
+        D[k, 35] = -c0 * v39
         v42 = product(A, B, acc, k, later, 5, Y[k, 32], Y[k, 34])
         v43 = product(A, B, acc, k, later, 6, Y[k, 7], Y[k, 34])
         v44 = Y[k, 9] + c0 * v43
@@ -325,10 +317,10 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         elif contact.exponent == 1.0:
             v79 = contact.stiffness * v65
         else:
-            v77 = Y[k, 38] ** c14 if k == 0 else (c14 * (acc[64] + k * Y[k, 38] * B[0, 64]) - acc[65]) / (k * B[0, 65])
+            v77 = Y[k, 38] ** c11 if k == 0 else (c11 * (acc[64] + k * Y[k, 38] * B[0, 64]) - acc[65]) / (k * B[0, 65])
             A[k, 64], B[k, 64], A[k, 65], B[k, 65] = k * Y[k, 38], v77, k * v77, Y[k, 38]
             v79 = contact.stiffness * v77
-        v80 = c15 * v71 + z
+        v80 = c12 * v71 + z
         v82 = product(A, B, acc, k, later, 22, v79, v80) + contact.viscous_damping * v71
         v83 = 0.0 if slack else v82
         if phase == FORWARD:
@@ -336,8 +328,8 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         elif phase == BACKWARD:
             v88 = -contact.friction * v83
         elif levels.friction == SMOOTHED:
-            v84 = math.tanh(c16 * v75) if k == 0 else (acc[66] + k * (c16 * v75) * B[0, 66]) / k
-            A[k, 66] = k * (c16 * v75)
+            v84 = math.tanh(c13 * v75) if k == 0 else (acc[66] + k * (c13 * v75) * B[0, 66]) / k
+            A[k, 66] = k * (c13 * v75)
             B[k, 66] = z - product(A, B, acc, k, later, 67, v84, v84)
             v88 = contact.friction * product(A, B, acc, k, later, 68, v83, v84)
         else:
@@ -346,15 +338,15 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v94 = -product(A, B, acc, k, later, 25, v68, v83) - product(A, B, acc, k, later, 26, v67, v88)
         if inputs.magnet_engaged:
             if magnet.terms == LINEAR:
-                v167 = c17 * Y[k, 34]
-                v168 = c18 * v45
+                v167 = -c14 * Y[k, 34]
+                v168 = c14 * v45
             elif magnet.terms == RADIAL:
                 v116 = product(A, B, acc, k, later, 28, v45, v45)
                 v117 = c1 * product(A, B, acc, k, later, 27, Y[k, 34], Y[k, 34]) + c1 * v116
                 v120 = product(A, B, acc, k, later, 29, v117, magnet.a7 * v117 + magnet.a5 * z) + magnet.a3 * z
                 v122 = product(A, B, acc, k, later, 30, v117, v120) + z
-                v167 = c17 * product(A, B, acc, k, later, 31, Y[k, 34], v122)
-                v168 = c18 * product(A, B, acc, k, later, 32, v45, v122)
+                v167 = -c14 * product(A, B, acc, k, later, 31, Y[k, 34], v122)
+                v168 = c14 * product(A, B, acc, k, later, 32, v45, v122)
             else:
                 v132 = product(A, B, acc, k, later, 70, v45, v45)
                 v133 = c1 * product(A, B, acc, k, later, 69, Y[k, 34], Y[k, 34]) + c1 * v132
@@ -367,13 +359,13 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
                 v149 = product(A, B, acc, k, later, 74, Y[k, 34], v147)
                 v150 = shaft.arm_magnet * product(A, B, acc, k, later, 73, v45, v146) - shaft.arm_magnet * v149
                 v151 = magnet.growth * v133 + z
-                v152 = -magnet.stiffness * (product(A, B, acc, k, later, 72, v133, v136) + z) + c2 * v150
+                v152 = -magnet.stiffness * (product(A, B, acc, k, later, 72, v133, v136) + z) - c2 * v150
                 v154 = product(A, B, acc, k, later, 76, v147, v151)
                 v167 = shaft.arm_magnet * product(A, B, acc, k, later, 75, Y[k, 34], v152) + c3 * v154
                 v157 = product(A, B, acc, k, later, 78, v146, v151)
                 v168 = -shaft.arm_magnet * product(A, B, acc, k, later, 77, v45, v152) + c3 * v157
-            v170 = c19 * v38
-            v171 = c20 * v49
+            v170 = -c15 * v38
+            v171 = -c16 * v49
         else:
             v167 = 0.0
             v168 = 0.0
@@ -388,11 +380,11 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         if levels.inner_house:
             v183 = Y[k, 4] - Y[k, 6]
             v196 = 0.0 if north < 0.0 else c4 * v183 + house.preload * z
-            v197 = 0.0 if north > 0.0 else c5 * v183 + house.preload * z
+            v197 = 0.0 if north > 0.0 else -c4 * v183 + house.preload * z
             v200 = Y[k, 10] - Y[k, 12]
             v198 = house.inner_beam_stiffness * (Y[k, 3] - Y[k, 5]) + house.inner_beam_damping * v200
-            v202 = c21 * v198
-            v203 = c21 * (v196 - v197)
+            v202 = -c17 * v198
+            v203 = -c17 * (v196 - v197)
         else:
             v196 = house.preload * z
             v197 = house.preload * z
@@ -401,11 +393,11 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v202 = 0.0
             v203 = 0.0
         if levels.outer_house:
-            v217 = 0.0 if east < 0.0 else c6 * Y[k, 5] + house.preload * z
-            v218 = 0.0 if east > 0.0 else c7 * Y[k, 5] + house.preload * z
+            v217 = 0.0 if east < 0.0 else c5 * Y[k, 5] + house.preload * z
+            v218 = 0.0 if east > 0.0 else -c5 * Y[k, 5] + house.preload * z
             v219 = house.outer_beam_stiffness * Y[k, 6] + house.outer_beam_damping * Y[k, 13]
-            v221 = c22 * (v198 - (v217 - v218))
-            v222 = c22 * (v196 - v197 - v219)
+            v221 = c18 * (v198 - (v217 - v218))
+            v222 = c18 * (v196 - v197 - v219)
         else:
             v217 = house.preload * z
             v218 = house.preload * z
@@ -413,29 +405,29 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v221 = 0.0
             v222 = 0.0
         v225 = inputs.speed_slope * Y[k, 29] + aim * z - Y[k, 9]
-        v228 = shaft.arm_magnet * (v167 + v170) + shaft.arm_disk * (shaft.unbalance * v181 + c8 * Y[k, 30])
-        v231 = shaft.arm_magnet * (v168 + v171) + shaft.arm_disk * (shaft.unbalance * v182 + c9 * Y[k, 30])
-        v234 = v231 + c10 * z + shaft.arm_ring * v94
+        v228 = shaft.arm_magnet * (v167 + v170) + shaft.arm_disk * (shaft.unbalance * v181 + c6 * Y[k, 30])
+        v231 = shaft.arm_magnet * (v168 + v171) + shaft.arm_disk * (shaft.unbalance * v182 + c7 * Y[k, 30])
+        v234 = v231 - c8 * z + shaft.arm_ring * v94
         v236 = product(A, B, acc, k, later, 37, Y[k, 33], v234)
-        v238 = -v236 - shaft.polar_inertia * product(A, B, acc, k, later, 38, Y[k, 8], v44)
-        v240 = c11 * v238 + c12 * product(A, B, acc, k, later, 39, Y[k, 8], v43)
+        v239 = product(A, B, acc, k, later, 39, Y[k, 8], v43)
+        v240 = c9 * (-v236 - shaft.polar_inertia * product(A, B, acc, k, later, 38, Y[k, 8], v44)) + c10 * v239
         i241 = 1.0 / Y[k, 35] if k == 0 else i241
         v241 = quotient(A, B, acc, k, later, 40, Y[k, 35], v240, i241)
         v242 = product(A, B, acc, k, later, 41, Y[k, 35], v228 + shaft.arm_ring * v91)
         v246 = product(A, B, acc, k, later, 43, v30, v44)
         v247 = v242 + c0 * product(A, B, acc, k, later, 42, v42, v234) + shaft.polar_inertia * v246
-        v251 = c11 * v247 + c13 * product(A, B, acc, k, later, 44, v30, v43)
+        v251 = c9 * v247 - c0 * product(A, B, acc, k, later, 44, v30, v43)
         v253 = product(A, B, acc, k, later, 46, Y[k, 8], v30)
         v254 = c0 * product(A, B, acc, k, later, 45, Y[k, 34], v241) + c0 * v253
         if inputs.ideal_drive:
             v258 = v254 + inputs.speed_slope * z
             v259 = shaft.polar_inertia * v258 + shaft.radius * v88
         else:
-            v258 = c23 * (constants.torque_gain * v225 - shaft.radius * v88)
+            v258 = c19 * (constants.torque_gain * v225 - shaft.radius * v88)
             v259 = constants.torque_gain * v225
         if levels.inner_house:
-            v262 = v202 + c21 * v91
-            v263 = v203 + c21 * v94
+            v262 = v202 - c17 * v91
+            v263 = v203 - c17 * v94
         else:
             v262 = v202
             v263 = v203
@@ -454,7 +446,7 @@ def sliding(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v281 = -v94
         v282 = v259 - shaft.radius * v88
         v283 = product(A, B, acc, k, later, 47, v44, v259)
-        v287 = product(A, B, acc, k, later, 48, Y[k, 30], c8 * v38 + c9 * v49)
+        v287 = product(A, B, acc, k, later, 48, Y[k, 30], c6 * v38 + c7 * v49)
         v289 = product(A, B, acc, k, later, 50, v49, v182)
         v290 = shaft.unbalance * product(A, B, acc, k, later, 49, v38, v181) + shaft.unbalance * v289
         if contact.gap_counts_outer == 0.0:
@@ -536,25 +528,21 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
     c0 = (1.0 if levels.euler else 0.0)
     c1 = contact.damping_factor / onset
     c2 = shaft.arm_magnet * shaft.arm_magnet
-    c3 = -2.0 * magnet.growth * magnet.ripple * magnet.stiffness
+    c3 = 2.0 * magnet.growth * magnet.ripple * magnet.stiffness
     c4 = magnet.number * magnet.ripple * magnet.stiffness
     c5 = 0.5 * house.pair_stiffness_vertical
-    c6 = -0.5 * house.pair_stiffness_vertical
-    c7 = 0.5 * house.pair_stiffness_horizontal
-    c8 = -0.5 * house.pair_stiffness_horizontal
-    c9 = inputs.hammer_force * inputs.hammer_x
-    c10 = inputs.hammer_force * inputs.hammer_y
-    c11 = -1.0 * shaft.arm_centre * shaft.gravity * shaft.mass
-    c12 = 1.0 / shaft.transverse_inertia
-    c13 = 2.0 * (1.0 if levels.euler else 0.0)
-    c14 = -1.0 * (1.0 if levels.euler else 0.0)
-    c15 = -1.0 * magnet.stiffness * shaft.arm_magnet
-    c16 = magnet.stiffness * shaft.arm_magnet
-    c17 = -1.0 * magnet.damping_x * shaft.arm_magnet
-    c18 = -1.0 * magnet.damping_y * shaft.arm_magnet
-    c19 = -1.0 / house.inner_mass
-    c20 = 1.0 / house.outer_mass
-    c21 = 1.0 / shaft.polar_inertia
+    c6 = 0.5 * house.pair_stiffness_horizontal
+    c7 = inputs.hammer_force * inputs.hammer_x
+    c8 = inputs.hammer_force * inputs.hammer_y
+    c9 = shaft.arm_centre * shaft.gravity * shaft.mass
+    c10 = 1.0 / shaft.transverse_inertia
+    c11 = 2.0 * (1.0 if levels.euler else 0.0)
+    c12 = magnet.stiffness * shaft.arm_magnet
+    c13 = magnet.damping_x * shaft.arm_magnet
+    c14 = magnet.damping_y * shaft.arm_magnet
+    c15 = 1.0 / house.inner_mass
+    c16 = 1.0 / house.outer_mass
+    c17 = 1.0 / shaft.polar_inertia
     i66 = 0.0
     i67 = 0.0
     i264 = 0.0
@@ -576,11 +564,11 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v30 = product(A, B, acc, k, later, 0, Y[k, 7], Y[k, 35])
         v33 = product(A, B, acc, k, later, 1, Y[k, 7], Y[k, 33])
         D[k, 32] = v33
-        D[k, 33] = c14 * product(A, B, acc, k, later, 2, Y[k, 7], Y[k, 32])
+        D[k, 33] = -c0 * product(A, B, acc, k, later, 2, Y[k, 7], Y[k, 32])
         v38 = product(A, B, acc, k, later, 3, Y[k, 8], Y[k, 35])
         v39 = product(A, B, acc, k, later, 4, Y[k, 8], Y[k, 34])
         D[k, 34] = v38
-        D[k, 35] = c14 * v39
+        D[k, 35] = -c0 * v39
         v42 = product(A, B, acc, k, later, 5, Y[k, 32], Y[k, 34])
         v43 = product(A, B, acc, k, later, 6, Y[k, 7], Y[k, 34])
         v44 = Y[k, 9] + c0 * v43
@@ -619,15 +607,15 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v85 = product(A, B, acc, k, later, 24, v67, v83)
         if inputs.magnet_engaged:
             if magnet.terms == LINEAR:
-                v158 = c15 * Y[k, 34]
-                v159 = c16 * v45
+                v158 = -c12 * Y[k, 34]
+                v159 = c12 * v45
             elif magnet.terms == RADIAL:
                 v107 = product(A, B, acc, k, later, 26, v45, v45)
                 v108 = c2 * product(A, B, acc, k, later, 25, Y[k, 34], Y[k, 34]) + c2 * v107
                 v111 = product(A, B, acc, k, later, 27, v108, magnet.a7 * v108 + magnet.a5 * z) + magnet.a3 * z
                 v113 = product(A, B, acc, k, later, 28, v108, v111) + z
-                v158 = c15 * product(A, B, acc, k, later, 29, Y[k, 34], v113)
-                v159 = c16 * product(A, B, acc, k, later, 30, v45, v113)
+                v158 = -c12 * product(A, B, acc, k, later, 29, Y[k, 34], v113)
+                v159 = c12 * product(A, B, acc, k, later, 30, v45, v113)
             else:
                 v123 = product(A, B, acc, k, later, 79, v45, v45)
                 v124 = c2 * product(A, B, acc, k, later, 78, Y[k, 34], Y[k, 34]) + c2 * v123
@@ -640,13 +628,13 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
                 v140 = product(A, B, acc, k, later, 83, Y[k, 34], v138)
                 v141 = shaft.arm_magnet * product(A, B, acc, k, later, 82, v45, v137) - shaft.arm_magnet * v140
                 v142 = magnet.growth * v124 + z
-                v143 = -magnet.stiffness * (product(A, B, acc, k, later, 81, v124, v127) + z) + c3 * v141
+                v143 = -magnet.stiffness * (product(A, B, acc, k, later, 81, v124, v127) + z) - c3 * v141
                 v145 = product(A, B, acc, k, later, 85, v138, v142)
                 v158 = shaft.arm_magnet * product(A, B, acc, k, later, 84, Y[k, 34], v143) + c4 * v145
                 v148 = product(A, B, acc, k, later, 87, v137, v142)
                 v159 = -shaft.arm_magnet * product(A, B, acc, k, later, 86, v45, v143) + c4 * v148
-            v161 = c17 * v38
-            v162 = c18 * v49
+            v161 = -c13 * v38
+            v162 = -c14 * v49
         else:
             v158 = 0.0
             v159 = 0.0
@@ -661,11 +649,11 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         if levels.inner_house:
             v174 = Y[k, 4] - Y[k, 6]
             v187 = 0.0 if north < 0.0 else c5 * v174 + house.preload * z
-            v188 = 0.0 if north > 0.0 else c6 * v174 + house.preload * z
+            v188 = 0.0 if north > 0.0 else -c5 * v174 + house.preload * z
             v191 = Y[k, 10] - Y[k, 12]
             v189 = house.inner_beam_stiffness * (Y[k, 3] - Y[k, 5]) + house.inner_beam_damping * v191
-            v193 = c19 * v189
-            v194 = c19 * (v187 - v188)
+            v193 = -c15 * v189
+            v194 = -c15 * (v187 - v188)
         else:
             v187 = house.preload * z
             v188 = house.preload * z
@@ -674,11 +662,11 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v193 = 0.0
             v194 = 0.0
         if levels.outer_house:
-            v208 = 0.0 if east < 0.0 else c7 * Y[k, 5] + house.preload * z
-            v209 = 0.0 if east > 0.0 else c8 * Y[k, 5] + house.preload * z
+            v208 = 0.0 if east < 0.0 else c6 * Y[k, 5] + house.preload * z
+            v209 = 0.0 if east > 0.0 else -c6 * Y[k, 5] + house.preload * z
             v210 = house.outer_beam_stiffness * Y[k, 6] + house.outer_beam_damping * Y[k, 13]
-            v212 = c20 * (v189 - (v208 - v209))
-            v213 = c20 * (v187 - v188 - v210)
+            v212 = c16 * (v189 - (v208 - v209))
+            v213 = c16 * (v187 - v188 - v210)
         else:
             v208 = house.preload * z
             v209 = house.preload * z
@@ -686,9 +674,9 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v212 = 0.0
             v213 = 0.0
         v216 = inputs.speed_slope * Y[k, 29] + aim * z - Y[k, 9]
-        v219 = shaft.arm_magnet * (v158 + v161) + shaft.arm_disk * (shaft.unbalance * v172 + c9 * Y[k, 30])
-        v222 = shaft.arm_magnet * (v159 + v162) + shaft.arm_disk * (shaft.unbalance * v173 + c10 * Y[k, 30])
-        v223 = v222 + c11 * z
+        v219 = shaft.arm_magnet * (v158 + v161) + shaft.arm_disk * (shaft.unbalance * v172 + c7 * Y[k, 30])
+        v222 = shaft.arm_magnet * (v159 + v162) + shaft.arm_disk * (shaft.unbalance * v173 + c8 * Y[k, 30])
+        v223 = v222 - c9 * z
         v228 = product(A, B, acc, k, later, 35, Y[k, 8], v44)
         v230 = product(A, B, acc, k, later, 36, Y[k, 8], v43)
         v237 = product(A, B, acc, k, later, 37, v30, v44)
@@ -700,18 +688,18 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v260 = v223 + shaft.arm_ring * v258
         v261 = product(A, B, acc, k, later, 43, Y[k, 33], v260)
         i264 = 1.0 / Y[k, 35] if k == 0 else i264
-        v264 = quotient(A, B, acc, k, later, 44, Y[k, 35], c12 * (-v261 - shaft.polar_inertia * v228) + c13 * v230, i264)
+        v264 = quotient(A, B, acc, k, later, 44, Y[k, 35], c10 * (-v261 - shaft.polar_inertia * v228) + c11 * v230, i264)
         v265 = product(A, B, acc, k, later, 45, Y[k, 35], v219 + shaft.arm_ring * v256)
         v268 = v265 + c0 * product(A, B, acc, k, later, 46, v42, v260) + shaft.polar_inertia * v237
-        v269 = c12 * v268 + c14 * v241
+        v269 = c10 * v268 - c0 * v241
         v271 = c0 * product(A, B, acc, k, later, 47, Y[k, 34], v264) + c0 * v244
         if inputs.ideal_drive:
             v275 = v271 + inputs.speed_slope * z
         else:
-            v275 = c21 * (constants.torque_gain * v216 - shaft.radius * v254)
+            v275 = c17 * (constants.torque_gain * v216 - shaft.radius * v254)
         if levels.inner_house:
-            v279 = v193 + c19 * v256
-            v280 = v194 + c19 * v258
+            v279 = v193 - c15 * v256
+            v280 = v194 - c15 * v258
         else:
             v279 = v193
             v280 = v194
@@ -721,7 +709,7 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
             v282 = v187 - v188
             v283 = 0.5 * v189 + house.preload * z
             v284 = -0.5 * v189 + house.preload * z
-        v304 = product(A, B, acc, k, later, 49, Y[k, 30], c9 * v38 + c10 * v49)
+        v304 = product(A, B, acc, k, later, 49, Y[k, 30], c7 * v38 + c8 * v49)
         v306 = product(A, B, acc, k, later, 51, v49, v173)
         v307 = shaft.unbalance * product(A, B, acc, k, later, 50, v38, v172) + shaft.unbalance * v306
         v314 = product(A, B, acc, k, later, 52, v38, v161) + product(A, B, acc, k, later, 53, v49, v162)
@@ -735,8 +723,8 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v342 = -product(A, B, acc, k, later, 68, v46, v264) + c0 * product(A, B, acc, k, later, 69, v42, v269)
         v343 = product(A, B, acc, k, later, 70, v45, v336)
         v346 = product(A, B, acc, k, later, 71, v33, v39)
-        v355 = shaft.arm_ring * (product(A, B, acc, k, later, 66, Y[k, 35], v269) + c14 * v338) - v279
-        v358 = shaft.arm_ring * (v342 + c0 * v343 + c13 * v346) - v280 - contact.gap_counts_outer * v213
+        v355 = shaft.arm_ring * (product(A, B, acc, k, later, 66, Y[k, 35], v269) - c0 * v338) - v279
+        v358 = shaft.arm_ring * (v342 + c0 * v343 + c11 * v346) - v280 - contact.gap_counts_outer * v213
         v360 = product(A, B, acc, k, later, 73, v67, v355 - contact.gap_counts_outer * v212)
         v362 = product(A, B, acc, k, later, 74, v70, v73)
         i363 = 1.0 / v63 if k == 0 else i363
@@ -749,20 +737,20 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v260 = v223 + shaft.arm_ring * v258
         v261 = product(A, B, acc, k, later, 43, Y[k, 33], v260)
         i264 = 1.0 / Y[k, 35] if k == 0 else i264
-        v264 = quotient(A, B, acc, k, later, 44, Y[k, 35], c12 * (-v261 - shaft.polar_inertia * v228) + c13 * v230, i264)
+        v264 = quotient(A, B, acc, k, later, 44, Y[k, 35], c10 * (-v261 - shaft.polar_inertia * v228) + c11 * v230, i264)
         v265 = product(A, B, acc, k, later, 45, Y[k, 35], v219 + shaft.arm_ring * v256)
         v268 = v265 + c0 * product(A, B, acc, k, later, 46, v42, v260) + shaft.polar_inertia * v237
-        v269 = c12 * v268 + c14 * v241
+        v269 = c10 * v268 - c0 * v241
         v271 = c0 * product(A, B, acc, k, later, 47, Y[k, 34], v264) + c0 * v244
         if inputs.ideal_drive:
             v275 = v271 + inputs.speed_slope * z
             v276 = shaft.polar_inertia * v275 + shaft.radius * v254
         else:
-            v275 = c21 * (constants.torque_gain * v216 - shaft.radius * v254)
+            v275 = c17 * (constants.torque_gain * v216 - shaft.radius * v254)
             v276 = constants.torque_gain * v216
         if levels.inner_house:
-            v279 = v193 + c19 * v256
-            v280 = v194 + c19 * v258
+            v279 = v193 - c15 * v256
+            v280 = v194 - c15 * v258
         else:
             v279 = v193
             v280 = v194
@@ -796,8 +784,8 @@ def rolling(constants, inputs, memory, aim, pulse, along, per_friction, Y, A, B,
         v333 = -v256 - (v296 - v297)
         v334 = -v258 - v298
         v342 = -product(A, B, acc, k, later, 68, v46, v264) + c0 * product(A, B, acc, k, later, 69, v42, v269)
-        v355 = shaft.arm_ring * (product(A, B, acc, k, later, 66, Y[k, 35], v269) + c14 * v338) - v279
-        v358 = shaft.arm_ring * (v342 + c0 * v343 + c13 * v346) - v280 - contact.gap_counts_outer * v213
+        v355 = shaft.arm_ring * (product(A, B, acc, k, later, 66, Y[k, 35], v269) - c0 * v338) - v279
+        v358 = shaft.arm_ring * (v342 + c0 * v343 + c11 * v346) - v280 - contact.gap_counts_outer * v213
         v360 = product(A, B, acc, k, later, 73, v67, v355 - contact.gap_counts_outer * v212)
         v365 = product(A, B, acc, k, later, 72, v66, v358) - v360 - v363 + shaft.radius * v275
         D[k, 0] = Y[k, 7]
