@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from rig import wire
+from rig.closing import Closing
 from rig.errors import InputError, RefusedError
 from rig.transport import DEFAULT_ENDPOINT, Client
 
@@ -45,7 +46,7 @@ class AcceptedFault(Accepted):
     first_row: Mapping[str, int]
 
 
-class Console:
+class Console(Closing):
     """Sends commands to one rig.
 
     Args:
@@ -90,12 +91,6 @@ class Console:
     def close(self) -> None:
         """Close the client."""
         self._client.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def hammer(self, *, force_n: float = 100.0, duration_ms: float = 5.0, direction: str | float = "x") -> Accepted:
         """Hit the shaft at the disk.

@@ -22,6 +22,7 @@ import numpy as np
 from drivers.link import LinkTimeoutError
 from drivers.samples import Pile, Samples, StreamEndedError, follow
 from drivers.sources import Source, open_source
+from rig.closing import Closing
 from rig.errors import InputError, UnknownNameError, Words
 from rig.wire import Continuity, Gap
 
@@ -122,7 +123,7 @@ class Aligner:
         return followed
 
 
-class Daq:
+class Daq(Closing):
     """Chosen channels as blocks without a gap inside; each tells how many rows are missing right before it.
 
     Args:
@@ -402,9 +403,3 @@ class Daq:
         self._source.close()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout=2.0)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

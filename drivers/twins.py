@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Self
 
 from drivers.accelerometer.twin import AccelerometerTwin
 from drivers.console import Console
@@ -15,12 +14,13 @@ from drivers.link import Port
 from drivers.magnet.twin import MagnetTwin
 from drivers.proximity.twin import ProximityTwin
 from drivers.stream import RigStream
+from rig.closing import Closing
 from rig.transport import Client
 
 TWINS: tuple[type[Twin], ...] = (ProximityTwin, ForceTwin, AccelerometerTwin, HammerTwin, DriveTwin, MagnetTwin)
 
 
-class Twins:
+class Twins(Closing):
     """Serves instruments of one rig; each link has instruments of its own, which know nothing of the others.
 
     Args:
@@ -84,9 +84,3 @@ class Twins:
     def close(self) -> None:
         """Switch all instruments off; may be called again."""
         self._closing.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

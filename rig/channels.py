@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import BaseModel, Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
 
 from rig.errors import InputError, UnknownNameError, Words
 from rig.outside import check, parse_toml
@@ -23,10 +23,8 @@ VERSION = 2
 TABLE = Path(__file__).with_name("channels.toml")
 
 
-class Channel(BaseModel):
+class Channel(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False):
     """One measured channel with its complete calibration; half a scale is refused on load."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: Annotated[str, Field(min_length=1)]
     label: str
@@ -91,10 +89,8 @@ class Channel(BaseModel):
         return -self.bias_v / self.sensitivity_v
 
 
-class Group(BaseModel):
+class Group(BaseModel, frozen=True, extra="forbid"):
     """Channels that share a connector: one key, one block, one rate."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     title: str
@@ -120,10 +116,8 @@ class Group(BaseModel):
         return counts * scale + offset
 
 
-class ChannelTable(BaseModel):
+class ChannelTable(BaseModel, frozen=True, extra="forbid"):
     """All groups, by name."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     groups: dict[str, Group]
     version: Annotated[int, Field(ge=1, le=2)] = 1

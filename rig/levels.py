@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from rig.kernels.constants import Levels
 from rig.kernels.contact import EXACT, NO_FRICTION, SMOOTHED, SWITCH
@@ -12,10 +12,8 @@ from rig.kernels.contact import EXACT, NO_FRICTION, SMOOTHED, SWITCH
 FRICTION_LAWS = {"none": NO_FRICTION, "smoothed": SMOOTHED, "switch": SWITCH, "exact": EXACT}
 
 
-class ModelLevels(BaseModel):
+class ModelLevels(BaseModel, frozen=True, extra="forbid"):
     """How much of the model takes part. What is left out costs nothing."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     magnet: Literal["linear", "map", "cylinders"] = "map"
     """A spring; the radial map of the paper's far-field sum; exact finite cylinders."""

@@ -54,27 +54,22 @@ class StepTimeoutError(TimeoutError):
 class Histogram:
     """Quantiles of any number of non-negative values in bounded memory.
 
-    Logarithmic bins from `low` to `high`; a quantile is the upper edge of its bin, hence up to 1/`bins_a_decade` of a
-    decade too large (4.7 % at 50), never too small, and never above the largest value. Counts are integers: hours do
-    not wear them out.
-
-    Args:
-        low: Everything below counts as `low`.
-        high: Everything above falls into the last bin.
-        bins_a_decade: Resolution.
+    Logarithmic bins from 1e-6 to 1e3, 50 a decade; all below and above counts as in the first and the last. A quantile
+    is the upper edge of its bin, hence up to 4.7 % too large, never too small, and never above the largest value.
+    Counts are integers: hours do not wear them out.
     """
 
-    def __init__(self, *, low: float = 1e-6, high: float = 1e3, bins_a_decade: int = 50) -> None:
-        self._low = low
-        self._a_decade = bins_a_decade
-        self.counts = [0] * (math.ceil(math.log10(high / low) * bins_a_decade) + 1)
+    _LOW, _HIGH, _A_DECADE = 1e-6, 1e3, 50
+
+    def __init__(self) -> None:
+        self.counts = [0] * (math.ceil(math.log10(self._HIGH / self._LOW) * self._A_DECADE) + 1)
         """Values in each bin."""
         self.count = 0
         self.largest = 0.0
 
     def add(self, value: float) -> None:
         """Count one value."""
-        at = 0 if value <= self._low else math.ceil(math.log10(value / self._low) * self._a_decade)
+        at = 0 if value <= self._LOW else math.ceil(math.log10(value / self._LOW) * self._A_DECADE)
         self.counts[min(at, len(self.counts) - 1)] += 1
         self.count += 1
         self.largest = max(self.largest, value)
@@ -86,7 +81,7 @@ class Histogram:
         for at, count in enumerate(self.counts):
             seen += count
             if count and seen >= rank:
-                return min(self._low * 10 ** (at / self._a_decade), self.largest)
+                return min(self._LOW * 10 ** (at / self._A_DECADE), self.largest)
         return self.largest
 
 

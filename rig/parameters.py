@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 from pydantic import (
     AfterValidator,
     BaseModel,
-    ConfigDict,
     StrictFloat,
     StrictInt,
     StrictStr,
@@ -41,10 +40,8 @@ def _number(value: float | str) -> float | str:
     return value if isinstance(value, str) else float(value)
 
 
-class Parameter(BaseModel):
+class Parameter(BaseModel, frozen=True, extra="forbid"):
     """One value with its unit, its place in the paper, its provenance and what the model accepts."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     value: Annotated[StrictFloat | StrictInt | StrictStr, AfterValidator(_number)]
     unit: str

@@ -35,7 +35,6 @@ LONGEST = (
     "tests/unit/test_identification.py",
     "tests/unit/test_validation.py",
     "tests/hostile/test_files.py",
-    "tests/physics/test_reference.py",
     "tests/parity/test_kernels.py",
 )
 """Modules that take more than 8 s, for which nobody is to wait at the end."""

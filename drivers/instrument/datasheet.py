@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from rig.channels import Channel, Group
 from rig.errors import InputError
 
 
-class Datasheet(BaseModel):
+class Datasheet(BaseModel, frozen=True, extra="forbid"):
     """Identification, and for each channel its complete calibration."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     manufacturer: str
     model: str

@@ -20,6 +20,7 @@ from drivers.instrument.protocol import Codec, Message, ProtocolError
 from drivers.link import ROOM, Link, LinkError, LinkTimeoutError, open_link
 from drivers.samples import Pile, Samples, StreamEndedError, follow
 from rig.channels import Group
+from rig.closing import Closing
 from rig.errors import InputError, RefusedError, Words
 from rig.wire import Continuity
 
@@ -53,7 +54,7 @@ class Done:
     time_s: float
 
 
-class Instrument:
+class Instrument(Closing):
     """One instrument at the end of a link.
 
     Args:
@@ -109,12 +110,6 @@ class Instrument:
     def close(self) -> None:
         """Close the link; may be called again."""
         self.link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _act(self, act: protocol.Act) -> Done:
         """Tell the instrument to do something.

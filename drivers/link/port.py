@@ -95,30 +95,17 @@ class Outbox:
             self._thread.join(timeout=2.0)
 
 
-class MessagePort:
-    """A port on a link that is the same from both ends (memory, serial line, CAN).
+class OutboxPort:
+    """What ports have in common that queue their data in an outbox.
 
     Args:
-        link: This end; closed with the port.
+        outbox: Sends it.
         url: What a host opens.
-        room: Bytes of data that wait to be sent.
+        max_bytes: Length of the longest message [bytes].
     """
 
-    def __init__(self, link: Link, url: str, *, room: int = _ROOM_BYTES) -> None:
-        self._link = link
-        self._outbox = Outbox(self._send, f"{url} sends", room=room)
-        self._closed = False
-        self._thread: threading.Thread | None = None
-        self.url = url
-        self.max_bytes = link.max_bytes
-        self.unsent = 0
-        """Messages that the link did not take in time."""
-
-    def serve(self, answer: Callable[[bytes], bytes], on_idle: Callable[[], None]) -> None:
-        """Answer requests from now on."""
-        self._outbox.start(on_idle)
-        self._thread = threading.Thread(target=self._answer, args=(answer,), name=f"{self.url} answers", daemon=True)
-        self._thread.start()
+    def __init__(self, outbox: Outbox, url: str, max_bytes: int) -> None:
+        self._outbox, self.url, self.max_bytes = outbox, url, max_bytes
 
     @property
     def idle(self) -> bool:
@@ -132,6 +119,30 @@ class MessagePort:
     def discard(self) -> None:
         """Forget data that wait to be sent."""
         self._outbox.discard()
+
+
+class MessagePort(OutboxPort):
+    """A port on a link that is the same from both ends (memory, serial line, CAN).
+
+    Args:
+        link: This end; closed with the port.
+        url: What a host opens.
+        room: Bytes of data that wait to be sent.
+    """
+
+    def __init__(self, link: Link, url: str, *, room: int = _ROOM_BYTES) -> None:
+        self._link = link
+        super().__init__(Outbox(self._send, f"{url} sends", room=room), url, link.max_bytes)
+        self._closed = False
+        self._thread: threading.Thread | None = None
+        self.unsent = 0
+        """Messages that the link did not take in time."""
+
+    def serve(self, answer: Callable[[bytes], bytes], on_idle: Callable[[], None]) -> None:
+        """Answer requests from now on."""
+        self._outbox.start(on_idle)
+        self._thread = threading.Thread(target=self._answer, args=(answer,), name=f"{self.url} answers", daemon=True)
+        self._thread.start()
 
     def _answer(self, answer: Callable[[bytes], bytes]) -> None:
         while not self._closed:

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from drivers.link import ROOM, Address, LinkClosedError, LinkTimeoutError
-from drivers.link.port import Outbox
+from drivers.link.port import Outbox, OutboxPort
 from rig.bounded_queue import BoundedQueue, take_first
 from rig.transport import NoReplyError, Server
 
@@ -99,7 +99,7 @@ class ZenohLink:
         self._client.close()
 
 
-class ZenohPort:
+class ZenohPort(OutboxPort):
     """The instrument's end, on a server that many instruments share and that stays open.
 
     Args:
@@ -111,27 +111,12 @@ class ZenohPort:
     def __init__(self, server: Server, address: Address, url: str) -> None:
         self._server = server
         self._address = address
-        self._outbox = Outbox(self._publish, f"{url} {address.name} publishes")
-        self.url = url
-        self.max_bytes = _MAX_BYTES
+        super().__init__(Outbox(self._publish, f"{url} {address.name} publishes"), url, _MAX_BYTES)
 
     def serve(self, answer: Callable[[bytes], bytes], on_idle: Callable[[], None]) -> None:
         """Answer requests from now on."""
         self._outbox.start(on_idle)
         self._server.answer(request_key(self._address.name), answer)
-
-    @property
-    def idle(self) -> bool:
-        """Whether what is pushed now leaves at once."""
-        return self._outbox.idle
-
-    def push(self, message: bytes) -> bool:
-        """Queue data; False where the queue is full."""
-        return self._outbox.push(message)
-
-    def discard(self) -> None:
-        """Forget data that wait to be sent."""
-        self._outbox.discard()
 
     def _publish(self, message: bytes) -> bool:
         self._server.publish(data_key(self._address.name), message)

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from drivers.samples import Samples
 from drivers.stream import RIG_GONE, whole_step
 from rig.channel_file import read_channels
 from rig.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 _PATIENCE_S = 3.0
 """A bus that is silent for so long has no rig any more, whose heart beats once a second."""

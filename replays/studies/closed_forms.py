@@ -143,11 +143,6 @@ RUNGE_KUTTA_4_REAL_LIMIT = 2.7852935634
 VERLET_LIMIT = 2.0
 
 
-def runge_kutta_4_gain(z: float) -> float:
-    """Factor on the energy of an oscillator in one step of h w = z."""
-    return 1.0 - z**6 / 72.0 + z**8 / 576.0
-
-
 def linear_motion(rates: np.ndarray, constant: np.ndarray, z0: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Z' = A z + b by the exponential of the bordered matrix, shape (n, len(z0))."""
     from scipy.linalg import expm

@@ -77,7 +77,10 @@ COMMANDS = {
     },
 }
 """What the help says of each command, which is what its own text begins with; the command itself is the function of its
-name in the module of its name, and is imported when it is called."""
+name in the module of its name, or in that of the requests, and is imported when it is called."""
+
+REQUESTS = ("hammer", "speed", "release", "step", "note", "stop", "pause", "resume", "seek", "rate")
+"""The commands that only ask something of a running rig or replay."""
 
 GROUPS = {
     "can": {
@@ -108,7 +111,7 @@ def rig() -> Group:
 
 def _load(name: str) -> Any:
     if name not in GROUPS:
-        return load_command(name, name)
+        return load_command("requests" if name in REQUESTS else name, name)
     from importlib import import_module
 
     function = getattr(import_module(f"rig.cli.{name}"), name)

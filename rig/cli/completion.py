@@ -23,60 +23,8 @@ from rig.cli.tables import echo, echo_document
 from rig.errors import InputError
 from rig.text import printable
 
-_BASH = r"""
-_rig() {
-    local line end cur=${COMP_WORDS[COMP_CWORD]}
-    [[ $cur != [=:] ]] || cur=
-    COMPREPLY=()
-    while IFS= read -r line; do
-        case $line in
-        $'\t'*)
-            compopt -o filenames -o default
-            [[ $cur == [~\"\'\$]* ]] || while IFS= read -r end; do COMPREPLY+=("$end"); done < <(
-                compgen -d -- "$cur"
-                for end in ${line}; do [[ $end == / ]] || compgen -f -X "!*$end" -- "$cur"; done
-            ) ;;
-        *) COMPREPLY+=("${line%%$'\t'*}") ;;
-        esac
-    done < <("${1/#\~/$HOME}" __complete bash "${COMP_LINE:0:COMP_POINT}" 2>/dev/null)
-    [[ ${COMPREPLY[0]} != *= ]] || compopt -o nospace
-}
-complete -F _rig rig
-"""
-_ZSH = r"""
-#compdef rig
-_rig() {
-    local line
-    local -a values ends
-    for line in "${(@f)$(${~words[1]} __complete zsh "${(j: :)words[1,CURRENT]}" 2>/dev/null)}"; do
-        case $line in
-        $'\t/') _files -/ ;;
-        $'\t'*) ends=(${=line}); _files ${ends:+-g} ${ends:+"${(j: :)${(@)ends/#/*}}"} ;;
-        ?*) values+=("${${line%%$'\t'*}//:/\\:}:${line#*$'\t'}") ;;
-        esac
-    done
-    (( $#values )) || return
-    if [[ $values[1] == *=:* ]]; then _describe '' values -S ''; else _describe '' values; fi
-}
-(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }
-compdef _rig rig
-"""
-_FISH = r"""
-function __rig_complete
-    set -l program (string replace -r '^~' $HOME -- (commandline -opc)[1])
-    for line in ($program __complete fish (commandline -cp | string collect) 2>/dev/null)
-        if test $line = \t/
-            __fish_complete_directories (commandline -ct)
-        else if string match -q \t'*' -- $line
-            __fish_complete_suffix (string split -n ' ' -- (string trim -- $line))
-        else
-            echo $line
-        end
-    end
-end
-complete -c rig -f -a '(__rig_complete)'
-"""
-_SCRIPTS = {"bash": _BASH, "zsh": _ZSH, "fish": _FISH}
+_SHELLS = ("bash", "zsh", "fish")
+"""Each has a script beside this module."""
 _RIG = Path(__file__).parents[1]
 _ENDING = re.compile(r"(?<![\w.])\.[a-z][a-z0-9]+\b")
 SCENE_KEYS = (
@@ -106,9 +54,9 @@ def completion(
     Without --install it prints the script, for `source <(rig completion bash)` or a place of your own.
     """
     shell = shell or Path(os.environ.get("SHELL", "")).name
-    if shell not in _SCRIPTS:
+    if shell not in _SHELLS:
         raise InputError("shell", "bash, zsh or fish", shell)
-    script = _SCRIPTS[shell].lstrip()
+    script = Path(__file__).with_suffix(f".{shell}").read_text(encoding="utf-8")
     if not install:
         echo_document(script)
         return

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 
+from rig.closing import Closing
 from rig.transport import NoReplyError
 
 
@@ -27,7 +28,7 @@ Subscription = tuple[str, Callable[[str, bytes], None], "MemoryClient"]
 """Expression of the keys, what takes key and payload, and whose it is."""
 
 
-class MemoryServer:
+class MemoryServer(Closing):
     """The rig's side; clients are made from it: `MemoryClient(server)`.
 
     Args:
@@ -137,14 +138,8 @@ class MemoryServer:
         for _, callback in watchers:
             callback(False)
 
-    def __enter__(self) -> MemoryServer:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class MemoryClient:
+class MemoryClient(Closing):
     """A client's side of a `MemoryServer` in the same process."""
 
     foreign = 0
@@ -188,9 +183,3 @@ class MemoryClient:
     def close(self) -> None:
         """Forget this client's subscriptions and watches."""
         self._server.forget(self)
-
-    def __enter__(self) -> MemoryClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -16,6 +16,7 @@ from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rig import wire
+from rig.closing import Closing
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 from rig.transport.access import Verb, allows, rules
@@ -64,7 +65,7 @@ class Exposure(NamedTuple):
     holder: Holder | None
 
 
-class ZenohServer:
+class ZenohServer(Closing):
     """The rig's side: listens on the loopback, and elsewhere where it is told to.
 
     Whoever connects may do what `rig.transport.access` says.
@@ -226,19 +227,13 @@ class ZenohServer:
             hang_up(port, {other for other, size in backlog_of(port).items() if size > _STALLED_BYTES})
         self._session.close()
 
-    def __enter__(self) -> ZenohServer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def _reply(query: Any, key: str, payload: bytes) -> None:
     with query:
         query.reply(key, payload, encoding="application/json")
 
 
-class ZenohClient:
+class ZenohClient(Closing):
     """A client's side: connects to one rig and listens on nothing. Reconnects by itself when that rig is started again.
 
     Subscriptions have a link of their own. It backs up when a callback is slow, and then nothing on it is read, which
@@ -483,12 +478,6 @@ class ZenohClient:
         if self._streams is not None:
             self._streams.close()
         self._session.close()
-
-    def __enter__(self) -> ZenohClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def client_at(address: str, *, wait_s: float) -> ZenohClient:

@@ -84,6 +84,7 @@ def test_drop_reaches_the_ring_as_a_body_falls(parameters):
     assert time_s == pytest.approx(math.sqrt(4 * R0 / acceleration), rel=1e-4)
     assert speed == pytest.approx(math.sqrt(4 * R0 * acceleration), rel=1e-4)
     assert fall(drop(parameters).simulation.model.constants) == pytest.approx((time_s, speed), rel=1e-4)
+    assert (time_s, speed) == (pytest.approx(25.6e-3, abs=0.05e-3), pytest.approx(0.145, abs=0.001))
 
 
 @pytest.mark.parametrize("parameters", ["as-printed", "corrected"])

@@ -41,15 +41,15 @@ class Store:
     A point counts as measured only for the code that it was measured with.
     """
 
-    def __init__(self, folder: Path, stem: str = "chart", *, fresh: bool = False) -> None:
+    def __init__(self, folder: Path, *, fresh: bool = False) -> None:
         """Open a folder, which is made where it is missing.
 
         Raises:
             InputError: It cannot be written, or is a file.
         """
-        self.folder, self.stem = folder, stem
+        self.folder = folder
         self.stamp = stamp()
-        self._journal = Journal(folder, f"{stem}.journal.jsonl", self.stamp["code"], fresh=fresh)
+        self._journal = Journal(folder, "chart.journal.jsonl", self.stamp["code"], fresh=fresh)
         self.outdated = self._journal.outdated
         self._rows = {tuple(row[name] for name in KEY): row for row in self._journal.rows}
 
@@ -86,7 +86,7 @@ class Store:
             },
             schema=schema,
         )
-        paths = [self.folder / f"{self.stem}.parquet", self.folder / f"{self.stem}.csv"]
+        paths = [self.folder / "chart.parquet", self.folder / "chart.csv"]
         pyarrow.parquet.write_table(table, paths[0])
         pyarrow.csv.write_csv(table, paths[1], pyarrow.csv.WriteOptions(quoting_style="needed"))
         return paths
@@ -97,13 +97,13 @@ def _digits(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def read_table(folder: Path, stem: str = "chart") -> list[Row]:
+def read_table(folder: Path) -> list[Row]:
     """The points of a table that a making of a chart has left in a folder.
 
     Raises:
         InputError: There is none, or it is no such table.
     """
-    path = folder / f"{stem}.csv"
+    path = folder / "chart.csv"
     try:
         with path.open(encoding="utf-8", newline="") as file:
             return [

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -204,11 +205,11 @@ def keeps_whirling(constants: Constants, y0: np.ndarray, spin: float) -> bool:
     return whirl_hz(0.9) < (1.0 - _SLOWER) * whirl_hz(0.4)  # both are negative
 
 
-def bisect(holds: Callable[[float], bool], low: float, high: float, *, steps: int = 10) -> float:
+def bisect(holds: Callable[[float], bool], low: float, high: float) -> float:
     """Where a test turns from false (at `low`) to true (at `high`), between logarithms; nan where it does not."""
     if holds(low) or not holds(high):
         return math.nan
-    for _ in range(steps):
+    for _ in range(10):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if holds(middle) else (middle, high)
     return math.sqrt(low * high)
@@ -232,22 +233,18 @@ class Threshold(NamedTuple):
         return self.bare / self.closed - 1.0
 
 
-def start_thresholds(frictions: tuple[float, ...] = FRICTIONS, *, steps: int = 10) -> list[Threshold]:
+def start_thresholds(frictions: tuple[float, ...] = FRICTIONS) -> list[Threshold]:
     """Slowest sliding whirl that gains speed [Hz], over friction; `full` is nan, the rig's magnets are no spring."""
     found = []
     for mu in frictions:
         constants = bare_rig(mu)
         closed = critical_whirl(oscillator(constants), mu)
-
-        def holds(whirl: float, constants: Constants = constants) -> bool:
-            return gains_speed(constants, whirl)
-
-        bare = bisect(holds, 0.6 * closed, 2.0 * closed, steps=steps)
+        bare = bisect(partial(gains_speed, constants), 0.6 * closed, 2.0 * closed)
         found.append(Threshold(mu, math.nan, closed / (2 * math.pi), bare / (2 * math.pi), math.nan, math.nan, _NONE))
     return found
 
 
-def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ, *, steps: int = 10) -> list[Threshold]:
+def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ) -> list[Threshold]:
     """Least friction that keeps up whirl, over spin: a rolling whirl, and the friction lowered under it."""
     found = []
     for spin_hz in spins_hz:
@@ -256,10 +253,7 @@ def sustain_thresholds(spins_hz: tuple[float, ...] = SPINS_HZ, *, steps: int = 1
         whirl, _ = rolling_whirl(bare, spin)
         closed = least_friction(oscillator(bare), -whirl)
         full = base_model(ModelLevels()).constants
-        values = []
-        for constants in (bare, full):
-            values.append(bisect(_holder(constants, spin), 0.3 * closed, 6.0 * closed, steps=steps))
-        bare_mu, full_mu = values
+        bare_mu, full_mu = (bisect(_holder(each, spin), 0.3 * closed, 6.0 * closed) for each in (bare, full))
         with_houses, used = friction_with_houses(full, spin), friction_used(full, spin)
         found.append(Threshold(math.nan, spin_hz, closed, bare_mu, full_mu, with_houses, used))
     return found

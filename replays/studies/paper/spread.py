@@ -9,7 +9,7 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from replays.studies.paper.pulse import PULSE_AT, Outcome, Pulse
 from rig.parameters import DEFAULT_SET, load_parameters
@@ -17,10 +17,8 @@ from rig.parameters import DEFAULT_SET, load_parameters
 SEED = 2013
 
 
-class Assumed(BaseModel):
+class Assumed(BaseModel, frozen=True, extra="forbid"):
     """One assumed value and the range that it may be in, assumed as well."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     key: str
     called: str

@@ -9,7 +9,7 @@ from importlib.resources import files
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from replays.studies.paper.spread import percentiles
 from rig.parameters import ParameterSet
@@ -23,10 +23,8 @@ _TEXT = 5e-3
 """How far a printed value may be off as it is rounded."""
 
 
-class Statement(BaseModel):
+class Statement(BaseModel, frozen=True, extra="forbid"):
     """One thing that the paper states."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     quantity: str
     place: str
@@ -52,10 +50,8 @@ class Statement(BaseModel):
         return "differs" if share <= 1.0 - SURE else "cannot be judged"
 
 
-class Printed(BaseModel):
+class Printed(BaseModel, frozen=True, extra="forbid"):
     """One printed value of a parameter, in SI."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     key: str
     symbol: str

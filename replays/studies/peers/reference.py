@@ -33,19 +33,13 @@ class Reference:
     error: float
     independent: bool
 
-    def error_until(self, time_s: float) -> float:
-        """The error bar of the part up to a time from the window's start [s]."""
-        part = self.solution.times <= time_s
-        return scaled_error(self.solution.states[part], self.second.states[part])
 
-
-def find_reference(problem: Problem, *, quick: bool = False, budget_s: float = 300.0) -> Reference | None:
+def find_reference(problem: Problem, *, quick: bool = False) -> Reference | None:
     """Solve a problem twice for reference.
 
     Args:
         problem: The problem.
         quick: The second by CVODE Adams, ten times quicker than DOP853 and ten times less sharp.
-        budget_s: Wall time allowed to each [s].
 
     Returns:
         The reference, or None where no two codes got through.
@@ -54,7 +48,7 @@ def find_reference(problem: Problem, *, quick: bool = False, budget_s: float = 3
     found: list[tuple[str, Solution]] = []
     for name, tolerance in (first, *(reversed(others) if quick else others)):
         if len(found) < 2 and PEERS[name].installed:
-            solution = PEERS[name].solve(problem, Setting(f"{tolerance:g}", tolerance), budget_s=budget_s)
+            solution = PEERS[name].solve(problem, Setting(f"{tolerance:g}", tolerance), budget_s=300.0)
             if solution.failure is None:
                 found.append((name, solution))
     if len(found) < 2:

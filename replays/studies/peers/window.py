@@ -19,6 +19,7 @@ from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, TOUCHING
 from rig.kernels.signals import N_STATE
 from rig.levels import FRICTION_LAWS
 from rig.model import Model, build_model
+from rig.motion import initial_state
 from rig.scenes import Scene
 
 TICK_S = 1e-6
@@ -80,7 +81,7 @@ def cut_window(
         )
 
     # Every piece of constant inputs up to the window is solved in turn.
-    state = _first_state(scene, model, _inputs(scene, model, 0)[0].speed)
+    state = initial_state(model, scene.initial, None, spin=_inputs(scene, model, 0)[0].speed)[:N_STATE]
     phase, onset_speed, now = FLIGHT, constants.contact.speed_floor, 0
     phase = _phase(piece(0, end_tick, sample_s))
     while now < start_tick:
@@ -113,21 +114,6 @@ def _phase(problem: Problem) -> int:
     if not problem.exact_friction:
         return TOUCHING
     return FORWARD if sliding > 0.0 else BACKWARD
-
-
-def _first_state(scene: Scene, model: Model, spin: float) -> np.ndarray:
-    """The scene's state at time zero, shape (14,)."""
-    initial, clearance = scene.initial, model.constants.contact.clearance
-    # Slightly inside the clearance, so that rounding does not make it a contact.
-    inside = clearance * (1.0 - 1e-12)
-    places: dict[str, tuple[float | None, float | None]] = {
-        "equilibrium": (None, None),
-        "top": (0.0, inside),
-        "bottom": (0.0, -inside),
-        "given": (initial.x_mm * 1e-3, initial.y_mm * 1e-3),
-    }
-    x, y = places[initial.position]
-    return model.state(ring_x=x, ring_y=y, spin=spin)[:N_STATE]
 
 
 def _inputs(scene: Scene, model: Model, tick: int) -> tuple[Inputs, int]:

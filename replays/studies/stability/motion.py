@@ -20,14 +20,10 @@ TICK_S = 1e-6
 """Length of a tick [s], unless a trial says otherwise."""
 
 
+@cache
 def base_model(levels: ModelLevels) -> Model:
     """The default parameters on a level of the model; a fit of the magnets' map is made once."""
-    return _base_model(levels.model_dump_json())
-
-
-@cache
-def _base_model(levels: str) -> Model:
-    return build_model(load_parameters(), ModelLevels.model_validate_json(levels))
+    return build_model(load_parameters(), levels)
 
 
 def quiet_inputs(

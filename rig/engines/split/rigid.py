@@ -35,35 +35,13 @@ class Axis(NamedTuple):
     py: float  # [1/s]
 
 
-class Houses(NamedTuple):
-    """Displacements and speeds of both houses, horizontal and vertical."""
-
-    x0: float  # inner [m]
-    x1: float  # its rate [m/s]
-    x2: float  # outer [m]
-    x3: float  # its rate [m/s]
-    y0: float  # inner [m]
-    y1: float  # its rate [m/s]
-    y2: float  # outer [m]
-    y3: float  # its rate [m/s]
-
-
-class Geometry(NamedTuple):
-    """What else is known of the axis, by its direction and rate."""
-
-    uz: float  # [1]
-    share: float  # Gamma' sin b, by which the spin w about the axis exceeds theta' [rad/s]
-
-
 class Motion(NamedTuple):
     """Of the shaft against the ring, where it is nearest to it."""
 
     nx: float  # direction from the ring's centre to the shaft's
     ny: float
-    per_distance: float  # 1 / distance of the centres [1/m]
-    depth: float  # penetration [m]; negative is the gap
-    rate: float  # of it [m/s]
-    lateral: float  # speed of the shaft's centre across [m/s]
+    rate: float  # of the penetration [m/s]
+    sliding: float  # speed of the shaft's surface across [m/s]
 
 
 class Plant(NamedTuple):
@@ -101,60 +79,38 @@ def plant_of(constants, inputs):
 
 
 @kernel
-def from_coordinates(constants, y):
-    """Generalised coordinates y as axis, spin about it [rad/s], spin angle [rad], houses."""
+def axis_at(constants, y):
+    """The axis at the state y, and the spin about it [rad/s]."""
     euler = constants.levels.euler
     ux, uy, px, py = axis_of(euler, y[S.GAMMA], y[S.BETA], y[S.GAMMA_RATE], y[S.BETA_RATE])
-    axis = Axis(ux, uy, px, py)
     w = y[S.THETA_RATE] + y[S.GAMMA_RATE] * ux if euler else y[S.THETA_RATE]
-    houses = Houses(y[S.X_IH], y[S.VX_IH], y[S.X_OH], y[S.VX_OH], y[S.Y_IH], y[S.VY_IH], y[S.Y_OH], y[S.VY_OH])
-    return axis, w, y[S.THETA], houses
+    return Axis(ux, uy, px, py), w
 
 
 @kernel
-def into_coordinates(constants, axis, w, theta, houses, y):
-    """The same the other way, into y."""
-    euler = constants.levels.euler
-    y[S.THETA] = theta
-    angles = angles_of(euler, axis.ux, axis.uy, axis.px, axis.py)
-    y[S.GAMMA], y[S.BETA], y[S.GAMMA_RATE], y[S.BETA_RATE] = angles
-    y[S.THETA_RATE] = w - axis.ux * y[S.GAMMA_RATE] if euler else w
-    y[S.X_IH], y[S.VX_IH], y[S.X_OH], y[S.VX_OH] = houses.x0, houses.x1, houses.x2, houses.x3
-    y[S.Y_IH], y[S.VY_IH], y[S.Y_OH], y[S.VY_OH] = houses.y0, houses.y1, houses.y2, houses.y3
-
-
-@kernel
-def geometry_of(euler, axis):
-    """What else is known of the axis."""
+def upright(euler, axis):
+    """What else is known of the axis: uz [1], and Gamma' sin b, by which the spin about it exceeds theta' [rad/s]."""
     if not euler:
-        return Geometry(1.0, 0.0)
+        return 1.0, 0.0
     ux, uy, px, py = axis
     uz = math.sqrt(1.0 - (ux * ux + uy * uy))
     pz = -(ux * px + uy * py) / uz
-    return Geometry(uz, ux / (1.0 - ux * ux) * (uy * pz - uz * py))
+    return uz, ux / (1.0 - ux * ux) * (uy * pz - uz * py)
 
 
 @kernel
-def eccentricity(constants, axis, houses):
-    """Centre of the shaft in the ring, from the ring's: horizontal, vertical [m]."""
+def motion_of(constants, axis, w, y):
+    """Motion of the shaft against the ring, with the axis and the spin w about it at the state y."""
     contact, lA = constants.contact, constants.shaft.arm_ring
     both = contact.gap_counts_outer
-    ex = lA * axis.ux - houses.x0 - both * houses.x2 - contact.offset_x
-    ey = lA * axis.uy - houses.y0 - both * houses.y2 - contact.offset_y
-    return ex, ey
-
-
-@kernel
-def motion_of(constants, px, py, houses, ex, ey):
-    """Motion of the shaft against the ring, with rate (px, py) of the axis and eccentricity (ex, ey)."""
-    contact, lA = constants.contact, constants.shaft.arm_ring
-    both = contact.gap_counts_outer
+    ex = lA * axis.ux - y[S.X_IH] - both * y[S.X_OH] - contact.offset_x
+    ey = lA * axis.uy - y[S.Y_IH] - both * y[S.Y_OH] - contact.offset_y
     distance = math.sqrt(ex * ex + ey * ey)
     per_distance = 1.0 / distance if distance > 0.0 else 0.0
     nx, ny = ex * per_distance, ey * per_distance
-    vx = lA * px - houses.x1 - both * houses.x3
-    vy = lA * py - houses.y1 - both * houses.y3
-    return Motion(nx, ny, per_distance, distance - contact.clearance, vx * nx + vy * ny, vy * nx - vx * ny)
+    vx = lA * axis.px - y[S.VX_IH] - both * y[S.VX_OH]
+    vy = lA * axis.py - y[S.VY_IH] - both * y[S.VY_OH]
+    return Motion(nx, ny, vx * nx + vy * ny, vy * nx - vx * ny + constants.shaft.radius * w)
 
 
 @kernel
@@ -169,48 +125,32 @@ def mobility_of(plant, euler, axis, nx, ny):
 
 
 @kernel
-def _seen(constants, plant, y):
-    """Motion at the ring, mobility there and sliding speed [m/s] at the state y."""
-    axis, w, _, houses = from_coordinates(constants, y)
-    ex, ey = eccentricity(constants, axis, houses)
-    motion = motion_of(constants, axis.px, axis.py, houses, ex, ey)
-    m = mobility_of(plant, constants.levels.euler, axis, motion.nx, motion.ny)
-    return motion, m, motion.lateral + constants.shaft.radius * w
-
-
-@kernel
-def _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt):
+def _strike(constants, inputs, plant, y, axis, w, motion, m, jn, jt):
     """Impulses jn, normal, and jt, across [N s], on the state y and in its integrals."""
-    shaft, euler, per_inner = constants.shaft, constants.levels.euler, plant.per_inner
-    axis, w, theta, houses = from_coordinates(constants, y)
-    geometry = geometry_of(euler, axis)
+    shaft, euler = constants.shaft, constants.levels.euler
+    uz, share = upright(euler, axis)
     jx, jy = -jn * motion.nx + jt * motion.ny, -jn * motion.ny - jt * motion.nx
     lost = axis.ux * jx + axis.uy * jy if euler else 0.0
-    axis = Axis(
-        axis.ux,
-        axis.uy,
-        axis.px + plant.arm * (jx - lost * axis.ux),
-        axis.py + plant.arm * (jy - lost * axis.uy),
-    )
+    px, py = axis.px + plant.arm * (jx - lost * axis.ux), axis.py + plant.arm * (jy - lost * axis.uy)
     spin = w
     if inputs.ideal_drive:
-        w += geometry_of(euler, axis).share - geometry.share
+        w += upright(euler, Axis(axis.ux, axis.uy, px, py))[1] - share
     else:
         w -= shaft.radius * jt * plant.per_Izz
-    houses = Houses(
-        houses.x0, houses.x1 - per_inner * jx, houses.x2, houses.x3,
-        houses.y0, houses.y1 - per_inner * jy, houses.y2, houses.y3,
-    )  # fmt: skip
-    into_coordinates(constants, axis, w, theta, houses, y)
+    angles = angles_of(euler, axis.ux, axis.uy, px, py)
+    y[S.GAMMA], y[S.BETA], y[S.GAMMA_RATE], y[S.BETA_RATE] = angles
+    y[S.THETA_RATE] = w - axis.ux * y[S.GAMMA_RATE] if euler else w
+    y[S.VX_IH] -= plant.per_inner * jx
+    y[S.VY_IH] -= plant.per_inner * jy
     torque = shaft.polar_inertia * (w - spin)
     y[S.DRIVE_WORK] += (torque + shaft.radius * jt) * 0.5 * (w + spin)
     y[S.CONTACT_LOSS] += jn * (motion.rate - 0.5 * (m.nn * jn + m.nt * jt))
-    y[S.FRICTION_LOSS] += jt * (sliding - 0.5 * (m.nt * jn + m.tt * jt))
-    y[S.GAP_WORK] += constants.contact.gap_counts_outer * (jx * houses.x3 + jy * houses.y3)
+    y[S.FRICTION_LOSS] += jt * (motion.sliding - 0.5 * (m.nt * jn + m.tt * jt))
+    y[S.GAP_WORK] += constants.contact.gap_counts_outer * (jx * y[S.VX_OH] + jy * y[S.VY_OH])
     y[S.CONTACT_IMPULSE] += jn
-    y[S.ANGULAR_IMPULSE_X] += torque * axis.ux - geometry.uz * shaft.arm_ring * jy
-    y[S.ANGULAR_IMPULSE_Y] += torque * axis.uy + geometry.uz * shaft.arm_ring * jx
-    y[S.ANGULAR_IMPULSE_Z] += torque * geometry.uz + shaft.arm_ring * (axis.ux * jy - axis.uy * jx)
+    y[S.ANGULAR_IMPULSE_X] += torque * axis.ux - uz * shaft.arm_ring * jy
+    y[S.ANGULAR_IMPULSE_Y] += torque * axis.uy + uz * shaft.arm_ring * jx
+    y[S.ANGULAR_IMPULSE_Z] += torque * uz + shaft.arm_ring * (axis.ux * jy - axis.uy * jx)
     if constants.levels.inner_house:
         y[S.HOUSE_IMPULSE_X] -= jx
         y[S.HOUSE_IMPULSE_Y] -= jy
@@ -237,7 +177,9 @@ def bounce(constants, inputs, plant, memory, room, y):
         compliant law takes it.
     """
     contact, mu = constants.contact, plant.friction
-    motion, m, sliding = _seen(constants, plant, y)
+    axis, w = axis_at(constants, y)
+    motion = motion_of(constants, axis, w, y)
+    m = mobility_of(plant, constants.levels.euler, axis, motion.nx, motion.ny)
     if motion.rate <= contact.speed_floor and _pressed(constants, inputs, memory, room, y) > _PRESSED:
         return False
     latch_onset(memory, motion.rate, contact)
@@ -245,11 +187,11 @@ def bounce(constants, inputs, plant, memory, room, y):
     change = (1.0 + contact.restitution) * max(motion.rate, 0.0) + _APART
     # Both conditions at once where it sticks; else the limit holds, and the normal condition with it.
     determinant = m.nn * m.tt - m.nt * m.nt
-    jn = (change * m.tt - sliding * m.nt) / determinant
-    jt = (sliding * m.nn - change * m.nt) / determinant
+    jn = (change * m.tt - motion.sliding * m.nt) / determinant
+    jt = (motion.sliding * m.nn - change * m.nt) / determinant
     if abs(jt) > mu * jn:
-        way = mu if sliding > 0.0 else -mu
+        way = mu if motion.sliding > 0.0 else -mu
         jn = change / (m.nn + way * m.nt)
         jt = way * jn
-    _strike(constants, inputs, plant, y, motion, m, sliding, jn, jt)
+    _strike(constants, inputs, plant, y, axis, w, motion, m, jn, jt)
     return True

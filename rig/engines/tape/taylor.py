@@ -12,6 +12,7 @@ everything is worked out with that coefficient left at 0, then once more with th
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -40,23 +41,12 @@ from __future__ import annotations
 import math
 
 from rig.engines.memory import ONSET, PHASE
+from rig.engines.taylor.lanes import complex_power, is_wide, product, quotient, sum_below
 from rig.engines.taylor.place import EAST, NORTH, ORDER, SLACK
 from rig.kernels.contact import BACKWARD, EXACT, FLIGHT, FORWARD, NO_FRICTION, ROLLING, SMOOTHED, TOUCHING  # noqa: F401
 from rig.kernels.geometry import sines_of
 from rig.kernels.magnet import LINEAR, RADIAL, RIPPLED  # noqa: F401
-from rig.kernels.stage import kernel, stage
-
-
-@stage
-def product(below, left_0, right_0, later, left, right):
-    """The k-th coefficient of a product; `later` is 0 for k = 0, else 1. No array goes in: that counts references."""
-    return below + left_0 * right + left * (later * right_0)
-
-
-@stage
-def quotient(below, first, divisor, dividend, inverse):
-    """The k-th coefficient of a quotient that begins with `first` (for k = 0: 0), by the inverse of the divisor's."""
-    return (dividend - below - divisor * first) * inverse
+from rig.kernels.stage import kernel
 '''
 
 
@@ -73,6 +63,10 @@ class _Code:
         self._first: set[int] = set()
         """Numbers of nodes that what it keeps at 0 is made of."""
         self._lane_of: dict[int, int] = {}
+        self._inside: set[int] = set()
+        """Numbers of sums that stand in the one expression that they are for."""
+        self._named: dict[int, str] = {}
+        """Names of nodes that have another's: what a branch gives it."""
         self.widest = self.rarest = 0
 
     def function(self) -> str:
@@ -88,6 +82,7 @@ class _Code:
         self._number_lanes(tape.items, 0, rare=False)
         self.rarest = _whole(self.widest)
         self._number_lanes(tape.items, self.rarest, rare=True)
+        self._place(tape.items, [*outputs.values(), residual])
         body = list(self._lines(tape.items, first=residual is not None))
         if residual is not None:
             body += [f"friction = {self._value(residual)} * per_friction", *self._lines(tape.items, again=True)]
@@ -113,21 +108,15 @@ class _Code:
             value = f"math.sin({begin}), math.cos({begin})" if angle == S.THETA else f"sines_of(levels, {begin})"
             lines.append(f"    Y[0, {TURNS[angle]}], Y[0, {TURNS[angle] + 1}] = {value}")
         lines += [
-            f"    wide = {_WIDE}",
+            "    wide = is_wide(constants, inputs)",
             f"    for p in range({wide}):",
             "        A[0, p] = B[0, p] = 0.0",
             "    z, later = 1.0, 0.0",
             "    for k in range(ORDER):",
-            f"        for p in range({wide}):",
-            "            acc[p] = 0.0",
             "        if wide:",
-            "            for j in range(1, k):",
-            f"                for p in range({wide}):",
-            "                    acc[p] += A[j, p] * B[k - j, p]",
+            f"            sum_below(A, B, acc, k, {wide})",
             "        else:",
-            "            for j in range(1, k):",
-            f"                for p in range({lanes}):",
-            "                    acc[p] += A[j, p] * B[k - j, p]",
+            f"            sum_below(A, B, acc, k, {lanes})",
             *(f"        {line}" for line in body),
             "        portion = 1.0 / (k + 1.0)",
         ]
@@ -197,93 +186,156 @@ class _Code:
             self.widest = max(self.widest, lane)
         return lane
 
+    def _place(self, items: list[Node | Fork], outputs: Iterable[Any]) -> None:
+        """What is used once, and in its own branch, needs no name of its own; nor what a branch gives a name."""
+        uses = Counter(source.number for item in _all(items) if item.number in self._needed for source in item.sources)
+        uses.update(value.node.number for value in outputs if isinstance(value, Symbol))
+
+        def alike(source: Node, user: Node) -> bool:
+            return (source.number in self._unknown) == (user.number in self._unknown)
+
+        def once(source: Node, branch: list[Node | Fork], user: Node) -> bool:
+            here = any(source is each for each in _own(branch))
+            single = uses[source.number] == 1 and user.number in self._needed
+            return here and single and source.kind in _WRITTEN and alike(source, user)
+
+        def place_in(branch: list[Node | Fork]) -> None:
+            for item in branch:
+                if isinstance(item, Node):
+                    for one in (item.arguments[place] for place in _INLINE.get(item.kind, ())):
+                        if not once(one, branch, item):
+                            continue
+                        self._inside.add(one.number)
+                        called = item.kind in _CALLS and _CALLS[0] in self._expression(one)
+                        if called or (item.kind in _WRITTEN and len(self._expression(item)) > _LONG):
+                            self._inside.remove(one.number)
+                    continue
+                for side, answer in enumerate((item.yes, item.no)):
+                    own = {node.number for node in _own(answer)}
+                    for joined in item.joined:
+                        value = joined.arguments[side]
+                        if not isinstance(value, Symbol) or joined.number not in self._needed:
+                            continue
+                        number = value.node.number
+                        scaled = value.coefficient != Known()
+                        inside = scaled and once(value.node, answer, joined)
+                        # A product fills its lane, whichever way the fork goes.
+                        before = once(value.node, branch, joined) and _CALLS[0] not in self._expression(value.node)
+                        if inside or before:
+                            self._inside.add(number)
+                        elif not scaled and number in own and alike(value.node, joined):
+                            self._named.setdefault(number, self._name(joined))
+                    place_in(answer)
+
+        place_in(items)
+
     # Code.
+
+    def _name(self, node: Node) -> str:
+        if node.kind == "column":
+            return f"Y[k, {node.arguments[0]}]"
+        return self._named.get(node.number, f"v{node.number}")
 
     def _constant(self, value: Known) -> str:
         if not value.over and not value.under:
             return repr(value.number)
+        if value.number < 0.0:
+            return f"-{self._constant(-value)}"
+        if (value.number, len(value.over), value.under) == (1.0, 1, ()) and "(" not in value.text:
+            return value.text
         return self._constants.setdefault(value.text, f"c{len(self._constants)}")
 
-    def _term(self, coefficient: Known, factor: str) -> str:
+    def _term(self, coefficient: Known, factor: Node | str, *, first: bool = False) -> str:
+        """A coefficient times a node; `first`: nothing stands before it, so that a sum needs no brackets."""
+        if isinstance(factor, Node):
+            bare = first and coefficient == Known()
+            factor = self._name(factor) if factor.number not in self._inside else self._expression(factor, bare=bare)
         if coefficient == Known():
             return factor
         return f"-{factor}" if coefficient == Known(-1.0) else f"{self._constant(coefficient)} * {factor}"
 
     def _value(self, value: Any) -> str:
         if isinstance(value, Symbol):
-            return self._term(value.coefficient, _name(value.node))
+            return self._term(value.coefficient, value.node, first=True)
         return "0.0" if value == 0.0 else self._term(known(value), "z")
+
+    def _expression(self, node: Node, *, bare: bool = True) -> str:
+        if node.kind == "product":
+            left, right = (self._term(Known(), each, first=True) for each in node.arguments)
+            return f"product(A, B, acc, k, later, {self._lane_of[node.number]}, {left}, {right})"
+        coefficient, part, other, *rest = node.arguments
+        before = self._term(coefficient, part, first=True)
+        text = f"{before} + {self._term(other, rest[0] if rest else 'z')}".replace("+ -", "- ")
+        return text if bare else f"({text})"
 
     def _lines(self, items: list[Node | Fork], *, first: bool = False, again: bool = False) -> Iterator[str]:
         for item in items:
             if not self._wanted(item, again):
                 continue
             if isinstance(item, Node):
-                yield from self._node(item, first)
+                if item.number not in self._inside and item.kind != "column":
+                    yield from self._node(item, first)
                 continue
-            for word, branch, side in ((f"if {item.condition}:", item.yes, 0), ("else:", item.no, 1)):
-                lines = [*self._lines(branch, first=first, again=again)]
-                lines += [
-                    f"{_name(each)} = {self._value(each.arguments[side])}"
-                    for each in item.joined
-                    if self._wanted(each, again)
-                ]
-                yield word
-                yield from (f"    {line}" for line in lines or ["pass"])
+            joined = [each for each in item.joined if self._wanted(each, again)]
+            yes, no = ([*self._lines(branch, first=first, again=again)] for branch in (item.yes, item.no))
+            if len(joined) == 1 and not yes and not no:
+                one, two = map(self._value, joined[0].arguments)
+                line = f"{self._name(joined[0])} = {one} if {item.condition} else {two}"
+                if len(line) <= _LONG:
+                    yield line
+                    continue
+            for side, lines in enumerate((yes, no)):
+                given = ((self._name(each), self._value(each.arguments[side])) for each in joined)
+                lines += [f"{name} = {value}" for name, value in given if name != value]
+            yield f"if {item.condition}:"
+            yield from (f"    {line}" for line in yes or ["pass"])
+            if no and no[0].startswith("if ") and all(line.startswith((" ", "el")) for line in no[1:]):
+                yield f"el{no[0]}"
+                yield from no[1:]
+            elif no:
+                yield "else:"
+                yield from (f"    {line}" for line in no)
 
     def _node(self, node: Node, first: bool) -> Iterator[str]:
-        name, arguments, p = _name(node), node.arguments, self._lane_of.get(node.number, -1)
-
-        def at(lane: int) -> str:
-            return f"acc[{lane}], A[0, {lane}], B[0, {lane}], later"
-
+        name, arguments, p = self._name(node), node.arguments, self._lane_of.get(node.number, -1)
         match node.kind:
-            case "column":
-                yield f"{name} = Y[k, {arguments[0]}]"
             case "rate":
-                yield f"D[k, {arguments[0]}] = {self._term(arguments[1], _name(arguments[2]))}"
+                yield f"D[k, {arguments[0]}] = {self._term(arguments[1], arguments[2], first=True)}"
             case "unknown":
                 yield f"{name} = {'0.0' if first else 'friction'}"
-            case "sum":
-                one, two = self._term(arguments[0], _name(arguments[1])), self._term(arguments[2], _name(arguments[3]))
-                yield f"{name} = {one} + {two}".replace("+ -", "- ")
-            case "shifted":
-                yield f"{name} = {self._term(arguments[0], _name(arguments[1]))} + {self._term(arguments[2], 'z')}"
-            case "product":
-                left, right = _name(arguments[0]), _name(arguments[1])
-                yield f"A[k, {p}], B[k, {p}] = {left}, {right}"
-                yield f"{name} = product({at(p)}, {left}, {right})"
+            case "sum" | "shifted" | "product":
+                yield f"{name} = {self._expression(node)}"
             case "quotient" | "reciprocal":
-                dividend, divisor = (
-                    ("z", arguments[0]) if node.kind == "reciprocal" else (_name(arguments[0]), arguments[1])
-                )
+                dividend = "z" if node.kind == "reciprocal" else self._term(Known(), arguments[0], first=True)
+                divisor = self._name(arguments[-1])
                 self._keep(f"i{node.number} = 0.0")
-                yield f"i{node.number} = 1.0 / {_name(divisor)} if k == 0 else i{node.number}"
-                yield f"{name} = quotient(acc[{p}], later * B[0, {p}], {_name(divisor)}, {dividend}, i{node.number})"
-                yield f"A[k, {p}], B[k, {p}] = {_name(divisor)}, {name}"
+                yield f"i{node.number} = 1.0 / {divisor} if k == 0 else i{node.number}"
+                yield f"{name} = quotient(A, B, acc, k, later, {p}, {divisor}, {dividend}, i{node.number})"
             case "root":
-                square = self._term(arguments[0], _name(arguments[1]))
+                square = self._term(*arguments)
                 yield f"{name} = math.sqrt({square}) if k == 0 else ({square} - acc[{p}]) * (0.5 / A[0, {p}])"
                 yield f"A[k, {p}] = B[k, {p}] = {name}"
             case "tanh":
                 # T' = (1 - T^2) v'.
-                value = self._term(arguments[0], _name(arguments[1]))
+                value = self._term(*arguments)
                 yield f"{name} = math.tanh({value}) if k == 0 else (acc[{p}] + k * ({value}) * B[0, {p}]) / k"
                 yield f"A[k, {p}] = k * ({value})"
-                yield f"A[k, {p + 1}], B[k, {p + 1}] = {name}, {name}"
-                yield f"B[k, {p}] = z - product({at(p + 1)}, {name}, {name})"
+                yield f"B[k, {p}] = z - product(A, B, acc, k, later, {p + 1}, {name}, {name})"
             case "power":
                 # x P' = n P x'.
-                x, exponent = _name(arguments[0]), self._constant(arguments[1])
+                x, exponent = self._name(arguments[0]), self._constant(arguments[1])
                 yield (
                     f"{name} = {x} ** {exponent} if k == 0 else "
                     f"({exponent} * (acc[{p}] + k * {x} * B[0, {p}]) - acc[{p + 1}]) / (k * B[0, {p + 1}])"
                 )
                 yield f"A[k, {p}], B[k, {p}], A[k, {p + 1}], B[k, {p + 1}] = k * {x}, {name}, k * {name}, {x}"
             case "complex_power":
-                yield from self._wave(node)
+                x, y, power = self._term(*arguments[:2]), self._term(*arguments[2:4]), f"int({arguments[4].text})"
+                yield "power_x, power_y = complex_power("
+                yield f"    A, B, acc, k, later, WAVE, {x}, {y}, {power}"
+                yield ")"
             case "part":
-                yield f"{name} = wave_{arguments[1]}"
+                yield f"{name} = power_{arguments[1]}"
             case _:
                 raise AssertionError(node.kind)
 
@@ -291,51 +343,22 @@ class _Code:
         if line not in self._begin:
             self._begin.append(line)
 
-    def _wave(self, node: Node) -> Iterator[str]:
-        """By squaring, as in `rig.kernels.magnet.complex_power`."""
-        times_x, x, times_y, y, exponent = node.arguments
-        yield f"square_x, square_y = {self._term(times_x, _name(x))}, {self._term(times_y, _name(y))}"
-        yield "wave_x, wave_y = z, 0.0"
-        yield f"bits, lane, begun = int({exponent.text}), WAVE, False"
-        body = """while bits > 0:
-    if bits & 1:
-        if begun:
-            A[k, lane], B[k, lane], A[k, lane + 1], B[k, lane + 1] = wave_x, square_x, wave_y, square_y
-            A[k, lane + 2], B[k, lane + 2], A[k, lane + 3], B[k, lane + 3] = wave_x, square_y, wave_y, square_x
-            one = product(acc[lane], A[0, lane], B[0, lane], later, wave_x, square_x)
-            one -= product(acc[lane + 1], A[0, lane + 1], B[0, lane + 1], later, wave_y, square_y)
-            two = product(acc[lane + 2], A[0, lane + 2], B[0, lane + 2], later, wave_x, square_y)
-            two += product(acc[lane + 3], A[0, lane + 3], B[0, lane + 3], later, wave_y, square_x)
-            wave_x, wave_y = one, two
-            lane += 4
-        else:
-            wave_x, wave_y, begun = square_x, square_y, True
-    bits >>= 1
-    if bits > 0:
-        A[k, lane], B[k, lane], A[k, lane + 1], B[k, lane + 1] = square_x, square_x, square_y, square_y
-        A[k, lane + 2], B[k, lane + 2] = square_x, square_y
-        one = product(acc[lane], A[0, lane], B[0, lane], later, square_x, square_x)
-        one -= product(acc[lane + 1], A[0, lane + 1], B[0, lane + 1], later, square_y, square_y)
-        square_y = 2.0 * product(acc[lane + 2], A[0, lane + 2], B[0, lane + 2], later, square_x, square_y)
-        square_x = one
-        lane += 3"""
-        yield from body.splitlines()
 
-
+_INLINE = {"sum": (1, 3), "shifted": (1,), "rate": (2,), "quotient": (0,), "product": (0, 1)}
+"""Arguments, by kind, that may be written in place."""
 _RARE = {
     "contact.exponent == 1.0": False,
     "contact.gap_counts_outer == 0.0": False,
     "levels.friction == SMOOTHED": True,
     "magnet.terms == RADIAL": False,
 }
-"""Conditions by which few scenes go, and the answer then."""
-_WIDE = """(
-        contact.gap_counts_outer != 0.0
-        or (contact.exponent != 1.5 and contact.exponent != 1.0)
-        or levels.friction == SMOOTHED
-        or (inputs.magnet_engaged and magnet.terms == RIPPLED)
-    )"""
-"""Whether a scene is one of these."""
+"""Conditions by which few scenes go, and the answer then: what `rig.engines.taylor.lanes.is_wide` asks for."""
+_CALLS = ("product", "quotient")
+"""What takes no product in place."""
+_LONG = 96
+"""Characters of an expression at the most."""
+_WRITTEN = ("sum", "shifted", "product")
+"""What needs no name where it is used once."""
 _LANES = {"product": 1, "quotient": 1, "reciprocal": 1, "root": 1, "tanh": 2, "power": 2}
 
 
@@ -343,8 +366,10 @@ def _whole(lanes: int) -> int:
     return -(-lanes // _VECTOR) * _VECTOR
 
 
-def _name(node: Node) -> str:
-    return f"v{node.number}"
+def _own(items: list[Node | Fork]) -> Iterator[Node]:
+    """The nodes of a branch, without those of the branches in it."""
+    for item in items:
+        yield from item.joined if isinstance(item, Fork) else [item]
 
 
 def _all(items: list[Node | Fork]) -> Iterator[Node]:
