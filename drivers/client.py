@@ -160,6 +160,11 @@ class Rig(Console):
         Raises:
             InputError: The URL is malformed, or there is no such channel or rate.
             ConnectionError: Nothing is there.
+
+        Example:
+            >>> Rig.open("can:zenoh:can0")
+            Traceback (most recent call last):
+            rig.errors.InputError: url must be zenoh:HOST:PORT[?tls=DIR]; instead received 'can:zenoh:can0'
         """
         from rig.transport.zenoh import client_at
 

@@ -24,7 +24,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drivers.client import Rig
     from rig.errors import InputError, UnknownNameError
     from rig.offline import Run, simulate
     from rig.orbit import full_spectrum, synchronous, waterfall, whirl_frequency
@@ -33,7 +32,9 @@ if TYPE_CHECKING:
     from rig.scenes import Scene, load_scene
     from rig.simulation import Simulation
 
-    connect = Rig.open
+    def connect(url: str = "", **settings: Any) -> Any:
+        """`drivers.client.Rig.open`, which must not be imported from below."""
+
 
 __all__ = [
     "InputError", "ParameterSet", "Run", "Samples", "Scene", "Simulation", "UnknownNameError", "connect",

@@ -18,6 +18,7 @@ from rig import contacts, magnets
 
 ROOT = Path(__file__).parents[2]
 MODULES = (
+    "drivers.client",
     "drivers.console",
     "drivers.daq",
     "recorder.reader",

@@ -97,6 +97,9 @@ def law_of(one: Shown) -> Law:
         drawn = typical < _DRAWN * one.noise / float(one.floor[0]) and _white(np.sign(best.left))
         if is_noise(best.left) or _rms(best.left) < (_HALF if drawn else _EXACTLY) * rms:
             return best
+        for law in _ringing(one):
+            if _rms(law.left) < _EXACTLY * rms:
+                return law
     return next(_at_random(one), replace(best, sure=False))
 
 
@@ -356,11 +359,7 @@ def _filtered(one: Shown) -> Iterator[Law]:
         return
     if not one.uniform:
         return
-    channel, (times_s, e) = one.channel, one.around or (one.times_s, one.foretold)
-    begin = int(np.searchsorted(times_s, one.times_s[0]))
-    round_trip = np.concatenate([e, e[::-1]])
-    wave = np.fft.rfft(round_trip)
-    turn = 2j * math.pi * np.fft.rfftfreq(len(round_trip), one.period_s)
+    channel, (begin, wave, turn) = one.channel, _waves(one)
 
     def through(corner_hz: float) -> np.ndarray:
         poles, residues, direct = channel_poles(
@@ -395,9 +394,45 @@ def _filtered(one: Shown) -> Iterator[Law]:
     if _rms(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
         yield Law("bandwidth", f"{corner_hz:.4g} Hz", corner_hz, left, 1, "Hz")
     if one.bare is not None and (_rms(left_by(1.0)) < _HARDLY * _rms(one.apart)):
-        left = one.values - one.bare()
-        left = one.left([one.level], left)[1] if channel.highpass_hz else left / one.floor
+        _, left = one.left([one.level] if channel.highpass_hz else [np.zeros(len(one.values))], one.values - one.bare())
         yield Law("no-filter", "what is above half of the rate folds back", 0.0, left, 1)
+
+
+def _waves(one: Shown) -> tuple[int, np.ndarray, np.ndarray]:
+    """What it should show, from before to behind, there and back: its first row, spectrum, frequencies [2 pi i Hz]."""
+    times_s, e = one.around or (one.times_s, one.foretold)
+    round_trip = np.concatenate([e, e[::-1]])
+    turn = 2j * math.pi * np.fft.rfftfreq(len(round_trip), one.period_s)
+    return int(np.searchsorted(times_s, one.times_s[0])), np.fft.rfft(round_trip), turn
+
+
+def _ringing(one: Shown) -> Iterator[Law]:
+    """A transducer with a resonance of its own, which may ring from what was before."""
+    if not one.uniform or not one.moves:
+        return
+    from scipy.interpolate import make_interp_spline
+    from scipy.optimize import minimize
+
+    begin, wave, turn = _waves(one)
+    t = one.times_s - one.times_s[0]
+
+    def left(logs: np.ndarray) -> np.ndarray:
+        w, quality = 2.0 * math.pi * math.exp(logs[0]), 0.5 + math.exp(logs[1])
+        shown = np.fft.irfft(wave * w**2 / (turn**2 + turn * w / quality + w**2))[begin:][: len(t)]
+        fading, angle = np.exp(-0.5 * w / quality * t), w * math.sqrt(1.0 - 0.25 / quality**2) * t
+        return one.left([fading * np.cos(angle), fading * np.sin(angle), one.level], one.values - shown)[1]
+
+    # x'' = w^2 (e - x) - (w / quality) x' has both numbers, though knocks do not make it exact.
+    shown = make_interp_spline(t, one.values, k=5)
+    pulls = [one.foretold - one.values, -shown.derivative()(t)]
+    (stiff, damping), _ = one.left(pulls, shown.derivative(2)(t))
+    if not (stiff > 0.0 and damping > 0.0 and math.sqrt(stiff) > 0.5 * damping):
+        return
+    start = [math.log(math.sqrt(stiff) / 2.0 / math.pi), math.log(math.sqrt(stiff) / damping - 0.5)]
+    close = {"xatol": 1e-7, "fatol": 1e-3}
+    found: Any = minimize(lambda logs: math.log(_rms(left(logs))), start, method="Nelder-Mead", options=close)
+    hz, quality = math.exp(found.x[0]), 0.5 + math.exp(found.x[1])
+    yield Law("resonance", f"at {hz:.4g} Hz, quality {quality:.3g}", hz, left(found.x), 4, "Hz")
 
 
 def _at_random(one: Shown) -> Iterator[Law]:
