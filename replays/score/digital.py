@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from replays.score.limits import Limits
-from replays.score.rows import NO_COUNT, Followed, follow
-from replays.score.scorecard import Bounds, Scorecard, judge_row
-from replays.score.signals import Recorded, Session, in_parts
+from replays.score.rows import NO_COUNT, Followed, follow, stretches
+from replays.score.scorecard import Scorecard, judge_row
+from replays.score.signals import Recorded, Sent, Session, in_parts
 from replays.score.waveform import student
 from replays.score.wiring import Wire
 from rig import units
@@ -39,6 +39,7 @@ class Scale:
         each, zero: The two, in the unit of the file.
         what: Counts, the channel's unit, volts, or fitted.
         gain_ppm, zero_counts: How far off that they are.
+        known: Whether some rows have shown it; otherwise it is what the file's unit says.
     """
 
     each: float
@@ -46,6 +47,7 @@ class Scale:
     what: str
     gain_ppm: float = 0.0
     zero_counts: float = 0.0
+    known: bool = True
 
     def counts(self, values: np.ndarray) -> np.ndarray:
         """The counts of values, int64, shape (n,); `NO_COUNT` where a value is none."""
@@ -66,20 +68,26 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
     """
     pieces = [slice(n, n + _PIECE) for n in range(0, len(values) - _PIECE + 1, _PIECE)] or [slice(None)]
     candidates = _candidates(unit, channel)
+    # Rows that are as most are show nothing of a scale.
+    telling = [moving for p in pieces if (moving := counts[p] != np.median(counts[p])).any()]
+    pieces = [p for p in pieces if (counts[p] != np.median(counts[p])).any()]
     for scale in candidates:
-        back = scale.counts(values)
-        if any((back[p] == counts[p]).mean() >= _ENOUGH and np.ptp(counts[p]) for p in pieces):
+        same = scale.counts(values) == counts
+        if any(
+            same[p].mean() >= _ENOUGH and same[p][t].mean() >= _ENOUGH for p, t in zip(pieces, telling, strict=True)
+        ):
             return scale
-    for p in pieces:
+    for p, moving in zip(pieces, telling, strict=True):
         x, y = counts[p].astype(float), values[p]
-        if not np.ptp(x) or not np.isfinite(y).all():
+        if not np.isfinite(y).all():
             continue
         each, zero = np.polyfit(x - x.mean(), y, 1)
         zero -= each * x.mean()
         if not each:
             continue
         scale = Scale(float(each), float(zero), "fitted")
-        if (scale.counts(y) == counts[p]).mean() >= _ENOUGH:
+        same = scale.counts(y) == counts[p]
+        if same.mean() >= _ENOUGH and same[moving].mean() >= _ENOUGH:
             near = min(candidates, key=lambda one: abs(math.log(abs(each / one.each))))
             ratio = float(each / near.each)
             zero_counts = float((zero - ratio * near.zero) / each)  # beside that gain, about a value of zero
@@ -98,36 +106,61 @@ def _candidates(unit: str, channel: Channel) -> list[Scale]:
     return found or [Scale(1.0, 0.0, "counts")]
 
 
-def scales_of(recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session) -> dict[str, Scale | None]:
-    """The scale of each signal that is connected, by its name in the file."""
-    found: dict[str, Scale | None] = {}
+def settle(
+    recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session
+) -> tuple[dict[str, Wire], dict[str, Scale]]:
+    """Which channel each signal has the counts of, and its scale, by its name in the file.
+
+    Where most signals show counts, one that does not is looked for in all channels; if it is in none, it is the channel
+    that it is named by, or alone is like, with what its unit says of its scale.
+    """
     held = {group: session.early(group) for group in session.groups}
+
+    def tried(name: str, of: str) -> tuple[np.ndarray, str, np.ndarray, Channel]:
+        channel, signal, wire = session.channels[of], recorded[name], wires[name]
+        counts = held[channel.group][:, session.groups[channel.group].index(of)]
+        late = round(wire.late_s * session.rate_hz(channel.group))
+        values, counts = signal.values[max(0, -late) :], counts[max(0, late) :]
+        few = min(len(values), len(counts), 1 << 16)
+        return values[:few], signal.unit, counts[:few], channel
+
+    found, settled = dict(wires), {}
     for name, wire in wires.items():
-        if wire.channel:
-            channel = session.channels[wire.channel]
-            counts = held[channel.group][:, session.groups[channel.group].index(wire.channel)]
-            late = round(wire.late_s * session.rate_hz(channel.group))
-            values = recorded[name].values[max(0, -late) :][: len(counts) - max(0, late)]
-            counts = counts[max(0, late) :][: len(values)]
-            few = min(len(values), len(counts), 1 << 16)
-            enough = few >= 2
-            found[name] = find_scale(values[:few], recorded[name].unit, counts[:few], channel) if enough else None
-    return found
+        scale = find_scale(*tried(name, wire.channel)) if wire.channel else None
+        if scale is not None:
+            settled[name] = scale
+    if 2 * len(settled) <= len(wires):
+        return found, settled
+    for name, wire in wires.items():
+        for other in () if name in settled else sorted(session.channels, key=lambda each: each != name):
+            if (scale := find_scale(*tried(name, other))) is not None:
+                found[name], settled[name] = replace(wire, channel=other, rivals=()), scale
+                break
+        named = name if name in session.channels else "" if wire.rivals else wire.channel
+        if name not in settled and named:
+            values, unit, counts, channel = tried(name, named)
+            apart = [
+                float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values) / scale.each))
+                for scale in _candidates(unit, channel)
+            ]
+            found[name] = replace(wire, channel=named)
+            settled[name] = replace(_candidates(unit, channel)[int(np.argmin(apart))], known=False)
+    return found, settled
 
 
 def score_digital(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], scales: Mapping[str, Scale | None],
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], scales: Mapping[str, Scale],
     session: Session, limits: Limits,
 ) -> None:  # fmt: skip
     """Put the rows of the digital path onto a scorecard."""
     for name, scale in scales.items():
         _score_scale(card, name, scale, session.channels[wires[name].channel], limits)
-    for group, names in session.groups.items():
-        members = [n for n, scale in scales.items() if scale is not None and wires[n].channel in names]
-        for rows in sorted({recorded[name].rows for name in members}):
-            alike = [name for name in members if recorded[name].rows == rows]
-            columns = [names.index(wires[name].channel) for name in alike]
-            _score_rows(card, group, alike, columns, recorded, scales, session, limits)
+    tables: dict[tuple[int, float], list[str]] = {}
+    for name in sorted(scales, key=lambda each: not scales[each].known):
+        rate_hz = session.rate_hz(session.channels[wires[name].channel].group)
+        tables.setdefault((recorded[name].rows, rate_hz), []).append(name)
+    for names in tables.values():
+        _score_rows(card, names, wires, recorded, scales, session, limits)
     for quantity in ("latency", "trigger row"):
         card.rows.append(judge_row("digital", quantity, "", None, limit=limits.bounds("digital", quantity)))
 
@@ -136,98 +169,94 @@ def _exact(count: float) -> tuple[float, float, float]:
     return float(count), float(count), float(count)
 
 
-def _score_scale(card: Scorecard, name: str, scale: Scale | None, channel: Channel, limits: Limits) -> None:
-    bounds = [limits.bounds("digital", each, channel) for each in ("scale", "offset")]
-    if scale is None:
-        note = "its counts cannot be told from the values: fewer digits, or an analogue path"
-        card.rows += [
-            judge_row("digital", each, name, None, limit=bound, note=note)
-            for each, bound in zip(("scale", "offset"), bounds, strict=True)
-        ]
-        return
+def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel, limits: Limits) -> None:
     note = f"{scale.what}: {scale.each:.9g} a count, {scale.zero:.9g} at zero"
-    card.rows.append(judge_row("digital", "scale", name, _exact(scale.gain_ppm), limit=bounds[0], note=note))
-    card.rows.append(judge_row("digital", "offset", name, _exact(scale.zero_counts), limit=bounds[1], note=note))
+    note += "" if scale.known else ", as no stretch of rows shows another: its values are not what was sent"
+    for quantity, off in (("scale", scale.gain_ppm), ("offset", scale.zero_counts)):
+        limit = limits.bounds("digital", quantity, channel)
+        card.rows.append(
+            judge_row("digital", quantity, name, _exact(off) if scale.known else None, limit=limit, note=note)
+        )
 
 
 def _score_rows(
-    card: Scorecard, group: str, names: Sequence[str], columns: Sequence[int], recorded: Mapping[str, Recorded],
-    scales: Mapping[str, Scale | None], session: Session, limits: Limits,
+    card: Scorecard, names: Sequence[str], wires: Mapping[str, Wire], recorded: Mapping[str, Recorded],
+    scales: Mapping[str, Scale], session: Session, limits: Limits,
 ) -> None:  # fmt: skip
-    """Follow the rows of one group, and judge what became of them and of their stamps."""
-    chosen = [(recorded[name].values, scales[name]) for name in names]
+    """Follow the rows of signals that are as long as each other, and judge what became of them and of their stamps."""
+    groups = list(dict.fromkeys(session.channels[wires[name].channel].group for name in names))
+    table = "all groups" if len(groups) == len(session.groups) > 1 else ", ".join(groups)
+    sound = sum(scales[name].known for name in names)
+    if not sound:
+        for name in names:
+            limit = limits.bounds("digital", "altered values")
+            note = "none of its signals shows which row is which"
+            card.rows.append(judge_row("digital", "altered values", name, None, limit=limit, note=note))
+        return
+    sent = Sent(session, groups)
+    columns = [sent.names.index(wires[name].channel) for name in names]
 
     def counts() -> Iterator[np.ndarray]:
-        for part in in_parts([values for values, _ in chosen]):
-            yield np.column_stack([s.counts(v) for v, (_, s) in zip(part, chosen, strict=True) if s is not None])
+        for part in in_parts([recorded[name].values for name in names]):
+            yield np.column_stack([scales[name].counts(values) for name, values in zip(names, part, strict=True)])
 
-    sent = (chunk[:, columns] for chunk in session.counts(group))
-    times_s = recorded[names[0]].times_s
-    stamps = Stamps(times_s, session.first_s(group), session.rate_hz(group))
+    rate_hz = session.rate_hz(groups[0])
+    stamps = Stamps(recorded[names[0]].times_s)
     found = Followed()
-    for places, found in follow(sent, counts()):  # noqa: B007
-        stamps.take(session.numbers(group, places) - session.numbers(group, np.zeros(1, np.int64)), places >= 0)
+    for places, found in follow((chunk[:, columns] for chunk in sent), counts(), sound):  # noqa: B007
+        known = places >= 0
+        first = sent.numbers(np.zeros(1, np.int64))
+        stamps.take(sent.first_s, (sent.numbers(places[known]) - first) / rate_hz, known)
 
-    def add(quantity: str, count: int, channel: str, places: np.ndarray) -> None:
-        limit = limits.bounds("digital", quantity)
+    def add(quantity: str, channel: str, rows: int, runs: np.ndarray, *, numbered: bool = True) -> None:
         note = ""
-        if len(places):
-            runs = _runs(session.numbers(group, places)) if quantity != "foreign rows" else _runs(places)
-            card.runs[f"{quantity} {channel}"] = runs
-            told = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in runs[:_NAMED])
-            note = f"rows {told}" + (f" and {len(runs) - _NAMED} more stretches" if len(runs) > _NAMED else "")
-        card.rows.append(judge_row("digital", quantity, channel, _exact(count), limit=limit, note=note))
+        if len(runs):
+            told = [(a, b) for a, b in (sent.numbers(runs) if numbered else runs).tolist()]
+            card.runs[f"{quantity} {channel}"] = told
+            note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in told[:_NAMED])
+            note += f" and {len(told) - _NAMED} more stretches" if len(told) > _NAMED else ""
+        limit = limits.bounds("digital", quantity)
+        card.rows.append(judge_row("digital", quantity, channel, _exact(rows), limit=limit, note=note))
 
-    missing = found.missing
-    add("missing rows", len(missing), group, missing)
-    add("doubled rows", len(found.doubled), group, np.unique(found.doubled[:, 0]))
-    add("swapped rows", len(found.swapped), group, found.swapped[:, 0])
-    add("foreign rows", len(found.foreign), group, found.foreign)
-    for name, wrong in zip(names, found.wrong.tolist(), strict=True):
-        add("altered values", wrong, name, np.unique(found.altered[:, 0]) if wrong else np.empty(0))
-    add("rows before the first", max(0, found.first), group, np.empty(0))
-    add("rows after the last", found.sent - 1 - found.last, group, np.empty(0))
+    add("missing rows", table, len(found.missing), stretches(found.missing))
+    for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
+        add(quantity, table, len(pairs), stretches(np.unique(pairs[:, 0])))
+    add("foreign rows", table, len(found.foreign), stretches(found.foreign), numbered=False)
+    for name, altered in zip(names, found.altered, strict=True):
+        add("altered values", name, altered.rows, altered.pairs())
+    none = stretches(np.empty(0, dtype=np.int64))
+    add("rows before the first", table, max(0, found.first), none)
+    add("rows after the last", table, found.sent - 1 - found.last, none)
     for quantity, estimate in stamps.judged().items():
-        bound: Bounds | None = limits.bounds("digital", quantity)
-        card.rows.append(judge_row("digital", quantity, group, estimate, limit=bound))
-    card.pictures[f"stamps {group}"] = stamps.picture()
-
-
-def _runs(places: np.ndarray) -> list[tuple[int, int]]:
-    """Ascending stretches as pairs of first and last."""
-    if not len(places):
-        return []
-    places = np.sort(places)
-    cuts = np.flatnonzero(np.diff(places) != 1)
-    firsts, lasts = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(places) - 1]])
-    return list(zip(places[firsts].tolist(), places[lasts].tolist(), strict=True))
+        limit = limits.bounds("digital", quantity)
+        card.rows.append(judge_row("digital", quantity, table, estimate, limit=limit))
+    card.pictures[f"stamps {table}"] = stamps.picture()
 
 
 class Stamps:
     """Time stamps against the times of the rows that they stand beside: offset and rate are two questions."""
 
-    def __init__(self, times_s: np.ndarray | None, first_s: float, rate_hz: float) -> None:
-        """Take stamps [s], None where there are none, and when the first row was sent [s], and how often [Hz]."""
-        self._times_s, self._first_s, self._rate_hz = times_s, first_s, rate_hz
+    def __init__(self, times_s: np.ndarray | None) -> None:
+        """Take stamps [s]; None where there are none."""
+        self._times_s = times_s
         self._at, self._back, self._last_s = 0, 0, -math.inf
         self._means: list[np.ndarray] = []
         self._squares, self._freedom = 0.0, 0
 
-    def take(self, numbers: np.ndarray, known: np.ndarray) -> None:
-        """Take numbers of the next rows from the first one sent, and which of them are known, each shape (n,)."""
-        part = slice(self._at, self._at + len(numbers))
+    def take(self, first_s: float, since_s: np.ndarray, known: np.ndarray) -> None:
+        """Take when the first row was sent, how long after it those of the next that are known [s], and which are."""
+        part = slice(self._at, self._at + len(known))
         self._at = part.stop
-        if self._times_s is None or not len(numbers):
+        if self._times_s is None or not len(known):
             return
         times_s = self._times_s[part]
         self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) <= 0.0))
         self._last_s = float(times_s[-1])
-        true_s = self._first_s + numbers[known] / self._rate_hz
-        apart = times_s[known] - true_s
+        apart = times_s[known] - first_s - since_s
         size = max(4, len(self._times_s) // _BATCHES)
         for begin in range(0, len(apart) - size + 1, size):
-            late, true = apart[begin : begin + size], true_s[begin : begin + size]
-            self._means.append(np.array([true.mean(), late.mean()]))
+            late = apart[begin : begin + size]
+            self._means.append(np.array([since_s[begin : begin + size].mean(), late.mean()]))
             self._squares += float(np.sum((late - late.mean()) ** 2))
             self._freedom += size - 1
 
@@ -242,8 +271,7 @@ class Stamps:
             return found
         from scipy.stats import chi2
 
-        true, late = np.array(self._means).T
-        since = true - self._first_s
+        since, late = np.array(self._means).T
         matrix = np.column_stack([np.ones(len(since)), since])
         parts = np.linalg.lstsq(matrix, late, rcond=None)[0]
         left = late - matrix @ parts
@@ -257,5 +285,5 @@ class Stamps:
         return found
 
     def picture(self) -> np.ndarray:
-        """Time and lateness of each batch [s], shape (n, 2)."""
+        """Time since the first row, and lateness, of each batch [s], shape (n, 2)."""
         return np.array(self._means).reshape(-1, 2)

@@ -8,7 +8,7 @@ from typing import Literal
 
 from replays.recordings.formats.mapping import FileOptions
 from replays.score.analogue import Formula, score_analogue
-from replays.score.digital import Scale, scales_of, score_digital
+from replays.score.digital import Scale, score_digital, settle
 from replays.score.limits import Limits, load_limits
 from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, QUANTITIES, Scorecard, ScoreRow, Verdict
 from replays.score.signals import Recorded, Session, open_recorded, rate_of
@@ -47,20 +47,20 @@ def judge(
     rate = max(each for _, each in sent.values())
     taken = {name: (signal.values, rate_of(signal) or rate) for name, signal in recorded.items() if signal.rows > 1}
     wires: dict[str, Wire] = {}
-    scales: dict[str, Scale | None] = {}
+    scales: dict[str, Scale] = {}
     if path != "analogue" and taken:
         # Rows of counts come as they were sent, whatever their stamps say.
         near = {name: rate if abs(each / rate - 1.0) < _NEAR else each for name, (_, each) in taken.items()}
         wires = find_wires({name: (values, near[name]) for name, (values, _) in taken.items()}, sent)
-        scales = scales_of(recorded, wires, session)
+        wires, scales = settle(recorded, wires, session)
     if path is None:
-        told = sum(each is not None for each in scales.values())
-        path = "digital" if scales and 2 * told > len(scales) else "analogue"
+        told = sum(each.known for each in scales.values())
+        path = "digital" if 2 * told > len(wires) else "analogue"
     if path == "analogue" and taken:
         wires = find_wires(taken, sent)
     if not any(wire.channel for wire in wires.values()):
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
-    if path == "digital" and not any(scales.values()):
+    if path == "digital" and not scales:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title)
     _score_wires(card, wires, session, scales, limits)
@@ -83,14 +83,15 @@ def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
 
 
 def _score_wires(
-    card: Scorecard, wires: Mapping[str, Wire], session: Session, scales: Mapping[str, Scale | None], limits: Limits
+    card: Scorecard, wires: Mapping[str, Wire], session: Session, scales: Mapping[str, Scale], limits: Limits
 ) -> None:
     """Mapping and, on the analogue path, polarity: a name of the rig's has to be that channel."""
     for name, wire in wires.items():
         known = session.channels.keys()
         verdict: Verdict = NO_LIMIT
         note = f"correlation {wire.likeness:.4f}"
-        certain = not wire.rivals or scales.get(name) is not None
+        scale = scales.get(name)
+        certain = not wire.rivals if scale is None else scale.known
         if not wire.channel or not certain:
             verdict = NOT_SHOWN
             note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""

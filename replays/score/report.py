@@ -101,5 +101,5 @@ def _stamps(means: np.ndarray) -> Figure:
     axes = figure.subplots()
     late = means[:, 1] - means[0, 1]
     axes.plot(means[:, 0], 1e6 * late, ".", color=ORANGE, ms=4)
-    axes.set(xlabel="time in the session [s]", ylabel=f"late [µs], from {means[0, 1]:.9g} s on")
+    axes.set(xlabel="time since the first row [s]", ylabel=f"late [µs], from {means[0, 1]:.9g} s on")
     return figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.daq import Aligner
+from drivers.samples import Samples
 from recorder.reader import Recording, join
 from replays.recordings.formats.mapping import FileOptions
 from replays.recordings.formats.source import Entry, Source, even_rate_hz, open_source
@@ -28,7 +31,7 @@ class Session:
     """What the rig sent.
 
     Attributes:
-        path: The file.
+        path, recording: The file, and what is in it.
         channels: Its channels by name.
         groups: Its groups that have rows, with the names of their channels.
     """
@@ -39,56 +42,26 @@ class Session:
         Raises:
             InputError: It cannot be read, or has no samples.
         """
-        self._recording = join(list(paths))
+        self.recording = join(list(paths))
         self.path = paths[0]
-        present = self._recording.streams
+        present = self.recording.streams
         self.groups = {
-            name: group.names for name, group in self._recording.table.groups.items() if sensor_key(name) in present
+            name: group.names for name, group in self.recording.table.groups.items() if sensor_key(name) in present
         }
-        table = self._recording.table.channels
+        table = self.recording.table.channels
         self.channels: dict[str, Channel] = {name: table[name] for names in self.groups.values() for name in names}
         if not self.channels:
             raise InputError("--against", "a recording with samples", str(self.path))
         self._kept: dict[str, tuple[np.ndarray, float, float]] = {}
-        self._jumps: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def rate_hz(self, group: str) -> float:
         """Rows a second of a group [Hz]."""
-        return next(self._recording.blocks(sensor_key(group))).rate_hz
-
-    def counts(self, group: str) -> Iterator[np.ndarray]:
-        """Counts of a group in chunks, int64, shape (n, channels)."""
-        for block in self._recording.blocks(sensor_key(group)):
-            yield block.values.astype(np.int64)
-
-    def first_s(self, group: str) -> float:
-        """Time of a group's first row [s]."""
-        return next(self._recording.blocks(sensor_key(group))).start_s
-
-    def numbers(self, group: str, places: np.ndarray) -> np.ndarray:
-        """The rig's own numbers of rows by their places in the file, shape (n,)."""
-        starts, numbers = self._seams(group)
-        at = np.searchsorted(starts, places, side="right") - 1
-        return numbers[at] + places - starts[at]
-
-    def _seams(self, group: str) -> tuple[np.ndarray, np.ndarray]:
-        """Places at which numbers begin anew or jump, and the numbers there."""
-        if group in self._jumps:
-            return self._jumps[group]
-        starts, numbers, rows, due = [], [], 0, None
-        for block in self._recording.blocks(sensor_key(group)):
-            if block.index != due:
-                starts.append(rows)
-                numbers.append(block.index)
-            rows += len(block.values)
-            due = block.index + len(block.values)
-        self._jumps[group] = np.array(starts), np.array(numbers)
-        return self._jumps[group]
+        return next(self.recording.blocks(sensor_key(group))).rate_hz
 
     def early(self, group: str) -> np.ndarray:
         """Counts of the first seconds of a group, shape (n, channels)."""
         most, parts, rows = _EARLY_S * self.rate_hz(group), [], 0
-        for part in self.counts(group):
+        for part in Sent(self, [group]):
             parts.append(part)
             rows += len(part)
             if rows >= most:
@@ -103,12 +76,51 @@ class Session:
         """
         group = self.channels[name].group
         if group not in self._kept:
-            samples = self._recording.samples(group)
+            samples = self.recording.samples(group)
             if len(samples) < 2 or np.any(np.diff(samples.index) != 1):
                 raise InputError("--against", "without lost rows on the analogue path", Words(f"{self.path}, {group}"))
             self._kept = {group: (samples.values, float(samples.times_s[0]), samples.rate_hz)}
         values, first_s, rate_hz = self._kept[group]
         return values[:, self.groups[group].index(name)], first_s, rate_hz
+
+
+class Sent:
+    """Rows of groups of one rate, those that all of them have: counts in chunks, int64, shape (n, channels).
+
+    Attributes:
+        first_s: Time of the first row, once there has been one [s].
+    """
+
+    def __init__(self, session: Session, groups: Sequence[str]) -> None:
+        """Take a session, and which of its groups."""
+        self._session, self._groups = session, groups
+        self.names = [name for group in groups for name in session.groups[group]]
+        self.first_s = math.nan
+        self._starts: list[int] = []
+        self._numbers: list[int] = []
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        keys = {sensor_key(group): group for group in self._groups}
+        columns = {group: range(len(self._session.groups[group])) for group in self._groups}
+        aligner = Aligner(columns, range(len(self.names)), _PART)
+        rows, due = 0, None
+        for key, block in self._session.recording.blocks_of(set(keys)):
+            names = self._session.groups[keys[key]]
+            units = ("",) * len(names)
+            part = Samples(block.index, block.tick, block.rate_hz, block.tick_rate_hz, names, units, block.values)
+            for joint in aligner.feed(keys[key], part):
+                if due is None:
+                    self.first_s = float(joint.times_s[0])
+                if joint.index != due:
+                    self._starts.append(rows)
+                    self._numbers.append(joint.index)
+                rows, due = rows + len(joint), joint.index + len(joint)
+                yield joint.values.astype(np.int64)
+
+    def numbers(self, places: np.ndarray) -> np.ndarray:
+        """The rig's own numbers of rows by their places among these, as far as they were read, shape (n,)."""
+        at = np.searchsorted(self._starts, places, side="right") - 1
+        return np.array(self._numbers)[at] + places - np.array(self._starts)[at]
 
 
 @dataclass(frozen=True)
