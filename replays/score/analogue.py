@@ -33,7 +33,11 @@ _AS_WELL = 1.1
 _GOOD = 0.9
 """Part of the power that the known signal, behind the channel's filter, must explain for a fit to be one of it."""
 _SOME = 0.05
-"""The same without the filter."""
+"""The same without the filter, for one to be looked for."""
+_OWN_CLOCK = 6.0, 1e-6
+"""A clock is a channel's own where it is off the others' by more than so many deviations, and by so much."""
+_PURER = 1.5
+"""Noises of a channel that what is not the sine in a sine may come to."""
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
 
@@ -68,12 +72,17 @@ class Fitted:
     values: np.ndarray
     exact: bool
 
+    @property
+    def good(self) -> bool:
+        """Whether the known signal explains enough of the record."""
+        return self.clean.likeness >= _GOOD
+
 
 def fit_channels(
     recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session, formulas: Mapping[str, Formula],
     remarks: list[str],
 ) -> list[Fitted]:  # fmt: skip
-    """Fit all signals that are connected; those that the known signal does not explain are left out."""
+    """Fit all signals that are connected; those of which it is not sure to what, only where that explains them."""
     found = []
     for name, wire in wires.items():
         if not wire.channel:
@@ -91,7 +100,7 @@ def fit_channels(
         stimulus: Stimulus = Sampled(sent, first_s, sent_hz) if formula is None else Exact(formula, span, rate)
         times_s = np.arange(len(values)) / rate
         one = _fit(name, channel, values, times_s, stimulus, first_s, wire, exact=formula is not None)
-        if one is not None:
+        if one is not None and (one.good or name == wire.channel or not wire.rivals):
             found.append(one)
     return found
 
@@ -111,10 +120,10 @@ def _fit(
     name: str, channel: Channel, values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, first_s: float,
     wire: Wire, *, exact: bool,
 ) -> Fitted | None:  # fmt: skip
-    whole = fit_waveform(values, times_s, stimulus, wire.late_s + first_s, within_s=wire.within_s)
-    if whole is None or whole.likeness < _SOME:
+    whole = fit_waveform(values, times_s, stimulus, wire.own_s + first_s, within_s=wire.within_s)
+    if whole is None:
         return None
-    shown = response(whole)
+    shown = response(whole) if whole.likeness >= _SOME else None
     low = clean = whole
     corner_hz, odd = None, False
     if shown is not None and shown.corner_hz is not None:
@@ -123,8 +132,6 @@ def _fit(
         if behind is not None and np.var(behind[0].residual) < _AS_WELL * np.var(clean.residual):
             (low, corner_hz), odd = behind, False
             clean = low
-    if clean.likeness < _GOOD:
-        return None
     return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact)
 
 
@@ -144,8 +151,7 @@ def score_analogue(
             limit = limits.bounds("analogue", "gain")
             note = "nothing that was sent explains it" if wire.channel else "no channel is like it"
             card.rows.append(judge_row("analogue", "gain", name, None, limit=limit, note=note))
-    if found:
-        _score_time(card, found, wires, limits)
+    _score_time(card, [one for one in found if one.good], wires, limits)
     for one in found:
         _score_fit(card, one, limits)
         _score_sine(card, one, limits)
@@ -155,30 +161,40 @@ def score_analogue(
 
 
 def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire], limits: Limits) -> None:
-    """Clock of all channels together, start of the first, and skew of the others against it."""
+    """Clock of all channels together, start of one in the middle of them, and skew of the others against it."""
 
     def add(quantity: str, channel: str, estimate: Any, of: Channel | None, note: str = "") -> None:
         limit = limits.bounds("analogue", quantity, of)
         card.rows.append(judge_row("analogue", quantity, channel, estimate, limit=limit, note=note))
 
-    spreads = np.array([one.low.spread[3] for one in found])
+    # One channel that is off has no say in what the others are: the reference is in the middle of them.
+    inner = sorted((one for one in found if not one.odd), key=lambda one: one.low.late_s) or found
+    if not inner:
+        return
+    reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else found[0]
+    spreads = np.maximum([one.low.spread[3] for one in found], 1e-15)
     drifts = np.array([one.low.drift for one in found])
-    weights = np.maximum(spreads, 1e-15) ** -2.0
-    drift, spread = float(weights @ drifts / weights.sum()), float(weights.sum() ** -0.5)
-    quantile = student(found[0].low.freedom)
-    # Its clock runs fast where the session's time goes slowly over its own.
-    add("clock", "", _about(-drift / (1.0 + drift), spread, quantile, 1e6), None)
-    first = found[0]
+    middle = np.median(drifts) if len(found) > 2 else reference.low.drift
+    own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * spreads, _OWN_CLOCK[1])
+    weights = np.where(own, 0.0, spreads**-2.0)
+    quantile = student(reference.low.freedom)
+    told = [("", float(weights @ drifts / weights.sum()), float(weights.sum() ** -0.5))]
+    told += [(found[n].name, drifts[n], spreads[n]) for n in np.flatnonzero(own)]
+    for name, drift, spread in told:
+        # Its clock runs fast where the session's time goes slowly over its own.
+        note = "off the clock of the others" if name else ""
+        add("clock", name, _about(-drift / (1.0 + drift), spread, quantile, 1e6), None, note)
     turned = any(wires[one.name].turned for one in found)
     note = "a periodic signal: up to whole periods" if turned else ""
-    begin_s = first.low.late_s - first.low.drift * first.low.middle_s
-    add("start", first.name, _about(begin_s, first.low.spread[2], quantile), first.channel, note)
-    for one in found[1:]:
-        apart = one.low.late_s - first.low.late_s
-        both = math.hypot(one.low.spread[2], first.low.spread[2])
-        odd = _ODD if one.odd or first.odd else ""
-        said = "; ".join(each for each in (f"against {first.name}", note, odd) if each)
-        add("skew", one.name, None if odd else _about(apart, both, quantile, 1e9), one.channel, said)
+    begin_s = reference.low.late_s - reference.low.drift * reference.low.middle_s
+    add("start", reference.name, _about(begin_s, reference.low.spread[2], quantile), reference.channel, note)
+    for one in found:
+        if one is not reference:
+            apart = one.low.late_s - reference.low.late_s
+            both = math.hypot(one.low.spread[2], reference.low.spread[2])
+            odd = _ODD if one.odd or reference.odd else ""
+            said = "; ".join(each for each in (f"against {reference.name}", note, odd) if each)
+            add("skew", one.name, None if odd else _about(apart, both, quantile, 1e9), one.channel, said)
 
 
 def _score_fit(card: Scorecard, one: Fitted, limits: Limits) -> None:
@@ -190,18 +206,18 @@ def _score_fit(card: Scorecard, one: Fitted, limits: Limits) -> None:
         limit = limits.bounds("analogue", quantity, channel)
         card.rows.append(judge_row("analogue", quantity, one.name, estimate, unit=unit, limit=limit, note=note))
 
-    note = _ODD if one.odd else ""
-    add("gain", None if one.odd else _about(abs(low.gain) - 1.0, low.spread[0], quantile, 1e6), note)
-    add("offset", _about(low.offset, low.spread[1], quantile))
+    note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
+    add("gain", None if note else _about(abs(low.gain) - 1.0, low.spread[0], quantile, 1e6), note)
+    add("offset", _about(low.offset, low.spread[1], quantile) if one.good else None)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
     brought = 0.0 if one.exact else channel.noise_v / abs(channel.sensitivity_v)
     split = split_noise(one.clean, floor=brought)
-    add("noise", split.noise)
-    add("jitter", None if split.jitter_s is None else _scaled(split.jitter_s, 1e9))
+    noise = split.noise if one.good else split.left
+    add("noise", noise)
+    add("jitter", _scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
     full = channel.adc_v / abs(channel.sensitivity_v)
-    noises = [max(each, 1e-12 * full) for each in (split.noise[0], split.noise[2], split.noise[1])]
-    bits = [math.log2(2.0 * full / (each * math.sqrt(12.0))) for each in noises]
-    ranges = [20.0 * math.log10(full / math.sqrt(2.0) / each) for each in noises]
+    bits = [math.log2(full / max(split.left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
+    ranges = [20.0 * math.log10(full / max(noise[n], 1e-12 * full) / math.sqrt(2.0)) for n in (0, 2, 1)]
     add("effective bits", (bits[0], bits[1], bits[2]))
     add("dynamic range", (ranges[0], ranges[1], ranges[2]))
     _score_corner(card, one, limits)
@@ -225,7 +241,9 @@ def _score_sine(card: Scorecard, one: Fitted, limits: Limits) -> None:
     """The standard's sine fit beside the known signal, where that is a sine."""
     names = ("SINAD", "ENOB", "THD", "SFDR")
     gaps = not np.isfinite(one.values).all()
-    if gaps or not is_sine(one.low.known[:_LONGEST]):
+    noises = 1 if one.exact else 2
+    quiet = _PURER * math.hypot(one.channel.noise_v, one.channel.lsb_v) / abs(one.channel.sensitivity_v)
+    if gaps or not is_sine(one.low.known[:_LONGEST], quiet):
         for quantity in names:
             limit = limits.bounds("analogue", quantity, one.channel)
             note = "values are missing" if gaps else "the signal is no sine"
@@ -233,10 +251,9 @@ def _score_sine(card: Scorecard, one: Fitted, limits: Limits) -> None:
         return
     fit = fit_sine(one.values)
     told = quality(fit)
-    noises = 1 if one.exact else 2
     for quantity, estimate in zip(names, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
         limit = limits.bounds("analogue", quantity, one.channel, amplitude=fit.amplitude[0], noises=noises)
-        note = "" if one.exact else "of the record as it is: the rig's own noise is in it"
+        note = "" if noises == 1 else "of the record as it is: the rig's own noise is in it"
         card.rows.append(judge_row("analogue", quantity, one.name, estimate, limit=limit, note=note))
 
 

@@ -23,6 +23,8 @@ from rig.channels import Channel
 
 _NEAR = 0.49
 """Part of a count by which a recovered one may be off a whole number: rounding of the file."""
+_NOTHING = 0.01
+"""Counts that are none."""
 _PIECE = 512
 """Consecutive rows on which a scale is found."""
 _ENOUGH = 0.99
@@ -39,6 +41,7 @@ class Scale:
         each, zero: The two, in the unit of the file.
         what: Counts, the channel's unit, volts, or fitted.
         gain_ppm, zero_counts: How far off that they are.
+        turned: Whether it has the other sign.
         known: Whether some rows have shown it; otherwise it is what the file's unit says.
     """
 
@@ -47,6 +50,7 @@ class Scale:
     what: str
     gain_ppm: float = 0.0
     zero_counts: float = 0.0
+    turned: bool = False
     known: bool = True
 
     def counts(self, values: np.ndarray) -> np.ndarray:
@@ -81,17 +85,21 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
         x, y = counts[p].astype(float), values[p]
         if not np.isfinite(y).all():
             continue
-        each, zero = np.polyfit(x - x.mean(), y, 1)
-        zero -= each * x.mean()
+        each, zero = map(float, np.polyfit(x - x.mean(), y, 1))
+        zero -= each * float(x.mean())
         if not each:
             continue
-        scale = Scale(float(each), float(zero), "fitted")
+        scale = Scale(each, zero, "fitted")
         same = scale.counts(y) == counts[p]
         if same.mean() >= _ENOUGH and same[moving].mean() >= _ENOUGH:
             near = min(candidates, key=lambda one: abs(math.log(abs(each / one.each))))
-            ratio = float(each / near.each)
-            zero_counts = float((zero - ratio * near.zero) / each)  # beside that gain, about a value of zero
-            return Scale(scale.each, scale.zero, f"fitted, beside {near.what}", 1e6 * (abs(ratio) - 1.0), zero_counts)
+            ratio = each / near.each
+            # Digits that the file leaves out, and those of numbers, are no gain and no zero.
+            unsure = 5.0 * float(np.std((y - zero) / each - x)) / math.sqrt(len(x))
+            gain, shift = abs(ratio) - 1.0, (zero - ratio * near.zero) / each  # beside that gain, about a value of zero
+            gain = gain if abs(gain) * np.std(x) > unsure + _NOTHING else 0.0
+            shift = shift if abs(shift) > unsure * math.hypot(1.0, x.mean() / np.std(x)) + _NOTHING else 0.0
+            return Scale(each, zero, f"fitted, beside {near.what}", 1e6 * gain, shift, ratio < 0.0)
     return None
 
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from replays.recordings.formats.mapping import FileOptions
 from replays.score.analogue import Formula, score_analogue
 from replays.score.digital import Scale, score_digital, settle
@@ -15,6 +17,8 @@ from replays.score.signals import Recorded, Session, open_recorded, rate_of
 from replays.score.wiring import Wire, find_wires
 from rig.errors import InputError, Words
 
+_LOUD = 4.0
+"""Noises of a channel from which on what was sent has to be seen."""
 _NEAR = 0.01
 """Part by which the rate of a DAQ that took rows may be off by its stamps."""
 
@@ -63,7 +67,7 @@ def judge(
     if path == "digital" and not scales:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title)
-    _score_wires(card, wires, session, scales, limits)
+    _score_wires(card, wires, session, scales if path == "digital" else {})
     if path == "digital":
         score_digital(card, recorded, wires, scales, session, limits)
     else:
@@ -82,27 +86,38 @@ def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
     return found
 
 
-def _score_wires(
-    card: Scorecard, wires: Mapping[str, Wire], session: Session, scales: Mapping[str, Scale], limits: Limits
-) -> None:
-    """Mapping and, on the analogue path, polarity: a name of the rig's has to be that channel."""
+def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, scales: Mapping[str, Scale]) -> None:
+    """Mapping and polarity: a name of the rig's has to be that channel."""
+    counts = {
+        name: values
+        for group, names in session.groups.items()
+        for name, values in zip(names, session.early(group).T, strict=True)
+    }
+    loud = {
+        name
+        for name, channel in session.channels.items()
+        if np.std(counts[name]) > _LOUD * channel.noise_v / channel.lsb_v
+    }
     for name, wire in wires.items():
         known = session.channels.keys()
         verdict: Verdict = NO_LIMIT
         note = f"correlation {wire.likeness:.4f}"
         scale = scales.get(name)
         certain = not wire.rivals if scale is None else scale.known
-        if not wire.channel or not certain:
+        if not wire.channel and card.path == "analogue" and name in loud:
+            verdict, note = FAIL, "nothing of what was sent is in it"
+        elif not wire.channel or not certain:
             verdict = NOT_SHOWN
             note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""
         elif name in known:
             verdict = PASS if wire.channel == name else FAIL
         card.rows.append(_row(card, "mapping", name, wire.channel or "-", verdict, note))
-        if card.path == "analogue" and wire.channel:
-            verdict = NOT_SHOWN if wire.turned else PASS if wire.polarity > 0 else FAIL
-            said = "as sent" if wire.polarity > 0 else "turned"
-            note = "half a period later it would be the other" if wire.turned else ""
-            card.rows.append(_row(card, "polarity", name, said, verdict, note))
+        if wire.channel:
+            turned = wire.polarity < 0 if scale is None else scale.turned
+            open_ = wire.turned if scale is None else not scale.known
+            verdict = NOT_SHOWN if open_ else FAIL if turned else PASS
+            note = "half a period later it would be the other" if wire.turned and open_ else ""
+            card.rows.append(_row(card, "polarity", name, "turned" if turned else "as sent", verdict, note))
     taken = [wire.channel for wire in wires.values() if wire.channel]
     for channel in dict.fromkeys(each for each in taken if taken.count(each) > 1):
         names = ", ".join(name for name, wire in wires.items() if wire.channel == channel)

@@ -42,6 +42,7 @@ _DIGITS = "a recording that keeps every digit of the counts"
 _STAMPED = "a recording that keeps time stamps"
 DIGITAL = {
     "mapping": Quantity("1", "cross-correlation, then equal counts", _RICH),
+    "polarity": Quantity("1", "sign of the scale", _RICH),
     "scale": Quantity("ppm", "least squares, then every count equal", _DIGITS),
     "offset": Quantity("counts", "least squares, then every count equal", _DIGITS),
     "altered values": Quantity("1", _EXACT, _LONGER),
@@ -68,7 +69,7 @@ ANALOGUE = {
     "clock": Quantity("ppm", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"),
     "noise": Quantity("", _SPLIT, _LONGER),
     "jitter": Quantity("ns", _SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
-    "effective bits": Quantity("bit", "of the noise, log2(range / (noise sqrt 12))", _LONGER),
+    "effective bits": Quantity("bit", "of the rms of all that is left, log2(range / (rms sqrt 12))", _LONGER),
     "dynamic range": Quantity("dB", "of the noise, full-scale sine over it", _LONGER),
     "corner": Quantity("Hz", "least squares behind a Butterworth low-pass, else cross spectra", _BEYOND),
     "SINAD": Quantity("dB", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),

@@ -23,6 +23,8 @@ from rig.wire import sensor_key
 _PART = 1 << 16
 _MOST = 1e30
 """Values that a measurement can have, in any unit."""
+_ALIKE = 0.2
+"""Part by which steps of time stamps that are alike may differ."""
 _EARLY_S = 30.0
 """So much of a session is looked through for where a recording begins [s]."""
 
@@ -201,10 +203,15 @@ def _reading(recording: Recording, channel: Channel) -> Callable[[], tuple[np.nd
 
 
 def rate_of(signal: Recorded) -> float | None:
-    """Rate that a signal has by its file [Hz]: of its stamps where it tells none."""
-    if signal.rate_hz is None and signal.times_s is not None:
-        return even_rate_hz(signal.times_s)
-    return signal.rate_hz
+    """Rate of a signal [Hz]: of those steps of its stamps that are alike, if most are; else as its file tells."""
+    if signal.times_s is None or signal.rows < 2:
+        return signal.rate_hz
+    steps = np.diff(signal.times_s)
+    usual = float(np.median(steps))
+    alike = steps[np.abs(steps - usual) < _ALIKE * usual]
+    if 2 * len(alike) > len(steps):
+        return len(alike) / float(alike.sum())
+    return signal.rate_hz or even_rate_hz(signal.times_s)
 
 
 def in_parts(columns: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, ...]]:

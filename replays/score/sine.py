@@ -13,8 +13,6 @@ import numpy as np
 HARMONICS = 10
 """The highest harmonic that counts for the total distortion."""
 _ROUNDS = 20
-_PURE = 0.98
-"""Part of a signal's power that one sine must hold for it to be taken for a sine."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +79,14 @@ def _peak(values: np.ndarray) -> float:
     return (k + side * (2.0 * ratio - 1.0) / (1.0 + ratio)) / len(values)
 
 
-def is_sine(values: np.ndarray) -> bool:
-    """Whether a signal is a sine and little else."""
+def is_sine(values: np.ndarray, noise: float) -> bool:
+    """Whether a signal is a sine, and what else is in it is no more than noise of some rms [unit]."""
     spread = float(np.var(values))
     if len(values) < 64 or not spread > 0.0:
         return False
     fit = fit_sine(values)
-    return 0.5 * fit.amplitude[0] ** 2 > _PURE * spread and 2.0 / len(values) < fit.frequency[0] < 0.49
+    pure = fit.nad < max(noise, 1e-6 * fit.amplitude[0])
+    return pure and fit.amplitude[0] > fit.nad and 2.0 / len(values) < fit.frequency[0] < 0.49
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,8 @@ _DISTINCT = 0.95
 """What correlates by more than this part of the best is not told from it."""
 _CLEAR = 0.98
 """From which it needs no second look."""
+_APART, _FAR_S = 3, 5e-3
+"""Samples that a signal may be off the others; and where nothing is much like it there, so long [s]."""
 _MOST = 1 << 17
 """Samples of a signal that are correlated, at most."""
 _TAKEN_S = (2.0, 0.25)
@@ -32,6 +34,7 @@ class Wire:
         turned: Whether the other polarity, at another time, is as alike: as of a sine.
         late_s: Time in the session less time in the recording, of all signals together [s], ...
         within_s: ... in this stretch of the recording [s].
+        own_s: The same as `late_s` of this signal alone, which may be somewhat off the others [s].
     """
 
     channel: str
@@ -41,6 +44,7 @@ class Wire:
     turned: bool
     late_s: float
     within_s: tuple[float, float]
+    own_s: float
 
 
 def find_wires(
@@ -93,20 +97,26 @@ def _find(
     lag = _nearest_peak(np.mean(clear, axis=0), behind) if clear else behind
     found = {}
     for name, curve in curves.items():
-        near = curve[:, max(0, lag - 3) : lag + 4]
-        amounts = np.abs(near).max(axis=1)
+        for apart in (_APART, round(_FAR_S * rate)):
+            first = max(0, lag - apart)
+            near = curve[:, first : lag + apart + 1]
+            amounts = np.abs(near).max(axis=1)
+            if amounts.max() > 0.5:
+                break
         k = int(np.argmax(amounts))
         rivals = tuple(names[j] for j in np.flatnonzero(amounts >= _DISTINCT * amounts[k]) if j != k)
         if name in rivals and name in names:  # its own name decides between equals
             rivals = (*(each for each in rivals if each != name), names[k])
             k = names.index(name)
-        peak = near[k][int(np.argmax(np.abs(near[k])))]
+        at = int(np.argmax(np.abs(near[k])))
+        peak = near[k][at]
         polarity = 1 if peak >= 0.0 else -1
         turned = float((-polarity * curve[k]).max()) > 0.9 * amounts[k]
         known = amounts[k] > ALIKE
+        late_s = (lag - behind) / rate - from_s
         found[name] = Wire(
             names[k] if known else "", polarity, float(amounts[k]), rivals if known else (), bool(turned),
-            (lag - behind) / rate - from_s, (from_s, from_s + taken_s),
+            late_s, (from_s, from_s + taken_s), late_s if turned else late_s + (first + at - lag) / rate,
         )  # fmt: skip
     return found
 
