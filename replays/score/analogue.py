@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from replays.score.limits import Limits
+from replays.score.recorded import Recorded
 from replays.score.scorecard import Scorecard, judge_row
-from replays.score.signals import Recorded, Session, rate_of
+from replays.score.sent import Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stimulus import Exact, Sampled, Stimulus
 from replays.score.waveform import (
@@ -38,12 +39,12 @@ _OWN_CLOCK = 6.0, 1e-6
 """A clock is a channel's own where it is off the others' by more than so many deviations, and by so much."""
 _PURER = 1.5
 """Noises of a channel that what is not the sine in a sine may come to."""
+_BETTER = 0.5
+"""A fit of less than this part of what another leaves is the better one."""
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
 
 _ODD = "behind a low-pass that is none of Butterworth's"
-
-Formula = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Fitted:
         corner_hz: Where it has fallen by 3 dB, with its 95 % interval; None where it does not.
         odd: Whether there is a low-pass that is none of the known ones.
         values: As recorded, in the channel's unit.
-        exact: Whether the known signal is a formula.
+        exact: Whether the known signal has no noise of its own.
     """
 
     name: str
@@ -83,26 +84,53 @@ def fit_channels(
     remarks: list[str],
 ) -> list[Fitted]:  # fmt: skip
     """Fit all signals that are connected; those of which it is not sure to what, only where that explains them."""
-    found = []
-    for name, wire in wires.items():
-        if not wire.channel:
-            continue
+    begins = [signal.times_s[0] for signal in recorded.values() if signal.times_s is not None and signal.rows]
+    zero_s = min(begins, default=0.0)
+
+    def fit(name: str, wire: Wire) -> Fitted | None:
         signal, channel = recorded[name], session.channels[wire.channel]
         sent, first_s, sent_hz = session.whole(wire.channel)
-        rate = rate_of(signal) or sent_hz
-        if rate_of(signal) is None:
-            remarks.append(f"{name}: the file tells no rate; taken for the session's, {sent_hz:g} Hz")
-        values, unit_known = in_unit(signal, channel)
-        if not unit_known:
-            remarks.append(f"{name}: the unit {signal.unit or 'is not told'}; taken for {channel.unit}")
+        rate = signal.rate_hz or sent_hz
         formula = formulas.get(wire.channel)
         span = (first_s, first_s + len(sent) / sent_hz)
         stimulus: Stimulus = Sampled(sent, first_s, sent_hz) if formula is None else Exact(formula, span, rate)
-        times_s = np.arange(len(values)) / rate
-        one = _fit(name, channel, values, times_s, stimulus, first_s, wire, exact=formula is not None)
+        begin_s = 0.0 if signal.times_s is None else float(signal.times_s[0] - zero_s)
+        times_s = begin_s + np.arange(signal.rows) / rate
+        within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
+        wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
+        exact = formula is not None or not session.noisy
+        return _fit(name, channel, in_unit(signal, channel)[0], times_s, stimulus, first_s, wire, exact=exact)
+
+    wires = {name: wire for name, wire in wires.items() if wire.channel}
+    wires |= _begun(fit, wires)
+    found = []
+    for name, wire in wires.items():
+        signal, channel = recorded[name], session.channels[wire.channel]
+        if signal.rate_hz is None:
+            remarks.append(f"{name}: the file tells no rate; taken for the session's, {channel.rate_hz:g} Hz")
+        if not in_unit(signal, channel)[1]:
+            remarks.append(f"{name}: the unit {signal.unit or 'is not told'}; taken for {channel.unit}")
+        one = fit(name, wire)
         if one is not None and (one.good or name == wire.channel or not wire.rivals):
             found.append(one)
     return found
+
+
+def _begun(fit: Callable[[str, Wire], Fitted | None], wires: Mapping[str, Wire]) -> dict[str, Wire]:
+    """Wires with another beginning, where what is nearly periodic fits better from there."""
+    if not wires:
+        return {}
+    name = max(wires, key=lambda each: (len(wires[each].others_s) > 0, wires[each].likeness))
+    late_s, best = wires[name].late_s, (math.inf, 0.0)
+    for other_s in (late_s, *wires[name].others_s):
+        shift = other_s - late_s
+        one = fit(name, replace(wires[name], own_s=wires[name].own_s + shift))
+        if one is not None:
+            left = float(np.std(one.clean.residual))
+            best = (left, shift) if left < _BETTER * best[0] else best
+            if left < _PURER / _BETTER * one.channel.noise_v / abs(one.channel.sensitivity_v):
+                break
+    return {each: replace(wire, own_s=wire.own_s + best[1]) for each, wire in wires.items() if wire.others_s}
 
 
 def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:

@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from replays.score.limits import Limits
-from replays.score.rows import NO_COUNT, Followed, follow, stretches
+from replays.score.recorded import Recorded, in_parts
+from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
 from replays.score.scorecard import Scorecard, judge_row
-from replays.score.signals import Recorded, Sent, Session, in_parts
+from replays.score.sent import Sent, Session
 from replays.score.waveform import student
 from replays.score.wiring import Wire
 from rig import units
@@ -26,7 +27,9 @@ _NEAR = 0.49
 _NOTHING = 0.01
 """Counts that are none."""
 _PIECE = 512
-"""Consecutive rows on which a scale is found."""
+"""Most consecutive rows on which a scale is found: a row may be lost before and behind them."""
+_LOOKED = 1 << 16
+"""Rows of a recording by which its scale is found."""
 _ENOUGH = 0.99
 _BATCHES = 256
 _NAMED = 5
@@ -70,7 +73,8 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
         counts: Of the same rows as far as none is lost, shape (n,).
         channel: The channel.
     """
-    pieces = [slice(n, n + _PIECE) for n in range(0, len(values) - _PIECE + 1, _PIECE)] or [slice(None)]
+    size = min(_PIECE, max(8, len(values) // 4))
+    pieces = [slice(n, n + size) for n in range(0, len(values) - size + 1, size)]
     candidates = _candidates(unit, channel)
     # Rows that are as most are show nothing of a scale.
     telling = [moving for p in pieces if (moving := counts[p] != np.median(counts[p])).any()]
@@ -114,61 +118,103 @@ def _candidates(unit: str, channel: Channel) -> list[Scale]:
     return found or [Scale(1.0, 0.0, "counts")]
 
 
+@dataclass(frozen=True)
+class Taken:
+    """What a signal has taken of its channel.
+
+    Attributes:
+        scale: Of its counts.
+        step, phase: Those rows whose number is the phase, modulo the step.
+    """
+
+    scale: Scale
+    step: int = 1
+    phase: int = 0
+
+
 def settle(
     recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session
-) -> tuple[dict[str, Wire], dict[str, Scale]]:
-    """Which channel each signal has the counts of, and its scale, by its name in the file.
+) -> tuple[dict[str, Wire], dict[str, Taken]]:
+    """Which channel each signal has the counts of, how scaled and of which rows, by its name in the file.
 
     Where most signals show counts, one that does not is looked for in all channels; if it is in none, it is the channel
     that it is named by, or alone is like, with what its unit says of its scale.
     """
     held = {group: session.early(group) for group in session.groups}
 
-    def tried(name: str, of: str) -> tuple[np.ndarray, str, np.ndarray, Channel]:
-        channel, signal, wire = session.channels[of], recorded[name], wires[name]
-        counts = held[channel.group][:, session.groups[channel.group].index(of)]
-        late = round(wire.late_s * session.rate_hz(channel.group))
-        values, counts = signal.values[max(0, -late) :], counts[max(0, late) :]
-        few = min(len(values), len(counts), 1 << 16)
-        return values[:few], signal.unit, counts[:few], channel
+    begins: dict[int, int] = {}
 
-    found, settled = dict(wires), {}
-    for name, wire in wires.items():
-        scale = find_scale(*tried(name, wire.channel)) if wire.channel else None
-        if scale is not None:
-            settled[name] = scale
+    def tried(name: str, of: str, begin: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
+        """Values and counts of the same rows: row j of the file was sent `begin` and j steps behind the first one."""
+        channel, signal, step = session.channels[of], recorded[name], step_of(name, of)
+        skipped = max(0, -(begin // step))
+        values = signal.values[skipped:]
+        counts = held[channel.group][1][begin + skipped * step :: step, session.place(of)]
+        few = min(len(values), len(counts), _LOOKED)
+        return values[:few], signal.unit, counts[:few] >> signal.lost_bits << signal.lost_bits, channel
+
+    def step_of(name: str, of: str) -> int:
+        sent_hz = session.rate_hz(session.channels[of].group)
+        return max(1, round(sent_hz / (recorded[name].rate_hz or sent_hz)))
+
+    def taken_of(name: str, of: str) -> Taken | None:
+        """By where its table begins, as far as that is known; else by where its counts are."""
+        signal, channel, step = recorded[name], session.channels[of], step_of(name, of)
+        table = id(signal.like or signal)
+        index, counts = held[channel.group]
+        late = [round(each * session.rate_hz(channel.group)) for each in (wires[name].late_s, wires[name].own_s)]
+        for begin in dict.fromkeys([begins.get(table, late[0]), *late]):
+            values, unit, there, _ = tried(name, of, begin)
+            if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
+                begins[table] = begin
+                return Taken(scale, step, (index + begin) % step)
+        if table not in begins:
+            there = counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
+            for scale in _candidates(signal.unit, channel):
+                begin = located(scale.counts(signal.values[:_LOOKED]), there, step)
+                if begin is not None:
+                    begins[table] = begin
+                    return Taken(scale, step, (index + begin) % step)
+        return None
+
+    settled = {name: taken for name, wire in wires.items() if wire.channel and (taken := taken_of(name, wire.channel))}
+    found = dict(wires)
     if 2 * len(settled) <= len(wires):
         return found, settled
     for name, wire in wires.items():
         for other in () if name in settled else sorted(session.channels, key=lambda each: each != name):
-            if (scale := find_scale(*tried(name, other))) is not None:
-                found[name], settled[name] = replace(wire, channel=other, rivals=()), scale
+            if (taken := taken_of(name, other)) is not None:
+                found[name], settled[name] = replace(wire, channel=other, rivals=()), taken
                 break
         named = name if name in session.channels else "" if wire.rivals else wire.channel
         if name not in settled and named:
-            values, unit, counts, channel = tried(name, named)
-            apart = [
-                float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values) / scale.each))
-                for scale in _candidates(unit, channel)
-            ]
+            step = step_of(name, named)
+            begin = begins.get(id(recorded[name].like or recorded[name]), 0)
+            values, unit, counts, channel = tried(name, named, begin)
+
+            def apart(scale: Scale) -> float:
+                return float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values)) / scale.each)  # noqa: B023
+
             found[name] = replace(wire, channel=named)
-            settled[name] = replace(_candidates(unit, channel)[int(np.argmin(apart))], known=False)
+            scale = replace(min(_candidates(unit, channel), key=apart), known=False)
+            settled[name] = Taken(scale, step, (held[channel.group][0] + begin) % step)
     return found, settled
 
 
 def score_digital(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], scales: Mapping[str, Scale],
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], taken: Mapping[str, Taken],
     session: Session, limits: Limits,
 ) -> None:  # fmt: skip
     """Put the rows of the digital path onto a scorecard."""
-    for name, scale in scales.items():
-        _score_scale(card, name, scale, session.channels[wires[name].channel], limits)
-    tables: dict[tuple[int, float], list[str]] = {}
-    for name in sorted(scales, key=lambda each: not scales[each].known):
+    for name, each in taken.items():
+        _score_scale(card, name, each.scale, session.channels[wires[name].channel], limits)
+    tables: dict[tuple[float, ...], list[str]] = {}
+    for name in sorted(taken, key=lambda each: not taken[each].scale.known):
         rate_hz = session.rate_hz(session.channels[wires[name].channel].group)
-        tables.setdefault((recorded[name].rows, rate_hz), []).append(name)
+        table = recorded[name].rows, rate_hz, taken[name].step, taken[name].phase
+        tables.setdefault(table, []).append(name)
     for names in tables.values():
-        _score_rows(card, names, wires, recorded, scales, session, limits)
+        _score_rows(card, names, wires, recorded, taken, session, limits)
     for quantity in ("latency", "trigger row"):
         card.rows.append(judge_row("digital", quantity, "", None, limit=limits.bounds("digital", quantity)))
 
@@ -189,32 +235,32 @@ def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel, lim
 
 def _score_rows(
     card: Scorecard, names: Sequence[str], wires: Mapping[str, Wire], recorded: Mapping[str, Recorded],
-    scales: Mapping[str, Scale], session: Session, limits: Limits,
+    taken: Mapping[str, Taken], session: Session, limits: Limits,
 ) -> None:  # fmt: skip
     """Follow the rows of signals that are as long as each other, and judge what became of them and of their stamps."""
     groups = list(dict.fromkeys(session.channels[wires[name].channel].group for name in names))
     table = "all groups" if len(groups) == len(session.groups) > 1 else ", ".join(groups)
-    sound = sum(scales[name].known for name in names)
+    scales, one = {name: taken[name].scale for name in names}, taken[names[0]]
+    sound = sum(scale.known for scale in scales.values())
     if not sound:
         for name in names:
             limit = limits.bounds("digital", "altered values")
             note = "none of its signals shows which row is which"
             card.rows.append(judge_row("digital", "altered values", name, None, limit=limit, note=note))
         return
-    sent = Sent(session, groups)
+    sent = Sent(session, groups, one.step, one.phase)
     columns = [sent.names.index(wires[name].channel) for name in names]
 
     def counts() -> Iterator[np.ndarray]:
         for part in in_parts([recorded[name].values for name in names]):
             yield np.column_stack([scales[name].counts(values) for name, values in zip(names, part, strict=True)])
 
-    rate_hz = session.rate_hz(groups[0])
+    bits = np.array([recorded[name].lost_bits for name in names])
     stamps = Stamps(recorded[names[0]].times_s)
     found = Followed()
-    for places, found in follow((chunk[:, columns] for chunk in sent), counts(), sound):  # noqa: B007
+    for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound):  # noqa: B007
         known = places >= 0
-        first = sent.numbers(np.zeros(1, np.int64))
-        stamps.take(sent.first_s, (sent.numbers(places[known]) - first) / rate_hz, known)
+        stamps.take(sent.first_s, sent.since_s(places[known]), known)
 
     def add(quantity: str, channel: str, rows: int, runs: np.ndarray, *, numbered: bool = True) -> None:
         note = ""
@@ -258,7 +304,7 @@ class Stamps:
         if self._times_s is None or not len(known):
             return
         times_s = self._times_s[part]
-        self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) <= 0.0))
+        self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) < 0.0))
         self._last_s = float(times_s[-1])
         apart = times_s[known] - first_s - since_s
         size = max(4, len(self._times_s) // _BATCHES)

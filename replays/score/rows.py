@@ -22,6 +22,8 @@ _MOST_STRETCHES = 10_000
 """Stretches of altered values that are kept of a channel."""
 _BROKEN = 0.5
 """A channel of whose values more than this part is altered has no say in which row one is."""
+_VOTES = 16
+"""Rows that have to agree on where a recording begins."""
 _GRAM = 4
 """Consecutive rows that are known together where one alone is not."""
 
@@ -38,12 +40,28 @@ def row_hashes(counts: np.ndarray) -> np.ndarray:
     return found
 
 
-def _grams(hashes: np.ndarray) -> np.ndarray:
-    """A number of each row with those behind it; the last ones have fewer."""
+def grams(hashes: np.ndarray, step: int = 1) -> np.ndarray:
+    """A number of each row with the next ones, every so many; the last ones have fewer."""
     found = hashes.copy()
-    for step in range(1, _GRAM):
-        found[:-step] += hashes[step:] * np.uint64(2 * step + 1) ^ np.uint64(step)
+    for n in range(1, _GRAM):
+        found[: -n * step] += hashes[n * step :] * np.uint64(2 * n + 1) ^ np.uint64(n)
     return found
+
+
+def located(counts: np.ndarray, among: np.ndarray, step: int) -> int | None:
+    """Where the first of some counts stands among those sent, of which every so many was taken; None if nowhere.
+
+    Args:
+        counts: Of one channel, int64, shape (n,).
+        among: Of the same one, shape (m,).
+        step: From one to the next; the place may be before the first.
+    """
+    if min(len(counts), len(among) // step) < 2 * _VOTES:
+        return None
+    here, there = (grams(row_hashes(each[:, None]), n) for each, n in ((counts, 1), (among, step)))
+    _, at, place = np.intersect1d(here, there, return_indices=True)
+    begins, votes = np.unique(place - at * step, return_counts=True)
+    return int(begins[np.argmax(votes)]) if len(votes) and votes.max() >= _VOTES else None
 
 
 class Stretches:
@@ -226,7 +244,7 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, high: int) -> tuple[np.
     n, rows = len(hashes), np.arange(len(hashes))
     places = np.full(n, -1, dtype=np.int64)
     ranks = {}
-    for level, (there, here) in enumerate(((nearby, hashes), (_grams(nearby), _grams(hashes)))):
+    for level, (there, here) in enumerate(((nearby, hashes), (grams(nearby), grams(hashes)))):
         order = np.argsort(there, kind="stable")
         ordered = there[order]
         left, right = np.searchsorted(ordered, here), np.searchsorted(ordered, here, side="right")

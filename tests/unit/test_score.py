@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from replays.recordings.export import write_run
 from replays.score.judgement import judge
 from replays.score.limits import load_limits
 from replays.score.rows import NO_COUNT, follow
@@ -21,6 +22,8 @@ from replays.score.stimulus import EDGE, Exact, Sampled
 from replays.score.waveform import behind_filter, fit_waveform, order_of, response, split_noise, student
 from rig.channels import default_table
 from rig.errors import InputError
+from rig.scenes import load_scene
+from rig.simulation import Simulation
 from tests.commands import said
 from tests.score_daqs import RATE_HZ, Tones, chips, counts_of, write_parquet, write_session
 
@@ -435,3 +438,20 @@ def test_intervals_hold_as_often_as_they_say() -> None:
         print(f"{name}: {np.mean(each):.1%} of {len(each)}")
     spread = 3.0 * math.sqrt(0.05 * 0.95 / seeds)
     assert all(0.93 - spread < np.mean(each) < 0.97 + spread for each in held.values())
+
+
+def test_a_test_signal_is_known_by_its_formula(tmp_path: Path) -> None:
+    """The session's own noise is then not in what the DAQ is held against."""
+    scene = load_scene("test-two-tone", {"duration_s": 0.8})
+    write_run(Simulation(scene), tmp_path / "sent.mcap")
+    generator, true_s = np.random.default_rng(8), 0.05 + np.arange(12_000) / RATE_HZ / (1.0 + 3e-5)
+    columns = {}
+    for name in ("disk_x", "P_N"):
+        source = scene.sources()[name]
+        noise = source.channel.noise_v * generator.standard_normal(len(true_s))
+        columns[f"{name} [V]"] = source.volts(true_s) + noise
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [tmp_path / "sent.mcap"])
+    assert red(card) == set()
+    assert card.row("clock").value == pytest.approx(30.0, abs=0.05)
+    for name in ("disk_x", "P_N"):
+        assert [card.row(quantity, name).verdict for quantity in ("gain", "noise", "effective bits")] == [PASS] * 3

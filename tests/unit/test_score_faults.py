@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from drivers.can.signals import messages_for
 from replays.score.judgement import judge
 from replays.score.scorecard import FAIL, Scorecard
 from rig.channels import default_table
@@ -208,6 +209,36 @@ OWN: dict[str, tuple[Callable[[dict[str, np.ndarray]], None], set[tuple[str, str
     "a fast clock of the stamps": (changed("time [s]", 1.0003), {(ALL, "stamp rate")}),
     "stale stamps": (changed("time [s]", plus=-0.01 * (ROWS % 200 == 150)), {BACK}),
 }
+
+
+@pytest.mark.parametrize(("suffix", "fd"), [(".log", True), (".asc", False), (".blf", True)])
+def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_path: Path) -> None:
+    """Of every n-th row, in classic frames of the upper 16 bits: what came is exact, and a lost frame is named."""
+    import can
+
+    session, counts = sessions[True]
+    table = messages_for(default_table())
+    message = next(each for each in (table.fd if fd else table.classic) if "disk_x" in str(each.signals))
+    form, step = message.samples, 2 if fd else 20
+    assert form is not None
+    rows = counts["probes"][40::step][:, : len(form.channels)]
+    first = np.arange(0, len(rows) - form.rows, form.rows)
+    rows = rows[: len(first) * form.rows]
+    with can.Logger(tmp_path / f"bus{suffix}") as log:
+        for n, data in enumerate(
+            form.pack(40 // (1 if fd else step) + first * (step if fd else 1), rows, message.length)
+        ):
+            if n != len(first) // 2:
+                settings: Any = {
+                    "is_fd": fd,
+                    "is_extended_id": False,
+                    "timestamp": 1e9 + n * form.rows * step / RATE_HZ,
+                }
+                log(can.Message(arbitration_id=message.identifier, data=data.tobytes(), **settings))
+    card = judge(tmp_path / f"bus{suffix}", [session])
+    assert red(card) == {("probes", "missing rows")}
+    lost = 40 + len(first) // 2 * form.rows * step
+    assert card.runs == {"missing rows probes": [(lost, lost + (form.rows - 1) * step)]}
 
 
 @pytest.mark.parametrize("defect", OWN)
