@@ -55,8 +55,12 @@ class Recorded:
         values, times_s = self.read()
         if self.like is None:
             self.__dict__["times_s"] = None if times_s is None else _spooled(times_s)
-        with np.errstate(invalid="ignore"):
-            return _spooled(np.where(np.abs(values) <= _MOST, values, np.nan))
+        del times_s
+        for begin in range(0, len(values), _KEPT):
+            part = values[begin : begin + _KEPT]
+            with np.errstate(invalid="ignore"):
+                part[~(np.abs(part) <= _MOST)] = np.nan
+        return _spooled(values)
 
     @cached_property
     def times_s(self) -> np.ndarray | None:
@@ -70,10 +74,11 @@ class Recorded:
             return self.like.rate_hz
         if self.times_s is None or self.rows < 2:
             return self.told_hz
-        steps = np.diff(self.times_s)
+        times_s = self.times_s[:_KEPT]
+        steps = np.diff(times_s)
         usual = float(np.median(steps))
         alike = steps[np.abs(steps - usual) < _ALIKE * usual]
-        if 2.0 * alike.sum() > self.times_s[-1] - self.times_s[0]:
+        if 2.0 * alike.sum() > times_s[-1] - times_s[0]:
             return len(alike) / float(alike.sum())
         return self.told_hz or even_rate_hz(self.times_s)
 

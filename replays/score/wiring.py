@@ -109,10 +109,10 @@ def _find(
         length = lengths[len(here)] / math.sqrt(_step(recorded[name][1], rate))
         for apart in (_APART, round(_FAR_S * rate)):
             first = max(0, lag - apart)
-            about = slice(first, min(lag + apart + 1, length.shape[1]))
-            stretch = np.lib.stride_tricks.sliding_window_view(padded, len(here), axis=1)[:, about]
-            near = stretch @ (here - here.mean())
-            near /= length[:, about] * max(float(np.linalg.norm(here - here.mean())), 1e-150)
+            about = range(first, min(lag + apart + 1, length.shape[1]))
+            still = here - here.mean()
+            near = np.column_stack([padded[:, at : at + len(here)] @ still for at in about])
+            near /= length[:, about] * max(float(np.linalg.norm(still)), 1e-150)
             amounts = np.abs(near).max(axis=1)
             if amounts.max() > 0.5:
                 break
@@ -136,6 +136,7 @@ def _find(
 
 
 def _even(values: np.ndarray, rate: float, wanted: float, seconds: float) -> np.ndarray:
+    values = np.asarray(values[: math.ceil(seconds * rate) + 2])
     held = np.nan_to_num(values, nan=float(np.nanmean(values)) if np.isfinite(values).any() else 0.0)
     rows = max(2, min(math.floor(seconds * wanted), math.floor((len(held) - 1) / rate * wanted) + 1))
     if (step := _step(rate, wanted)) > 1:
