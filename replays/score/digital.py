@@ -32,6 +32,8 @@ _LOOKED = 1 << 16
 """Rows of a recording by which its scale is found."""
 _ENOUGH = 0.99
 _BATCHES = 256
+_SAME_CLOCK_S = 10.0
+"""Stamps that are farther from the wall time of the session are of another clock."""
 _NAMED = 5
 """Rows that are named in a line; all stand in the document."""
 
@@ -215,8 +217,6 @@ def score_digital(
         tables.setdefault(table, []).append(name)
     for names in tables.values():
         _score_rows(card, names, wires, recorded, taken, session, limits)
-    for quantity in ("latency", "trigger row"):
-        card.rows.append(judge_row("digital", quantity, "", None, limit=limits.bounds("digital", quantity)))
 
 
 def _exact(count: float) -> tuple[float, float, float]:
@@ -257,10 +257,15 @@ def _score_rows(
 
     bits = np.array([recorded[name].lost_bits for name in names])
     stamps = Stamps(recorded[names[0]].times_s)
-    found = Followed()
+    found, trigger, at = Followed(), None, 0
     for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound):  # noqa: B007
-        known = places >= 0
-        stamps.take(sent.first_s, sent.since_s(places[known]), known)
+        known = np.flatnonzero(places >= 0)
+        stamps.take(sent.first_s, sent.since_s(places[known]), known, len(places))
+        if trigger is None and session.trigger_s is not None and len(known):
+            behind = np.flatnonzero(sent.first_s + sent.since_s(places[known]) >= session.trigger_s)
+            # Row 0 is behind whatever was before the recording.
+            trigger = at + int(known[behind[0]]) if len(behind) and at + known[behind[0]] else None
+        at += len(places)
 
     def add(quantity: str, channel: str, rows: int, runs: np.ndarray, *, numbered: bool = True) -> None:
         note = ""
@@ -281,7 +286,8 @@ def _score_rows(
     none = stretches(np.empty(0, dtype=np.int64))
     add("rows before the first", table, max(0, found.first), none)
     add("rows after the last", table, found.sent - 1 - found.last, none)
-    for quantity, estimate in stamps.judged().items():
+    told = {**stamps.judged(session.wall_s), "trigger row": None if trigger is None else _exact(trigger)}
+    for quantity, estimate in told.items():
         limit = limits.bounds("digital", quantity)
         card.rows.append(judge_row("digital", quantity, table, estimate, limit=limit))
     card.pictures[f"stamps {table}"] = stamps.picture()
@@ -297,11 +303,11 @@ class Stamps:
         self._means: list[np.ndarray] = []
         self._squares, self._freedom = 0.0, 0
 
-    def take(self, first_s: float, since_s: np.ndarray, known: np.ndarray) -> None:
+    def take(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
         """Take when the first row was sent, how long after it those of the next that are known [s], and which are."""
-        part = slice(self._at, self._at + len(known))
+        part = slice(self._at, self._at + rows)
         self._at = part.stop
-        if self._times_s is None or not len(known):
+        if self._times_s is None or not rows:
             return
         times_s = self._times_s[part]
         self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) < 0.0))
@@ -314,9 +320,13 @@ class Stamps:
             self._squares += float(np.sum((late - late.mean()) ** 2))
             self._freedom += size - 1
 
-    def judged(self) -> dict[str, tuple[float, float, float] | None]:
-        """Offset at the first row [s], rate [ppm], jitter [s] and steps back: value, low, high; None: not told."""
-        names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back")
+    def judged(self, wall_s: float | None) -> dict[str, tuple[float, float, float] | None]:
+        """Offset at the first row [s], rate [ppm], jitter [s], steps back, latency [s], with low and high ends if told.
+
+        Args:
+            wall_s: Wall time at which what was sent at time zero came to who recorded the session [s].
+        """
+        names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
         if self._times_s is None:
             return dict.fromkeys(names)
         found: dict[str, tuple[float, float, float] | None] = dict.fromkeys(names)
@@ -334,6 +344,9 @@ class Stamps:
         half = student(freedom) * np.sqrt(np.diag(covariance))
         for name, n, size in (("stamp offset", 0, 1.0), ("stamp rate", 1, 1e6)):
             found[name] = size * parts[n], size * (parts[n] - half[n]), size * (parts[n] + half[n])
+        if wall_s is not None and abs(late.mean() - wall_s) < _SAME_CLOCK_S:
+            value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
+            found["latency"] = float(value), float(value - wide), float(value + wide)
         ends = [math.sqrt(self._squares / chi2.ppf(p, self._freedom)) for p in (0.975, 0.025)]
         found["stamp jitter"] = math.sqrt(self._squares / self._freedom), ends[0], ends[1]
         return found

@@ -56,8 +56,12 @@ DIGITAL = {
     "stamp rate": Quantity("ppm", "straight line through means of batches, Student's t", _STAMPED),
     "stamp jitter": Quantity("s", "rms within batches, chi squared", _STAMPED),
     "stamps that go back": Quantity("1", _EXACT, _STAMPED),
-    "latency": Quantity("s", "-", "the DAQ beside a rig that runs: a file does not tell when its rows came"),
-    "trigger row": Quantity("1", "-", "a triggered recording of a scene with a hammer or a step"),
+    "latency": Quantity(
+        "s",
+        "stamps less the arrival of the rows at the session's recorder, Student's t",
+        "the DAQ, stamping rows by the computer's clock as they come, beside `rig record` of a rig that runs",
+    ),
+    "trigger row": Quantity("1", _EXACT, "a triggered recording of a scene with a hammer or another command"),
 }
 ANALOGUE = {
     "mapping": Quantity("1", "cross-correlation of all pairs", _RICH),

@@ -15,12 +15,14 @@ from recorder.reader import join
 from rig.channels import Channel
 from rig.errors import InputError, Words
 from rig.generators import Source
+from rig.sampling import TICKS_HZ
 from rig.scenes import Scene, parse_scene
 from rig.wire import sensor_key
 
 Formula = Callable[[np.ndarray], np.ndarray]
 
 _PART = 1 << 16
+_TRIGGERS = ("hammer", "speed", "release", "fault")
 _SMOOTH = ("sine", "two-tone", "chirp", "multisine", "quiet", "recorded")
 """Test signals that are known between samples; in the others an instant lies on this or that side of a jump."""
 _EARLY_S = 30.0
@@ -65,6 +67,18 @@ class Session:
             return parse_scene(self.recording.scene.get("scene") or {})
         except InputError:
             return None
+
+    @property
+    def trigger_s(self) -> float | None:
+        """When the first command took effect, by which a DAQ may be triggered [s]; None if there was none."""
+        ticks = [event["tick"] for event in self.recording.events if event.get("event") in _TRIGGERS]
+        return ticks[0] / TICKS_HZ if ticks else None
+
+    @property
+    def wall_s(self) -> float | None:
+        """Wall time at which what was sent at time zero came to its recorder [unix s]; None where that is not told."""
+        clock = self.recording.clock
+        return float(np.median(clock[:, 1] - clock[:, 0])) if len(clock) else None
 
     @property
     def noisy(self) -> bool:

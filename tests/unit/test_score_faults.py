@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from drivers.can.signals import messages_for
+from recorder.reader import Recording
 from replays.score.judgement import judge
 from replays.score.scorecard import FAIL, Scorecard
+from replays.sessions.session import FOLDER
 from rig.channels import default_table
 from rig.commands import FaultCommand
 from rig.faults import KINDS
@@ -245,3 +247,22 @@ def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_pa
 def test_a_daqs_own_defects(defect: str, sessions: Sessions, tmp_path: Path) -> None:
     (session, counts), (change, declares) = sessions[True], OWN[defect]
     assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session])) == declares
+
+
+def test_stamps_of_the_computers_clock_show_latency(sessions: Sessions, tmp_path: Path) -> None:
+    session, counts = sessions[True]
+    late_s = 3e-3 + 1e-4 * np.random.default_rng(3).standard_normal(len(ROWS))
+    row = judge(daq(tmp_path / "daq.parquet", counts, changed("time [s]", plus=1.7e9 + late_s)), [session]).row(
+        "latency", ALL
+    )
+    assert row.low < late_s.mean() < row.high < row.low + 2e-5
+
+
+def test_a_recording_that_a_command_triggered_shows_its_row(tmp_path: Path) -> None:
+    session = FOLDER / "hammer-3.2.mcap"
+    with Recording.open(session) as recording:
+        samples, (tick,) = recording.samples("forces"), [e["tick"] for e in recording.events if e["event"] == "hammer"]
+    row = round(tick * 1e-6 * samples.rate_hz)
+    columns = {f"{name} [N]": samples[name][row - 40 :] for name in samples}
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
+    assert card.row("trigger row", "forces").value == 40
