@@ -41,6 +41,7 @@ _PURER = 1.5
 """Noises of a channel that what is not the sine in a sine may come to."""
 _BETTER = 0.5
 """A fit of less than this part of what another leaves is the better one."""
+_SINE = ("SINAD", "ENOB", "THD", "SFDR")
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
 
@@ -180,11 +181,12 @@ def score_analogue(
             note = "nothing that was sent explains it" if wire.channel else "no channel is like it"
             card.rows.append(judge_row("analogue", "gain", name, None, limit=limit, note=note))
     _score_time(card, [one for one in found if one.good], wires, limits)
+    sines = []
     for one in found:
         _score_fit(card, one, limits)
-        _score_sine(card, one, limits)
+        sines.append(_score_sine(card, one, limits))
         card.pictures[f"analogue {one.name}"] = one
-    for quantity in ("alias rejection", "trigger row"):
+    for quantity in (*(() if any(sines) else _SINE), "alias rejection", "trigger row"):
         card.rows.append(judge_row("analogue", quantity, "", None, limit=limits.bounds("analogue", quantity)))
 
 
@@ -265,24 +267,20 @@ def _score_corner(card: Scorecard, one: Fitted, limits: Limits) -> None:
     card.rows.append(judge_row("analogue", "corner", one.name, estimate, limit=limit, note=note))
 
 
-def _score_sine(card: Scorecard, one: Fitted, limits: Limits) -> None:
-    """The standard's sine fit beside the known signal, where that is a sine."""
-    names = ("SINAD", "ENOB", "THD", "SFDR")
+def _score_sine(card: Scorecard, one: Fitted, limits: Limits) -> bool:
+    """The standard's sine fit beside the known signal; whether that is a sine, and no value is missing."""
     gaps = not np.isfinite(one.values).all()
     noises = 1 if one.exact else 2
     quiet = _PURER * math.hypot(one.channel.noise_v, one.channel.lsb_v) / abs(one.channel.sensitivity_v)
     if gaps or not is_sine(one.low.known[:_LONGEST], quiet):
-        for quantity in names:
-            limit = limits.bounds("analogue", quantity, one.channel)
-            note = "values are missing" if gaps else "the signal is no sine"
-            card.rows.append(judge_row("analogue", quantity, one.name, None, limit=limit, note=note))
-        return
+        return False
     fit = fit_sine(one.values)
     told = quality(fit)
-    for quantity, estimate in zip(names, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
+    for quantity, estimate in zip(_SINE, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
         limit = limits.bounds("analogue", quantity, one.channel, amplitude=fit.amplitude[0], noises=noises)
         note = "" if noises == 1 else "of the record as it is: the rig's own noise is in it"
         card.rows.append(judge_row("analogue", quantity, one.name, estimate, limit=limit, note=note))
+    return True
 
 
 def _scaled(estimate: tuple[float, float, float], size: float) -> tuple[float, float, float]:

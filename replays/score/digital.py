@@ -224,7 +224,7 @@ def _exact(count: float) -> tuple[float, float, float]:
 
 
 def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel, limits: Limits) -> None:
-    note = f"{scale.what}: {scale.each:.9g} a count, {scale.zero:.9g} at zero"
+    note = f"{scale.what}: {scale.each:.9g} a count, {scale.zero + 0.0:.9g} at zero"
     note += "" if scale.known else ", as no stretch of rows shows another: its values are not what was sent"
     for quantity, off in (("scale", scale.gain_ppm), ("offset", scale.zero_counts)):
         limit = limits.bounds("digital", quantity, channel)
