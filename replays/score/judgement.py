@@ -19,8 +19,8 @@ from replays.score.sent import Formula, Session
 from replays.score.wiring import Wire, find_wires
 from rig.errors import InputError, Words
 
-_LOUD = 4.0
-"""Noises of a channel from which on what was sent has to be seen."""
+_LOUD, _MANY = 4.0, 1000
+"""Noises of a channel, and rows, from which on what was sent has to be seen."""
 _NEAR = 0.01
 """Part by which the rate of a DAQ that took rows may be off by its stamps."""
 
@@ -69,7 +69,7 @@ def judge(
     if path == "digital" and not rows:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title)
-    _score_wires(card, wires, session, rows if path == "digital" else {})
+    _score_wires(card, recorded, wires, session, rows if path == "digital" else {})
     if path == "digital":
         score_digital(card, recorded, wires, rows, session, limits)
     else:
@@ -107,7 +107,10 @@ def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
     return found
 
 
-def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, rows: Mapping[str, Taken]) -> None:
+def _score_wires(
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session,
+    rows: Mapping[str, Taken],
+) -> None:  # fmt: skip
     """Mapping and polarity: a name of the rig's has to be that channel."""
     counts = {
         name: values
@@ -125,7 +128,7 @@ def _score_wires(card: Scorecard, wires: Mapping[str, Wire], session: Session, r
         note = f"correlation {wire.likeness:.4f}"
         scale = rows[name].scale if name in rows else None
         certain = not wire.rivals if scale is None else scale.known
-        if not wire.channel and card.path == "analogue" and name in loud:
+        if not wire.channel and card.path == "analogue" and name in loud and recorded[name].rows >= _MANY:
             verdict, note = FAIL, "nothing of what was sent is in it"
         elif not wire.channel or not certain:
             verdict = NOT_SHOWN

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-ALIKE = 0.2
-"""Correlation from which a signal counts as found."""
+_ALIKE, _CHANCE = 0.2, 6.0
+"""Correlation from which a signal counts as found, and times the root of its samples: few are by chance."""
 _DISTINCT = 0.95
 """What correlates by more than this part of the best is not told from it."""
 _CLEAR = 0.98
@@ -125,7 +125,7 @@ def _find(
         peak = near[k][at]
         polarity = 1 if peak >= 0.0 else -1
         turned = max(-polarity * end[k] for end in ends[name]) > 0.9 * amounts[k]
-        known = amounts[k] > ALIKE
+        known = amounts[k] > max(_ALIKE, _CHANCE / math.sqrt(len(here) / _step(recorded[name][1], rate)))
         late_s = (lag - behind) / rate - from_s
         found[name] = Wire(
             names[k] if known else "", polarity, float(amounts[k]), rivals if known else (), bool(turned),
@@ -196,7 +196,7 @@ def _common_lags(curves: list[tuple[np.ndarray, np.ndarray]], zero: int) -> list
         curves: How much each signal is like the channel that is most alike, and like that of its name, by lag.
         zero: No lag.
     """
-    clear = [alike for alike, _ in curves if alike.max() > ALIKE]
+    clear = [alike for alike, _ in curves if alike.max() > _ALIKE]
     if not clear:
         return [zero]
     curve = np.mean(clear, axis=0)
