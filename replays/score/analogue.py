@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from replays.score.limits import Limits
 from replays.score.recorded import Recorded
-from replays.score.scorecard import Scorecard, judge_row
+from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stimulus import Exact, Sampled, Stimulus
@@ -69,7 +67,7 @@ class Fitted:
     low: Waveform
     clean: Waveform
     shown: Response | None
-    corner_hz: tuple[float, float, float] | None
+    corner_hz: Interval | None
     odd: bool
     values: np.ndarray
     exact: bool
@@ -164,12 +162,12 @@ def _fit(
     return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact)
 
 
-def _about(value: float, spread: float, quantile: float, size: float = 1.0) -> tuple[float, float, float]:
+def _about(value: float, spread: float, quantile: float, size: float = 1.0) -> Interval:
     return size * value, size * (value - quantile * spread), size * (value + quantile * spread)
 
 
 def score_analogue(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session, limits: Limits,
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session,
     formulas: Mapping[str, Formula],
 ) -> None:  # fmt: skip
     """Put the rows of the analogue path onto a scorecard."""
@@ -177,26 +175,20 @@ def score_analogue(
     fitted = {one.name for one in found}
     for name, wire in wires.items():
         if name not in fitted:
-            limit = limits.bounds("analogue", "gain")
             note = "nothing that was sent explains it" if wire.channel else "no channel is like it"
-            card.rows.append(judge_row("analogue", "gain", name, None, limit=limit, note=note))
-    _score_time(card, [one for one in found if one.good], wires, limits)
+            card.add("gain", name, None, note=note)
+    _score_time(card, [one for one in found if one.good], wires)
     sines = []
     for one in found:
-        _score_fit(card, one, limits)
-        sines.append(_score_sine(card, one, limits))
+        _score_fit(card, one)
+        sines.append(_score_sine(card, one))
         card.pictures[f"analogue {one.name}"] = one
     for quantity in (*(() if any(sines) else _SINE), "alias rejection", "trigger row"):
-        card.rows.append(judge_row("analogue", quantity, "", None, limit=limits.bounds("analogue", quantity)))
+        card.add(quantity, "", None)
 
 
-def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire], limits: Limits) -> None:
+def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire]) -> None:
     """Clock of all channels together, start of one in the middle of them, and skew of the others against it."""
-
-    def add(quantity: str, channel: str, estimate: Any, of: Channel | None, note: str = "") -> None:
-        limit = limits.bounds("analogue", quantity, of)
-        card.rows.append(judge_row("analogue", quantity, channel, estimate, limit=limit, note=note))
-
     # One channel that is off has no say in what the others are: the reference is in the middle of them.
     inner = sorted((one for one in found if not one.odd), key=lambda one: one.low.late_s) or found
     if not inner:
@@ -204,7 +196,7 @@ def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire],
     reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else found[0]
     spreads = np.maximum([one.low.spread[3] for one in found], 1e-15)
     drifts = np.array([one.low.drift for one in found])
-    middle = np.median(drifts) if len(found) > 2 else reference.low.drift
+    middle = np.sort(drifts)[(len(found) - 1) // 2] if len(found) > 2 else reference.low.drift
     own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * spreads, _OWN_CLOCK[1])
     weights = np.where(own, 0.0, spreads**-2.0)
     quantile = student(reference.low.freedom)
@@ -213,28 +205,28 @@ def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire],
     for name, drift, spread in told:
         # Its clock runs fast where the session's time goes slowly over its own.
         note = "off the clock of the others" if name else ""
-        add("clock", name, _about(-drift / (1.0 + drift), spread, quantile, 1e6), None, note)
+        card.add("clock", name, _about(-drift / (1.0 + drift), spread, quantile, 1e6), note=note)
     turned = any(wires[one.name].turned for one in found)
     note = "a periodic signal: up to whole periods" if turned else ""
     begin_s = reference.low.late_s - reference.low.drift * reference.low.middle_s
-    add("start", reference.name, _about(begin_s, reference.low.spread[2], quantile), reference.channel, note)
+    start = _about(begin_s, reference.low.spread[2], quantile)
+    card.add("start", reference.name, start, of=reference.channel, note=note)
     for one in found:
         if one is not reference:
             apart = one.low.late_s - reference.low.late_s
             both = math.hypot(one.low.spread[2], reference.low.spread[2])
             odd = _ODD if one.odd or reference.odd else ""
             said = "; ".join(each for each in (f"against {reference.name}", note, odd) if each)
-            add("skew", one.name, None if odd else _about(apart, both, quantile, 1e9), one.channel, said)
+            skew = None if odd else _about(apart, both, quantile, 1e9)
+            card.add("skew", one.name, skew, of=one.channel, note=said)
 
 
-def _score_fit(card: Scorecard, one: Fitted, limits: Limits) -> None:
+def _score_fit(card: Scorecard, one: Fitted) -> None:
     low, channel = one.low, one.channel
     quantile = student(low.freedom)
-    unit = channel.unit
 
-    def add(quantity: str, estimate: tuple[float, float, float] | None, note: str = "") -> None:
-        limit = limits.bounds("analogue", quantity, channel)
-        card.rows.append(judge_row("analogue", quantity, one.name, estimate, unit=unit, limit=limit, note=note))
+    def add(quantity: str, estimate: Interval | None, note: str = "") -> None:
+        card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
     note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
     add("gain", None if note else _about(abs(low.gain) - 1.0, low.spread[0], quantile, 1e6), note)
@@ -250,24 +242,18 @@ def _score_fit(card: Scorecard, one: Fitted, limits: Limits) -> None:
     ranges = [20.0 * math.log10(full / max(noise[n], 1e-12 * full) / math.sqrt(2.0)) for n in (0, 2, 1)]
     add("effective bits", (bits[0], bits[1], bits[2]))
     add("dynamic range", (ranges[0], ranges[1], ranges[2]))
-    _score_corner(card, one, limits)
-
-
-def _score_corner(card: Scorecard, one: Fitted, limits: Limits) -> None:
-    limit = limits.bounds("analogue", "corner", one.channel)
-    estimate, note = None, ""
-    if one.corner_hz is not None:
-        estimate = one.corner_hz
-    elif one.shown is not None:
+    limit = card.asked(card.path, "corner", channel)
+    estimate, note = one.corner_hz, ""
+    if estimate is None and one.shown is not None:
         highest = float(one.shown.frequency_hz[-1])
         if limit is not None and highest >= limit.low:
             estimate, note = (highest, highest, math.inf), "no fall by 3 dB up to there"
         else:
             note = f"no fall by 3 dB up to {highest:.0f} Hz, beyond which the signal shows nothing"
-    card.rows.append(judge_row("analogue", "corner", one.name, estimate, limit=limit, note=note))
+    add("corner", estimate, note)
 
 
-def _score_sine(card: Scorecard, one: Fitted, limits: Limits) -> bool:
+def _score_sine(card: Scorecard, one: Fitted) -> bool:
     """The standard's sine fit beside the known signal; whether that is a sine, and no value is missing."""
     gaps = not np.isfinite(one.values).all()
     noises = 1 if one.exact else 2
@@ -277,11 +263,10 @@ def _score_sine(card: Scorecard, one: Fitted, limits: Limits) -> bool:
     fit = fit_sine(one.values)
     told = quality(fit)
     for quantity, estimate in zip(_SINE, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
-        limit = limits.bounds("analogue", quantity, one.channel, amplitude=fit.amplitude[0], noises=noises)
         note = "" if noises == 1 else "of the record as it is: the rig's own noise is in it"
-        card.rows.append(judge_row("analogue", quantity, one.name, estimate, limit=limit, note=note))
+        card.add(quantity, one.name, estimate, of=one.channel, note=note, amplitude=fit.amplitude[0], noises=noises)
     return True
 
 
-def _scaled(estimate: tuple[float, float, float], size: float) -> tuple[float, float, float]:
+def _scaled(estimate: Interval, size: float) -> Interval:
     return estimate[0] * size, estimate[1] * size, estimate[2] * size

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.limits import Limits
 from replays.score.recorded import Recorded, in_parts
 from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
-from replays.score.scorecard import Scorecard, judge_row
+from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
 from replays.score.waveform import student
 from replays.score.wiring import Wire
@@ -78,27 +77,23 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
     """
     size = min(_PIECE, max(8, len(values) // 4))
     pieces = [slice(n, n + size) for n in range(0, len(values) - size + 1, size)]
+
+    def shows(scale: Scale, p: slice) -> bool:
+        # Rows that are as most are show nothing of a scale.
+        same, moving = scale.counts(values[p]) == counts[p], counts[p] != np.median(counts[p])
+        return bool(moving.any()) and min(same.mean(), same[moving].mean()) >= _ENOUGH
+
     candidates = _candidates(unit, channel)
-    # Rows that are as most are show nothing of a scale.
-    telling = [moving for p in pieces if (moving := counts[p] != np.median(counts[p])).any()]
-    pieces = [p for p in pieces if (counts[p] != np.median(counts[p])).any()]
     for scale in candidates:
-        same = scale.counts(values) == counts
-        if any(
-            same[p].mean() >= _ENOUGH and same[p][t].mean() >= _ENOUGH for p, t in zip(pieces, telling, strict=True)
-        ):
+        if any(shows(scale, p) for p in pieces):
             return scale
-    for p, moving in zip(pieces, telling, strict=True):
+    for p in pieces:
         x, y = counts[p].astype(float), values[p]
-        if not np.isfinite(y).all():
+        if not np.isfinite(y).all() or not np.ptp(x):
             continue
         each, zero = map(float, np.polyfit(x - x.mean(), y, 1))
         zero -= each * float(x.mean())
-        if not each:
-            continue
-        scale = Scale(each, zero, "fitted")
-        same = scale.counts(y) == counts[p]
-        if same.mean() >= _ENOUGH and same[moving].mean() >= _ENOUGH:
+        if each and shows(Scale(each, zero, "fitted"), p):
             near = min(candidates, key=lambda one: abs(math.log(abs(each / one.each))))
             ratio = each / near.each
             # Digits that the file leaves out, and those of numbers, are no gain and no zero.
@@ -206,37 +201,34 @@ def settle(
 
 def score_digital(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], taken: Mapping[str, Taken],
-    session: Session, limits: Limits,
+    session: Session,
 ) -> None:  # fmt: skip
     """Put the rows of the digital path onto a scorecard."""
     for name, each in taken.items():
-        _score_scale(card, name, each.scale, session.channels[wires[name].channel], limits)
+        _score_scale(card, name, each.scale, session.channels[wires[name].channel])
     tables: dict[tuple[float, ...], list[str]] = {}
     for name in sorted(taken, key=lambda each: not taken[each].scale.known):
         rate_hz = session.rate_hz(session.channels[wires[name].channel].group)
         table = recorded[name].rows, rate_hz, taken[name].step, taken[name].phase
         tables.setdefault(table, []).append(name)
     for names in tables.values():
-        _score_rows(card, names, wires, recorded, taken, session, limits)
+        _score_rows(card, names, wires, recorded, taken, session)
 
 
-def _exact(count: float) -> tuple[float, float, float]:
+def _exact(count: float) -> Interval:
     return float(count), float(count), float(count)
 
 
-def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel, limits: Limits) -> None:
+def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel) -> None:
     note = f"{scale.what}: {scale.each:.9g} a count, {scale.zero + 0.0:.9g} at zero"
     note += "" if scale.known else ", as no stretch of rows shows another: its values are not what was sent"
     for quantity, off in (("scale", scale.gain_ppm), ("offset", scale.zero_counts)):
-        limit = limits.bounds("digital", quantity, channel)
-        card.rows.append(
-            judge_row("digital", quantity, name, _exact(off) if scale.known else None, limit=limit, note=note)
-        )
+        card.add(quantity, name, _exact(off) if scale.known else None, of=channel, note=note)
 
 
 def _score_rows(
     card: Scorecard, names: Sequence[str], wires: Mapping[str, Wire], recorded: Mapping[str, Recorded],
-    taken: Mapping[str, Taken], session: Session, limits: Limits,
+    taken: Mapping[str, Taken], session: Session,
 ) -> None:  # fmt: skip
     """Follow the rows of signals that are as long as each other, and judge what became of them and of their stamps."""
     groups = list(dict.fromkeys(session.channels[wires[name].channel].group for name in names))
@@ -245,9 +237,7 @@ def _score_rows(
     sound = sum(scale.known for scale in scales.values())
     if not sound:
         for name in names:
-            limit = limits.bounds("digital", "altered values")
-            note = "none of its signals shows which row is which"
-            card.rows.append(judge_row("digital", "altered values", name, None, limit=limit, note=note))
+            card.add("altered values", name, None, note="no signal beside it shows which row is which")
         return
     sent = Sent(session, groups, one.step, one.phase)
     columns = [sent.names.index(wires[name].channel) for name in names]
@@ -275,8 +265,7 @@ def _score_rows(
             card.runs[f"{quantity} {channel}"] = told
             note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in told[:_NAMED])
             note += f" and {len(told) - _NAMED} more stretches" if len(told) > _NAMED else ""
-        limit = limits.bounds("digital", quantity)
-        card.rows.append(judge_row("digital", quantity, channel, _exact(rows), limit=limit, note=note))
+        card.add(quantity, channel, _exact(rows), note=note)
 
     add("missing rows", table, len(found.missing), stretches(found.missing))
     for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
@@ -289,8 +278,7 @@ def _score_rows(
     add("rows after the last", table, found.sent - 1 - found.last, none)
     told = {**stamps.judged(session.wall_s), "trigger row": None if trigger is None else _exact(trigger)}
     for quantity, estimate in told.items():
-        limit = limits.bounds("digital", quantity)
-        card.rows.append(judge_row("digital", quantity, table, estimate, limit=limit))
+        card.add(quantity, table, estimate)
     card.pictures[f"stamps {table}"] = stamps.picture()
 
 
@@ -321,7 +309,7 @@ class Stamps:
             self._squares += float(np.sum((late - late.mean()) ** 2))
             self._freedom += size - 1
 
-    def judged(self, wall_s: float | None) -> dict[str, tuple[float, float, float] | None]:
+    def judged(self, wall_s: float | None) -> dict[str, Interval | None]:
         """Offset at the first row [s], rate [ppm], jitter [s], steps back, latency [s], with low and high ends if told.
 
         Args:
@@ -330,7 +318,7 @@ class Stamps:
         names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
         if self._times_s is None:
             return dict.fromkeys(names)
-        found: dict[str, tuple[float, float, float] | None] = dict.fromkeys(names)
+        found: dict[str, Interval | None] = dict.fromkeys(names)
         found["stamps that go back"] = _exact(self._back)
         if len(self._means) < 8:
             return found

@@ -68,12 +68,12 @@ def judge(
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
     if path == "digital" and not rows:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
-    card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title)
-    _score_wires(card, recorded, wires, session, rows if path == "digital" else {})
+    card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds)
+    _score_wires(card, recorded, wires, session, rows if path == "digital" else {}, sent)
     if path == "digital":
-        score_digital(card, recorded, wires, rows, session, limits)
+        score_digital(card, recorded, wires, rows, session)
     else:
-        score_analogue(card, recorded, wires, session, limits, {**session.formulas(), **(formulas or {})})
+        score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
     return card
 
 
@@ -109,18 +109,13 @@ def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
 
 def _score_wires(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session,
-    rows: Mapping[str, Taken],
+    rows: Mapping[str, Taken], sent: Mapping[str, tuple[np.ndarray, float]],
 ) -> None:  # fmt: skip
     """Mapping and polarity: a name of the rig's has to be that channel."""
-    counts = {
-        name: values
-        for group, names in session.groups.items()
-        for name, values in zip(names, session.early(group)[1].T, strict=True)
-    }
     loud = {
         name
         for name, channel in session.channels.items()
-        if np.std(counts[name]) > _LOUD * channel.noise_v / channel.lsb_v
+        if np.std(sent[name][0]) > _LOUD * channel.noise_v / channel.lsb_v
     }
     for name, wire in wires.items():
         known = session.channels.keys()
