@@ -172,7 +172,7 @@ def test_a_block_that_comes_late_and_rows_that_are_none_are_told() -> None:
 
 def recorded(
     generator: np.random.Generator, *, ppm: float = 0.0, jitter_s: float = 0.0, skew_s: float = 0.0, gain: float = 1.0,
-    offset: float = 0.0, noise: float = 1.0, step_v: float = 0.0, wires: tuple[int, ...] = (0, 1, 2, 3),
+    offset: float = 0.0, wires: tuple[int, ...] = (0, 1, 2, 3),
     turned: int = -1, corner_hz: float = 0.0, seconds: float = SECONDS,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """What a DAQ with these defects makes of the tones, in volts; skew is that of the second channel."""
@@ -185,9 +185,8 @@ def recorded(
         value = signal(at_s) if not corner_hz else signal.behind(corner_hz, 4)(at_s)
         value = gain * (-value if n == turned else value) + offset
         volts = channel.bias_v + channel.sensitivity_v * value
-        volts = volts + noise * channel.noise_v * generator.standard_normal(rows)
-        step = step_v or channel.lsb_v
-        columns[f"{channel.name} [V]"] = np.rint(volts / step) * step
+        volts = volts + channel.noise_v * generator.standard_normal(rows)
+        columns[f"{channel.name} [V]"] = np.rint(volts / channel.lsb_v) * channel.lsb_v
     return columns
 
 
@@ -199,11 +198,9 @@ def recorded(
         ({"wires": (1, 0, 2, 2), "turned": 2}, {"mapping", "polarity"}),
         ({"ppm": 260.0, "skew_s": 1.5e-6}, {"clock", "skew"}),
         ({"jitter_s": 120e-9}, {"jitter", "effective bits"}),
-        ({"noise": 1.6}, {"noise", "effective bits", "dynamic range"}),
-        ({"step_v": 40.0 / 2**12}, {"noise", "effective bits", "dynamic range"}),
         ({"corner_hz": 2000.0}, {"corner"}),
     ],
-    ids=["perfect", "gain-offset", "swapped-polarity", "clock-skew", "jitter", "noise", "12-bit", "low-pass"],
+    ids=["perfect", "gain-offset", "swapped-polarity", "clock-skew", "jitter", "low-pass"],
 )
 def test_each_defect_turns_red_what_it_declares_and_nothing_else(
     sent: tuple[Path, np.ndarray], tmp_path: Path, defects: dict[str, float], declared: set[str]

@@ -125,7 +125,7 @@ def declared(kinds: tuple[str, ...], what: set[str] | None = None) -> set[tuple[
 
 
 def daq(
-    path: Path, counts: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], None] = lambda _: None
+    path: Path, counts: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], Any] = lambda _: None
 ) -> Path:
     """A file of volts."""
     columns = {"time [s]": np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ}
@@ -175,11 +175,11 @@ def test_a_daq_that_takes_counts(kinds: tuple[str, ...], rig: Rig, sessions: Ses
 
 
 ROWS = np.arange(round(SECONDS * RATE_HZ))
-LATE_BLOCK = np.concatenate([ROWS[:4000], ROWS[4200:4400], ROWS[4000:4200], ROWS[4400:]])
+LATE = np.r_[ROWS[:4000], ROWS[4200:4400], ROWS[4000:4200], ROWS[4400:5000], 5001, 5000, ROWS[5002:]]
 
 
 def swapped(columns: dict[str, np.ndarray]) -> None:
-    columns["disk_x [V]"], columns["P_N [V]"] = columns["P_N [V]"], columns["disk_x [V]"]
+    columns["disk_y [V]"], columns["P_E [V]"] = columns["P_E [V]"], columns["disk_y [V]"]
 
 
 def changed(name: str, times: float = 1.0, plus: Any = 0.0) -> Callable[[dict[str, np.ndarray]], None]:
@@ -196,18 +196,17 @@ def picked(rows: np.ndarray) -> Callable[[dict[str, np.ndarray]], None]:
     return pick
 
 
+WRONG = (changed("disk_x [V]", 1.0005), changed("P_N [V]", plus=0.25), changed("P_S [V]", -1.0), swapped)
 BACK, ALL = ("all groups", "stamps that go back"), "all groups"
-OWN: dict[str, tuple[Callable[[dict[str, np.ndarray]], None], set[tuple[str, str]]]] = {
+OWN: dict[str, tuple[Callable[[dict[str, np.ndarray]], Any], set[tuple[str, str]]]] = {
     "sound": (lambda _: None, set()),
-    "a row lost": (picked(np.delete(ROWS, 4321)), {(ALL, "missing rows")}),
-    "a block lost": (picked(np.delete(ROWS, ROWS[4000:4200])), {(ALL, "missing rows")}),
+    "a row and a block lost": (picked(np.delete(ROWS, np.r_[4321, 6000:6200])), {(ALL, "missing rows")}),
     "a block twice": (picked(np.insert(ROWS, 4200, ROWS[4000:4200])), {(ALL, "doubled rows"), BACK}),
-    "a block late": (picked(LATE_BLOCK), {(ALL, "swapped rows"), BACK}),
-    "two rows swapped": (picked(np.r_[ROWS[:5000], 5001, 5000, ROWS[5002:]]), {(ALL, "swapped rows"), BACK}),
-    "a wrong sensitivity": (changed("disk_x [V]", 1.0005), {("disk_x", "scale")}),
-    "a wrong zero": (changed("P_N [V]", plus=0.25), {("P_N", "offset")}),
-    "a wrong sign": (changed("P_N [V]", -1.0), {("P_N", "polarity")}),
-    "two channels swapped": (swapped, {("disk_x", "mapping"), ("P_N", "mapping")}),
+    "a block late, and two rows swapped": (picked(LATE), {(ALL, "swapped rows"), BACK}),
+    "wrong sensitivity, zero, sign and wires": (
+        lambda columns: [change(columns) for change in WRONG],
+        {("disk_x", "scale"), ("P_N", "offset"), ("P_S", "polarity"), ("disk_y", "mapping"), ("P_E", "mapping")},
+    ),
     "a fast clock of the stamps": (changed("time [s]", 1.0003), {(ALL, "stamp rate")}),
     "stale stamps": (changed("time [s]", plus=-0.01 * (ROWS % 200 == 150)), {BACK}),
 }
