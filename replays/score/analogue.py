@@ -43,6 +43,7 @@ _SINE = ("SINAD", "ENOB", "THD", "SFDR")
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
 
+_NOT_SURE = "what was sent nearly repeats, and no beginning leaves noise alone: what is left may be of a wrong one"
 _ODD = "behind a low-pass that is none of Butterworth's"
 
 
@@ -101,7 +102,7 @@ def fit_channels(
         return _fit(name, channel, in_unit(signal, channel)[0], times_s, stimulus, first_s, wire, exact=exact)
 
     wires = {name: wire for name, wire in wires.items() if wire.channel}
-    wires |= _begun(fit, wires)
+    wires |= _begun(fit, wires, remarks)
     found = []
     for name, wire in wires.items():
         signal, channel = recorded[name], session.channels[wire.channel]
@@ -115,7 +116,7 @@ def fit_channels(
     return found
 
 
-def _begun(fit: Callable[[str, Wire], Fitted | None], wires: Mapping[str, Wire]) -> dict[str, Wire]:
+def _begun(fit: Callable[[str, Wire], Fitted | None], wires: Mapping[str, Wire], remarks: list[str]) -> dict[str, Wire]:
     """Wires with another beginning, where what is nearly periodic fits better from there."""
     if not wires:
         return {}
@@ -129,6 +130,9 @@ def _begun(fit: Callable[[str, Wire], Fitted | None], wires: Mapping[str, Wire])
             best = (left, shift) if left < _BETTER * best[0] else best
             if left < _PURER / _BETTER * one.channel.noise_v / abs(one.channel.sensitivity_v):
                 break
+    else:
+        if len(set(wires[name].others_s) - {late_s}) > 1:
+            remarks.append(_NOT_SURE)
     return {each: replace(wire, own_s=wire.own_s + best[1]) for each, wire in wires.items() if wire.others_s}
 
 

@@ -138,6 +138,8 @@ def _score_wires(
             note = "half a period later it would be the other" if wire.turned and open_ else ""
             card.rows.append(_row(card, "polarity", name, "turned" if turned else "as sent", verdict, note))
     taken = [wire.channel for wire in wires.values() if wire.channel]
+    if absent := [name for name in session.channels if name not in taken]:
+        card.remarks.append(f"not in the file, or not found in it: {', '.join(absent)}")
     for channel in dict.fromkeys(each for each in taken if taken.count(each) > 1):
         names = ", ".join(name for name, wire in wires.items() if wire.channel == channel)
         card.remarks.append(f"{channel} is recorded more than once: {names}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,7 +65,7 @@ def find_wires(
     """
     long, short = _TAKEN_S
     wires = _find(recorded, sent, 0.0, long)
-    if all(wire.likeness > _CLEAR for wire in wires.values()):
+    if all(wire.likeness > _CLEAR and not wire.others_s for wire in wires.values()):
         return wires
     # Where most of them vary most.
     rate = min(each for _, each in recorded.values())
@@ -76,7 +76,11 @@ def find_wires(
     begin = int(np.argmax(sums[size:] - sums[:-size])) if rows > size else 0
     more = _find(recorded, sent, begin / rate, short)
     alike = [sum(wire.likeness for wire in found.values()) for found in (wires, more)]
-    return more if alike[1] > alike[0] else wires
+    first, second = (more, wires) if alike[1] > alike[0] else (wires, more)
+    return {
+        name: replace(wire, others_s=(second[name].late_s, *second[name].others_s, *wire.others_s))
+        for name, wire in first.items()
+    }
 
 
 def _find(

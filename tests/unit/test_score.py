@@ -167,6 +167,21 @@ def test_a_block_that_comes_late_and_rows_that_are_none_are_told() -> None:
     assert not len(found.missing)
 
 
+def test_a_channel_that_is_broken_has_no_say_in_which_row_is_which() -> None:
+    counts = np.random.default_rng(6).integers(-9000, 9000, (200_000, 3))
+    daq = counts.copy()
+    daq[70_000:, 1] += 1
+    order = np.insert(np.delete(np.arange(len(daq)), [150_000, 150_700]), 160_000, 160_001)
+    chunks = [daq[order[n : n + 30_000]] for n in range(0, len(order), 30_000)]
+    *_, (_, found) = follow([counts], chunks, 3)
+    assert (found.missing.tolist(), found.doubled[:, 0].tolist()) == ([150_000, 150_700], [160_001])
+    assert [each.pairs().tolist() for each in found.altered] == [
+        [],
+        [[70_000, 149_999], [150_001, 150_699], [150_701, 199_999]],
+        [],
+    ]
+
+
 # Analogue: formulas of tones, sampled by the DAQ's own clock.
 
 
@@ -437,9 +452,10 @@ def test_intervals_hold_as_often_as_they_say() -> None:
     assert all(0.93 - spread < np.mean(each) < 0.97 + spread for each in held.values())
 
 
-def test_a_test_signal_is_known_by_its_formula(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["test-two-tone", "test-chirp", "test-multisine"])
+def test_a_test_signal_is_known_by_its_formula(name: str, tmp_path: Path) -> None:
     """The session's own noise is then not in what the DAQ is held against."""
-    scene = load_scene("test-two-tone", {"duration_s": 0.8})
+    scene = load_scene(name, {"duration_s": 0.8})
     write_run(Simulation(scene), tmp_path / "sent.mcap")
     generator, true_s = np.random.default_rng(8), 0.05 + np.arange(12_000) / RATE_HZ / (1.0 + 3e-5)
     columns = {}
