@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.limits import Limits
-from replays.score.scorecard import Scorecard, judge_row
-from replays.score.signals import Recorded, Session, rate_of
+from replays.score.recorded import Recorded
+from replays.score.scorecard import Interval, Scorecard
+from replays.score.sent import Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
 from replays.score.stimulus import Exact, Sampled, Stimulus
 from replays.score.waveform import (
@@ -33,13 +32,19 @@ _AS_WELL = 1.1
 _GOOD = 0.9
 """Part of the power that the known signal, behind the channel's filter, must explain for a fit to be one of it."""
 _SOME = 0.05
-"""The same without the filter."""
+"""The same without the filter, for one to be looked for."""
+_OWN_CLOCK = 6.0, 1e-6
+"""A clock is a channel's own where it is off the others' by more than so many deviations, and by so much."""
+_PURER = 1.5
+"""Noises of a channel that what is not the sine in a sine may come to."""
+_BETTER = 0.5
+"""A fit of less than this part of what another leaves is the better one."""
+_SINE = ("SINAD", "ENOB", "THD", "SFDR")
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
 
+_NOT_SURE = "what was sent nearly repeats, and no beginning leaves noise alone: what is left may be of a wrong one"
 _ODD = "behind a low-pass that is none of Butterworth's"
-
-Formula = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class Fitted:
         corner_hz: Where it has fallen by 3 dB, with its 95 % interval; None where it does not.
         odd: Whether there is a low-pass that is none of the known ones.
         values: As recorded, in the channel's unit.
-        exact: Whether the known signal is a formula.
+        exact: Whether the known signal has no noise of its own.
     """
 
     name: str
@@ -63,37 +68,72 @@ class Fitted:
     low: Waveform
     clean: Waveform
     shown: Response | None
-    corner_hz: tuple[float, float, float] | None
+    corner_hz: Interval | None
     odd: bool
     values: np.ndarray
     exact: bool
+
+    @property
+    def good(self) -> bool:
+        """Whether the known signal explains enough of the record."""
+        return self.clean.likeness >= _GOOD
 
 
 def fit_channels(
     recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session, formulas: Mapping[str, Formula],
     remarks: list[str],
 ) -> list[Fitted]:  # fmt: skip
-    """Fit all signals that are connected; those that the known signal does not explain are left out."""
-    found = []
-    for name, wire in wires.items():
-        if not wire.channel:
-            continue
+    """Fit all signals that are connected; those of which it is not sure to what, only where that explains them."""
+    begins = [signal.times_s[0] for signal in recorded.values() if signal.times_s is not None and signal.rows]
+    zero_s = min(begins, default=0.0)
+
+    def fit(name: str, wire: Wire) -> Fitted | None:
         signal, channel = recorded[name], session.channels[wire.channel]
         sent, first_s, sent_hz = session.whole(wire.channel)
-        rate = rate_of(signal) or sent_hz
-        if rate_of(signal) is None:
-            remarks.append(f"{name}: the file tells no rate; taken for the session's, {sent_hz:g} Hz")
-        values, unit_known = in_unit(signal, channel)
-        if not unit_known:
-            remarks.append(f"{name}: the unit {signal.unit or 'is not told'}; taken for {channel.unit}")
+        rate = signal.rate_hz or sent_hz
         formula = formulas.get(wire.channel)
         span = (first_s, first_s + len(sent) / sent_hz)
         stimulus: Stimulus = Sampled(sent, first_s, sent_hz) if formula is None else Exact(formula, span, rate)
-        times_s = np.arange(len(values)) / rate
-        one = _fit(name, channel, values, times_s, stimulus, first_s, wire, exact=formula is not None)
-        if one is not None:
+        begin_s = 0.0 if signal.times_s is None else float(signal.times_s[0] - zero_s)
+        times_s = begin_s + np.arange(signal.rows) / rate
+        within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
+        wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
+        exact = formula is not None or not session.noisy
+        return _fit(name, channel, in_unit(signal, channel)[0], times_s, stimulus, first_s, wire, exact=exact)
+
+    wires = {name: wire for name, wire in wires.items() if wire.channel}
+    wires |= _begun(fit, wires, remarks)
+    found = []
+    for name, wire in wires.items():
+        signal, channel = recorded[name], session.channels[wire.channel]
+        if signal.rate_hz is None:
+            remarks.append(f"{name}: the file tells no rate; taken for the session's, {channel.rate_hz:g} Hz")
+        if not in_unit(signal, channel)[1]:
+            remarks.append(f"{name}: the unit {signal.unit or 'is not told'}; taken for {channel.unit}")
+        one = fit(name, wire)
+        if one is not None and (one.good or name == wire.channel or not wire.rivals):
             found.append(one)
     return found
+
+
+def _begun(fit: Callable[[str, Wire], Fitted | None], wires: Mapping[str, Wire], remarks: list[str]) -> dict[str, Wire]:
+    """Wires with another beginning, where what is nearly periodic fits better from there."""
+    if not wires:
+        return {}
+    name = max(wires, key=lambda each: (len(wires[each].others_s) > 0, wires[each].likeness))
+    late_s, best = wires[name].late_s, (math.inf, 0.0)
+    for other_s in (late_s, *wires[name].others_s):
+        shift = other_s - late_s
+        one = fit(name, replace(wires[name], own_s=wires[name].own_s + shift))
+        if one is not None:
+            left = float(np.std(one.clean.residual))
+            best = (left, shift) if left < _BETTER * best[0] else best
+            if left < _PURER / _BETTER * one.channel.noise_v / abs(one.channel.sensitivity_v):
+                break
+    else:
+        if len(set(wires[name].others_s) - {late_s}) > 1:
+            remarks.append(_NOT_SURE)
+    return {each: replace(wire, own_s=wire.own_s + best[1]) for each, wire in wires.items() if wire.others_s}
 
 
 def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
@@ -111,10 +151,10 @@ def _fit(
     name: str, channel: Channel, values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, first_s: float,
     wire: Wire, *, exact: bool,
 ) -> Fitted | None:  # fmt: skip
-    whole = fit_waveform(values, times_s, stimulus, wire.late_s + first_s, within_s=wire.within_s)
-    if whole is None or whole.likeness < _SOME:
+    whole = fit_waveform(values, times_s, stimulus, wire.own_s + first_s, within_s=wire.within_s)
+    if whole is None:
         return None
-    shown = response(whole)
+    shown = response(whole) if whole.likeness >= _SOME else None
     low = clean = whole
     corner_hz, odd = None, False
     if shown is not None and shown.corner_hz is not None:
@@ -123,17 +163,15 @@ def _fit(
         if behind is not None and np.var(behind[0].residual) < _AS_WELL * np.var(clean.residual):
             (low, corner_hz), odd = behind, False
             clean = low
-    if clean.likeness < _GOOD:
-        return None
     return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact)
 
 
-def _about(value: float, spread: float, quantile: float, size: float = 1.0) -> tuple[float, float, float]:
+def _about(value: float, spread: float, quantile: float, size: float = 1.0) -> Interval:
     return size * value, size * (value - quantile * spread), size * (value + quantile * spread)
 
 
 def score_analogue(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session, limits: Limits,
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session,
     formulas: Mapping[str, Formula],
 ) -> None:  # fmt: skip
     """Put the rows of the analogue path onto a scorecard."""
@@ -141,104 +179,98 @@ def score_analogue(
     fitted = {one.name for one in found}
     for name, wire in wires.items():
         if name not in fitted:
-            limit = limits.bounds("analogue", "gain")
             note = "nothing that was sent explains it" if wire.channel else "no channel is like it"
-            card.rows.append(judge_row("analogue", "gain", name, None, limit=limit, note=note))
-    if found:
-        _score_time(card, found, wires, limits)
+            card.add("gain", name, None, note=note)
+    _score_time(card, [one for one in found if one.good], wires)
+    sines = []
     for one in found:
-        _score_fit(card, one, limits)
-        _score_sine(card, one, limits)
+        _score_fit(card, one)
+        sines.append(_score_sine(card, one))
         card.pictures[f"analogue {one.name}"] = one
-    for quantity in ("alias rejection", "trigger row"):
-        card.rows.append(judge_row("analogue", quantity, "", None, limit=limits.bounds("analogue", quantity)))
+    for quantity in (*(() if any(sines) else _SINE), "alias rejection", "trigger row"):
+        card.add(quantity, "", None)
 
 
-def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire], limits: Limits) -> None:
-    """Clock of all channels together, start of the first, and skew of the others against it."""
-
-    def add(quantity: str, channel: str, estimate: Any, of: Channel | None, note: str = "") -> None:
-        limit = limits.bounds("analogue", quantity, of)
-        card.rows.append(judge_row("analogue", quantity, channel, estimate, limit=limit, note=note))
-
-    spreads = np.array([one.low.spread[3] for one in found])
+def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire]) -> None:
+    """Clock of all channels together, start of one in the middle of them, and skew of the others against it."""
+    # One channel that is off has no say in what the others are: the reference is in the middle of them.
+    inner = sorted((one for one in found if not one.odd), key=lambda one: one.low.late_s) or found
+    if not inner:
+        return
+    reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else found[0]
+    spreads = np.maximum([one.low.spread[3] for one in found], 1e-15)
     drifts = np.array([one.low.drift for one in found])
-    weights = np.maximum(spreads, 1e-15) ** -2.0
-    drift, spread = float(weights @ drifts / weights.sum()), float(weights.sum() ** -0.5)
-    quantile = student(found[0].low.freedom)
-    # Its clock runs fast where the session's time goes slowly over its own.
-    add("clock", "", _about(-drift / (1.0 + drift), spread, quantile, 1e6), None)
-    first = found[0]
+    middle = np.sort(drifts)[(len(found) - 1) // 2] if len(found) > 2 else reference.low.drift
+    own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * spreads, _OWN_CLOCK[1])
+    weights = np.where(own, 0.0, spreads**-2.0)
+    quantile = student(reference.low.freedom)
+    told = [("", float(weights @ drifts / weights.sum()), float(weights.sum() ** -0.5))]
+    told += [(found[n].name, drifts[n], spreads[n]) for n in np.flatnonzero(own)]
+    for name, drift, spread in told:
+        # Its clock runs fast where the session's time goes slowly over its own.
+        note = "off the clock of the others" if name else ""
+        card.add("clock", name, _about(-drift / (1.0 + drift), spread, quantile, 1e6), note=note)
     turned = any(wires[one.name].turned for one in found)
     note = "a periodic signal: up to whole periods" if turned else ""
-    begin_s = first.low.late_s - first.low.drift * first.low.middle_s
-    add("start", first.name, _about(begin_s, first.low.spread[2], quantile), first.channel, note)
-    for one in found[1:]:
-        apart = one.low.late_s - first.low.late_s
-        both = math.hypot(one.low.spread[2], first.low.spread[2])
-        odd = _ODD if one.odd or first.odd else ""
-        said = "; ".join(each for each in (f"against {first.name}", note, odd) if each)
-        add("skew", one.name, None if odd else _about(apart, both, quantile, 1e9), one.channel, said)
+    begin_s = reference.low.late_s - reference.low.drift * reference.low.middle_s
+    start = _about(begin_s, reference.low.spread[2], quantile)
+    card.add("start", reference.name, start, of=reference.channel, note=note)
+    for one in found:
+        if one is not reference:
+            apart = one.low.late_s - reference.low.late_s
+            both = math.hypot(one.low.spread[2], reference.low.spread[2])
+            odd = _ODD if one.odd or reference.odd else ""
+            said = "; ".join(each for each in (f"against {reference.name}", note, odd) if each)
+            skew = None if odd else _about(apart, both, quantile, 1e9)
+            card.add("skew", one.name, skew, of=one.channel, note=said)
 
 
-def _score_fit(card: Scorecard, one: Fitted, limits: Limits) -> None:
+def _score_fit(card: Scorecard, one: Fitted) -> None:
     low, channel = one.low, one.channel
     quantile = student(low.freedom)
-    unit = channel.unit
 
-    def add(quantity: str, estimate: tuple[float, float, float] | None, note: str = "") -> None:
-        limit = limits.bounds("analogue", quantity, channel)
-        card.rows.append(judge_row("analogue", quantity, one.name, estimate, unit=unit, limit=limit, note=note))
+    def add(quantity: str, estimate: Interval | None, note: str = "") -> None:
+        card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
-    note = _ODD if one.odd else ""
-    add("gain", None if one.odd else _about(abs(low.gain) - 1.0, low.spread[0], quantile, 1e6), note)
-    add("offset", _about(low.offset, low.spread[1], quantile))
+    note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
+    add("gain", None if note else _about(abs(low.gain) - 1.0, low.spread[0], quantile, 1e6), note)
+    add("offset", _about(low.offset, low.spread[1], quantile) if one.good else None)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
     brought = 0.0 if one.exact else channel.noise_v / abs(channel.sensitivity_v)
     split = split_noise(one.clean, floor=brought)
-    add("noise", split.noise)
-    add("jitter", None if split.jitter_s is None else _scaled(split.jitter_s, 1e9))
+    noise = split.noise if one.good else split.left
+    add("noise", noise)
+    add("jitter", _scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
     full = channel.adc_v / abs(channel.sensitivity_v)
-    noises = [max(each, 1e-12 * full) for each in (split.noise[0], split.noise[2], split.noise[1])]
-    bits = [math.log2(2.0 * full / (each * math.sqrt(12.0))) for each in noises]
-    ranges = [20.0 * math.log10(full / math.sqrt(2.0) / each) for each in noises]
+    bits = [math.log2(full / max(split.left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
+    ranges = [20.0 * math.log10(full / max(noise[n], 1e-12 * full) / math.sqrt(2.0)) for n in (0, 2, 1)]
     add("effective bits", (bits[0], bits[1], bits[2]))
     add("dynamic range", (ranges[0], ranges[1], ranges[2]))
-    _score_corner(card, one, limits)
-
-
-def _score_corner(card: Scorecard, one: Fitted, limits: Limits) -> None:
-    limit = limits.bounds("analogue", "corner", one.channel)
-    estimate, note = None, ""
-    if one.corner_hz is not None:
-        estimate = one.corner_hz
-    elif one.shown is not None:
+    limit = card.asked(card.path, "corner", channel)
+    estimate, note = one.corner_hz, ""
+    if estimate is None and one.shown is not None:
         highest = float(one.shown.frequency_hz[-1])
         if limit is not None and highest >= limit.low:
             estimate, note = (highest, highest, math.inf), "no fall by 3 dB up to there"
         else:
             note = f"no fall by 3 dB up to {highest:.0f} Hz, beyond which the signal shows nothing"
-    card.rows.append(judge_row("analogue", "corner", one.name, estimate, limit=limit, note=note))
+    add("corner", estimate, note)
 
 
-def _score_sine(card: Scorecard, one: Fitted, limits: Limits) -> None:
-    """The standard's sine fit beside the known signal, where that is a sine."""
-    names = ("SINAD", "ENOB", "THD", "SFDR")
+def _score_sine(card: Scorecard, one: Fitted) -> bool:
+    """The standard's sine fit beside the known signal; whether that is a sine, and no value is missing."""
     gaps = not np.isfinite(one.values).all()
-    if gaps or not is_sine(one.low.known[:_LONGEST]):
-        for quantity in names:
-            limit = limits.bounds("analogue", quantity, one.channel)
-            note = "values are missing" if gaps else "the signal is no sine"
-            card.rows.append(judge_row("analogue", quantity, one.name, None, limit=limit, note=note))
-        return
+    noises = 1 if one.exact else 2
+    quiet = _PURER * math.hypot(one.channel.noise_v, one.channel.lsb_v) / abs(one.channel.sensitivity_v)
+    if gaps or not is_sine(one.low.known[:_LONGEST], quiet):
+        return False
     fit = fit_sine(one.values)
     told = quality(fit)
-    noises = 1 if one.exact else 2
-    for quantity, estimate in zip(names, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
-        limit = limits.bounds("analogue", quantity, one.channel, amplitude=fit.amplitude[0], noises=noises)
-        note = "" if one.exact else "of the record as it is: the rig's own noise is in it"
-        card.rows.append(judge_row("analogue", quantity, one.name, estimate, limit=limit, note=note))
+    for quantity, estimate in zip(_SINE, (told.sinad_db, told.enob, told.thd_db, told.sfdr_db), strict=True):
+        note = "" if noises == 1 else "of the record as it is: the rig's own noise is in it"
+        card.add(quantity, one.name, estimate, of=one.channel, note=note, amplitude=fit.amplitude[0], noises=noises)
+    return True
 
 
-def _scaled(estimate: tuple[float, float, float], size: float) -> tuple[float, float, float]:
+def _scaled(estimate: Interval, size: float) -> Interval:
     return estimate[0] * size, estimate[1] * size, estimate[2] * size

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from replays.score.limits import Limits
-from replays.score.rows import NO_COUNT, Followed, follow
-from replays.score.scorecard import Bounds, Scorecard, judge_row
-from replays.score.signals import Recorded, Session, in_parts
+from replays.score.recorded import Recorded, in_parts
+from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
+from replays.score.scorecard import Interval, Scorecard
+from replays.score.sent import Sent, Session
 from replays.score.waveform import student
 from replays.score.wiring import Wire
 from rig import units
@@ -23,10 +23,17 @@ from rig.channels import Channel
 
 _NEAR = 0.49
 """Part of a count by which a recovered one may be off a whole number: rounding of the file."""
+_NOTHING = 0.01
+"""Counts that are none."""
 _PIECE = 512
-"""Consecutive rows on which a scale is found."""
+"""Most consecutive rows on which a scale is found: a row may be lost before and behind them."""
+_LOOKED = 1 << 16
+"""Rows of a recording by which its scale is found."""
 _ENOUGH = 0.99
-_BATCHES = 256
+_BATCHES, _APART = 256, 32
+"""Of stamps that are shown, and that are judged."""
+_SAME_CLOCK_S = 10.0
+"""Stamps that are farther from the wall time of the session are of another clock."""
 _NAMED = 5
 """Rows that are named in a line; all stand in the document."""
 
@@ -39,6 +46,8 @@ class Scale:
         each, zero: The two, in the unit of the file.
         what: Counts, the channel's unit, volts, or fitted.
         gain_ppm, zero_counts: How far off that they are.
+        turned: Whether it has the other sign.
+        known: Whether some rows have shown it; otherwise it is what the file's unit says.
     """
 
     each: float
@@ -46,6 +55,8 @@ class Scale:
     what: str
     gain_ppm: float = 0.0
     zero_counts: float = 0.0
+    turned: bool = False
+    known: bool = True
 
     def counts(self, values: np.ndarray) -> np.ndarray:
         """The counts of values, int64, shape (n,); `NO_COUNT` where a value is none."""
@@ -64,26 +75,33 @@ def find_scale(values: np.ndarray, unit: str, counts: np.ndarray, channel: Chann
         counts: Of the same rows as far as none is lost, shape (n,).
         channel: The channel.
     """
-    pieces = [slice(n, n + _PIECE) for n in range(0, len(values) - _PIECE + 1, _PIECE)] or [slice(None)]
+    size = min(_PIECE, max(8, len(values) // 4))
+    pieces = [slice(n, n + size) for n in range(0, len(values) - size + 1, size)]
+
+    def shows(scale: Scale, p: slice) -> bool:
+        # Rows that are as most are show nothing of a scale.
+        same, moving = scale.counts(values[p]) == counts[p], counts[p] != np.median(counts[p])
+        return bool(moving.any()) and min(same.mean(), same[moving].mean()) >= _ENOUGH
+
     candidates = _candidates(unit, channel)
     for scale in candidates:
-        back = scale.counts(values)
-        if any((back[p] == counts[p]).mean() >= _ENOUGH and np.ptp(counts[p]) for p in pieces):
+        if any(shows(scale, p) for p in pieces):
             return scale
     for p in pieces:
         x, y = counts[p].astype(float), values[p]
-        if not np.ptp(x) or not np.isfinite(y).all():
+        if not np.isfinite(y).all() or not np.ptp(x):
             continue
-        each, zero = np.polyfit(x - x.mean(), y, 1)
-        zero -= each * x.mean()
-        if not each:
-            continue
-        scale = Scale(float(each), float(zero), "fitted")
-        if (scale.counts(y) == counts[p]).mean() >= _ENOUGH:
+        each, zero = map(float, np.polyfit(x - x.mean(), y, 1))
+        zero -= each * float(x.mean())
+        if each and shows(Scale(each, zero, "fitted"), p):
             near = min(candidates, key=lambda one: abs(math.log(abs(each / one.each))))
-            ratio = float(each / near.each)
-            zero_counts = float((zero - ratio * near.zero) / each)  # beside that gain, about a value of zero
-            return Scale(scale.each, scale.zero, f"fitted, beside {near.what}", 1e6 * (abs(ratio) - 1.0), zero_counts)
+            ratio = each / near.each
+            # Digits that the file leaves out, and those of numbers, are no gain and no zero.
+            unsure = 5.0 * float(np.std((y - zero) / each - x)) / math.sqrt(len(x))
+            gain, shift = abs(ratio) - 1.0, (zero - ratio * near.zero) / each  # beside that gain, about a value of zero
+            gain = gain if abs(gain) * np.std(x) > unsure + _NOTHING else 0.0
+            shift = shift if abs(shift) > unsure * math.hypot(1.0, x.mean() / np.std(x)) + _NOTHING else 0.0
+            return Scale(each, zero, f"fitted, beside {near.what}", 1e6 * gain, shift, ratio < 0.0)
     return None
 
 
@@ -98,152 +116,218 @@ def _candidates(unit: str, channel: Channel) -> list[Scale]:
     return found or [Scale(1.0, 0.0, "counts")]
 
 
-def scales_of(recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session) -> dict[str, Scale | None]:
-    """The scale of each signal that is connected, by its name in the file."""
-    found: dict[str, Scale | None] = {}
+@dataclass(frozen=True)
+class Taken:
+    """What a signal has taken of its channel.
+
+    Attributes:
+        scale: Of its counts.
+        step, phase: Those rows whose number is the phase, modulo the step.
+    """
+
+    scale: Scale
+    step: int = 1
+    phase: int = 0
+
+
+def settle(
+    recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session
+) -> tuple[dict[str, Wire], dict[str, Taken]]:
+    """Which channel each signal has the counts of, how scaled and of which rows, by its name in the file.
+
+    Where most signals show counts, one that does not is looked for in all channels; if it is in none, it is the channel
+    that it is named by, or alone is like, with what its unit says of its scale.
+    """
     held = {group: session.early(group) for group in session.groups}
+
+    begins: dict[int, int] = {}
+
+    def tried(name: str, of: str, begin: int) -> tuple[np.ndarray, str, np.ndarray, Channel]:
+        """Values and counts of the same rows: row j of the file was sent `begin` and j steps behind the first one."""
+        channel, signal, step = session.channels[of], recorded[name], step_of(name, of)
+        skipped = max(0, -(begin // step))
+        values = signal.values[skipped:]
+        counts = held[channel.group][1][begin + skipped * step :: step, session.place(of)]
+        few = min(len(values), len(counts), _LOOKED)
+        return values[:few], signal.unit, counts[:few] >> signal.lost_bits << signal.lost_bits, channel
+
+    def step_of(name: str, of: str) -> int:
+        sent_hz = session.rate_hz(session.channels[of].group)
+        return max(1, round(sent_hz / (recorded[name].rate_hz or sent_hz)))
+
+    def taken_of(name: str, of: str) -> Taken | None:
+        """By where its table begins, as far as that is known; else by where its counts are."""
+        signal, channel, step = recorded[name], session.channels[of], step_of(name, of)
+        table = id(signal.like or signal)
+        index, counts = held[channel.group]
+        late = [round(each * session.rate_hz(channel.group)) for each in (wires[name].late_s, wires[name].own_s)]
+        for begin in dict.fromkeys([begins.get(table, late[0]), *late]):
+            values, unit, there, _ = tried(name, of, begin)
+            if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
+                begins[table] = begin
+                return Taken(scale, step, (index + begin) % step)
+        if table not in begins:
+            there = counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
+            for scale in _candidates(signal.unit, channel):
+                begin = located(scale.counts(signal.values[:_LOOKED]), there, step)
+                if begin is not None:
+                    begins[table] = begin
+                    return Taken(scale, step, (index + begin) % step)
+        return None
+
+    settled = {name: taken for name, wire in wires.items() if wire.channel and (taken := taken_of(name, wire.channel))}
+    found = dict(wires)
+    if 2 * len(settled) <= len(wires):
+        return found, settled
     for name, wire in wires.items():
-        if wire.channel:
-            channel = session.channels[wire.channel]
-            counts = held[channel.group][:, session.groups[channel.group].index(wire.channel)]
-            late = round(wire.late_s * session.rate_hz(channel.group))
-            values = recorded[name].values[max(0, -late) :][: len(counts) - max(0, late)]
-            counts = counts[max(0, late) :][: len(values)]
-            few = min(len(values), len(counts), 1 << 16)
-            enough = few >= 2
-            found[name] = find_scale(values[:few], recorded[name].unit, counts[:few], channel) if enough else None
-    return found
+        for other in () if name in settled else sorted(session.channels, key=lambda each: each != name):
+            if (taken := taken_of(name, other)) is not None:
+                found[name], settled[name] = replace(wire, channel=other, rivals=()), taken
+                break
+        named = name if name in session.channels else "" if wire.rivals else wire.channel
+        if name not in settled and named:
+            step = step_of(name, named)
+            begin = begins.get(id(recorded[name].like or recorded[name]), 0)
+            values, unit, counts, channel = tried(name, named, begin)
+
+            def apart(scale: Scale) -> float:
+                return float(np.nanmedian(np.abs(scale.each * counts + scale.zero - values)) / scale.each)  # noqa: B023
+
+            found[name] = replace(wire, channel=named)
+            scale = replace(min(_candidates(unit, channel), key=apart), known=False)
+            settled[name] = Taken(scale, step, (held[channel.group][0] + begin) % step)
+    return found, settled
 
 
 def score_digital(
-    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], scales: Mapping[str, Scale | None],
-    session: Session, limits: Limits,
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], taken: Mapping[str, Taken],
+    session: Session,
 ) -> None:  # fmt: skip
     """Put the rows of the digital path onto a scorecard."""
-    for name, scale in scales.items():
-        _score_scale(card, name, scale, session.channels[wires[name].channel], limits)
-    for group, names in session.groups.items():
-        members = [n for n, scale in scales.items() if scale is not None and wires[n].channel in names]
-        for rows in sorted({recorded[name].rows for name in members}):
-            alike = [name for name in members if recorded[name].rows == rows]
-            columns = [names.index(wires[name].channel) for name in alike]
-            _score_rows(card, group, alike, columns, recorded, scales, session, limits)
-    for quantity in ("latency", "trigger row"):
-        card.rows.append(judge_row("digital", quantity, "", None, limit=limits.bounds("digital", quantity)))
+    for name, each in taken.items():
+        _score_scale(card, name, each.scale, session.channels[wires[name].channel])
+    tables: dict[tuple[float, ...], list[str]] = {}
+    for name in sorted(taken, key=lambda each: not taken[each].scale.known):
+        rate_hz = session.rate_hz(session.channels[wires[name].channel].group)
+        table = recorded[name].rows, rate_hz, taken[name].step, taken[name].phase
+        tables.setdefault(table, []).append(name)
+    for names in tables.values():
+        _score_rows(card, names, wires, recorded, taken, session)
 
 
-def _exact(count: float) -> tuple[float, float, float]:
+def _exact(count: float) -> Interval:
     return float(count), float(count), float(count)
 
 
-def _score_scale(card: Scorecard, name: str, scale: Scale | None, channel: Channel, limits: Limits) -> None:
-    bounds = [limits.bounds("digital", each, channel) for each in ("scale", "offset")]
-    if scale is None:
-        note = "its counts cannot be told from the values: fewer digits, or an analogue path"
-        card.rows += [
-            judge_row("digital", each, name, None, limit=bound, note=note)
-            for each, bound in zip(("scale", "offset"), bounds, strict=True)
-        ]
-        return
-    note = f"{scale.what}: {scale.each:.9g} a count, {scale.zero:.9g} at zero"
-    card.rows.append(judge_row("digital", "scale", name, _exact(scale.gain_ppm), limit=bounds[0], note=note))
-    card.rows.append(judge_row("digital", "offset", name, _exact(scale.zero_counts), limit=bounds[1], note=note))
+def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel) -> None:
+    note = f"{scale.what}: {scale.each:.9g} a count, {scale.zero + 0.0:.9g} at zero"
+    note += "" if scale.known else ", as no stretch of rows shows another: its values are not what was sent"
+    for quantity, off in (("scale", scale.gain_ppm), ("offset", scale.zero_counts)):
+        card.add(quantity, name, _exact(off) if scale.known else None, of=channel, note=note)
 
 
 def _score_rows(
-    card: Scorecard, group: str, names: Sequence[str], columns: Sequence[int], recorded: Mapping[str, Recorded],
-    scales: Mapping[str, Scale | None], session: Session, limits: Limits,
+    card: Scorecard, names: Sequence[str], wires: Mapping[str, Wire], recorded: Mapping[str, Recorded],
+    taken: Mapping[str, Taken], session: Session,
 ) -> None:  # fmt: skip
-    """Follow the rows of one group, and judge what became of them and of their stamps."""
-    chosen = [(recorded[name].values, scales[name]) for name in names]
+    """Follow the rows of signals that are as long as each other, and judge what became of them and of their stamps."""
+    groups = list(dict.fromkeys(session.channels[wires[name].channel].group for name in names))
+    table = "all groups" if len(groups) == len(session.groups) > 1 else ", ".join(groups)
+    scales, one = {name: taken[name].scale for name in names}, taken[names[0]]
+    sound = sum(scale.known for scale in scales.values())
+    if not sound:
+        for name in names:
+            card.add("altered values", name, None, note="no signal beside it shows which row is which")
+        return
+    sent = Sent(session, groups, one.step, one.phase)
+    columns = [sent.names.index(wires[name].channel) for name in names]
 
     def counts() -> Iterator[np.ndarray]:
-        for part in in_parts([values for values, _ in chosen]):
-            yield np.column_stack([s.counts(v) for v, (_, s) in zip(part, chosen, strict=True) if s is not None])
+        for part in in_parts([recorded[name].values for name in names]):
+            yield np.column_stack([scales[name].counts(values) for name, values in zip(names, part, strict=True)])
 
-    sent = (chunk[:, columns] for chunk in session.counts(group))
-    times_s = recorded[names[0]].times_s
-    stamps = Stamps(times_s, session.first_s(group), session.rate_hz(group))
-    found = Followed()
-    for places, found in follow(sent, counts()):  # noqa: B007
-        stamps.take(session.numbers(group, places) - session.numbers(group, np.zeros(1, np.int64)), places >= 0)
+    bits = np.array([recorded[name].lost_bits for name in names])
+    stamps = Stamps(recorded[names[0]].times_s)
+    found, trigger, at = Followed(), None, 0
+    for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound):  # noqa: B007
+        known = np.flatnonzero(places >= 0)
+        stamps.take(sent.first_s, sent.since_s(places[known]), known, len(places))
+        if trigger is None and session.trigger_s is not None and len(known):
+            behind = np.flatnonzero(sent.first_s + sent.since_s(places[known]) >= session.trigger_s)
+            # Row 0 is behind whatever was before the recording.
+            trigger = at + int(known[behind[0]]) if len(behind) and at + known[behind[0]] else None
+        at += len(places)
 
-    def add(quantity: str, count: int, channel: str, places: np.ndarray) -> None:
-        limit = limits.bounds("digital", quantity)
+    def add(quantity: str, channel: str, rows: int, runs: np.ndarray, *, numbered: bool = True) -> None:
         note = ""
-        if len(places):
-            runs = _runs(session.numbers(group, places)) if quantity != "foreign rows" else _runs(places)
-            card.runs[f"{quantity} {channel}"] = runs
-            told = ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in runs[:_NAMED])
-            note = f"rows {told}" + (f" and {len(runs) - _NAMED} more stretches" if len(runs) > _NAMED else "")
-        card.rows.append(judge_row("digital", quantity, channel, _exact(count), limit=limit, note=note))
+        if len(runs):
+            told = [(a, b) for a, b in (sent.numbers(runs) if numbered else runs).tolist()]
+            card.runs[f"{quantity} {channel}"] = told
+            note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in told[:_NAMED])
+            note += f" and {len(told) - _NAMED} more stretches" if len(told) > _NAMED else ""
+        card.add(quantity, channel, _exact(rows), note=note)
 
-    missing = found.missing
-    add("missing rows", len(missing), group, missing)
-    add("doubled rows", len(found.doubled), group, np.unique(found.doubled[:, 0]))
-    add("swapped rows", len(found.swapped), group, found.swapped[:, 0])
-    add("foreign rows", len(found.foreign), group, found.foreign)
-    for name, wrong in zip(names, found.wrong.tolist(), strict=True):
-        add("altered values", wrong, name, np.unique(found.altered[:, 0]) if wrong else np.empty(0))
-    add("rows before the first", max(0, found.first), group, np.empty(0))
-    add("rows after the last", found.sent - 1 - found.last, group, np.empty(0))
-    for quantity, estimate in stamps.judged().items():
-        bound: Bounds | None = limits.bounds("digital", quantity)
-        card.rows.append(judge_row("digital", quantity, group, estimate, limit=bound))
-    card.pictures[f"stamps {group}"] = stamps.picture()
-
-
-def _runs(places: np.ndarray) -> list[tuple[int, int]]:
-    """Ascending stretches as pairs of first and last."""
-    if not len(places):
-        return []
-    places = np.sort(places)
-    cuts = np.flatnonzero(np.diff(places) != 1)
-    firsts, lasts = np.concatenate([[0], cuts + 1]), np.concatenate([cuts, [len(places) - 1]])
-    return list(zip(places[firsts].tolist(), places[lasts].tolist(), strict=True))
+    add("missing rows", table, len(found.missing), stretches(found.missing))
+    for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
+        add(quantity, table, len(pairs), stretches(np.unique(pairs[:, 0])))
+    add("foreign rows", table, len(found.foreign), stretches(found.foreign), numbered=False)
+    for name, altered in zip(names, found.altered, strict=True):
+        add("altered values", name, altered.rows, altered.pairs())
+    none = stretches(np.empty(0, dtype=np.int64))
+    add("rows before the first", table, max(0, found.first), none)
+    add("rows after the last", table, found.sent - 1 - found.last, none)
+    told = {**stamps.judged(session.wall_s), "trigger row": None if trigger is None else _exact(trigger)}
+    for quantity, estimate in told.items():
+        card.add(quantity, table, estimate)
+    card.pictures[f"stamps {table}"] = stamps.picture()
 
 
 class Stamps:
     """Time stamps against the times of the rows that they stand beside: offset and rate are two questions."""
 
-    def __init__(self, times_s: np.ndarray | None, first_s: float, rate_hz: float) -> None:
-        """Take stamps [s], None where there are none, and when the first row was sent [s], and how often [Hz]."""
-        self._times_s, self._first_s, self._rate_hz = times_s, first_s, rate_hz
+    def __init__(self, times_s: np.ndarray | None) -> None:
+        """Take stamps [s]; None where there are none."""
+        self._times_s = times_s
         self._at, self._back, self._last_s = 0, 0, -math.inf
         self._means: list[np.ndarray] = []
         self._squares, self._freedom = 0.0, 0
 
-    def take(self, numbers: np.ndarray, known: np.ndarray) -> None:
-        """Take numbers of the next rows from the first one sent, and which of them are known, each shape (n,)."""
-        part = slice(self._at, self._at + len(numbers))
+    def take(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
+        """Take when the first row was sent, how long after it those of the next that are known [s], and which are."""
+        part = slice(self._at, self._at + rows)
         self._at = part.stop
-        if self._times_s is None or not len(numbers):
+        if self._times_s is None or not rows:
             return
         times_s = self._times_s[part]
-        self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) <= 0.0))
+        self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) < 0.0))
         self._last_s = float(times_s[-1])
-        true_s = self._first_s + numbers[known] / self._rate_hz
-        apart = times_s[known] - true_s
+        apart = times_s[known] - first_s - since_s
         size = max(4, len(self._times_s) // _BATCHES)
         for begin in range(0, len(apart) - size + 1, size):
-            late, true = apart[begin : begin + size], true_s[begin : begin + size]
-            self._means.append(np.array([true.mean(), late.mean()]))
+            late = apart[begin : begin + size]
+            self._means.append(np.array([since_s[begin : begin + size].mean(), late.mean()]))
             self._squares += float(np.sum((late - late.mean()) ** 2))
             self._freedom += size - 1
 
-    def judged(self) -> dict[str, tuple[float, float, float] | None]:
-        """Offset at the first row [s], rate [ppm], jitter [s] and steps back: value, low, high; None: not told."""
-        names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back")
+    def judged(self, wall_s: float | None) -> dict[str, Interval | None]:
+        """Offset at the first row [s], rate [ppm], jitter [s], steps back, latency [s], with low and high ends if told.
+
+        Args:
+            wall_s: Wall time at which what was sent at time zero came to who recorded the session [s].
+        """
+        names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
         if self._times_s is None:
             return dict.fromkeys(names)
-        found: dict[str, tuple[float, float, float] | None] = dict.fromkeys(names)
+        found: dict[str, Interval | None] = dict.fromkeys(names)
         found["stamps that go back"] = _exact(self._back)
         if len(self._means) < 8:
             return found
         from scipy.stats import chi2
 
-        true, late = np.array(self._means).T
-        since = true - self._first_s
+        # Rows that came in bursts are not independent: several batches are one here.
+        several = max(1, len(self._means) // _APART)
+        whole = np.array(self._means[: len(self._means) // several * several])
+        since, late = whole.reshape(-1, several, 2).mean(axis=1).T
         matrix = np.column_stack([np.ones(len(since)), since])
         parts = np.linalg.lstsq(matrix, late, rcond=None)[0]
         left = late - matrix @ parts
@@ -252,10 +336,13 @@ class Stamps:
         half = student(freedom) * np.sqrt(np.diag(covariance))
         for name, n, size in (("stamp offset", 0, 1.0), ("stamp rate", 1, 1e6)):
             found[name] = size * parts[n], size * (parts[n] - half[n]), size * (parts[n] + half[n])
+        if wall_s is not None and abs(late.mean() - wall_s) < _SAME_CLOCK_S:
+            value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
+            found["latency"] = float(value), float(value - wide), float(value + wide)
         ends = [math.sqrt(self._squares / chi2.ppf(p, self._freedom)) for p in (0.975, 0.025)]
         found["stamp jitter"] = math.sqrt(self._squares / self._freedom), ends[0], ends[1]
         return found
 
     def picture(self) -> np.ndarray:
-        """Time and lateness of each batch [s], shape (n, 2)."""
+        """Time since the first row, and lateness, of each batch [s], shape (n, 2)."""
         return np.array(self._means).reshape(-1, 2)

@@ -6,15 +6,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from replays.recordings.formats.mapping import FileOptions
-from replays.score.analogue import Formula, score_analogue
-from replays.score.digital import Scale, scales_of, score_digital
+from replays.score.analogue import score_analogue
+from replays.score.can_log import is_can_log, open_can_log
+from replays.score.digital import Taken, score_digital, settle
 from replays.score.limits import Limits, load_limits
+from replays.score.recorded import Recorded, open_recorded
 from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, QUANTITIES, Scorecard, ScoreRow, Verdict
-from replays.score.signals import Recorded, Session, open_recorded, rate_of
+from replays.score.sent import Formula, Session
 from replays.score.wiring import Wire, find_wires
 from rig.errors import InputError, Words
 
+_LOUD, _MANY = 4.0, 1000
+"""Noises of a channel, and rows, from which on what was sent has to be seen."""
 _NEAR = 0.01
 """Part by which the rate of a DAQ that took rows may be off by its stamps."""
 
@@ -31,7 +37,8 @@ def judge(
         against: The session that the rig sent, in one file or its parts.
         limits: What is asked; the set `as-calibrated` unless given.
         path: Which of the two; None: digital where counts can be told from what most signals have, else analogue.
-        formulas: What was sent exactly, by channel: value [unit] of the session's time [s]; otherwise its own samples.
+        formulas: What was sent exactly, by channel: value [unit] of the session's time [s]; otherwise as the scene's
+            test signal has it, or its own samples.
         options: How a text file is read, where it does not say so itself.
 
     Raises:
@@ -39,36 +46,54 @@ def judge(
     """
     limits = load_limits() if limits is None else limits
     session = Session(against)
-    recorded = _by_name(open_recorded(file, options))
+    opened = open_can_log(file, session.recording.table) if is_can_log(file) else open_recorded(file, options)
+    recorded = _by_name(opened)
     sent = {}
     for group, names in session.groups.items():
-        early = session.early(group)
+        _, early = session.early(group)
         sent |= {name: (early[:, n], session.rate_hz(group)) for n, name in enumerate(names)}
     rate = max(each for _, each in sent.values())
-    taken = {name: (signal.values, rate_of(signal) or rate) for name, signal in recorded.items() if signal.rows > 1}
     wires: dict[str, Wire] = {}
-    scales: dict[str, Scale | None] = {}
-    if path != "analogue" and taken:
+    rows: dict[str, Taken] = {}
+    if path != "analogue":
         # Rows of counts come as they were sent, whatever their stamps say.
-        near = {name: rate if abs(each / rate - 1.0) < _NEAR else each for name, (_, each) in taken.items()}
-        wires = find_wires({name: (values, near[name]) for name, (values, _) in taken.items()}, sent)
-        scales = scales_of(recorded, wires, session)
+        wires = _connect(recorded, sent, {name: _near(each.rate_hz or rate, rate) for name, each in recorded.items()})
+        wires, rows = settle(recorded, wires, session)
     if path is None:
-        told = sum(each is not None for each in scales.values())
-        path = "digital" if scales and 2 * told > len(scales) else "analogue"
-    if path == "analogue" and taken:
-        wires = find_wires(taken, sent)
+        told = sum(each.scale.known for each in rows.values())
+        path = "digital" if 2 * told > len(wires) else "analogue"
+    if path == "analogue":
+        wires = _connect(recorded, sent, {name: each.rate_hz or rate for name, each in recorded.items()})
     if not any(wire.channel for wire in wires.values()):
         raise InputError("FILE", f"a recording of what {session.path.name} has", Words(f"{file}, of which nothing is"))
-    if path == "digital" and not any(scales.values()):
+    if path == "digital" and not rows:
         raise InputError("--path", "analogue, as no counts can be told from the values", path)
-    card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title)
-    _score_wires(card, wires, session, scales, limits)
+    card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds)
+    _score_wires(card, recorded, wires, session, rows if path == "digital" else {}, sent)
     if path == "digital":
-        score_digital(card, recorded, wires, scales, session, limits)
+        score_digital(card, recorded, wires, rows, session)
     else:
-        score_analogue(card, recorded, wires, session, limits, formulas or {})
+        score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
     return card
+
+
+def _near(rate_hz: float, sent_hz: float) -> float:
+    """The rate itself, or that of every n-th row that was sent, if it is nearly that."""
+    exact = sent_hz / max(1, round(sent_hz / rate_hz))
+    return exact if abs(rate_hz / exact - 1.0) < _NEAR else rate_hz
+
+
+def _connect(
+    recorded: Mapping[str, Recorded], sent: Mapping[str, tuple[np.ndarray, float]], rates: Mapping[str, float]
+) -> dict[str, Wire]:
+    """Wires of all signals that have values; those that have stamps of their own need not begin with the others."""
+    tables: dict[int, dict[str, tuple[np.ndarray, float]]] = {}
+    for name, signal in recorded.items():
+        if signal.rows > 1:
+            own = id(signal.like or signal) if signal.times_s is not None else 0
+            tables.setdefault(own, {})[name] = signal.values, rates[name]
+    wires = {name: wire for part in tables.values() for name, wire in find_wires(part, sent).items()}
+    return {name: wires[name] for name in recorded if name in wires}
 
 
 def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
@@ -83,26 +108,38 @@ def _by_name(signals: Sequence[Recorded]) -> dict[str, Recorded]:
 
 
 def _score_wires(
-    card: Scorecard, wires: Mapping[str, Wire], session: Session, scales: Mapping[str, Scale | None], limits: Limits
-) -> None:
-    """Mapping and, on the analogue path, polarity: a name of the rig's has to be that channel."""
+    card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], session: Session,
+    rows: Mapping[str, Taken], sent: Mapping[str, tuple[np.ndarray, float]],
+) -> None:  # fmt: skip
+    """Mapping and polarity: a name of the rig's has to be that channel."""
+    loud = {
+        name
+        for name, channel in session.channels.items()
+        if np.std(sent[name][0]) > _LOUD * channel.noise_v / channel.lsb_v
+    }
     for name, wire in wires.items():
         known = session.channels.keys()
         verdict: Verdict = NO_LIMIT
         note = f"correlation {wire.likeness:.4f}"
-        certain = not wire.rivals or scales.get(name) is not None
-        if not wire.channel or not certain:
+        scale = rows[name].scale if name in rows else None
+        certain = not wire.rivals if scale is None else scale.known
+        if not wire.channel and card.path == "analogue" and name in loud and recorded[name].rows >= _MANY:
+            verdict, note = FAIL, "nothing of what was sent is in it"
+        elif not wire.channel or not certain:
             verdict = NOT_SHOWN
             note += f"; as like {', '.join(wire.rivals)}" if wire.rivals else ""
         elif name in known:
             verdict = PASS if wire.channel == name else FAIL
         card.rows.append(_row(card, "mapping", name, wire.channel or "-", verdict, note))
-        if card.path == "analogue" and wire.channel:
-            verdict = NOT_SHOWN if wire.turned else PASS if wire.polarity > 0 else FAIL
-            said = "as sent" if wire.polarity > 0 else "turned"
-            note = "half a period later it would be the other" if wire.turned else ""
-            card.rows.append(_row(card, "polarity", name, said, verdict, note))
+        if wire.channel:
+            turned = wire.polarity < 0 if scale is None else scale.turned
+            open_ = wire.turned if scale is None else not scale.known
+            verdict = NOT_SHOWN if open_ else FAIL if turned else PASS
+            note = "half a period later it would be the other" if wire.turned and open_ else ""
+            card.rows.append(_row(card, "polarity", name, "turned" if turned else "as sent", verdict, note))
     taken = [wire.channel for wire in wires.values() if wire.channel]
+    if absent := [name for name in session.channels if name not in taken]:
+        card.remarks.append(f"not in the file, or not found in it: {', '.join(absent)}")
     for channel in dict.fromkeys(each for each in taken if taken.count(each) > 1):
         names = ", ".join(name for name, wire in wires.items() if wire.channel == channel)
         card.remarks.append(f"{channel} is recorded more than once: {names}")

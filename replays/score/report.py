@@ -15,7 +15,7 @@ from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, Scorecard, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MARKS: dict[Verdict, Mark] = {PASS: "good", FAIL: "bad", NOT_SHOWN: "open", NO_LIMIT: "plain"}
+_MARKS: dict[Verdict, Mark] = {FAIL: "bad", NOT_SHOWN: "open", PASS: "good", NO_LIMIT: "plain"}
 _STRETCHES = 100
 """Parts of a record of which the lateness is shown."""
 
@@ -33,10 +33,11 @@ def make_report(card: Scorecard, *, origin: Mapping[str, str] | None = None) -> 
     report = Report(f"Scorecard of {card.title}", f"{verdict[0].upper()}{verdict[1:]}.", origin=origin, mark=mark)
     for remark in card.remarks:
         report.text(remark)
+    rows = sorted(card.rows, key=lambda row: list(_MARKS).index(row.verdict))
     report.heading("Scorecard")
     report.table(
-        ("quantity", "channel", "value", "95 % interval", "unit", "limit", "verdict", "note"),
-        [Row((*row.cells(), row.note), _MARKS[row.verdict]) for row in card.rows],
+        ("quantity", "channel", "value", "95 % interval", "unit", "limit", "note", "verdict"),
+        [Row((*row.cells()[:-1], row.note, row.verdict), _MARKS[row.verdict]) for row in rows],
         caption="A row passes, or fails, with its whole interval; one that reaches over its limit shows neither.",
     )
     unshown = {row.quantity: row.run for row in card.rows if row.verdict == NOT_SHOWN}
@@ -101,5 +102,5 @@ def _stamps(means: np.ndarray) -> Figure:
     axes = figure.subplots()
     late = means[:, 1] - means[0, 1]
     axes.plot(means[:, 0], 1e6 * late, ".", color=ORANGE, ms=4)
-    axes.set(xlabel="time in the session [s]", ylabel=f"late [µs], from {means[0, 1]:.9g} s on")
+    axes.set(xlabel="time since the first row [s]", ylabel=f"late [µs], from {means[0, 1]:.9g} s on")
     return figure

@@ -18,6 +18,12 @@ _BACK, _PART = 1 << 14, 1 << 12
 """Rows behind the one that is due among which a row is looked for, and rows that are looked up at a time."""
 _AHEAD, _MOST_AHEAD = 1 << 13, 1 << 22
 """Rows ahead among which they are looked for at first, and at most."""
+_MOST_STRETCHES = 10_000
+"""Stretches of altered values that are kept of a channel."""
+_BROKEN = 0.5
+"""A channel of whose values more than this part is altered has no say in which row one is."""
+_VOTES = 16
+"""Rows that have to agree on where a recording begins."""
 _GRAM = 4
 """Consecutive rows that are known together where one alone is not."""
 
@@ -34,12 +40,62 @@ def row_hashes(counts: np.ndarray) -> np.ndarray:
     return found
 
 
-def _grams(hashes: np.ndarray) -> np.ndarray:
-    """A number of each row with those behind it; the last ones have fewer."""
+def grams(hashes: np.ndarray, step: int = 1) -> np.ndarray:
+    """A number of each row with the next ones, every so many; the last ones have fewer."""
     found = hashes.copy()
-    for step in range(1, _GRAM):
-        found[:-step] += hashes[step:] * np.uint64(2 * step + 1) ^ np.uint64(step)
+    for n in range(1, _GRAM):
+        found[: -n * step] += hashes[n * step :] * np.uint64(2 * n + 1) ^ np.uint64(n)
     return found
+
+
+def located(counts: np.ndarray, among: np.ndarray, step: int) -> int | None:
+    """Where the first of some counts stands among those sent, of which every so many was taken; None if nowhere.
+
+    Args:
+        counts: Of one channel, int64, shape (n,).
+        among: Of the same one, shape (m,).
+        step: From one to the next; the place may be before the first.
+    """
+    if min(len(counts), len(among) // step) < 2 * _VOTES:
+        return None
+    here, there = (grams(row_hashes(each[:, None]), n) for each, n in ((counts, 1), (among, step)))
+    _, at, place = np.intersect1d(here, there, return_indices=True)
+    begins, votes = np.unique(place - at * step, return_counts=True)
+    return int(begins[np.argmax(votes)]) if len(votes) and votes.max() >= _VOTES else None
+
+
+class Stretches:
+    """Rows of which some may be too many to keep: how many they are, and the first stretches of them.
+
+    Attributes:
+        rows: How many rows.
+    """
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self._parts: list[np.ndarray] = []
+        self._kept = 0
+
+    def add(self, places: np.ndarray) -> None:
+        """Take rows, behind those that were taken before, or nearly so, shape (n,)."""
+        self.rows += len(places)
+        if len(places) and self._kept < _MOST_STRETCHES:
+            self._parts.append(stretches(np.unique(places)))
+            self._kept += len(self._parts[-1])
+
+    def pairs(self) -> np.ndarray:
+        """First and last row of each stretch, shape (n, 2)."""
+        if not self._parts:
+            return stretches(np.empty(0, dtype=np.int64))
+        found = np.concatenate(self._parts)
+        begins = np.append(True, found[1:, 0] != found[:-1, 1] + 1)
+        return np.column_stack([found[begins, 0], found[np.append(begins[1:], True), 1]])
+
+
+def stretches(places: np.ndarray) -> np.ndarray:
+    """Ascending places as stretches without a gap: first and last of each, shape (n, 2)."""
+    begins = np.diff(places, prepend=-2) != 1
+    return np.column_stack([places[begins], places[np.append(begins[1:], True)[: len(places)]]])
 
 
 @dataclass
@@ -52,10 +108,9 @@ class Followed:
         first, last: The earliest and the latest row that came, by its place among those sent; -1 if none did.
         doubled: Places of rows that came once more, and numbers of the recorded rows, int64, shape (n, 2).
         swapped: Places of rows that came behind later ones, and numbers of the recorded rows, shape (n, 2).
-        altered: Places of rows of which some value is another, and numbers of the recorded rows, shape (n, 2).
+        altered: Of each channel the rows whose value is another.
         foreign: Numbers of recorded rows that are none of those sent, shape (n,).
         times: How often each row came, uint8, shape (sent,).
-        wrong: Number of altered values of each channel, shape (channels,).
     """
 
     sent: int = 0
@@ -64,10 +119,9 @@ class Followed:
     last: int = -1
     doubled: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
     swapped: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
-    altered: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+    altered: list[Stretches] = field(default_factory=list)
     foreign: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     times: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.uint8))
-    wrong: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     @property
     def missing(self) -> np.ndarray:
@@ -80,12 +134,19 @@ class Followed:
 class _Sent:
     """The rows near by, of those that were sent."""
 
-    def __init__(self, chunks: Iterable[np.ndarray]) -> None:
+    def __init__(self, chunks: Iterable[np.ndarray], by: np.ndarray) -> None:
         self._chunks = iter(chunks)
         self.start = self.end = 0
         self.ended = False
         self.counts = np.empty((0, 0), dtype=np.int64)
         self.hashes = np.empty(0, dtype=np.uint64)
+        self.by = by
+
+    def know(self, by: np.ndarray) -> None:
+        """Know rows by other columns than before."""
+        if not np.array_equal(by, self.by):
+            self.by = by
+            self.hashes = row_hashes(self.counts[:, by])
 
     def hold(self, begin: int, end: int) -> None:
         """Have rows from one place to another, as far as there are any; those before are let go."""
@@ -106,31 +167,34 @@ class _Sent:
             joined = np.concatenate(whole) if whole else self.counts[:0]
             skip = len(joined) - (self.end - begin)  # rows that came and are let go at once
             self.counts = joined[skip:]
-            new = row_hashes(self.counts[max(0, held - skip) :])
+            new = row_hashes(self.counts[max(0, held - skip) :, self.by])
             self.hashes = np.concatenate(
                 [self.hashes[len(self.hashes) - held + skip :] if held > skip else new[:0], new]
             )
             self.start = begin
 
 
-def follow(sent: Iterable[np.ndarray], recorded: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, Followed]]:
+def follow(
+    sent: Iterable[np.ndarray], recorded: Iterable[np.ndarray], sound: int
+) -> Iterator[tuple[np.ndarray, Followed]]:
     """Follow recorded rows among those sent.
 
     Args:
         sent: Counts in chunks, int64, shape (n, channels).
         recorded: The same of the recorded ones; `NO_COUNT` where a value is no count.
+        sound: Rows are known by so many of the first channels; the others are compared alone.
 
     Yields:
         Place of each recorded row among those sent, -1 of a foreign one, shape (n,), chunk by chunk; and what has been
         found up to there, whose arrays are complete with the last chunk, which has no rows.
     """
-    window, found = _Sent(sent), Followed()
-    events: dict[str, list[np.ndarray]] = {"doubled": [], "swapped": [], "altered": [], "foreign": []}
+    window, found = _Sent(sent, np.arange(sound)), Followed()
+    events: dict[str, list[np.ndarray]] = {"doubled": [], "swapped": [], "foreign": []}
     due, highest = 0, -1
     for chunk in recorded:
-        if not found.wrong.size:
-            found.wrong = np.zeros(chunk.shape[1], dtype=np.int64)
-        hashes = row_hashes(chunk)
+        found.altered = found.altered or [Stretches() for _ in range(chunk.shape[1])]
+        before = np.array([each.rows for each in found.altered])
+        hashes = row_hashes(chunk[:, window.by])
         places = np.empty(len(chunk), dtype=np.int64)
         at, low = 0, due - _BACK
         while at < len(chunk):
@@ -147,6 +211,9 @@ def follow(sent: Iterable[np.ndarray], recorded: Iterable[np.ndarray]) -> Iterat
                 known = places[part][places[part] >= 0]
                 due = int(known[-1]) + 1 if len(known) else due + at - part.start
         highest = _note(found, events, places, chunk, window, highest)
+        wrong = np.array([each.rows for each in found.altered]) - before
+        by = np.flatnonzero(wrong[:sound] < _BROKEN * len(chunk))
+        window.know(by if len(by) else np.arange(sound))
         yield places, found
     while not window.ended:
         window.hold(window.end, window.end + 1)
@@ -177,7 +244,7 @@ def _places(window: _Sent, hashes: np.ndarray, due: int, high: int) -> tuple[np.
     n, rows = len(hashes), np.arange(len(hashes))
     places = np.full(n, -1, dtype=np.int64)
     ranks = {}
-    for level, (there, here) in enumerate(((nearby, hashes), (_grams(nearby), _grams(hashes)))):
+    for level, (there, here) in enumerate(((nearby, hashes), (grams(nearby), grams(hashes)))):
         order = np.argsort(there, kind="stable")
         ordered = there[order]
         left, right = np.searchsorted(ordered, here), np.searchsorted(ordered, here, side="right")
@@ -260,9 +327,8 @@ def _note(
         np.add.at(found.times, came, np.minimum(1, 255 - found.times[came]).astype(np.uint8))
     inside = came >= window.start
     there = window.counts[came[inside] - window.start]
-    different = there != counts[inside]
-    found.wrong += different.sum(axis=0)
-    events["altered"].append(np.column_stack([came, numbers])[inside][different.any(axis=1)])
+    for column, known in enumerate((there != counts[inside]).T):
+        found.altered[column].add(came[inside][known])
     found.first = int(came.min()) if found.first < 0 else min(found.first, int(came.min()))
     found.last = max(found.last, int(came.max()))
     return int(tops[-1])

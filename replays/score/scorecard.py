@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +15,8 @@ from rig.text import finite
 PASS, FAIL, NOT_SHOWN, NO_LIMIT = "pass", "fail", "this run does not show it", "no limit"
 Verdict = Literal["pass", "fail", "this run does not show it", "no limit"]
 Path_ = Literal["digital", "analogue"]
+Interval = tuple[float, float, float]
+"""Value, low and high end."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ _DIGITS = "a recording that keeps every digit of the counts"
 _STAMPED = "a recording that keeps time stamps"
 DIGITAL = {
     "mapping": Quantity("1", "cross-correlation, then equal counts", _RICH),
+    "polarity": Quantity("1", "sign of the scale", _RICH),
     "scale": Quantity("ppm", "least squares, then every count equal", _DIGITS),
     "offset": Quantity("counts", "least squares, then every count equal", _DIGITS),
     "altered values": Quantity("1", _EXACT, _LONGER),
@@ -55,8 +59,12 @@ DIGITAL = {
     "stamp rate": Quantity("ppm", "straight line through means of batches, Student's t", _STAMPED),
     "stamp jitter": Quantity("s", "rms within batches, chi squared", _STAMPED),
     "stamps that go back": Quantity("1", _EXACT, _STAMPED),
-    "latency": Quantity("s", "-", "the DAQ beside a rig that runs: a file does not tell when its rows came"),
-    "trigger row": Quantity("1", "-", "a triggered recording of a scene with a hammer or a step"),
+    "latency": Quantity(
+        "s",
+        "stamps less the arrival of the rows at the session's recorder, Student's t",
+        "the DAQ, stamping rows by the computer's clock as they come, beside `rig record` of a rig that runs",
+    ),
+    "trigger row": Quantity("1", _EXACT, "a triggered recording of a scene with a hammer or another command"),
 }
 ANALOGUE = {
     "mapping": Quantity("1", "cross-correlation of all pairs", _RICH),
@@ -68,7 +76,7 @@ ANALOGUE = {
     "clock": Quantity("ppm", f"{_SANDWICH}, weighted mean of channels", "a longer run with a signal above 100 Hz"),
     "noise": Quantity("", _SPLIT, _LONGER),
     "jitter": Quantity("ns", _SPLIT, "a steep signal (test-sine at 1 kHz or more, or two tones), 10 s"),
-    "effective bits": Quantity("bit", "of the noise, log2(range / (noise sqrt 12))", _LONGER),
+    "effective bits": Quantity("bit", "of the rms of all that is left, log2(range / (rms sqrt 12))", _LONGER),
     "dynamic range": Quantity("dB", "of the noise, full-scale sine over it", _LONGER),
     "corner": Quantity("Hz", "least squares behind a Butterworth low-pass, else cross spectra", _BEYOND),
     "SINAD": Quantity("dB", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
@@ -148,7 +156,7 @@ class ScoreRow:
 
 
 def judge_row(
-    path: Path_, quantity: str, channel: str, estimate: tuple[float, float, float] | None, *, unit: str = "",
+    path: Path_, quantity: str, channel: str, estimate: Interval | None, *, unit: str = "",
     limit: Bounds | None = None, note: str = "",
 ) -> ScoreRow:  # fmt: skip
     """A row with its verdict: the whole interval decides, and one that reaches over a limit shows nothing.
@@ -184,6 +192,7 @@ class Scorecard:
         title: Of what.
         path: Digital or analogue.
         limits: Title of the limits.
+        asked: What they ask of a path's quantity, on a channel of the session's table.
         rows: The rows.
         remarks: What was assumed.
         pictures: What pictures are made of, by kind and channel.
@@ -193,10 +202,19 @@ class Scorecard:
     title: str
     path: Path_
     limits: str
+    asked: Callable[..., Bounds | None]
     rows: list[ScoreRow] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     pictures: dict[str, Any] = field(default_factory=dict)
     runs: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+
+    def add(
+        self, quantity: str, channel: str, estimate: Interval | None, *, of: Any = None, unit: str = "", note: str = "",
+        **told: Any,
+    ) -> None:  # fmt: skip
+        """Add a row that is judged by its limit: as `judge_row`, `of` the session's channel, and what a limit needs."""
+        limit = self.asked(self.path, quantity, of, **told)
+        self.rows.append(judge_row(self.path, quantity, channel, estimate, unit=unit, limit=limit, note=note))
 
     @property
     def good(self) -> bool:
@@ -227,16 +245,9 @@ class Scorecard:
 
     def document(self) -> dict[str, Any]:
         """As a document for JSON."""
-        rows = [
-            {
-                "quantity": row.quantity, "channel": row.channel or None, "value": row.value, "low": row.low,
-                "high": row.high, "unit": row.unit, "method": row.method, "verdict": row.verdict,
-                "limit": None if row.limit is None
-                else {"low": row.limit.low, "high": row.limit.high, "source": row.limit.source},
-                "run": row.run or None, "note": row.note or None,
-            }
-            for row in self.rows
-        ]  # fmt: skip
+        rows = [{name: each or None for name, each in asdict(row).items()} for row in self.rows]
+        for row, told in zip(self.rows, rows, strict=True):
+            told |= {"value": row.value, "low": row.low, "high": row.high}
         return finite({
             "title": self.title, "path": self.path, "good": self.good, "verdict": self.verdict_line,
             "limits": self.limits, "rows": rows, "remarks": self.remarks, "runs": self.runs,

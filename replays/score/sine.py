@@ -1,4 +1,4 @@
-"""Sine fits of IEEE 1057 with three and four parameters, and what of a record is neither the sine nor its offset.
+"""The sine fit of IEEE 1057 with four parameters, and what of a record is neither the sine nor its offset.
 
 Definitions are those of IEEE Std 1057-2017 as papers and tutorials give them; the standard itself was not at hand.
 """
@@ -13,8 +13,6 @@ import numpy as np
 HARMONICS = 10
 """The highest harmonic that counts for the total distortion."""
 _ROUNDS = 20
-_PURE = 0.98
-"""Part of a signal's power that one sine must hold for it to be taken for a sine."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +22,11 @@ class SineFit:
     Attributes:
         frequency: [cycles a sample], and its standard deviation.
         amplitude: [unit], and its standard deviation.
-        phase: At the first sample [rad].
-        offset: [unit], and its standard deviation.
         residual: What is left, shape (n,).
     """
 
     frequency: tuple[float, float]
     amplitude: tuple[float, float]
-    phase: float
-    offset: tuple[float, float]
     residual: np.ndarray
 
     @property
@@ -41,32 +35,28 @@ class SineFit:
         return math.sqrt(float(self.residual @ self.residual) / (len(self.residual) - 4))
 
 
-def fit_sine(values: np.ndarray, frequency: float | None = None) -> SineFit:
-    """Fit a sine: four parameters, or three where the frequency [cycles a sample] is given; values shape (n,)."""
+def fit_sine(values: np.ndarray) -> SineFit:
+    """Fit a sine with four parameters to values, shape (n,)."""
     n = np.arange(len(values)) - 0.5 * (len(values) - 1)
-    w = 2.0 * math.pi * (_peak(values) if frequency is None else frequency)
-    columns = [np.cos(w * n), np.sin(w * n), np.ones(len(n))]
-    beta = np.linalg.lstsq(np.column_stack(columns), values, rcond=None)[0]
-    for _ in range(_ROUNDS if frequency is None else 0):
-        c, s = np.cos(w * n), np.sin(w * n)
-        columns = [c, s, np.ones(len(n)), n * (beta[1] * c - beta[0] * s)]
-        beta = np.linalg.lstsq(np.column_stack(columns), values, rcond=None)[0]
+    w, ones = 2.0 * math.pi * _peak(values), np.ones(len(n))
+
+    def solved(*more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        matrix = np.column_stack([np.cos(w * n), np.sin(w * n), ones, *more])
+        return matrix, np.linalg.lstsq(matrix, values, rcond=None)[0]
+
+    _, beta = solved()
+    for _ in range(_ROUNDS):
+        _, beta = solved(n * (beta[1] * np.cos(w * n) - beta[0] * np.sin(w * n)))
         w += beta[3]
         if abs(beta[3]) * len(n) < 1e-12:
             break
-    c, s = np.cos(w * n), np.sin(w * n)
-    slope = [n * (beta[1] * c - beta[0] * s)] if frequency is None else []
-    matrix = np.column_stack([c, s, np.ones(len(n)), *slope])
-    beta = np.linalg.lstsq(matrix[:, :3], values, rcond=None)[0]
-    residual = values - matrix[:, :3] @ beta
-    variance = float(residual @ residual) / (len(n) - matrix.shape[1])
-    spread = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * variance)
-    amplitude = math.hypot(beta[0], beta[1])
+    matrix, beta = solved()
+    residual = values - matrix @ beta
+    matrix, _ = solved(n * (beta[1] * np.cos(w * n) - beta[0] * np.sin(w * n)))
+    spread = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(residual @ residual) / (len(n) - 4))
     return SineFit(
-        (w / (2.0 * math.pi), spread[3] / (2.0 * math.pi) if slope else 0.0),
-        (amplitude, float(max(spread[0], spread[1]))),
-        math.atan2(-beta[1], beta[0]) + w * n[0],
-        (float(beta[2]), float(spread[2])),
+        (w / (2.0 * math.pi), spread[3] / (2.0 * math.pi)),
+        (math.hypot(beta[0], beta[1]), float(max(spread[0], spread[1]))),
         residual,
     )
 
@@ -81,13 +71,14 @@ def _peak(values: np.ndarray) -> float:
     return (k + side * (2.0 * ratio - 1.0) / (1.0 + ratio)) / len(values)
 
 
-def is_sine(values: np.ndarray) -> bool:
-    """Whether a signal is a sine and little else."""
+def is_sine(values: np.ndarray, noise: float) -> bool:
+    """Whether a signal is a sine, and what else is in it is no more than noise of some rms [unit]."""
     spread = float(np.var(values))
     if len(values) < 64 or not spread > 0.0:
         return False
     fit = fit_sine(values)
-    return 0.5 * fit.amplitude[0] ** 2 > _PURE * spread and 2.0 / len(values) < fit.frequency[0] < 0.49
+    pure = fit.nad < max(noise, 1e-6 * fit.amplitude[0])
+    return pure and fit.amplitude[0] > fit.nad and 2.0 / len(values) < fit.frequency[0] < 0.49
 
 
 @dataclass(frozen=True)

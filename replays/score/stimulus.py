@@ -38,27 +38,37 @@ class Sampled:
     def __init__(self, values: np.ndarray, first_s: float, rate_hz: float) -> None:
         """Take even samples, shape (n,), the first at a time [s]."""
         self._values, self._first_s, self._rate_hz = values, first_s, rate_hz
+        self._kept: tuple[int, int, Any] | None = None
         last_s = first_s + (len(values) - 1) / rate_hz
         self.span_s = (first_s + EDGE / rate_hz, last_s - EDGE / rate_hz)
 
     def __call__(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `Stimulus`."""
-        from scipy.interpolate import make_interp_spline
-        from scipy.signal import firwin, upfirdn
-
-        taps = firwin(2 * _HALF_TAPS * _FINER + 1, _CUTOFF / _FINER, window=cast(Any, ("kaiser", _KAISER))) * _FINER
         at = (times_s - self._first_s) * self._rate_hz
         values, slopes = np.empty(len(at)), np.empty(len(at))
         for begin in range(0, len(at), _CHUNK):
             part = slice(begin, begin + _CHUNK)
-            low = max(0, int(at[part].min()) - EDGE)
-            high = min(len(self._values), int(at[part].max()) + EDGE + 1)
-            finer = upfirdn(taps, self._values[low:high], up=_FINER)[_HALF_TAPS * _FINER : -_HALF_TAPS * _FINER or None]
-            spline = make_interp_spline(np.arange(len(finer)), finer, k=5)
+            low, high = 0, len(self._values)
+            if high > _CHUNK:
+                low = max(0, int(at[part].min()) - EDGE)
+                high = min(high, int(at[part].max()) + EDGE + 1)
+            spline = self._spline(low, high)
             place = (at[part] - low) * _FINER
             values[part] = spline(place)
             slopes[part] = spline(place, nu=1) * (_FINER * self._rate_hz)
         return values, slopes
+
+    def _spline(self, low: int, high: int) -> Any:
+        """Of some of the samples, by their place at four times the rate; the last one is kept."""
+        from scipy.interpolate import make_interp_spline
+        from scipy.signal import firwin, upfirdn
+
+        if self._kept is None or self._kept[:2] != (low, high):
+            window = cast(Any, ("kaiser", _KAISER))
+            taps = firwin(2 * _HALF_TAPS * _FINER + 1, _CUTOFF / _FINER, window=window) * _FINER
+            finer = upfirdn(taps, self._values[low:high], up=_FINER)[_HALF_TAPS * _FINER : -_HALF_TAPS * _FINER or None]
+            self._kept = low, high, make_interp_spline(np.arange(len(finer)), finer, k=5)
+        return self._kept[2]
 
 
 class Exact:

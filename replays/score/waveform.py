@@ -15,8 +15,13 @@ import numpy as np
 from replays.score.stimulus import Stimulus
 
 _BLOCKS = 64
-_FIRST_S = 0.25
-"""Where the signal is steepest, a stretch this long is fitted first; it is doubled until it is all."""
+_FIRST_S = (0.25, 0.03)
+"""Where the signal is steepest, a stretch this long is fitted first; it is doubled until it is all.
+
+The second where the first finds nothing: over a shorter one clocks may be farther apart.
+"""
+_FOUND = 0.9
+"""Part of the recorded power that has to be explained for the signal to count as found."""
 _ROUNDS, _FINAL = 4, 3
 _SETTLED = 1e-3
 """A step below this part of its standard deviation is the last."""
@@ -89,7 +94,6 @@ def fit_waveform(
         late_s: Time of the stimulus less time of the file, to a part of a period of the signal [s].
         within_s: Where in the file that is so [s]; None: anywhere.
     """
-    middle = 0.5 * (times_s[0] + times_s[-1])
     low, high = stimulus.span_s
     moved = times_s + late_s
     inside = np.isfinite(values) & (moved >= low) & (moved <= high)
@@ -100,10 +104,24 @@ def fit_waveform(
     if within_s is not None:
         begin, end = np.searchsorted(times_s, within_s)
         near = max(first, min(begin, last + 1 - _LEAST)), min(last + 1, max(end, first + _LEAST))
-    begin, end = _steepest(values, times_s, *near)
-    line = (late_s, 0.0)
+    best = None
+    for first_s in _FIRST_S:
+        found = _grow(values, times_s, stimulus, late_s, (first, last + 1), _steepest(values, times_s, *near, first_s))
+        if found is not None and (best is None or found.likeness > best.likeness):
+            best = found
+        if best is not None and best.likeness > _FOUND:
+            break
+    return best
+
+
+def _grow(
+    values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, late_s: float, rows: tuple[int, int],
+    stretch: tuple[int, int],
+) -> Waveform | None:  # fmt: skip
+    """The fit of all of some rows, from that of a stretch of them."""
+    middle, (begin, end), line = 0.5 * (times_s[0] + times_s[-1]), stretch, (late_s, 0.0)
     while True:
-        whole = (begin, end) == (first, last + 1)
+        whole = (begin, end) == rows
         found = _solve(values, times_s, stimulus, line, slice(begin, end), final=whole)
         if found is None or abs(found.drift) > _MOST_DRIFT:
             return None
@@ -112,12 +130,12 @@ def fit_waveform(
         if whole:
             return replace(found, late_s=line[0])
         wider = end - begin
-        begin, end = max(first, begin - wider // 2), min(last + 1, end + wider - wider // 2)
+        begin, end = max(rows[0], begin - wider // 2), min(rows[1], end + wider - wider // 2)
 
 
-def _steepest(values: np.ndarray, times_s: np.ndarray, first: int, last: int) -> tuple[int, int]:
+def _steepest(values: np.ndarray, times_s: np.ndarray, first: int, last: int, wanted_s: float) -> tuple[int, int]:
     rate = (len(times_s) - 1) / (times_s[-1] - times_s[0])
-    length = min(last - first, max(_LEAST, round(_FIRST_S * rate)))
+    length = min(last - first, max(_LEAST, round(wanted_s * rate)))
     steps = np.nan_to_num(np.diff(values[first:last], append=values[last - 1])) ** 2
     sums = np.concatenate([[0.0], np.cumsum(steps)])
     held = sums[length:] - sums[:-length]
@@ -193,10 +211,12 @@ class NoiseSplit:
     """Noise of the voltage and of the sampling instants, each as value, low and high end of its 95 % interval.
 
     Attributes:
-        noise: rms [unit].
+        left: All that is left, rms [unit].
+        noise: What of it goes not with the slope, rms [unit].
         jitter_s: rms [s]; None where the signal's slope does not vary.
     """
 
+    left: tuple[float, float, float]
     noise: tuple[float, float, float]
     jitter_s: tuple[float, float, float] | None
 
@@ -210,9 +230,17 @@ def split_noise(found: Waveform, *, floor: float = 0.0) -> NoiseSplit:
     """
     squared, steep = found.residual**2, (found.gain * found.slope) ** 2
     typical = float(np.mean(steep))
-    total = float(np.mean(squared))
-    varied = typical > 0.0 and float(np.std(steep)) > 0.05 * typical
-    columns = [np.ones(len(squared)), steep / typical] if varied else [np.ones(len(squared))]
+    ones = np.ones(len(squared))
+    (left,) = _powers(squared, [ones], floor)
+    if not (typical > 0.0 and float(np.std(steep)) > 0.05 * typical):
+        return NoiseSplit(left, left, None)
+    noise, late = _powers(squared, [ones, steep / typical], floor)
+    size = math.sqrt(typical)
+    return NoiseSplit(left, noise, (late[0] / size, late[1] / size, late[2] / size))
+
+
+def _powers(squared: np.ndarray, columns: list[np.ndarray], floor: float) -> list[tuple[float, float, float]]:
+    """What squares are made of, as roots; of the first one less of its low end than there may have been before."""
     matrix, weights, rounds = np.column_stack(columns), np.ones(len(squared)), 3
     while True:
         weighted = matrix * weights[:, None]
@@ -222,17 +250,13 @@ def split_noise(found: Waveform, *, floor: float = 0.0) -> NoiseSplit:
         if not rounds:
             break
         # A square of normal noise spreads as its own mean.
+        total = float(np.mean(squared))
         weights = np.maximum(matrix @ parts, 0.05 * total) ** -2.0 * total**2
-    left = squared - matrix @ parts
-    covariance, freedom = _sandwich(weighted, left, inverse)
+    covariance, freedom = _sandwich(weighted, squared - matrix @ parts, inverse)
     half = student(freedom) * np.sqrt(np.diag(covariance))
-    noise = _root(parts[0], half[0])
-    noise = (noise[0], math.sqrt(max(0.0, noise[1] ** 2 - floor**2)), noise[2])
-    return NoiseSplit(noise, _root(parts[1] / typical, half[1] / typical) if varied else None)
-
-
-def _root(power: float, half: float) -> tuple[float, float, float]:
-    return math.sqrt(max(0.0, power)), math.sqrt(max(0.0, power - half)), math.sqrt(max(0.0, power + half))
+    roots = np.sqrt(np.maximum(0.0, [parts, parts - half, parts + half]))
+    roots[1, 0] = math.sqrt(max(0.0, roots[1, 0] ** 2 - floor**2))
+    return [(float(value), float(low), float(high)) for value, low, high in roots.T]
 
 
 @dataclass(frozen=True)

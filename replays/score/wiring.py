@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-ALIKE = 0.2
-"""Correlation from which a signal counts as found."""
+_ALIKE, _CHANCE = 0.2, 6.0
+"""Correlation from which a signal counts as found, and times the root of its samples: few are by chance."""
 _DISTINCT = 0.95
 """What correlates by more than this part of the best is not told from it."""
 _CLEAR = 0.98
 """From which it needs no second look."""
+_APART, _FAR_S = 3, 5e-3
+"""Samples that a signal may be off the others; and where nothing is much like it there, so long [s]."""
+_LAGS = 12
+"""Lags that are told beside the likeliest, at most."""
 _MOST = 1 << 17
 """Samples of a signal that are correlated, at most."""
 _TAKEN_S = (2.0, 0.25)
@@ -32,6 +36,8 @@ class Wire:
         turned: Whether the other polarity, at another time, is as alike: as of a sine.
         late_s: Time in the session less time in the recording, of all signals together [s], ...
         within_s: ... in this stretch of the recording [s].
+        others_s: What `late_s` might be as well, of what is nearly periodic.
+        own_s: The same as `late_s` of this signal alone, which may be somewhat off the others [s].
     """
 
     channel: str
@@ -41,6 +47,8 @@ class Wire:
     turned: bool
     late_s: float
     within_s: tuple[float, float]
+    others_s: tuple[float, ...]
+    own_s: float
 
 
 def find_wires(
@@ -57,7 +65,7 @@ def find_wires(
     """
     long, short = _TAKEN_S
     wires = _find(recorded, sent, 0.0, long)
-    if all(wire.likeness > _CLEAR for wire in wires.values()):
+    if all(wire.likeness > _CLEAR and not wire.others_s for wire in wires.values()):
         return wires
     # Where most of them vary most.
     rate = min(each for _, each in recorded.values())
@@ -67,8 +75,12 @@ def find_wires(
     sums = np.cumsum(np.concatenate([[0.0], whole]))
     begin = int(np.argmax(sums[size:] - sums[:-size])) if rows > size else 0
     more = _find(recorded, sent, begin / rate, short)
-    clear = [sum(w.likeness > ALIKE for w in found.values()) for found in (wires, more)]
-    return more if clear[1] > clear[0] else wires
+    alike = [sum(wire.likeness for wire in found.values()) for found in (wires, more)]
+    first, second = (more, wires) if alike[1] > alike[0] else (wires, more)
+    return {
+        name: replace(wire, others_s=(second[name].late_s, *second[name].others_s, *wire.others_s))
+        for name, wire in first.items()
+    }
 
 
 def _find(
@@ -85,36 +97,64 @@ def _find(
     there, even = _spectra(sent, rate, length, math.ceil((length + taken_s) * rate))
     taken = {name: _even(values, each, rate, taken_s) for name, (values, each) in recorded.items()}
     lengths = {n: _lengths(even, behind, n) for n in {len(here) for here in taken.values()}}
-    curves = {name: _likeness(here, behind, there, lengths[len(here)]) for name, here in taken.items()}
-    names = list(sent)
-    # All signals of a file began together: the lag at which most of the best pairs are alike.
-    best = {name: int(np.argmax(np.abs(curve).max(axis=1))) for name, curve in curves.items()}
-    clear = [np.abs(curves[name][k]) for name, k in best.items() if np.abs(curves[name][k]).max() > ALIKE]
-    lag = _nearest_peak(np.mean(clear, axis=0), behind) if clear else behind
-    found = {}
-    for name, curve in curves.items():
-        near = curve[:, max(0, lag - 3) : lag + 4]
-        amounts = np.abs(near).max(axis=1)
+    names, found = list(sent), {}
+    best: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    ends: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for name, here in taken.items():
+        length = lengths[len(here)] / math.sqrt(_step(recorded[name][1], rate))
+        curve = _likeness(here, behind, there, length)
+        alike = np.abs(curve).max(axis=0)
+        best[name] = alike, np.abs(curve[names.index(name)]) if name in names else alike
+        ends[name] = curve.min(axis=1), curve.max(axis=1)
+    lags = _common_lags(list(best.values()), behind + round(from_s * rate))
+    lag = lags[0]
+    padded = np.pad(even, ((0, 0), (behind, max(map(len, taken.values())) + round(_FAR_S * rate) + _APART)))
+    for name, here in taken.items():
+        length = lengths[len(here)] / math.sqrt(_step(recorded[name][1], rate))
+        for apart in (_APART, round(_FAR_S * rate)):
+            first = max(0, lag - apart)
+            about = range(first, min(lag + apart + 1, length.shape[1]))
+            still = here - here.mean()
+            near = np.column_stack([padded[:, at : at + len(here)] @ still for at in about])
+            near /= length[:, about] * max(float(np.linalg.norm(still)), 1e-150)
+            amounts = np.abs(near).max(axis=1)
+            if amounts.max() > 0.5:
+                break
         k = int(np.argmax(amounts))
         rivals = tuple(names[j] for j in np.flatnonzero(amounts >= _DISTINCT * amounts[k]) if j != k)
         if name in rivals and name in names:  # its own name decides between equals
             rivals = (*(each for each in rivals if each != name), names[k])
             k = names.index(name)
-        peak = near[k][int(np.argmax(np.abs(near[k])))]
+        at = int(np.argmax(np.abs(near[k])))
+        peak = near[k][at]
         polarity = 1 if peak >= 0.0 else -1
-        turned = float((-polarity * curve[k]).max()) > 0.9 * amounts[k]
-        known = amounts[k] > ALIKE
+        turned = max(-polarity * end[k] for end in ends[name]) > 0.9 * amounts[k]
+        known = amounts[k] > max(_ALIKE, _CHANCE / math.sqrt(len(here) / _step(recorded[name][1], rate)))
+        late_s = (lag - behind) / rate - from_s
         found[name] = Wire(
             names[k] if known else "", polarity, float(amounts[k]), rivals if known else (), bool(turned),
-            (lag - behind) / rate - from_s, (from_s, from_s + taken_s),
+            late_s, (from_s, from_s + taken_s), tuple((each - behind) / rate - from_s for each in lags[1:]),
+            late_s if turned else late_s + (first + at - lag) / rate,
         )  # fmt: skip
     return found
 
 
 def _even(values: np.ndarray, rate: float, wanted: float, seconds: float) -> np.ndarray:
+    values = np.asarray(values[: math.ceil(seconds * rate) + 2])
     held = np.nan_to_num(values, nan=float(np.nanmean(values)) if np.isfinite(values).any() else 0.0)
     rows = max(2, min(math.floor(seconds * wanted), math.floor((len(held) - 1) / rate * wanted) + 1))
+    if (step := _step(rate, wanted)) > 1:
+        even = np.zeros(rows)
+        part = held[: -(-rows // step)]
+        even[::step] = part - part.mean()
+        return even
     return np.interp(np.arange(rows) * (rate / wanted), np.arange(len(held)), held)
+
+
+def _step(rate: float, wanted: float) -> int:
+    """How many samples at a rate go from one to the next of what has every n-th of them; 1 where it has not."""
+    step = round(wanted / rate)
+    return step if step > 1 and abs(step * rate / wanted - 1.0) < 1e-9 else 1
 
 
 def _spectra(
@@ -123,12 +163,12 @@ def _spectra(
     """Spectra of what was sent, and its even samples, all of one length."""
     from scipy.fft import next_fast_len
 
-    size = 2 * int(next_fast_len(size) or size)
+    size = 2 * (next_fast_len(-(-size // 2), real=True) or size)
     rows = []
     for values, each in sent.values():
         even = _even(values, each, rate, length)
         rows.append(np.pad(even - even.mean(), (0, math.ceil(length * rate) - len(even))))
-    return np.fft.rfft(rows, size, axis=1), np.array(rows)
+    return np.fft.rfft(np.array(rows, np.float32), size, axis=1), np.array(rows)
 
 
 def _lengths(sent: np.ndarray, before: int, n: int) -> np.ndarray:
@@ -144,15 +184,33 @@ def _lengths(sent: np.ndarray, before: int, n: int) -> np.ndarray:
 def _likeness(here: np.ndarray, before: int, there: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Correlation with each channel by lag, from so many samples before the session on."""
     size = 2 * (there.shape[1] - 1)
-    here = here - here.mean()
+    here = (here - here.mean()).astype(np.float32)
     whole = np.fft.irfft(np.conj(np.fft.rfft(here, size)) * there, size, axis=1)
     curve = np.concatenate([whole[:, size - before :], whole[:, : lengths.shape[1] - before]], axis=1)
-    return curve / (lengths * max(math.sqrt(float(here @ here)), 1e-150))
+    return curve / (lengths * max(float(np.linalg.norm(here)), 1e-150))
 
 
-def _nearest_peak(curve: np.ndarray, zero: int) -> int:
-    """The peak nearest to no lag, of those that are as good as the best: a sine has one each period."""
-    high = curve >= 0.98 * curve.max()
+def _common_lags(curves: list[tuple[np.ndarray, np.ndarray]], zero: int) -> list[int]:
+    """Lags at which all signals of a file may have begun together, the likeliest first.
+
+    Of the peaks that are as good as the best, as a sine has one each period, and sequences that begin apart from one
+    another have, that at which most signals are what they are named; of those the nearest to none.
+
+    Args:
+        curves: How much each signal is like the channel that is most alike, and like that of its name, by lag.
+        zero: No lag.
+    """
+    clear = [alike for alike, _ in curves if alike.max() > _ALIKE]
+    if not clear:
+        return [zero]
+    curve = np.mean(clear, axis=0)
+    high = curve >= _DISTINCT * curve.max()
     edges = np.flatnonzero(np.diff(np.concatenate([[0], high.astype(np.int8), [0]])))
     peaks = [low + int(np.argmax(curve[low:up])) for low, up in edges.reshape(-1, 2)]
-    return min(peaks, key=lambda at: abs(at - zero))
+
+    def rank(at: int) -> tuple[int, bool, int]:
+        named = sum(bool(own[at] >= _CLEAR * alike[at]) for alike, own in curves)
+        return named, bool(curve[at] >= _CLEAR * curve.max()), -abs(at - zero)
+
+    first = max(peaks, key=rank)
+    return [first, *sorted(set(peaks) - {first}, key=lambda at: -curve[at])[:_LAGS]]

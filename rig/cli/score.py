@@ -30,7 +30,9 @@ _STYLES = {"pass": "", "fail": "red", "this run does not show it": "yellow", "no
 
 
 def score(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="What the DAQ recorded: as `rig import`, or .mcap.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="What the DAQ recorded: as `rig import`, .mcap, or a CAN log.")
+    ],
     *,
     against: Annotated[
         list[Path], typer.Option("--against", metavar="SESSION.mcap", help="What the rig sent; its parts, repeated.")

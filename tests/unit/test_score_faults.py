@@ -1,0 +1,267 @@
+"""Every fault of a channel turns red the rows that it is declared to, of its own channels, and no other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from drivers.can.signals import messages_for
+from recorder.reader import Recording
+from replays.score.judgement import judge
+from replays.score.scorecard import FAIL, Scorecard
+from replays.sessions.session import FOLDER
+from rig.channels import default_table
+from rig.commands import FaultCommand
+from rig.faults import KINDS
+from rig.faulty import Faulty
+from rig.kernels.observe import EDGE, KEYPHASOR_WIDTH
+from rig.kernels.signals import COLUMN, N_ROW
+from rig.sensors.conditioning import Conditioner
+from tests.score_daqs import Tones, write_parquet, write_session
+
+LEFT = {"noise", "effective bits", "dynamic range"}
+
+
+class Declared(NamedTuple):
+    """A fault, and what it turns red where the DAQ samples by itself; where it takes counts, that they are altered."""
+
+    channel: str
+    numbers: dict[str, Any]
+    red: set[str]
+
+
+TABLE = {
+    "gain": Declared("disk_x", {"factor": 1.001}, {"gain"}),
+    "offset": Declared("disk_y", {"value": 0.01}, {"offset"}),
+    # Over a run its mean is an offset, and the rest of it is left.
+    "drift": Declared("ring_x", {"rate": 0.1}, {"offset", *LEFT}),
+    "polarity": Declared("P_N", {}, {"polarity"}),
+    "stuck": Declared("P_S", {}, {"mapping"}),
+    "nonlinear": Declared("P_E", {"end": 4000.0}, {"gain", *LEFT}),
+    "open": Declared("outer_y", {}, {"mapping"}),
+    "short": Declared("inner_x", {}, {"mapping"}),
+    "intermittent": Declared("inner_y", {"slot_s": 0.002}, LEFT),
+    "hum": Declared("outer_x", {"amplitude_v": 0.02}, LEFT),
+    "crosstalk": Declared("P_W", {"source": "disk_x", "db": -30.0}, LEFT),
+    "saturation": Declared("disk_x", {"part": 0.2}, {"gain", *LEFT}),
+    "swap": Declared("disk_y", {"other": "ring_x"}, {"mapping"}),
+    # The filter was in what was sent: without it, all is earlier, and more of high frequencies.
+    "no-filter": Declared("P_N", {}, {"gain", "skew", *LEFT}),
+    # The same of another one in its place.
+    "bandwidth": Declared("P_S", {"corner_hz": 500.0}, {"corner", "skew"}),
+    "late": Declared("P_E", {"late_us": 3.0}, {"skew"}),
+    "clock": Declared("P_W", {"ppm": 500.0}, {"clock", "skew"}),
+    # None can be early, so that the mean of the next two is a delay; what they leave goes with the slope.
+    "jitter": Declared("ring_y", {"rms_us": 0.5}, {"jitter", "skew", "effective bits"}),
+    "wander": Declared("inner_y", {"amplitude_us": 1.0, "period_s": 0.1}, {"jitter", "skew", "effective bits"}),
+    "noise": Declared("outer_x", {"factor": 3.0}, LEFT),
+    "spikes": Declared("outer_y", {"rate_hz": 50.0, "size_v": 0.5}, LEFT),
+    # Rounded down, and set, are on the mean an offset.
+    "bits": Declared("disk_x", {"lost": 13}, {"offset", *LEFT}),
+    "stuck-bit": Declared("disk_y", {"bit": 14}, {"offset", *LEFT}),
+    "clip": Declared("ring_x", {"part": 0.55}, {"gain", "offset", *LEFT}),
+    "freeze": Declared("P_N", {}, {"mapping"}),
+    "miss-pulses": Declared("keyphasor", {"part": 1.0}, {"mapping"}),
+    "extra-pulses": Declared("keyphasor", {"part": 1.0}, LEFT),
+    "edge-jitter": Declared("keyphasor", {"rms_us": 300.0}, LEFT),
+}
+RATE_HZ, ROWS_HZ, SECONDS, TURN_HZ = 20_000, 100_000, 0.5, 15.0
+GROUPS = [default_table().groups[name] for name in ("probes", "forces", "accelerations", "drive")]
+CHANNELS = [channel for group in GROUPS for channel in group.channels if channel.name != "speed"]
+
+
+Sessions = dict[bool, tuple[Path, dict[str, np.ndarray]]]
+
+
+class Rig:
+    """Tones in place of the physics, behind the sensors' chains."""
+
+    def __init__(self) -> None:
+        t = np.arange(round(SECONDS * ROWS_HZ) + 1) / ROWS_HZ
+        self.rows = np.zeros((len(t), N_ROW))
+        angle = self.rows[:, COLUMN["theta"]] = 2.0 * np.pi * TURN_HZ * t
+        self.rows[:, COLUMN["theta_rate"]] = 2.0 * np.pi * TURN_HZ
+        ahead = (angle + np.pi) % (2.0 * np.pi) - np.pi
+        self.rows[:, COLUMN["keyphasor"]] = np.clip(0.5 + np.minimum(ahead, KEYPHASOR_WIDTH - ahead) / EDGE, 0.0, 1.0)
+        tones = [c for group in GROUPS for c in group.channels if c.name != "keyphasor"]
+        self.made = np.column_stack([
+            Tones(n, c.si / abs(c.sensitivity_v), high_hz=2500.0, tones=80)(t) for n, c in enumerate(tones)
+        ])  # fmt: skip
+        places = {channel.name: N_ROW + n for n, channel in enumerate(tones)} | {"keyphasor": COLUMN["keyphasor"]}
+        self.columns = [places[name] for group in GROUPS for name in group.names]
+
+    def counts(self, faults: tuple[str, ...], *, noisy: bool) -> dict[str, np.ndarray]:
+        """Counts by group with faults from the beginning on."""
+        chain = Conditioner(GROUPS, row_rate_hz=ROWS_HZ, seed=2, noise=noisy, columns=self.columns)
+        faulty = Faulty(default_table(), [chain], seed=2, row_ticks=10, ideal=False, noisy=True)
+        for kind in faults:
+            command = {"channel": TABLE[kind].channel, "kind": kind, **TABLE[kind].numbers}
+            faulty.take(FaultCommand.model_validate(command), 0, [])
+        return faulty.counts(self.rows, self.made, 0)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return Rig()
+
+
+@pytest.fixture(scope="module")
+def sessions(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Sessions:
+    """Sessions without faults, without noise and with it, and their counts."""
+    folder, counts = tmp_path_factory.mktemp("sent"), {noisy: rig.counts((), noisy=noisy) for noisy in (False, True)}
+    return {noisy: (write_session(folder / f"{noisy}.mcap", each), each) for noisy, each in counts.items()}
+
+
+def red(card: Scorecard) -> set[tuple[str, str]]:
+    return {(row.channel, row.quantity) for row in card.rows if row.verdict == FAIL}
+
+
+def declared(kinds: tuple[str, ...], what: set[str] | None = None) -> set[tuple[str, str]]:
+    return {(name, row) for kind in kinds for name in names_of(kind) for row in what or TABLE[kind].red}
+
+
+def daq(
+    path: Path, counts: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], Any] = lambda _: None
+) -> Path:
+    """A file of volts."""
+    columns = {"time [s]": np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ}
+    for group in GROUPS:
+        for n, channel in enumerate(group.channels):
+            if channel in CHANNELS:
+                columns[f"{channel.name} [V]"] = counts[group.name][:, n] * channel.lsb_v
+    change(columns)
+    return write_parquet(path, columns)
+
+
+def test_every_kind_is_declared() -> None:
+    assert set(TABLE) == set(KINDS)
+
+
+def names_of(kind: str) -> set[str]:
+    return {TABLE[kind].channel, TABLE[kind].numbers.get("other", TABLE[kind].channel)}
+
+
+def together(most: int) -> list[tuple[str, ...]]:
+    """Kinds of which no two are on one channel, so many at a time."""
+    sets: list[tuple[str, ...]] = []
+    for kind in TABLE:
+        taken = [
+            n
+            for n, each in enumerate(sets)
+            if len(each) < most and names_of(kind).isdisjoint(set().union(*map(names_of, each)))
+        ]
+        if taken:
+            sets[taken[0]] += (kind,)
+        else:
+            sets.append((kind,))
+    return sets
+
+
+@pytest.mark.parametrize("kinds", together(13), ids=len)
+def test_a_daq_that_samples_by_itself(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
+    card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[False][0]], path="analogue")
+    assert red(card) == declared(kinds)
+
+
+@pytest.mark.parametrize("kinds", together(5), ids=len)
+def test_a_daq_that_takes_counts(kinds: tuple[str, ...], rig: Rig, sessions: Sessions, tmp_path: Path) -> None:
+    card = judge(daq(tmp_path / "daq.parquet", rig.counts(kinds, noisy=True)), [sessions[True][0]])
+    assert card.path == "digital"
+    assert red(card) == declared(kinds, {"altered values"})
+
+
+ROWS = np.arange(round(SECONDS * RATE_HZ))
+LATE = np.r_[ROWS[:4000], ROWS[4200:4400], ROWS[4000:4200], ROWS[4400:5000], 5001, 5000, ROWS[5002:]]
+
+
+def swapped(columns: dict[str, np.ndarray]) -> None:
+    columns["disk_y [V]"], columns["P_E [V]"] = columns["P_E [V]"], columns["disk_y [V]"]
+
+
+def changed(name: str, times: float = 1.0, plus: Any = 0.0) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(columns: dict[str, np.ndarray]) -> None:
+        columns[name] = times * columns[name] + plus
+
+    return change
+
+
+def picked(rows: np.ndarray) -> Callable[[dict[str, np.ndarray]], None]:
+    def pick(columns: dict[str, np.ndarray]) -> None:
+        columns.update({name: values[rows] for name, values in columns.items()})
+
+    return pick
+
+
+WRONG = (changed("disk_x [V]", 1.0005), changed("P_N [V]", plus=0.25), changed("P_S [V]", -1.0), swapped)
+BACK, ALL = ("all groups", "stamps that go back"), "all groups"
+OWN: dict[str, tuple[Callable[[dict[str, np.ndarray]], Any], set[tuple[str, str]]]] = {
+    "sound": (lambda _: None, set()),
+    "a row and a block lost": (picked(np.delete(ROWS, np.r_[4321, 6000:6200])), {(ALL, "missing rows")}),
+    "a block twice": (picked(np.insert(ROWS, 4200, ROWS[4000:4200])), {(ALL, "doubled rows"), BACK}),
+    "a block late, and two rows swapped": (picked(LATE), {(ALL, "swapped rows"), BACK}),
+    "wrong sensitivity, zero, sign and wires": (
+        lambda columns: [change(columns) for change in WRONG],
+        {("disk_x", "scale"), ("P_N", "offset"), ("P_S", "polarity"), ("disk_y", "mapping"), ("P_E", "mapping")},
+    ),
+    "a fast clock of the stamps": (changed("time [s]", 1.0003), {(ALL, "stamp rate")}),
+    "stale stamps": (changed("time [s]", plus=-0.01 * (ROWS % 200 == 150)), {BACK}),
+}
+
+
+@pytest.mark.parametrize(("suffix", "fd"), [(".log", True), (".asc", False), (".blf", True)])
+def test_a_logger_of_a_can_bus(suffix: str, fd: bool, sessions: Sessions, tmp_path: Path) -> None:
+    """Of every n-th row, in classic frames of the upper 16 bits: what came is exact, and a lost frame is named."""
+    import can
+
+    session, counts = sessions[True]
+    table = messages_for(default_table())
+    message = next(each for each in (table.fd if fd else table.classic) if "disk_x" in str(each.signals))
+    form, step = message.samples, 2 if fd else 20
+    assert form is not None
+    rows = counts["probes"][40::step][:, : len(form.channels)]
+    first = np.arange(0, len(rows) - form.rows, form.rows)
+    rows = rows[: len(first) * form.rows]
+    with can.Logger(tmp_path / f"bus{suffix}") as log:
+        for n, data in enumerate(
+            form.pack(40 // (1 if fd else step) + first * (step if fd else 1), rows, message.length)
+        ):
+            if n != len(first) // 2:
+                settings: Any = {
+                    "is_fd": fd,
+                    "is_extended_id": False,
+                    "timestamp": 1e9 + n * form.rows * step / RATE_HZ,
+                }
+                log(can.Message(arbitration_id=message.identifier, data=data.tobytes(), **settings))
+    card = judge(tmp_path / f"bus{suffix}", [session])
+    assert red(card) == {("probes", "missing rows")}
+    lost = 40 + len(first) // 2 * form.rows * step
+    assert card.runs == {"missing rows probes": [(lost, lost + (form.rows - 1) * step)]}
+
+
+@pytest.mark.parametrize("defect", OWN)
+def test_a_daqs_own_defects(defect: str, sessions: Sessions, tmp_path: Path) -> None:
+    (session, counts), (change, declares) = sessions[True], OWN[defect]
+    assert red(judge(daq(tmp_path / "daq.parquet", counts, change), [session])) == declares
+
+
+def test_stamps_of_the_computers_clock_show_latency(sessions: Sessions, tmp_path: Path) -> None:
+    session, counts = sessions[True]
+    late_s = 3e-3 + 1e-4 * np.random.default_rng(3).standard_normal(len(ROWS))
+    row = judge(daq(tmp_path / "daq.parquet", counts, changed("time [s]", plus=1.7e9 + late_s)), [session]).row(
+        "latency", ALL
+    )
+    assert row.low < late_s.mean() < row.high < row.low + 2e-5
+
+
+def test_a_recording_that_a_command_triggered_shows_its_row(tmp_path: Path) -> None:
+    session = FOLDER / "hammer-3.2.mcap"
+    with Recording.open(session) as recording:
+        samples, (tick,) = recording.samples("forces"), [e["tick"] for e in recording.events if e["event"] == "hammer"]
+    row = round(tick * 1e-6 * samples.rate_hz)
+    columns = {f"{name} [N]": samples[name][row - 40 :] for name in samples}
+    card = judge(write_parquet(tmp_path / "daq.parquet", columns), [session])
+    assert card.row("trigger row", "forces").value == 40
