@@ -160,11 +160,6 @@ class Rig(Console):
         Raises:
             InputError: The URL is malformed, or there is no such channel or rate.
             ConnectionError: Nothing is there.
-
-        Example:
-            >>> Rig.open("can:zenoh:can0")
-            Traceback (most recent call last):
-            rig.errors.InputError: url must be zenoh:HOST:PORT[?tls=DIR]; instead received 'can:zenoh:can0'
         """
         from rig.transport.zenoh import client_at
 
@@ -399,6 +394,31 @@ class Rig(Console):
             )  # fmt: skip
 
         self._client.subscribe(key, take)
+
+
+def connect(
+    url: str = "zenoh:" + DEFAULT_ENDPOINT, *, channels: Sequence[str] = (), wait_s: float = 3.0, **settings: Any
+) -> Rig:
+    """One client of a running rig: its commands, and what comes back.
+
+    Args:
+        url: `zenoh:HOST:PORT`, with `?tls=DIR` for a rig that is exposed.
+        channels: Channels that are read, from now on.
+        wait_s: How long to wait for a rig to be there [s].
+        settings: More of `Rig`: `rate_hz`, `buffer_s`, `truth`, `name`.
+
+    Raises:
+        InputError: The URL is malformed, or there is no such channel, rate or table.
+        ConnectionError: Nothing is there.
+
+    Example:
+        Of a rig that runs: `with rig.connect(channels=["disk_x"]) as machine`.
+
+        >>> connect("can:zenoh:can0")
+        Traceback (most recent call last):
+        rig.errors.InputError: url must be zenoh:HOST:PORT[?tls=DIR]; instead received 'can:zenoh:can0'
+    """
+    return Rig.open(url, channels=channels, wait_s=wait_s, **settings)
 
 
 def _joined(first: Samples, second: Samples) -> Samples:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
@@ -16,9 +17,10 @@ from recorder.recording_file import Message, RecordingFile
 from recorder.records import Chunk
 from recorder.samples import row_times_s, samples_of
 from recorder.survey import OnBlock, Stream, Survey
+from rig.declared import Declared, in_order
 from rig.errors import InputError, UnknownNameError, Words
 from rig.samples import Samples, joined
-from rig.wire import EDGES, EVENTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
+from rig.wire import EDGES, EVENTS, FAULTS, STATUS, Block, Gap, schema_of, sensor_key, truth_key
 
 
 class Recording:
@@ -64,6 +66,10 @@ class Recording:
         self.catalogue, self.table = first.catalogue, first.table
         self.parameters, self.scene = first.parameters, first.scene
         self._surveys = surveys
+        self.true = False
+        """Blocks are as the rig made them: see `truly`."""
+        self.hears = True
+        """What the rig told of faults of blocks counts: see `untold`."""
 
     @classmethod
     def open(cls, path: Path | str, *, salvage: bool = False) -> Self:
@@ -170,7 +176,12 @@ class Recording:
         Raises:
             InputError: The file is damaged.
         """
-        self._surveys = tuple(Survey(part, on_block) for part in self.parts)
+        self._surveys = tuple(Survey(part, on_block, hears=self.hears) for part in self.parts)
+
+    def forget(self) -> None:
+        """Look through the files anew where that is asked for."""
+        self._surveys = ()
+        self.__dict__.pop("streams", None)
 
     def _surveyed(self) -> tuple[Survey, ...]:
         if not self._surveys:
@@ -255,11 +266,30 @@ class Recording:
         for key in keys:
             if schema_of(key) is None:
                 raise InputError("key", "a key of blocks (sensors or truth)", key)
+        found = self._blocks_as_sent(keys)
+        return in_order(found) if self.true else found
+
+    def _blocks_as_sent(self, keys: set[str]) -> Iterator[tuple[str, Block]]:
+        told = Declared() if self.true else None
         for part in self.parts:
-            for key, _, _, payload in part.stamped(keys):
-                block = part.block(key, payload)
-                if block is not None:
-                    yield key, block
+            for key, _, _, payload in part.stamped(keys if told is None else {*keys, FAULTS}):
+                if told is not None and key == FAULTS:
+                    told.declare(documents.document_in(key, payload) or {})
+                elif (block := part.block(key, payload)) is not None:
+                    yield key, block if told is None else told.true(key, block)
+
+    def truly(self) -> Self:
+        """The same with blocks as the rig made them, where it told of faults that they met: once, in order, in time."""
+        found = copy(self)
+        found.true = FAULTS in self.messages
+        return found
+
+    def untold(self) -> Self:
+        """The same for one who knows nothing of what the rig told of faults: only `doubts` and `streams` differ."""
+        found = copy(self)
+        found.hears = False
+        found.forget()
+        return found
 
     def everything(self) -> Iterator[Message]:
         """Every message in file order: topic, simulated time [ns], wall time of arrival [unix ns] and payload."""

@@ -84,17 +84,18 @@ class Survey:
         streams: Extent of every block stream by key.
     """
 
-    def __init__(self, file: RecordingFile, on_block: OnBlock | None = None) -> None:
+    def __init__(self, file: RecordingFile, on_block: OnBlock | None = None, *, hears: bool = True) -> None:
         """Read the whole file.
 
         Args:
             file: The file.
             on_block: Is shown each block that fits the catalogue.
+            hears: What the rig told of faults of blocks counts.
 
         Raises:
             InputError: The file is damaged.
         """
-        self.file = file
+        self.file, self._hears = file, hears
         self._continuity, self._steps = Declared(), dict[str, list[Gap]]()
         self._agreement = Agreement(file)
         self.streams: dict[str, Stream] = {}
@@ -180,6 +181,8 @@ class Survey:
         if key not in documents.KINDS or (document := documents.document_in(key, payload)) is None:
             return
         if key == FAULTS:
+            if not self._hears:
+                return
             self._continuity.declare(document)
         self._agreement.follow(key, time_ns, document)
         if key == schemas.GAPS:

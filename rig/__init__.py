@@ -15,7 +15,7 @@ what is plotted of a rotor.
 
 Recordings are opened by `recorder.reader.Recording`, whose samples are of the
 same kind, and written by `replays.recordings.export.write_run`; a running rig
-is read and commanded by `rig.connect`, which is `drivers.client.Rig.open`. The
+is read and commanded by `rig.connect`, which is `drivers.client.connect`. The
 same objects carry the commands of `rig`.
 """
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rig.simulation import Simulation
 
     def connect(url: str = "", **settings: Any) -> Any:
-        """`drivers.client.Rig.open`, which must not be imported from below."""
+        """`drivers.client.connect`, which must not be imported from below."""
 
 
 __all__ = [
@@ -58,7 +58,7 @@ if not TYPE_CHECKING:  # a type checker knows all names by the imports above
         from importlib import import_module, metadata
 
         if name == "connect":
-            return import_module("drivers.client").Rig.open
+            return import_module("drivers.client").connect
         if name == "__version__":
             return metadata.version("rotor-stator-rig")
         home = next((home for home, names in _HOMES.items() if name in names), None)

@@ -7,8 +7,9 @@ these tells what a fault has taken from what was really lost.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from heapq import heappop, heappush
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -20,6 +21,8 @@ from rig.wire import Block, Continuity, Gap
 _MOST = 10_000
 """Blocks of a stream that were told and have not come."""
 _MOST_STREAMS = 1000
+_AHEAD = 1100
+"""So many blocks wait for an earlier one: those that come while one is held back for longest."""
 
 
 class _Sent(Outside, extra="ignore"):
@@ -38,6 +41,28 @@ class _Told(Outside, extra="ignore"):
 class _Document(Outside, extra="ignore", strict=False):
     event: str
     blocks: tuple[_Told, ...] = ()
+
+
+def in_order(blocks: Iterator[tuple[str, Block]]) -> Iterator[tuple[str, Block]]:
+    """Blocks of several streams that may come late or twice, each stream in order and once."""
+    waiting: dict[str, list[tuple[int, int, Block]]] = {}
+    due: dict[str, int] = {}
+    for n, (key, block) in enumerate(blocks):
+        heap = waiting.setdefault(key, [])
+        heappush(heap, (block.index, n, block))
+        due.setdefault(key, block.index)
+        while heap and (heap[0][0] <= due[key] or len(heap) > _AHEAD):
+            yield from _next(key, heap, due)
+    for key, heap in waiting.items():
+        while heap:
+            yield from _next(key, heap, due)
+
+
+def _next(key: str, heap: list[tuple[int, int, Block]], due: dict[str, int]) -> Iterator[tuple[str, Block]]:
+    index, _, block = heappop(heap)
+    if index >= due[key]:
+        due[key] = index + len(block.values)
+        yield key, block
 
 
 class Declared(Continuity):

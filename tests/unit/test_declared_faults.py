@@ -19,6 +19,7 @@ from recorder.session import RecordingSession
 from recorder.summary import Summary
 from recorder.trigger import Capture, Trigger
 from replays.recordings.export import write_run
+from replays.recordings.validation import validate
 from rig import wire
 from rig.declared import Declared
 from rig.errors import InputError
@@ -186,3 +187,18 @@ def test_nothing_that_is_told_can_end_or_swell_who_hears_it() -> None:
         rows.take("rig/sensors/x0", wire.Block(0, n, 2e4, 1e6, np.zeros((1, 4), np.int32)))
     assert (rows.received, rows.lost) == ({"rig/sensors/x0": 3000}, {"rig/sensors/x0": 0})
     assert len(rows.faulty) <= 1000
+
+
+@pytest.mark.parametrize("kind", BLOCKS)
+def test_a_validation_knows_blocks_by_what_was_told_of_them(kind: str, tmp_path: Path) -> None:
+    """Bit by bit where it was told; one who was not told sees what does not fit together, but for what only waits."""
+    write_run(Simulation(scene(kind)), tmp_path / "a.mcap")
+    recording = Recording.open(tmp_path / "a.mcap")
+    known = validate(recording)
+    assert known.bit_exact
+    assert known.good
+    taken = kind in ("dropout", "lose-blocks")
+    assert (known.skipped > 0) == taken
+    blind = validate(recording, blind=True)
+    assert bool(blind.doubts) == (kind not in ("dropout", "lose-blocks", "late-blocks"))
+    assert blind.good == (not blind.doubts)

@@ -58,6 +58,7 @@ def validate(
     experiment = Experiment.of(recording)
     if changes:
         experiment = experiment.changed(changes)
+    recording = recording.untold() if blind else recording.truly()
     if blind:
         experiment = experiment.without_faults()
     again = _done_again(recording, experiment, criteria, step)
@@ -76,7 +77,8 @@ def validate(
         declared=declared, window_s=(begin, end), window_reason=reason, residuals=tuple(trajectory),
         truth=tuple(truth), phases=tuple(phases), statistics=tuple(judged),
         calibration=tuple(calibration(recording, experiment)),
-        skipped=sum(stream.lost for stream in recording.streams.values()),
+        skipped=sum(one.skipped for one in again.bits.values())
+        or sum(stream.lost - stream.declared for stream in recording.streams.values()),
         explained=None, fitted=again.tuned.fitted if again.tuned is not None else (),
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
         doubts=(*recording.doubts, *parameter_doubts(recording)), faults=again.faults,
