@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from recorder.reader import Recording
+from recorder.rewrite import cut
 from replays.recordings.experiment import Experiment
 from replays.recordings.prediction import measured, predict
 from replays.recordings.validation import validate
@@ -111,6 +112,19 @@ def test_a_validation_tells_it(tmp_path: Path) -> None:
     assert lines[1].startswith("P_W drift: +50 N/s, from 0.1")
     assert found.explained is not None
     assert found.explained.best == ("ring_x hum", "P_W drift")
+
+
+def test_a_recording_from_inside_a_run_is_good(tmp_path: Path) -> None:
+    """Nothing lacks of what was before it."""
+    whole = recorded(tmp_path / "a.mcap", "stable-run", duration_s=0.6, drive__speed_hz=12.0)
+    cut(whole, tmp_path / "part.mcap", from_s=0.25, to_s=0.5)
+    for blind in (False, True):
+        assert validate(Recording.open(tmp_path / "part.mcap"), blind=blind).good
+    fault = {"at_s": 0.3, "command": "fault", "channel": "disk_x", "kind": "offset", "value": 0.01}
+    faulty = recorded(tmp_path / "b.mcap", "stable-run", duration_s=0.6, drive__speed_hz=12.0, commands=[fault])
+    cut(faulty, tmp_path / "late.mcap", from_s=0.25, to_s=0.5)
+    found = validate(Recording.open(tmp_path / "late.mcap"), blind=True)
+    assert [one.line.partition(",")[0] for one in found.faults] == ["disk_x offset: +0.01 mm"]
 
 
 def some_fault(rng: random.Random) -> dict[str, Any]:

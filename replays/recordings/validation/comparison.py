@@ -160,7 +160,11 @@ def _done_again(
     names = [channel.name for part in parts.values() for channel in part.channels]
     off = {name for part in parts for name in bits.off(part)}
     own: list[Explanation] = []
-    if all(truth) and len(off) < (len(names) if same else FEW_CHANNELS * len(names)):
+    if (
+        not all(one.equal for one in found.values())
+        and all(truth)
+        and len(off) < (len(names) if same else FEW_CHANNELS * len(names))
+    ):
         own = own_faults(
             parts, nominal, bits.apart, recording.edges(), bits.edges_s(), partial(predict, experiment), step
         )  # fmt: skip

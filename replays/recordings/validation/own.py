@@ -93,7 +93,10 @@ def own_faults(
         steps = max(each.noise / float(each.floor[0]) for each in its)
         begin, end = min(each.lasted_s[0] for each in its), max(each.lasted_s[1] for each in its)
         found.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
-    edges = _own_edges(recorded_s, made_s)
+    # A recording may begin, and end, inside a run.
+    begin_s = min(float(part.times_s[0]) for part in parts.values())
+    end_s = max(float(part.times_s[-1]) for part in parts.values())
+    edges = _own_edges(*(each[(each > begin_s) & (each < end_s)] for each in (recorded_s, made_s)))
     return found if edges is None else [*(one for one in found if not one.name.startswith("keyphasor")), edges]
 
 
