@@ -37,6 +37,10 @@ from rig.transport import DEFAULT_ENDPOINT, Client
 
 _PATIENCE_S = 10.0
 """How long a rig that runs may send nothing [s]."""
+_LOST_S = 2.0
+"""Rows of a step that was answered are there, or lost [s]."""
+_STEP_S = 20.0
+"""How long a step may take, and ten times what it simulates [s]."""
 _HALF = 0.5
 """A keyphasor's pulse begins where its signal, 0 to 1, rises through this."""
 
@@ -112,6 +116,10 @@ class Rig(Console):
         name: str | None = None,
     ) -> None:
         super().__init__(client, name=name)
+        if isinstance(channels, str):
+            raise InputError("channels", "a list of names", channels)
+        if not buffer_s > 0.0:
+            raise InputError("buffer_s", "greater than 0", buffer_s)
         status, document = self.status(), wire.decode_document(client.request(wire.CATALOGUE))
         self.pace: str = status["pace"]
         """real-time, lockstep or free."""
@@ -139,6 +147,7 @@ class Rig(Console):
             except BaseException:
                 source.close()
                 raise
+        self._room = max(1, round(0.5 * buffer_s * self.daq.rate_hz)) if channels else 0
         self._back: Samples | None = None
         """Rows that were read, and not taken."""
         self._next = math.ceil(self._at * self.daq.rate_hz / self._tick_rate_hz) if channels else 0
@@ -195,12 +204,14 @@ class Rig(Console):
     def advance(self, duration_s: float) -> Samples:
         """Let the rig go on, and take the rows of that time: of real time when it comes, of lockstep at once.
 
+        Fewer come where rows were lost behind them: the next ones tell of the gap.
+
         Raises:
             InputError: No time above 0 with a row in it.
-            NotSeenError: The rig sent nothing for long, or fewer rows before a gap.
+            NotSeenError: The rig sent nothing for long.
             StreamEndedError: The run is over.
         """
-        rows = round(duration_s * self.daq.rate_hz) if duration_s > 0.0 else 0
+        rows = round(duration_s * self.daq.rate_hz) if 0.0 < duration_s < math.inf else 0
         if rows < 1:
             raise InputError("duration_s", f"at least a row, {1.0 / self.daq.rate_hz:g} s", duration_s)
         return self._take(rows)
@@ -219,6 +230,8 @@ class Rig(Console):
             StreamEndedError: The run was over before.
         """
         rate = self.daq.rate_hz
+        if not 0.0 < within_s < math.inf:
+            raise InputError("within_s", "a time above 0", within_s)
         left, piece = max(1, round(within_s * rate)), max(1, round(piece_s * rate))
         first_s = last_s = None
         while left > 0:
@@ -227,9 +240,11 @@ class Rig(Console):
             first_s = samples.times_s[0] if first_s is None else first_s
             last_s = samples.times_s[-1]
             met = np.asarray(condition(samples))
-            if met.shape != (len(samples),):
+            if met.shape != (len(samples),) or met.dtype != bool:
                 raise InputError(
-                    "condition", f"one truth value a row, shape ({len(samples)},)", Words(f"shape {met.shape}")
+                    "condition",
+                    f"one truth value a row, shape ({len(samples)},)",
+                    Words(f"{met.dtype}, shape {met.shape}"),
                 )
             if met.any():
                 at = int(np.flatnonzero(met)[0])
@@ -257,8 +272,12 @@ class Rig(Console):
         try:
             while True:
                 fresh = self._take(piece, whole=False)
-                held, told = (fresh, 0) if held is None or fresh.gap else (_joined(held, fresh), told)
+                follows = held is not None and fresh.index == held.index + len(held)
+                held, told = (_joined(held, fresh), told) if held is not None and follows else (fresh, 0)
                 edges_s = _edges(held)
+                high = held["keyphasor"] >= _HALF
+                if (high[1:-1] & ~high[:-2] & ~high[2:]).any():
+                    raise InputError("rate_hz", "high enough for two rows in a pulse of the keyphasor", daq.rate_hz)
                 for begin_s, end_s in pairwise(edges_s):
                     told = int(np.searchsorted(held.times_s, end_s))
                     yield _turn(held, begin_s, end_s)
@@ -282,17 +301,23 @@ class Rig(Console):
         if taken is not None and len(taken) >= rows:
             self._give_back(taken.rows(rows, len(taken)))
             return taken.rows(0, rows)
+        lockstep, deadline = self.pace == "lockstep", time.monotonic() + _PATIENCE_S
         while taken is None or (whole and len(taken) < rows):
-            missing = rows - (0 if taken is None else len(taken))
+            # No more at a time than there is room for.
+            missing = min(rows - (0 if taken is None else len(taken)), self._room)
             refused = self._step_to(self._next + missing)
             try:
-                fresh = daq.read(missing, timeout_s=_PATIENCE_S)
+                fresh = daq.read(missing, timeout_s=_LOST_S if lockstep and refused is None else _PATIENCE_S)
             except LinkTimeoutError as error:
-                raise refused or NotSeenError(f"the rig sent no rows: {error}") from error
+                if refused is not None or not lockstep or time.monotonic() > deadline:
+                    raise refused or NotSeenError(f"the rig sent no rows: {error}") from error
+                # What was published and has not come is lost: what comes behind it tells of the gap.
+                self._next = max(self._next + 1, math.floor(self._at * daq.rate_hz / self._tick_rate_hz))
+                continue
             self._next = fresh.index + len(fresh)
             if taken is not None and fresh.gap:
                 self._give_back(fresh)
-                raise NotSeenError(f"{fresh.gap} rows are missing behind {taken.times_s[-1]:.6f} s")
+                return taken
             taken = fresh if taken is None else _joined(taken, fresh)
         return taken
 
@@ -305,7 +330,9 @@ class Rig(Console):
         ticks = row * self._tick_rate_hz / self.daq.rate_hz - self._at
         if self.pace == "lockstep" and ticks > 0.0:
             try:
-                self._at = self.step(math.ceil(ticks / self._block_ticks - 1e-9) * self._block_ticks).tick
+                whole = math.ceil(ticks / self._block_ticks - 1e-9) * self._block_ticks
+                # A rig that was killed never answers.
+                self._at = self.step(whole, timeout_s=_STEP_S + 10.0 * whole / self._tick_rate_hz).tick
             except RefusedError as error:
                 return error
         return None

@@ -81,7 +81,32 @@ def test_turns_are_those_of_the_shaft() -> None:
         assert abs(turn.once["disk_x"] - once) < 0.02 * abs(once) + 1e-4
 
 
+def test_rows_that_are_read_between_turns_are_of_none() -> None:
+    with connected(channels=CHANNELS, buffer_s=0.5) as machine:
+        speeds = []
+        for turn in machine.turns():
+            speeds.append(turn.speed_hz)
+            assert len(machine.advance(0.7)) == 14_000  # more than there is room for at a time
+            if len(speeds) == 2:
+                break
+        assert speeds == pytest.approx([12.0, 12.0], rel=2e-3)
+        with pytest.raises(InputError, match="condition must be one truth value a row"):
+            machine.until(lambda rows: rows["disk_x"], within_s=0.1)
+
+
+def test_rows_that_a_fault_takes_end_a_piece_and_the_next_tells_of_the_gap() -> None:
+    with connected(channels=["disk_x"]) as machine:
+        machine.advance(0.1)
+        machine.fault("probes", "dropout", for_s=0.2)
+        rest = machine.advance(0.5)
+        assert rest.gap == 4000
+        assert rest.times_s[0] == pytest.approx(0.3)
+        assert machine.until(lambda rows: rows["disk_x"] < 99.0, within_s=0.1).index == rest.index + len(rest)
+
+
 @pytest.mark.parametrize(("settings", "says"), [
+    ({"channels": "disk_x"}, "channels must be a list of names"),
+    ({"channels": ["disk_x"], "buffer_s": -1.0}, "buffer_s must be greater than 0"),
     ({"channels": ["disk_z"]}, "channel must be one of the source's"),
     ({"channels": ["disk_x"], "truth": ["contacts"]}, "truth must be one of the rig's tables, such as contact"),
     ({"channels": ["disk_x"], "rate_hz": 3000.0}, "rate_hz must be 20000 divided by a whole number"),

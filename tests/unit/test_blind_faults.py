@@ -182,3 +182,29 @@ def test_random_faults_have_their_names(tmp_path: Path) -> None:
     print(f"{seen} faults: {len(wrong)} wrong, {len(unnamed)} unnamed", *wrong, *unnamed, sep="\n")
     assert len(wrong) <= 0.01 * seen
     assert len(unnamed) <= 0.05 * seen
+
+
+def test_what_several_have_alike_and_what_lacks_truth_is_told(tmp_path: Path) -> None:
+    """All of a kind late are late, and not the others early; without the truth a channel alone is told as well."""
+    late = {"at_s": 0.05, "command": "fault", "channel": "forces", "kind": "late", "late_us": 200.0}
+    gain = {"at_s": 0.05, "command": "fault", "channel": "disk_x", "kind": "gain", "factor": 1.1}
+    pulse = {"at_s": 0.02, "command": "hammer", "force_n": 120.0, "duration_ms": 5.0, "direction": "x"}
+    alike = recorded(tmp_path / "a.mcap", "hammer", duration_s=0.4, commands=[pulse, late, gain])
+    lines = [one.line.partition(", from")[0] for one in validate(alike, blind=True).faults]
+    assert sorted(lines) == ["P_N, P_S, P_E, P_W delay: +200 µs", "disk_x gain: +10 %"]
+    one = recorded(tmp_path / "b.mcap", "hammer", duration_s=0.4, commands=[pulse, gain])
+    cut(one, tmp_path / "c.mcap", only="sensors")
+    found = validate(Recording.open(tmp_path / "c.mcap"), blind=True)
+    assert not found.good
+    assert "disk_x gain" in (found.explained.conclusion if found.explained else "")
+
+
+def test_what_changes_on_the_way_is_not_named_by_its_beginning(tmp_path: Path) -> None:
+    faults = [
+        {"at_s": 0.05, "command": "fault", "channel": "P_N", "kind": "gain", "factor": 1.05, "for_s": 2.0},
+        {"at_s": 2.05, "command": "fault", "channel": "P_N", "kind": "polarity"},
+    ]
+    recording = recorded(tmp_path / "a.mcap", "stable-run", duration_s=2.5, commands=faults)
+    (told,), _ = found_in(recording)
+    assert not told.sure
+    assert "and at its end" in told.change

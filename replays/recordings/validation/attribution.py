@@ -227,8 +227,8 @@ def explain_log(
             f"nearest are {_listed(sensors)}: {part:.0%} of the difference; the rest is another fault, or the model"
         )
     elif not best and 0 < len(few := channels_in(sensors, tuned.scales)) < FEW_CHANNELS * len(tuned.scales):
-        conclusion = f"of {len(tuned.scales)} channels {_and(few)} alone: a fault that has no name here, as hum, "
-        conclusion += "cross-talk or drift, or a number of the model that moves no other; this log cannot tell"
+        conclusion = f"of {len(tuned.scales)} channels {_and(few)} alone: a fault that has no name here, "
+        conclusion += "or a number of the model that moves no other; this log cannot tell"
     elif not best:
         conclusion = "neither a sensor nor the clock explains it: the model is off; `rig identify` fits numbers of it"
     return Explained(

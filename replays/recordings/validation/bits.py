@@ -104,7 +104,9 @@ class Bits:
         return [name for name, counts in self.apart(group)[1].items() if counts.any()]
 
     def edges_s(self) -> np.ndarray:
-        """Keyphasor edges that were made again [s]."""
+        """Keyphasor edges that were made again [s]; none where none were recorded."""
+        if EDGES not in self.streams:
+            return np.empty(0)
         return np.concatenate([np.empty(0), *self._edges]) / TICK_RATE_HZ
 
     def finish(self) -> dict[str, StreamBits]:

@@ -83,9 +83,10 @@ def validate(
         parts=again.parts, nominal=again.nominal, files=len(recording.parts),
         doubts=(*recording.doubts, *parameter_doubts(recording)), faults=again.faults,
     )  # fmt: skip
-    if again.own and again.same_motion:
-        return replace(validation, faults=as_faults(again.own), explained=own_explained(again.own))
     firsts = [one.first_s for one in trajectory if one.first_s is not None]
+    # Without the truth a number of the model may be it, where that is off from the beginning on.
+    if again.own and (again.same_motion or (not firsts and all(one.sure for one in again.own))):
+        return replace(validation, faults=as_faults(again.own), explained=own_explained(again.own))
     if validation.good or validation.doubts or not firsts or not moves:
         return validation
     step("what explains the difference")

@@ -20,8 +20,8 @@ from replays.recordings.validation.explanation import (
     smooth_columns,
     vector,
 )
-from replays.recordings.validation.laws import gain_words, law_of
-from replays.recordings.validation.shown import FEW, OFF, Shown
+from replays.recordings.validation.laws import law_of
+from replays.recordings.validation.shown import FEW, OFF, Shown, gain_words
 from replays.recordings.validation.trajectory import floors
 from rig.channels import Channel
 
@@ -92,7 +92,7 @@ def told_of(shown: list[Shown], end_s: float, step: Callable[[str], None] = lamb
             a, b = a.at(times_s), b.at(times_s)
         elif a.unit != b.unit or len(a.values) != len(b.values):
             continue
-        pair = _swapped(a, b, told) or (_turned(a, b, told) if a.unit == b.unit else None)
+        pair = _swapped(a, b, told) or (_turned(a, b, told) if a.counts is None else None)
         if pair is not None:
             found.append(pair)
             seen |= {a.name, b.name}
@@ -296,7 +296,7 @@ def _together(alone: list[_Alone], told: _Telling, moving: list[str]) -> list[Ex
             change = gain_words(1.0 + value)[1] if kind == "gain" else f"{value * 1e6:+.4g} µs"
             names, unit = [one.shown.name for one in group], "s" if kind == "delay" else ""
             others = [name for name in moving if name not in names]
-            if kind == "delay" and len(others) < len(names):
+            if kind == "delay" and len(others) < len(names) and group[0].shown.counts is None:
                 if not others:
                     continue
                 names, value, change = others, -value, f"{-value * 1e6:+.4g} µs"

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from replays.recordings.prediction import Measured, Prediction
 from replays.recordings.validation.explanation import Explanation
 from replays.recordings.validation.faults import SOME, around, beside, channels_in, told_of
+from replays.recordings.validation.laws import law_of
 from replays.recordings.validation.shown import FEW, Shown
 from replays.recordings.validation.signals import SignalFault
 from rig.channels import Channel
@@ -25,6 +28,8 @@ _AT_END, _ENOUGH = 1e-3, 0.2
 """Rows so near to an end of what its conditioner puts out tell nothing, where this part of the rows is not."""
 _NO_FILTER = 1e4
 """A corner so many times its own is none."""
+_NAMES = re.compile(r"((?:\w+(?:, | and ))*\w+) ?(.*)")
+"""Channels, and what they have."""
 _EVEN_S = 1e-5
 """Edges that move by less than this about their mean move alike."""
 
@@ -47,7 +52,7 @@ def own_faults(
         again: Predicts other channels of the same motion.
         step: Told what is being done.
     """
-    shown = []
+    shown, ends = [], dict[str, Callable[[], Shown]]()
     for name, part in parts.items():
         index, counts = apart(name)
         at = np.searchsorted(part.index, index)
@@ -63,28 +68,15 @@ def own_faults(
             lasted_s = float(part.times_s[rows[0]]), float(part.times_s[rows[-1]])
             settled = rows[0] + round(max(_HELD_S, _PERIODS / channel.bandwidth_hz) * channel.rate_hz)
             first = settled if rows[-1] - settled > 2 * (settled - rows[0]) else rows[0]
-            rows = np.arange(first, min(int(rows[-1]) + 1, first + _MOST))
+            foretold, last = nominal.values[name][:, c], int(rows[-1]) + 1
+            made = partial(_shown, part, channel, foretold, off, lasted_s)
+            few = partial(_bare, part, channel, again), partial(beside, parts, nominal, channel)
+            rows = np.arange(first, min(last, first + _MOST))
             if len(rows) < SOME:
                 rows = np.arange(max(0, first - SOME), min(first + SOME, len(off)))
-            foretold = nominal.values[name][:, c]
-            limits = np.array([*channel.range_v, -channel.adc_v, channel.adc_v])
-            ends = np.abs(
-                (channel.bias_v + channel.sensitivity_v * (foretold + channel.scale * off))[:, None] - limits
-            ).min(axis=1)
-            within = ~np.convolve(ends < _AT_END * np.ptp(channel.range_v), np.ones(2 * FEW + 1), "same").astype(bool)
-            if within[rows].mean() > _ENOUGH:
-                rows = rows[within[rows]]
-            said = np.rint((part.values[rows, c] - channel.offset) / channel.scale)
-            shown.append(
-                Shown(
-                    channel, part.times_s[rows], (foretold + channel.scale * off)[rows], foretold[rows],
-                    np.full(len(rows), 0.5 * abs(channel.scale)), channel.noise_v / abs(channel.sensitivity_v),
-                    partial(_bare, part, channel, again, rows),
-                    partial(beside, parts, nominal, channel),
-                    np.column_stack([said, said - off[rows]]).astype(np.int64), lasted_s,
-                    around(part, foretold, rows[0], rows[-1] + 1),
-                )
-            )  # fmt: skip
+            shown.append(made(rows, *few))
+            if last - first > 2 * _MOST:
+                ends[channel.name] = partial(made, np.arange(last - _MOST, last), *few)
     about = {one.name: one for one in shown}
     found = []
     for one in told_of(shown, max((float(one.times_s[-1]) for one in shown), default=0.0), step):
@@ -92,12 +84,37 @@ def own_faults(
         # Over the noise, not over the steps of the converter.
         steps = max(each.noise / float(each.floor[0]) for each in its)
         begin, end = min(each.lasted_s[0] for each in its), max(each.lasted_s[1] for each in its)
+        if one.sure and len(its) == 1 and its[0].name in ends:
+            step(f"what {its[0].name} has at its end")
+            later = law_of(ends[its[0].name]())
+            if one.name != f"{its[0].name} {later.name}":
+                one = replace(one, sure=False, change=f"{one.change}, and at its end {later.name} {later.change}")
         found.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
     # A recording may begin, and end, inside a run.
     begin_s = min(float(part.times_s[0]) for part in parts.values())
     end_s = max(float(part.times_s[-1]) for part in parts.values())
     edges = _own_edges(*(each[(each > begin_s) & (each < end_s)] for each in (recorded_s, made_s)))
     return found if edges is None else [*(one for one in found if not one.name.startswith("keyphasor")), edges]
+
+
+def _shown(
+    part: Measured, channel: Channel, foretold: np.ndarray, off: np.ndarray, lasted_s: tuple[float, float],
+    rows: np.ndarray, bare: Callable[[np.ndarray], np.ndarray], others: Callable[[], Mapping[Channel, Any]],
+) -> Shown:  # fmt: skip
+    """A channel in some rows, of which it is known by how many counts they are off, shape (all rows,)."""
+    volts = channel.bias_v + channel.sensitivity_v * (foretold + channel.scale * off)
+    limits = np.array([*channel.range_v, -channel.adc_v, channel.adc_v])
+    at_end = np.abs(volts[:, None] - limits).min(axis=1) < _AT_END * np.ptp(channel.range_v)
+    within = ~np.convolve(at_end, np.ones(2 * FEW + 1), "same").astype(bool)
+    if within[rows].mean() > _ENOUGH:
+        rows = rows[within[rows]]
+    said = np.rint((part.values[rows, part.names.index(channel.name)] - channel.offset) / channel.scale)
+    return Shown(
+        channel, part.times_s[rows], (foretold + channel.scale * off)[rows], foretold[rows],
+        np.full(len(rows), 0.5 * abs(channel.scale)), channel.noise_v / abs(channel.sensitivity_v),
+        partial(bare, rows), others, np.column_stack([said, said - off[rows]]).astype(np.int64), lasted_s,
+        around(part, foretold, rows[0], rows[-1] + 1),
+    )  # fmt: skip
 
 
 def _bare(
@@ -136,8 +153,9 @@ def as_faults(own: Sequence[Explanation]) -> tuple[SignalFault, ...]:
     """What channels have by themselves, as faults that signals show."""
     found = []
     for one in own:
-        names, _, what = one.name.rpartition(" ")
+        names, what = _NAMES.fullmatch(one.name).groups()  # pyright: ignore[reportOptionalMemberAccess]
         text = one.change if one.sure else f"by no law that has a name here; nearest is {what} {one.change}"
-        text += f", from {one.from_s:.4f} to {one.to_s:.4f} s"
-        found.append(SignalFault(names, what if one.sure else "differs", one.from_s, one.to_s, text))
+        what, text = (what if one.sure else "differs", f"{text}, ") if what else (one.change, "")
+        text += f"from {one.from_s:.4f} to {one.to_s:.4f} s"
+        found.append(SignalFault(names, what, one.from_s, one.to_s, text))
     return tuple(found)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,13 @@ _PART = 0.05
 """Of what is left, by which another number makes it smaller where all but the channel is known to the bit."""
 _ABOUT = 4.5
 """Rows about the one that differs first."""
+_UNITS = {
+    25.4: "as mm for inch", 1.0 / 25.4: "as inch for mm", 1e3: "a thousand", 1e-3: "a thousandth",
+    9.80665: "as m/s^2 for g", 1.0 / 9.80665: "as g for m/s^2", 4.4482: "as N for lbf", 1.0 / 4.4482: "as lbf for N",
+    60.0: "as 1/min for Hz", 1.0 / 60.0: "as Hz for 1/min", 2.0: "twice", 0.5: "half", 10.0: "tenfold",
+    0.1: "a tenth",
+}  # fmt: skip
+"""Gains that slips with units and ranges make."""
 OFF = 6.0
 """A sample so many floors off is no noise."""
 
@@ -200,3 +207,26 @@ class Law:
     unit: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
     sure: bool = True
+
+
+def rms_of(left: np.ndarray) -> float:
+    """Root mean square, shape (n,)."""
+    return math.sqrt(float(left @ left) / max(1, len(left)))
+
+
+def least_at(cost: Callable[[float], float], low: float, high: float) -> float:
+    """Where a cost is least between two ends."""
+    from scipy.optimize import minimize_scalar
+
+    found: Any = minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 1e-9})
+    return float(found.x)
+
+
+def gain_words(gain: float) -> tuple[str, str]:
+    """What a factor is called, and how large it is, in words."""
+    known = next((text for factor, text in _UNITS.items() if abs(gain / factor - 1.0) < 0.02), "")
+    if abs(gain + 1.0) < 0.1:
+        return "polarity", "turned round"
+    if abs(gain) < 0.05 and not known:
+        return "signal", "missing"
+    return "gain", f"{100.0 * (gain - 1.0):+.3g} %" + (f" ({known})" if known else "")
