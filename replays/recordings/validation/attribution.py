@@ -34,6 +34,7 @@ from replays.recordings.validation.numbers import numbers_of_the_model
 from replays.recordings.validation.own import as_faults
 from replays.recordings.validation.signals import SignalFault
 from replays.recordings.validation.trajectory import scaled
+from rig.channels import default_table
 from rig.errors import InputError, SimulationError
 
 _GROWTH_S = (5e-3, 10e-3, 20e-3, 40e-3, 80e-3, 160e-3)
@@ -208,6 +209,14 @@ def explain_log(
     # One that explains no more than the sensors do is not told beside them.
     numbers = [one for one in numbers if one.at_floor or one.explained > MOST]
     conclusion, best = conclude([*sensors, *numbers], sensors if cured else [], rules, end_s=end_s)
+    early = next((one.value for one in sensors if one.name == "hammer delay" and one.value < 0.0), None)
+    probes = [name for name in tuned.scales if name in default_table().groups["probes"].names]
+    if early is not None and best and len(probes) > 1:
+        # Until forces answer, nothing but the probes tells of time.
+        conclusion += (
+            f"; or sensor: {', '.join(probes)} delay {-early * 1e6:+.4g} µs: up to the first contact these look "
+        )
+        conclusion += "alike, and this log cannot tell"
     if far:
         also = f"; {conclusion}" if best else ""
         best = (*(one.key for one in far), *best)
