@@ -264,6 +264,9 @@ class Faulty:
         if not faults and not len(self._held):
             return edges
         real, end = edges + tick, tick + self.row_ticks * len(rows)
+        # What has ended since shows none of them.
+        lasts = [(self._held >= one.begin) & (self._held < one.end) for one, _ in faults]
+        self._held = self._held[np.any(lasts, axis=0)] if lasts else np.empty(0)
         # The rate that edges tell: what rows tell there depends on where a block begins.
         rate = 2e6 * math.pi / np.diff(real, prepend=before)
         # Before the first of all there is none: the row behind it tells, wherever the block begins.
@@ -273,15 +276,28 @@ class Faulty:
         found = real
         for one, mark in faults:
             inside = (found >= one.begin) & (found < one.end)
-            if not inside.any():
-                continue
             here, nearest = found[inside], np.maximum(np.searchsorted(real, found[inside], side="right") - 1, 0)
+            angles, rates = turns[nearest], rate[nearest]
+            if tick <= one.begin < end:
+                # The turn that it begins in has pulses to come, too; its edge, as what there is then tells.
+                at_rows = np.interp(one.begin, tick + self.row_ticks * np.arange(len(rows)), np.arange(len(rows)))
+                low, part = int(at_rows), at_rows % 1.0
+                theta, fast = (
+                    rows[low, COLUMN[name]] * (1.0 - part) + rows[min(low + 1, len(rows) - 1), COLUMN[name]] * part
+                    for name in ("theta", "theta_rate")
+                )
+                if fast > 0.0:
+                    turn = math.floor(theta / TURN) * TURN
+                    here = np.append(one.begin - TICKS_HZ * (theta - turn) / fast, here)
+                    angles, rates = np.append(turn, angles), np.append(fast, rates)
             at = At(
                 (here - one.begin) / TICKS_HZ, np.arange(len(here)), self.channels[mark], one.draws[mark], {},
-                _nothing, turns[nearest], rate[nearest], _mark,
+                _nothing, angles, rates, _mark,
             )  # fmt: skip
             shown = np.rint(one.what.edges(here, at) * FRACTIONS) / FRACTIONS
-            found = np.sort(np.concatenate([found[~inside], shown[np.isfinite(shown)]]))
+            # As the signal: behind its end there is what there is.
+            shown = shown[(shown >= one.begin) & (shown < one.end)]
+            found = np.sort(np.concatenate([found[~inside], shown]))
         found = np.sort(np.concatenate([self._held, found]))
         self._held = found[found >= end]
         return found[found < end] - tick

@@ -180,6 +180,18 @@ def test_what_pulses_lack_or_have_too_many_edges_have_too(sound: dict[str, np.nd
     assert ((moved > 0.0) & (moved < 8 * 300.0)).all()
 
 
+@pytest.mark.parametrize("cut", [1_000, 7_000, 400_000])
+@pytest.mark.parametrize(("from_s", "for_s"), [(0.081, 0.2), (0.115, 0.21), (0.15, 0.001), (0.09, 0.011)])
+def test_edges_are_those_that_the_signal_has(from_s: float, for_s: float, cut: int) -> None:
+    """A fault may begin and end in the midst of a turn, whose other pulses are there in both, or in none."""
+    fault = {"channel": "keyphasor", "kind": "extra-pulses", "part": 1.0, "at_s": from_s, "for_s": for_s}
+    found, channel = run(fault, cut=cut)[0], SCENE.table.channels["keyphasor"]
+    high = found["keyphasor"] * channel.scale > 0.5
+    rising_s = (np.flatnonzero(high[1:] & ~high[:-1]) + 1) / channel.rate_hz
+    # The run begins in a pulse; half a turn on is told by the speed of the last one.
+    np.testing.assert_allclose(rising_s[1:], found["edges"] * 1e-6, atol=5e-4)
+
+
 def test_several_at_once_on_a_group_and_one_of_them_cleared(sound: dict[str, np.ndarray]) -> None:
     hum = {"channel": "probes", "kind": "hum", "amplitude_v": 0.2}
     there, _ = run(hum, {"channel": "disk_x", "kind": "noise", "factor": 4.0, "at_s": 0.15, "for_s": 0.05})

@@ -70,7 +70,7 @@ def validate(
     phases, judged = [], []
     if moves:
         step("statistics by phase, and their spread")
-        phases, judged = statistics(again.quick, again.parts, again.nominal, tables, criteria, again.members)
+        phases, judged = statistics(again.quick, again.parts, again.nominal, tables, again.criteria, again.members)
     validation = Validation(
         path=recording.path, scene=experiment.scene.name, criteria=criteria.title, changes=dict(changes or {}),
         bits=again.bits, bit_exact=bool(again.bits) and all(one.equal for one in again.bits.values()),

@@ -75,7 +75,7 @@ class StatisticCriterion(_Section):
     """Patterns of names; of several criteria the first that fits phase and quantity holds."""
     reason: Reason
     relative: NotNegative = 0.0
-    """Part of the predicted value, ..."""
+    """Part of the predicted value (a distance of spectra is a part already: then of 1), ..."""
     absolute: NotNegative = 0.0
     """... plus so much in the quantity's own unit, ..."""
     spread: NotNegative

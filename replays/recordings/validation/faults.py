@@ -201,20 +201,21 @@ class _Telling:
 def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
     """Two channels that show each other's signal, each at what it shows at rest."""
     crossed, own, before = np.empty(0), np.inf, np.concatenate([a.apart, b.apart])
-    if not (a.moves or b.moves) or (a.counts is None and not (a.moves and b.moves)):
+    if a.counts is None and not (a.moves and b.moves):
         return None
     for x, y in ((a, b), (b, a)):
         # Of logs nobody knows which cable, conditioner or name it is; the rig's own cables carry volts.
-        volts = 1.0 if x.counts is None else y.channel.sensitivity_v / x.channel.sensitivity_v
-        times_s, foretold = y.around or (y.times_s, y.foretold)
-        shown = x.coupled(times_s, volts * foretold)
+        times_s, signal = y.around or (y.times_s, y.foretold)
+        if x.counts is not None:
+            volts = np.clip(y.channel.bias_v + y.channel.sensitivity_v * signal, *x.channel.range_v)
+            signal = (volts - x.channel.bias_v) / x.channel.sensitivity_v
+        shown = x.coupled(times_s, signal)
         factors, left = x.left([shown, x.level])
-        if y.moves and abs(factors[0] - 1.0) > 0.1:
+        if y.moves and signal.std() > x.noise and abs(factors[0] - 1.0) > 0.1:
             return None
         if not y.moves:
-            rest = (y.channel.bias_v - x.channel.bias_v) / x.channel.sensitivity_v
             (level,), left = x.left([x.level], x.values - shown)
-            if not x.channel.highpass_hz and abs(level - rest) > OFF * x.noise:
+            if abs(level) > OFF * x.noise:
                 return None
         own = min(own, excess(x.left([x.foretold, x.level])[1]))
         crossed = np.concatenate([crossed, left])

@@ -203,6 +203,8 @@ def _of_others(one: Shown) -> Iterator[Law]:
         (part, _), left = one.left([one.coupled(*shown), ones], d)
         through = abs(part * one.channel.sensitivity_v / other.sensitivity_v)
         change = f"{part:.4g} {one.unit} for a {other.unit} of {other.name}"
+        if one.counts is not None and through > 1.0:
+            continue  # none is louder there than at home
         if one.counts is not None and through > 0.0:
             change = f"{20.0 * math.log10(through):.3g} dB of {other.name}"
         found.append(Law("crosstalk", change, float(part), left, count))

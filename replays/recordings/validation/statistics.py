@@ -129,7 +129,8 @@ def _judge(
     criterion = criteria.statistic_of(phase.name, name)
     limit = None
     if criterion is not None:
-        limit = criterion.relative * abs(predicted) + criterion.absolute + criterion.spread * deviation
+        size = 1.0 if name in SPECTRA else abs(predicted)
+        limit = criterion.relative * size + criterion.absolute + criterion.spread * deviation
     return StatisticResult(
         number=number, phase=phase.name, quantity=name, unit=QUANTITIES[name].unit, recorded=value, foretold=predicted,
         spread=deviation, limit=limit, reason=criterion.reason if criterion else "",

@@ -79,8 +79,10 @@ def late(one: Shown) -> Iterator[Law]:
 def _delays(one: Shown) -> tuple[np.ndarray, np.ndarray]:
     """How the delay goes: middles of pieces behind the first row [s], and how late each is [s]."""
     spline, t = one.foretold_at, one.times_s - one.times_s[0]
-    slope, at, found, late_s = spline.derivative(), [], [], 0.0
-    for rows in np.array_split(np.arange(len(t)), min(_SEGMENTS, len(t) // FEW)):
+    slope, at, found = spline.derivative(), [], []
+    pieces = np.array_split(np.arange(len(t)), min(_SEGMENTS, len(t) // FEW))
+    late_s = delayed_by(one.at(one.times_s[: max(FEW, len(t) // 8)]))[0]
+    for rows in pieces:
         for _ in range(8):
             places = one.times_s[rows] - late_s
             falls, off = -slope(places), one.values[rows] - spline(places)
