@@ -207,18 +207,22 @@ def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
         # Of logs nobody knows which cable, conditioner or name it is; the rig's own cables carry volts.
         times_s, signal = y.around or (y.times_s, y.foretold)
         if x.counts is not None:
-            volts = np.clip(y.channel.bias_v + y.channel.sensitivity_v * signal, *x.channel.range_v)
+            volts = np.clip(y.channel.bias_v + y.channel.sensitivity_v * signal, *y.channel.range_v)
             signal = (volts - x.channel.bias_v) / x.channel.sensitivity_v
         shown = x.coupled(times_s, signal)
         factors, left = x.left([shown, x.level])
         if y.moves and signal.std() > x.noise and abs(factors[0] - 1.0) > 0.1:
-            return None
+            if x.counts is None:
+                return None
+            continue  # its converter may be too small for it: the other of the two tells
         if not y.moves:
             (level,), left = x.left([x.level], x.values - shown)
             if abs(level) > OFF * x.noise:
                 return None
         own = min(own, excess(x.left([x.foretold, x.level])[1]))
         crossed = np.concatenate([crossed, left])
+    if not len(crossed):
+        return None
     if not is_noise(crossed) and excess(crossed) > 0.01 * (own if a.counts is None else excess(before)):
         return None
     return told(f"{a.name} and {b.name}", "swapped", 0.0, crossed, before)

@@ -21,6 +21,12 @@ _PERIODS = 1.5
 """So many periods of a hum must be there."""
 _HIGHEST_HZ = 1000.0
 """Of a hum."""
+_ALSO = ("gain and delay", "bandwidth")
+"""What a resonance may look like."""
+_MORE = {"offset": ("drift", "hum", "crosstalk", "delay", "gain and offset"), "delay": ("clock", "wander", "gain")}
+"""Laws that are one with another number."""
+_LOUD = 0.5
+"""Less than this part of what it should show is left without its loudest line."""
 _HALF = 0.5
 """What is left where noise was drawn again may be this part of what was there."""
 _ANOTHER = 1.6
@@ -49,17 +55,13 @@ def law_of(one: Shown) -> Law:
     laws = [*_of_level(one), *_of_time(one)]
     if one.moves or one.counts is not None:
         laws += _of_others(one)
-    if one.moves:
         laws += _bent(one)
-        if one.even:
-            laws += [*late(one), *filtered(one)]
+    if one.moves and one.even:
+        laws += [*late(one), *filtered(one)]
     best = min(laws, key=lambda law: one.cost(law.left, law.count))
     if one.counts is not None:
-        least = one.cost(best.left, best.count) + DECIDES
-        alike = dict.fromkeys(
-            law.name for law in laws if law.count == best.count and one.cost(law.left, law.count) < least
-        )
-        best = replace(best, name=" or ".join([best.name, *(name for name in alike if name != best.name)]))
+        names = " or ".join([best.name, *_alike(one, best, laws)])
+        best = replace(best, name=" or ".join(dict.fromkeys(names.split(" or "))))
     rms = rms_of(before)
     if one.counts is None:
         if is_noise(best.left) or rms_of(best.left) < _NEARLY * min(1.0, rms) + 1.0:
@@ -77,6 +79,20 @@ def law_of(one: Shown) -> Law:
             if rms_of(law.left) < _EXACTLY * rms:
                 return law
     return next(_at_random(one), replace(best, sure=False))
+
+
+def _alike(one: Shown, best: Law, laws: list[Law]) -> dict[str, None]:
+    """Names of laws of another kind than the best that leave as little: what moves little, or evenly, tells them not."""
+    # Of a narrow band, a resonance is a gain with a delay.
+    others = [*laws, *(ringing(one) if one.moves and best.name in _ALSO else ())]
+    least, kind = one.cost(best.left, 0) + DECIDES, best.name.partition(" ")[0]
+    return dict.fromkeys(
+        law.name
+        for law in others
+        if not {law.name, law.name.partition(" ")[0]} & {kind, *_MORE.get(kind, ())}
+        and (law.count <= best.count + 1 or law.name == "resonance")
+        and one.cost(law.left, 0) < least
+    )
 
 
 def _white(left: np.ndarray) -> bool:
@@ -185,6 +201,8 @@ def _of_time(one: Shown) -> Iterator[Law]:
         return [ones, *(wave(turn) for turn in turns for wave in (np.cos, np.sin))]
 
     peak, span = float(hz[within][size[within].argmax()]), 1.0 / length_s
+    if rms_of(one.left(columns(peak), one.foretold)[1]) < _LOUD * float(one.foretold.std() / one.floor.min()):
+        return  # what is as loud there by itself is not hum
     for third in (False, True):
         f = least_at(
             lambda f, third=third: float(np.sum(one.left(columns(f, third), d)[1] ** 2)), peak - span, peak + span
