@@ -82,7 +82,7 @@ def law_of(one: Shown) -> Law:
 
 
 def _alike(one: Shown, best: Law, laws: list[Law]) -> dict[str, None]:
-    """Names of laws of another kind than the best that leave as little: what moves evenly, or little, tells them not."""
+    """Names of other laws than the best that leave as little: what moves evenly, or little, tells them not apart."""
     # Of a narrow band, a resonance is a gain with a delay.
     others = [*laws, *(ringing(one) if one.moves and best.name in _ALSO else ())]
     least, kind = one.cost(best.left, 0) + DECIDES, best.name.partition(" ")[0]
