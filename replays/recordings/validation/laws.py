@@ -25,6 +25,8 @@ _ALSO = ("gain and delay", "bandwidth")
 """What a resonance may look like."""
 _MORE = {"offset": ("drift", "hum", "crosstalk", "delay", "gain and offset"), "delay": ("clock", "wander", "gain")}
 """Laws that are one with another number."""
+_TIMES = ("delay", "clock", "wander")
+"""Laws by which noise is drawn again, so that there is exactly that of two draws."""
 _LOUD = 0.5
 """Less than this part of what it should show is left without its loudest line."""
 _HALF = 0.5
@@ -74,6 +76,10 @@ def law_of(one: Shown) -> Law:
         typical = 1.48 * float(np.median(np.abs(best.left)))
         drawn = typical < _DRAWN * one.noise / float(one.floor[0]) and _white(np.sign(best.left))
         if is_noise(best.left) or rms_of(best.left) < (_HALF if drawn else _EXACTLY) * rms:
+            return best
+        twice = rms_of(best.left) * float(one.floor[0]) / (math.sqrt(2.0) * one.noise) if one.noise > 0.0 else 0.0
+        timed = best.name.split(" or ")[0] in _TIMES
+        if timed and abs(twice - 1.0) < _EXACTLY + 3.0 / math.sqrt(len(before)) and _white(best.left):
             return best
         for law in ringing(one):
             if rms_of(law.left) < _EXACTLY * rms:
@@ -262,10 +268,18 @@ def _at_random(one: Shown) -> Iterator[Law]:
     if off.any() and off.mean() < _SPARSE and max(lengths) < 3 and is_noise(one.apart[~off]):
         yield _spikes(one, off, one.apart[~off])
         return
+    # An AC-coupled one shows nothing of a level but what fades away.
+    fades = one.channel.highpass_hz > 0.0
+    if one.counts is not None and one.moves and fades:
+        near = _FADING * float(np.ptp(e)) + 2.0 * OFF * float(one.floor[0])
+        loud = np.abs(e) > 5.0 * near
+        gone, sound = (float((np.abs(left) < near)[loud].mean()) if loud.any() else 0.0 for left in (one.values, d))
+        if gone + sound > _ALL and min(gone, sound) > _FADING:
+            yield Law("intermittent", f"{gone:.2g} of the time nothing", gone, one.apart[~off], 2)
+            return
     if one.counts is not None and off.any() and not off.all() and one.moves:
         level = float(np.median(one.values[off]))
-        # Filters go towards it, and an AC-coupled one shows nothing of it but what fades away.
-        fades = one.channel.highpass_hz > 0.0
+        # Filters go towards it.
         slack = (_FADING if fades else _SLACK) * float(np.ptp(e)) + 2.0 * OFF * one.floor
         there = off & (np.abs(one.values - level) < slack)
         varied = not fades or float(e[there].std()) > 5.0 * float(slack[0])
@@ -282,9 +296,9 @@ def _at_random(one: Shown) -> Iterator[Law]:
             yield Law("intermittent", change, part, one.apart[~off], 2)
             return
     (_,), rest = one.left([np.ones(len(d))], d)
-    if one.counts is not None and one.moves and one.even:
+    if one.moves and one.even and (one.counts is not None or _white(rest)):
         late_s, delayed, slope = delayed_by(one)
-        timed, floor = one.values - delayed, 1.5 * one.noise
+        timed, floor = one.values - delayed, (1.0 if one.counts is None else 1.5) * one.noise
         rms_s = math.sqrt(float(timed**2 @ slope**2) / float(slope**2 @ slope**2))
         bend = rms_s**2 * one.foretold_at.derivative(2)(one.times_s - late_s) / math.sqrt(2.0)
         width = np.sqrt((rms_s * slope) ** 2 + bend**2 + floor**2)
@@ -292,7 +306,7 @@ def _at_random(one: Shown) -> Iterator[Law]:
         # The more likely of the two; each has a number of its own.
         gain = float(np.sum(np.log(plain / width))) + 0.5 * float(rest @ rest / rest.var() - z @ z)
         seen = rms_s * rms_of(slope) > 2.0 * one.noise
-        if gain > DECIDES and seen and _white(z):
+        if gain > DECIDES and seen and (one.counts is None or _white(z)):
             yield Law("jitter", f"{1e6 * rms_s:.4g} µs about {1e6 * late_s:.4g} µs", rms_s, z / z.std(), 2, "s")
             return
     tied = one.moves and abs(float(np.corrcoef(rest, e)[0, 1])) > 0.1

@@ -19,6 +19,8 @@ _UNEVEN, _UNEVEN_S = 8.0, 5e-5
 """A turn is off by so many deviations of turns, and by as much [s]."""
 _ANOTHER = 0.2
 """Part by which pulses are more or fewer than turns."""
+_SHARP, _MOSTLY = 10.0, 0.995
+"""Times what second differences of a probe are in this part of the rows, which inertia leaves to none."""
 _LOUD = 3.0
 """Times the noise of its peers."""
 
@@ -55,6 +57,7 @@ def signal_faults(parts: dict[str, Measured]) -> list[SignalFault]:
     """
     found = []
     for part in parts.values():
+        found += _jumps(part)
         noises = [measured_noise(part.values[:, c]) for c in range(len(part.channels))]
         for c, channel in enumerate(part.channels):
             if channel.signal == "keyphasor":
@@ -66,6 +69,26 @@ def signal_faults(parts: dict[str, Measured]) -> list[SignalFault]:
                 text = f"{times:.2g} times that of its peers"
                 found.append(SignalFault(channel.name, "noise", float(part.times_s[0]), float(part.times_s[-1]), text))
     return found
+
+
+def _jumps(part: Measured) -> list[SignalFault]:
+    """Where most of the probes jump at once, and stay there: nothing that has a mass does."""
+    probes = part.values[:, [c for c, channel in enumerate(part.channels) if channel.unit == "mm"]]
+    if probes.shape[1] < 2 or len(probes) < 2 * _HELD:
+        return []
+    steps = np.diff(probes, axis=0)
+    bends = np.abs(np.diff(steps, axis=0))
+    sharp = bends > _SHARP * np.maximum(np.quantile(bends, _MOSTLY, axis=0), 1e-300)
+    # A step bends there and back; a spike once more.
+    lasts = sharp[1:] & sharp[:-1] & (np.abs(probes[3:] - probes[:-3]) > 0.5 * np.abs(steps[1:-1]))
+    rows = np.flatnonzero((4 * lasts.sum(axis=1) >= 3 * probes.shape[1]) & (np.diff(part.index)[1:-1] == 1))
+    if not len(rows):
+        return []
+    begin, end = (float(part.times_s[row + 1]) for row in rows[[0, -1]])
+    text = (
+        f"probes jump at once in {len(rows)} rows, the first behind {begin:.4f} s: samples are missing there, or double"
+    )
+    return [SignalFault("time", "rows", begin, end, text)]
 
 
 def edge_faults(edges_s: np.ndarray, until_s: float, speed_hz: float) -> list[SignalFault]:
