@@ -125,7 +125,8 @@ def _by_counts(one: Shown) -> Iterator[Law]:
     ends = (sound > high).any() or (sound < low).any()
     if ends and (said == np.clip(sound, low, high)).all() and (one.noise > 0.0 or (said == sound).any()):
         part = max(abs(low), abs(high) + 1) / 2.0 ** (one.channel.adc_bits - 1)
-        yield Law("clip", f"at {part:.4g} of the converter's range", part, none)
+        if part < 1.0:  # every converter has its own ends
+            yield Law("clip", f"at {part:.4g} of the converter's range", part, none)
     off = said != sound
     sizes = np.abs(said - sound)[off]
     if off.mean() < _SPARSE and len(sizes) and sizes.min() == sizes.max() > _ROUNDED:

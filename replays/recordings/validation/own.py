@@ -66,13 +66,16 @@ def own_faults(
             if not len(rows):
                 continue
             lasted_s = float(part.times_s[rows[0]]), float(part.times_s[rows[-1]])
-            settled = rows[0] + round(max(_HELD_S, _PERIODS / channel.bandwidth_hz) * channel.rate_hz)
-            first = settled if rows[-1] - settled > 2 * (settled - rows[0]) else rows[0]
-            foretold, last = nominal.values[name][:, c], int(rows[-1]) + 1
+            fine = round(_PERIODS / channel.bandwidth_hz * channel.rate_hz)
+            skips = (max(fine, round(_HELD_S * channel.rate_hz)), fine, 0)
+            first = next(int(rows[0]) + skip for skip in skips if rows[-1] - rows[0] >= 3 * skip)
+            # What is behind its end is its filter's.
+            last = int(rows[-1]) + 1 - (fine if rows[-1] - first > 3 * fine else 0)
+            foretold, dense = nominal.values[name][:, c], 5 * np.count_nonzero(off[first:last]) > last - first
             made = partial(_shown, part, channel, foretold, off, lasted_s)
             few = partial(_bare, part, channel, again), partial(beside, parts, nominal, channel)
             rows = np.arange(first, min(last, first + _MOST))
-            if len(rows) < SOME:
+            if len(rows) < (FEW if dense else SOME):
                 rows = np.arange(max(0, first - SOME), min(first + SOME, len(off)))
             shown.append(made(rows, *few))
             if last - first > 2 * _MOST:
@@ -89,6 +92,8 @@ def own_faults(
             later = law_of(ends[its[0].name]())
             if one.name != f"{its[0].name} {later.name}":
                 one = replace(one, sure=False, change=f"{one.change}, and at its end {later.name} {later.change}")
+        # So short, what holds its value for a while is much like anything else, but for what fits to the count.
+        one = replace(one, sure=one.sure and (end - begin > _HELD_S or one.squares == 0.0))
         found.append(replace(one, left=one.left / max(1.0, steps), from_s=begin, to_s=end))
     # A recording may begin, and end, inside a run.
     begin_s = min(float(part.times_s[0]) for part in parts.values())

@@ -144,6 +144,8 @@ def filtered(one: Shown) -> Iterator[Law]:
 
     plain = wave / through(channel.bandwidth_hz)
     margin = min(len(one.values) // 8, round(_SETTLES_S / one.period_s))
+    if len(one.values) - margin - round(_ENDS_S / one.period_s) < 2 * FEW:
+        return  # too short to tell
 
     def left_by(other: np.ndarray | float) -> np.ndarray:
         left = one.values - np.fft.irfft(plain * other)[begin:][: len(one.values)]
