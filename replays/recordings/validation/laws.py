@@ -82,7 +82,7 @@ def law_of(one: Shown) -> Law:
         if timed and abs(twice - 1.0) < _EXACTLY + 3.0 / math.sqrt(len(before)) and _white(best.left):
             return best
         for law in ringing(one):
-            if rms_of(law.left) < _EXACTLY * rms:
+            if rms_of(law.left) < 2.0 * _EXACTLY * rms:  # knocks between samples ring, too
                 return law
     return next(_at_random(one), replace(best, sure=False))
 

@@ -25,6 +25,8 @@ _HARDLY = 0.3
 """Where this part of what differs is left without the folding, that is looked at too."""
 _SETTLES_S = 0.02
 """Behind this it is another filter's."""
+_RINGS_HZ, _RINGS = (20.0, 4000.0), 60
+"""Between these resonances are looked for, at so many."""
 _SAME = 0.8
 """Of the noise, below which what is left has none of its own."""
 
@@ -194,14 +196,21 @@ def ringing(one: Shown) -> Iterator[Law]:
         fading, angle = np.exp(-0.5 * w / quality * t), w * math.sqrt(1.0 - 0.25 / quality**2) * t
         return one.left([fading * np.cos(angle), fading * np.sin(angle), one.level], one.values - shown)[1]
 
-    # x'' = w^2 (e - x) - (w / quality) x' has both numbers, though knocks do not make it exact.
+    def cost(logs: np.ndarray) -> float:
+        return math.log(rms_of(left(logs)))
+
+    # x'' = w^2 (e - x) - (w / quality) x' has both numbers, though knocks do not make it exact; else one of many.
     shown = make_interp_spline(t, one.values, k=5)
     pulls = [one.foretold - one.values, -shown.derivative()(t)]
     (stiff, damping), _ = one.left(pulls, shown.derivative(2)(t))
-    if not (stiff > 0.0 and damping > 0.0 and math.sqrt(stiff) > 0.5 * damping):
-        return
-    start = [math.log(math.sqrt(stiff) / 2.0 / math.pi), math.log(math.sqrt(stiff) / damping - 0.5)]
+    starts = [
+        np.log([hz, quality - 0.5])
+        for hz in np.geomspace(*_RINGS_HZ, _RINGS)
+        for quality in (1.0, 10.0, 100.0)
+    ]  # fmt: skip
+    if stiff > 0.0 and damping > 0.0 and math.sqrt(stiff) > 0.5 * damping:
+        starts.append(np.log([math.sqrt(stiff) / 2.0 / math.pi, math.sqrt(stiff) / damping - 0.5]))
     close = {"xatol": 1e-7, "fatol": 1e-3}
-    found: Any = minimize(lambda logs: math.log(rms_of(left(logs))), start, method="Nelder-Mead", options=close)
+    found: Any = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options=close)
     hz, quality = math.exp(found.x[0]), 0.5 + math.exp(found.x[1])
     yield Law("resonance", f"at {hz:.4g} Hz, quality {quality:.3g}", hz, left(found.x), 4, "Hz")
