@@ -77,8 +77,9 @@ class ZenohBus(NodeBus):
 
     def _nobody(self) -> str:
         return (
-            f"no hub for CAN channel {self.channel} answers at {self._address}; start one with: "
-            f"rig can hub {self.channel} (or with the rig: rig run --can zenoh:{self.channel})"
+            f"no hub for CAN channel {self.channel} answers at {self._address}; name where it listens "
+            f"(endpoint=HOST:PORT), or start one with: rig can hub {self.channel} (or with the rig: rig run --can "
+            f"zenoh:{self.channel})"
         )
 
     def _where(self) -> str:
