@@ -235,7 +235,7 @@ class Protection:
             self._pulse, self._turning = int(index[row]), True
         # A turn that lasts already longer than one at the limit is not too fast: a shaft that stands has no pulse.
         over = (fast >= settings.overspeed_turns) & ((index - pulse) * settings.overspeed_hz < self._rate_hz)
-        lost = index - np.maximum(pulse, self._armed) > self._rows(settings.speed_lost_s)
+        lost = index - np.maximum(pulse, self._armed) >= self._rows(settings.speed_lost_s)
         return {
             ("overspeed", settings.keyphasor): (over & enabled & (settings.overspeed_hz > 0.0), speed_hz),
             ("speed-lost", settings.keyphasor): (lost & enabled & (settings.speed_lost_s > 0.0), speed_hz),
