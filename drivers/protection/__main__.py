@@ -66,15 +66,15 @@ def parse(arguments: Sequence[str]) -> tuple[str, Settings]:
     )
     parser.add_argument("url", nargs="?", default="zenoh:" + DEFAULT_ENDPOINT)
     for name, field in Settings.model_fields.items():
-        option, kind, settings = "--" + name.replace("_", "-"), field.annotation, {"default": argparse.SUPPRESS}
+        kind: Any = field.annotation
+        option: dict[str, Any] = {"type": kind, "required": field.is_required()}
         if kind is bool:
-            parser.add_argument(option, action=argparse.BooleanOptionalAction, **settings)
+            option = {"action": argparse.BooleanOptionalAction}
         elif get_origin(kind) is Literal:
-            parser.add_argument(option, choices=get_args(kind), **settings)
+            option = {"choices": get_args(kind)}
         elif get_origin(kind) is tuple:
-            parser.add_argument(option, action="append", metavar="CHANNEL", **settings)
-        else:
-            parser.add_argument(option, type=kind, required=field.is_required(), **settings)
+            option = {"action": "append", "metavar": "CHANNEL"}
+        parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, **option)
     given = vars(parser.parse_args(arguments))
     return given.pop("url"), check(Settings, given, field="")
 
