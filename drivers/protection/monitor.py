@@ -109,7 +109,7 @@ class Protection:
         changes = [
             (int(row), place, alarm)
             for place, (alarm, (on, _)) in enumerate(states.items())
-            for row in np.flatnonzero(np.diff(on, prepend=alarm in self.active))
+            for row in _changes(on, alarm in self.active)
         ]
         for row, _, alarm in sorted(changes):
             on, values = states[alarm]
@@ -225,14 +225,13 @@ class Protection:
     def _speed(self, keyphasor: np.ndarray, index: np.ndarray, enabled: np.ndarray) -> dict[Alarm, tuple]:
         settings, before = self.settings, self._over["pulse", ""]
         high = self._above(("pulse", ""), keyphasor, *_PULSE)
-        begins, speed_hz, fast = np.diff(high, prepend=before) & high, np.zeros(len(index)), np.zeros(len(index), int)
-        speed_hz[:], fast[:] = self._speed_hz, self._fast
-        pulse = np.maximum.accumulate(np.where(begins, index, self._pulse))
-        for row in np.flatnonzero(begins):
+        begins = [row for row in _changes(high, before) if high[row]]
+        speed_hz, fast, pulse = (np.full(len(index), state) for state in (self._speed_hz, self._fast, self._pulse))
+        for row in begins:
             self._speed_hz = self._rate_hz / (index[row] - self._pulse) if self._turning else 0.0
             self._fast = self._fast + 1 if self._speed_hz > settings.overspeed_hz else 0
-            speed_hz[row:], fast[row:] = self._speed_hz, self._fast
             self._pulse, self._turning = int(index[row]), True
+            speed_hz[row:], fast[row:], pulse[row:] = self._speed_hz, self._fast, self._pulse
         # A turn that lasts already longer than one at the limit is not too fast: a shaft that stands has no pulse.
         over = (fast >= settings.overspeed_turns) & ((index - pulse) * settings.overspeed_hz < self._rate_hz)
         lost = index - np.maximum(pulse, self._armed) >= self._rows(settings.speed_lost_s)
@@ -267,6 +266,14 @@ class Protection:
         above = np.where(last >= 0, values[last] > high, self._over.get(what, False))
         self._over[what] = bool(above[-1])
         return above
+
+
+def _changes(on: np.ndarray, before: bool) -> np.ndarray:
+    """Rows at which a truth is another one than at the row before, shape (changes,)."""
+    changes = on.copy()
+    changes[0] ^= before
+    changes[1:] ^= on[:-1]
+    return np.flatnonzero(changes)
 
 
 def _sliding(extreme: Callable[..., np.ndarray], values: np.ndarray, window: int) -> np.ndarray:

@@ -117,7 +117,7 @@ MUTANTS = [
     ),
     Mutant(
         "edges counted twice", "a_pulse_is_counted_once",
-        "np.diff(high, prepend=before) & high", "np.diff(high, prepend=before)",
+        " if high[row]]", "]",
     ),
     Mutant("pulse without hysteresis", "a_pulse_is_counted_once", "_PULSE = (0.6, 0.4)", "_PULSE = (0.5, 0.5)"),
     Mutant(
