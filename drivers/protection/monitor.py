@@ -104,7 +104,7 @@ class Protection:
             return Action(kind, name, row, tick, time_s, float(value))
 
         told = [action("rows-lost", "", samples.index, missing)] if missing else []
-        told += [action("reset", " ".join(alarm), first, 0.0) for alarm in self._acknowledged()]
+        told += [action("reset", " ".join(alarm).strip(), first, 0.0) for alarm in self._acknowledged()]
         states = self._states(signals, first)
         changes = [
             (int(row), place, alarm)

@@ -140,7 +140,7 @@ def a_reset_ends_what_is_over(device: Any) -> None:
     monitor.reset()
     actions = monitor.feed(samples(300, disk_x=swing(100, (50, 1200.0)), disk_y=0.0))
     assert told(actions) == [
-        ("reset", "danger disk_x", 300), ("reset", "trip ", 300), ("alert", "disk_x", 350), ("danger", "disk_x", 351),
+        ("reset", "danger disk_x", 300), ("reset", "trip", 300), ("alert", "disk_x", 350), ("danger", "disk_x", 351),
         ("trip", "danger disk_x", 351),
     ]  # fmt: skip
 
