@@ -5,9 +5,9 @@ above a set point for the delay is an alarm; its cause is over where the level f
 hysteresis. Dangers, by the vote, are a trip. A probe whose output leaves the OK limits is NOT OK from that row on,
 until it was within them for `ok_recovery_s`; meanwhile it raises no alarm, and `not_ok` says how it votes.
 
-Rows that are missing, up to a window of them, are taken as the last that came; beyond, and where the numbers of rows
-go back, all begins anew with both probes NOT OK. Every state is that of a row: how rows are cut into blocks changes
-nothing.
+Rows that are missing, up to a window of them, are taken as the last that came, and those that come late or twice are
+left out; where more are missing, or the numbers of rows begin anew, all begins anew with both probes NOT OK. Every
+state is that of a row: how rows are cut into blocks changes nothing.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from itertools import accumulate
 import numpy as np
 
 from drivers.protection.settings import Settings
-from drivers.samples import Samples
+from drivers.samples import Samples, follow
 from rig.errors import InputError
 from rig.units import factor
-from rig.wire import row_tick, row_times_s
+from rig.wire import Continuity, row_tick, row_times_s
 
 Alarm = tuple[str, str]
 """Its kind, and its channel."""
@@ -75,6 +75,7 @@ class Protection:
         self._latching = {"trip"}
         self._latching |= {"danger", "overspeed"} if settings.latch_danger else set()
         self._latching |= {"alert", "speed-lost"} if settings.latch_alert else set()
+        self._came = Continuity()
         self._next: int | None = None
         self._to_reset = False
 
@@ -93,8 +94,10 @@ class Protection:
         Raises:
             InputError: A channel is missing, its unit is no length, or the rate changes.
         """
-        if not len(samples):
+        fresh = follow(self._came, samples) if len(samples) else None
+        if fresh is None:
             return []
+        samples = fresh
         signals, missing = self._continued(samples)
         first = samples.index + len(samples) - signals.shape[1]
 
@@ -192,8 +195,11 @@ class Protection:
         ):
             for name, level, okay in zip(probes, levels, good, strict=True):
                 high = self.multiply * set_um
-                above = self._above((kind, name), level, high, high * (1.0 - settings.hysteresis))
-                run = self._run((kind, name), above & okay & armed & (name not in self.bypassed))
+                enabled = okay & armed & (name not in self.bypassed)
+                above = self._above(
+                    (kind, name), np.where(enabled, level, -1.0), high, high * (1.0 - settings.hysteresis)
+                )
+                run = self._run((kind, name), above)
                 causes[kind, name] = run > self._rows(delay_s), level
         if settings.timed:
             causes |= self._speed(signals[2], index, armed & (settings.keyphasor not in self.bypassed))

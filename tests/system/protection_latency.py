@@ -65,11 +65,10 @@ def _again(machine: Rig) -> bool:
 def main(trips: str = "1000", block_ms: str = "1") -> None:
     """Print the latency's distribution."""
     found, status = latencies_ms(int(trips), block_ms)
-    at = {name: np.percentile(found, part) for name, part in (("p50", 50), ("p99", 99), ("p99.9", 99.9), ("most", 100))}
+    told = [f"p{part:g} {np.percentile(found, part):.2f} ms" for part in (50, 99, 99.9, 100)]
     print(
-        f"{trips} trips, blocks of {block_ms} ms: " + ", ".join(f"{name} {value:.2f} ms" for name, value in at.items())
+        f"{trips} trips, blocks of {block_ms} ms: {', '.join(told)}; lateness of the rig [ms]: {status['lateness_ms']}"
     )
-    print({name: status[name] for name in status if "late" in name or "lag" in name})
 
 
 if __name__ == "__main__":

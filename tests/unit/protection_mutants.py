@@ -58,8 +58,8 @@ MUTANTS = [
         "math.floor(duration_s * self._rate_hz + 1e-6)",
     ),
     Mutant(
-        "delay goes on after a break", "a_delay_begins_anew", "run = self._run((kind, name), above &",
-        "run = np.cumsum(above) + 0 * self._run((kind, name), above &",
+        "delay goes on after a break", "a_delay_begins_anew", "run = self._run((kind, name), above)",
+        "run = np.cumsum(above) + 0 * self._run((kind, name), above)",
     ),
     Mutant("latch lost", "a_danger_stays_and_an_alert_goes", _LATCHED, "on, value"),
     Mutant("all latched", "a_danger_stays_and_an_alert_goes", _LATCHED.partition(" if ")[2], "True else on, value"),
@@ -78,7 +78,7 @@ MUTANTS = [
     ),
     Mutant(
         "alarm of a probe that is NOT OK", "a_probe_that_is_not_ok_raises_no_alarm",
-        "above & okay & armed", "above & armed",
+        "okay & armed &", "armed &",
     ),
     Mutant(
         "NOT OK stays in the vote", "a_probe_that_is_not_ok_votes_as_is_told", "np.array(dangers), off | bad",
@@ -161,6 +161,10 @@ MUTANTS = [
         "first = samples.index + len(samples) - signals.shape[1] + (samples.index > 0)",
     ),
     Mutant("missing rows left out", "rows_that_are_missing_are_taken_as_the_last", "elif missing:", "elif False:"),
+    Mutant(
+        "rows that come twice", "rows_that_come_twice_count_once", "fresh = follow(self._came, samples)",
+        "fresh = samples",
+    ),
     Mutant(
         "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "            self._runs = {}",
         '            self._runs = {("ok", name): recovery for name in (settings.x, settings.y)}',

@@ -305,6 +305,8 @@ def no_alarm_while_it_starts(device: Any) -> None:
         ("alert", "disk_x", 300), ("danger", "disk_x", 350), ("trip", "danger disk_x", 350),
         ("speed-lost", "keyphasor", 400),
     ]  # fmt: skip
+    # What was above a set point then is not held by the hysteresis.
+    assert run(device, settings(startup_s=0.3, hysteresis=0.1), swing(600, (0, 600.0), (100, 470.0)))[1] == []
 
 
 @scenario
@@ -366,7 +368,8 @@ def blocks_change_nothing(device: Any) -> None:
     whole = device.Protection(given).feed(rows)
     assert {each.kind for each in whole} == {"alert", "danger", "trip", "clear", "not-ok", "overspeed", "speed-lost"}
     rng = np.random.default_rng(2)
-    for cuts in (np.arange(0, 6001, 10), np.arange(0, 6000, 7), np.sort(rng.integers(0, 6000, 40)), np.arange(2000)):
+    by_chance = np.sort(rng.integers(0, 6000, 40))
+    for cuts in (np.arange(0, 6001, 20), np.arange(0, 6000, 37), by_chance, np.arange(2400, 2900)):
         monitor, found = device.Protection(given), []
         for begin, end in zip([0, *cuts], [*cuts, 6000], strict=True):
             found += monitor.feed(rows.rows(int(begin), int(end)))
@@ -383,6 +386,16 @@ def rows_that_are_missing_are_taken_as_the_last(device: Any) -> None:
     # The step is in the window from row 100 to 199; danger after 50 rows, in the middle of what is missing.
     assert told(actions, "rows-lost", "danger") == [("rows-lost", "", 180), ("danger", "disk_x", 150)]
     assert actions[-1].kind == "clear"
+
+
+@scenario
+def rows_that_come_twice_count_once(device: Any) -> None:
+    given, rows = eventful()
+    whole, monitor = device.Protection(given).feed(rows), device.Protection(given)
+    parts = [rows.rows(begin, begin + 100) for begin in range(0, 6000, 100)]
+    # Row 0 once more would be that of another run.
+    again = [part for number, part in enumerate(parts) for part in (part, parts[max(1, number - 3)])][2:]
+    assert [each for part in (parts[0], *again) for each in monitor.feed(part)] == whole
 
 
 @scenario
