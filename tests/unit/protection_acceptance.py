@@ -6,6 +6,7 @@ are told beside each table. `python -m tests.unit.protection_acceptance [HOURS]`
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -16,8 +17,10 @@ import numpy as np
 
 from drivers.protection import Action, Protection, Settings
 from drivers.samples import Samples
+from rig.kernels.signals import COLUMN
 from rig.scenes import load_scene
 from rig.simulation import Simulation
+from rig.wire import Block
 
 ALERT_UM, DANGER_UM = 500.0, 1000.0
 BEGIN_S, END_S = 0.25, 0.75
@@ -40,14 +43,18 @@ def monitor(**changes: Any) -> Settings:
 def stream(group: str, changes: dict[str, Any], scene: str = "test-sine") -> Iterator[Samples]:
     """Blocks of a group of channels, as they are sent."""
     simulation = Simulation(load_scene(scene, {"sensors.groups": [group], "drive.speed_hz": 6.2, **changes}))
-    table = simulation.table.groups[group]
-    units = tuple(channel.unit for channel in table.channels)
     while simulation.tick < simulation.end_tick:
         for message in simulation.advance(min(100_000, simulation.end_tick - simulation.tick)).messages:
-            block = message.block
-            if message.key.endswith(f"/{group}") and len(block.values):
-                values = table.engineering(block.values)
-                yield Samples(block.index, block.tick, block.rate_hz, block.tick_rate_hz, table.names, units, values)
+            if message.key.endswith(f"/{group}") and len(message.block.values):
+                yield samples_of(simulation, group, message.block)
+
+
+def samples_of(simulation: Simulation, group: str, block: Block) -> Samples:
+    """A block in engineering units."""
+    table = simulation.table.groups[group]
+    units = tuple(channel.unit for channel in table.channels)
+    values = table.engineering(block.values)
+    return Samples(block.index, block.tick, block.rate_hz, block.tick_rate_hz, table.names, units, values)
 
 
 def outcome(settings: Settings, rows: list[Samples]) -> list[Action]:
@@ -165,6 +172,41 @@ def judged(rows: list[Samples], vote: str, not_ok: str) -> str:
     kinds = {each.kind for each in outcome(monitor(vote=vote, not_ok=not_ok), rows)}
     found = "T" if "trip" in kinds else "a" if kinds & {"alert", "danger"} else ""
     return (found + ("N" if "not-ok" in kinds else "")) or "-"
+
+
+WHIRL = [
+    # Ramp of the drive [Hz/s], delay of danger [s], whether whirl is established after a blow of 100 N at 6.2 Hz.
+    (2.0, 0.0, True),  # the rig's own drive: as fast as a monitor may be, the shaft goes on turning
+    (300.0, 0.02, False),
+    (300.0, 0.1, True),
+]
+FULL_S = 0.05
+"""Whirl is established where the contact lasts so long, but for a twentieth of it, and goes round backward [s]."""
+
+
+def whirls(ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks: int = 10_000) -> tuple[float, bool]:
+    """A blow at 0.1 s with the monitor in the loop: from the blow to the trip [s], and whether whirl is established."""
+    blow = {"at_s": 0.1, "command": "hammer", "force_n": force_n}
+    changes = {"duration_s": 0.4, "drive.ramp_rate": ramp_hz_s, "commands": [blow], "sensors.groups": ["probes"]}
+    simulation = Simulation(load_scene("hammer", changes))
+    device = Protection(
+        Settings(alert_um=1500, danger_um=1500, alert_delay_s=delay_s, danger_delay_s=delay_s, startup_s=0.05)
+    )
+    rows, trip_s = [], math.nan
+    while simulation.tick < simulation.end_tick:
+        frame = simulation.advance(block_ticks)
+        rows.append(frame.rows[:, [COLUMN[name] for name in ("normal_force", "ring_x", "ring_y")]])
+        if any(
+            action.kind == "trip" for action in device.feed(samples_of(simulation, "probes", frame.samples["probes"]))
+        ):
+            simulation.submit("speed", {"speed_hz": 0.0})
+            trip_s = 1e-6 * simulation.tick - 0.1
+    force, x, y = np.vstack(rows).T
+    span = round(FULL_S * 1e6 / simulation.row_ticks)
+    contact = np.convolve(force > 0.0, np.ones(span) / span, "valid")
+    angle = np.unwrap(np.arctan2(y, x))
+    turns = (angle[span - 1 :] - angle[: 1 - span]) / (2.0 * math.pi)
+    return trip_s, bool(((contact > 0.95) & (turns < -0.25)).any())
 
 
 def noise(hours: float) -> tuple[list[Action], float]:

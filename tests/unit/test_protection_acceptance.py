@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -67,6 +68,14 @@ def test_all_kinds_of_faults_are_judged() -> None:
     assert set(KINDS) - set(table.FAULTS) - set(table.PULSES) == {"no-filter", "bandwidth"}, (
         "test signals have no filter"
     )
+
+
+@pytest.mark.parametrize(("ramp_hz_s", "delay_s", "established"), table.WHIRL)
+def test_a_trip_stops_whirl_where_drive_and_delay_are_fast(ramp_hz_s: float, delay_s: float, established: bool) -> None:
+    trip_s, found = table.whirls(ramp_hz_s, delay_s)
+    assert found == established
+    # The level is above its set point 6.3 ms after the blow begins; the trip is at the end of a block.
+    assert math.isclose(trip_s, 0.01 * math.ceil(100.0 * (0.0063 + delay_s)))
 
 
 def test_noise_raises_no_alarm() -> None:
