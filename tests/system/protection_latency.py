@@ -38,7 +38,8 @@ def latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
         # Nobody reads what it says: a pipe would be full one day, and it would wait.
         processes.python("-m", "drivers.protection", url, *OPTIONS, stdout=subprocess.DEVNULL, stderr=None),
     ):  # fmt: skip
-        time.sleep(5.0)  # it starts
+        machine.event(lambda event: "on" in event.get("tags", ()), timeout_s=60.0)
+        time.sleep(0.5)
         while len(found) < trips:
             fault = machine.fault("disk_x", "offset", value=0.5, for_s=0.02)
             tick = fault.first_row["probes"] * 50
