@@ -88,4 +88,4 @@ def test_a_trip_stops_whirl_where_drive_and_delay_are_fast(ramp_hz_s: float, del
 
 
 def test_noise_raises_no_alarm() -> None:
-    assert table.noise(1.0 / 3600.0)[0] == []
+    assert table.noise(4.0 / 3600.0)[0] == []
