@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             protect(machine, Protection(settings), lambda line: print(line, flush=True))
     except KeyboardInterrupt:
         return
-    except (ConnectionError, EOFError, InputError) as error:
+    except (ConnectionError, TimeoutError, EOFError, InputError) as error:
         print(error, file=sys.stderr)
         sys.exit(2)
 

@@ -66,7 +66,7 @@ def _again(machine: Rig) -> bool:
 def main(trips: str = "1000", block_ms: str = "1") -> None:
     """Print the latency's distribution."""
     found, status = latencies_ms(int(trips), block_ms)
-    told = [f"p{part:g} {np.percentile(found, part):.2f} ms" for part in (50, 99, 99.9, 100)]
+    told = [f"p{part:g} {np.percentile(found, part):.2f} ms" for part in (0, 10, 50, 99, 99.9, 100)]
     print(
         f"{trips} trips, blocks of {block_ms} ms: {', '.join(told)}; lateness of the rig [ms]: {status['lateness_ms']}"
     )

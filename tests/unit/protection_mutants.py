@@ -166,8 +166,8 @@ MUTANTS = [
         "fresh = samples",
     ),
     Mutant(
-        "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "            self._runs = {}",
-        '            self._runs = {("ok", name): recovery for name in (settings.x, settings.y)}',
+        "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "0 if known else self._rows",
+        "self._rows",
     ),
 ]  # fmt: skip
 
