@@ -33,7 +33,7 @@ class Mutant:
         assert text.count(self.text) == 1, f"{self.name}: its text stands there {text.count(self.text)} times"
         module = ModuleType(self.source.__name__)
         exec(compile(text.replace(self.text, self.instead), self.name, "exec"), module.__dict__)
-        made = {name: getattr(module, name) for name in ("Protection", "obey") if hasattr(module, name)}
+        made = {name: getattr(module, name) for name in ("Protection", "obey", "protect") if hasattr(module, name)}
         return SimpleNamespace(**{**vars(sound()), **made})
 
     def fails(self, scenario: str) -> bool:
@@ -142,6 +142,9 @@ MUTANTS = [
     Mutant(
         "trip sent by each danger", "a_trip_is_sent_once_and_first", 'if action.kind == "trip"]',
         'if action.kind != "clear"]\n    machine.speed(0.0) if len(trips) > 1 else None', runner,
+    ),
+    Mutant(
+        "its own notes reset it", "a_note_of_others_resets_it", ' and "protection" not in event["tags"]', "", runner,
     ),
     Mutant(
         "state of each block", "blocks_change_nothing",
