@@ -97,7 +97,8 @@ class CanClient(Closing):
         elif name == "DeviceState":
             standing = Standing(raw["state"])
             if raw["node"] == self.node:
-                self._joined = standing is Standing.JOINED
+                if standing is not Standing.REFUSED:  # which may be another's, who took the same number
+                    self._joined = standing is Standing.JOINED
                 self._standings.put((standing, self._at(raw["time"])))
             if standing is not Standing.REFUSED:
                 told = {"device": name_of(raw["node"]), "state": standing.name.lower()}
