@@ -10,6 +10,7 @@ import pytest
 
 from drivers.can import analysis
 from drivers.can.bus.timing import speed
+from drivers.can.devices import DeviceKind, Said, device_frame
 from drivers.can.message import checksum, crc8
 from drivers.can.schedule import Schedule, schedule_from
 from drivers.can.signals import (
@@ -264,3 +265,22 @@ def test_random_frames_are_no_commands_and_their_checksum_is_what_it_seems() -> 
     assert not any(isinstance(result, Command) for result in results)
     passed = sum(result is not Result.BAD_CHECKSUM for result in results)
     assert passed == pytest.approx(100_000 / 256, abs=5 * math.sqrt(100_000 / 256))
+
+
+def test_what_a_device_says_is_read_as_it_was_said_and_nothing_else_is() -> None:
+    message = TABLE.by_name["Device"]
+    said = {kind: parse_command(*device_frame(message, kind, 7, block=300, patience_s=2.5), 0) for kind in DeviceKind}
+    assert said == {
+        DeviceKind.JOIN: Said(DeviceKind.JOIN, 7, {"device": "CAN 7", "patience_s": 2.5}),
+        DeviceKind.DONE: Said(DeviceKind.DONE, 7, {"device": "CAN 7", "block": 300}),
+        DeviceKind.LEAVE: Said(DeviceKind.LEAVE, 7, {"device": "CAN 7"}),
+    }
+    assert all((one ^ other).bit_count() >= 4 for one in DeviceKind for other in DeviceKind if one != other)
+    identifier, data = device_frame(message, DeviceKind.LEAVE, 7)
+    for wrong, result in ((b"\x34", Result.BAD_KIND), (data[:1] + b"\x07\x01", Result.BAD_KIND)):
+        changed = wrong + data[len(wrong) : 7]
+        assert parse_command(identifier, changed + bytes([checksum(identifier, changed)]), 0) is result
+    assert parse_command(identifier, data[:7] + bytes([data[7] ^ 1]), 0) is Result.BAD_CHECKSUM
+    assert parse_command(identifier, data[:7], 0) is Result.BAD_LENGTH
+    with pytest.raises(InputError, match="device must be of a node from 0 to 255"):
+        device_frame(message, DeviceKind.JOIN, 256)
