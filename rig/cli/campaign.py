@@ -1,0 +1,192 @@
+"""`rig campaign`: scripted tests of a device in the loop, for whoever does not know pytest, which runs them."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rig.cli.folder import check_folder
+from rig.cli.tables import echo, progress_bar
+from rig.errors import InputError, Words
+from rig.text import printable
+
+_TOML = ".campaign.toml"
+_INTERRUPTED = 130
+_WORDS = {"passed": "pass", "failed": "FAIL", "error": "ERROR", "skipped": "skip"}
+_EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
+
+
+def campaign(
+    files: Annotated[
+        list[str],
+        typer.Argument(metavar="FILE...", help="NAME.campaign.toml, or tests of pytest; FILE::CASE for one case."),
+    ],
+    *,
+    keyword: Annotated[
+        str | None, typer.Option("--keyword", "-k", metavar="WORDS", help="Only cases with these words in their names.")
+    ] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", metavar="N", min=1, help="So many cases at a time.")] = 1,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="FOLDER", help="For results.json, junit.xml, index.html and evidence/."),
+    ] = None,
+    against: Annotated[
+        Path | None, typer.Option("--against", metavar="FOLDER", help="Results of an earlier campaign to compare with.")
+    ] = None,
+    url: Annotated[
+        str | None, typer.Option(metavar="URL", help="Run on the rig there; what cannot be done there is skipped.")
+    ] = None,
+    replay: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="Run on a recording that is played, likewise.")
+    ] = None,
+) -> None:
+    """Run scripted tests of a device in the loop, and judge them.
+
+    Exit status 0: all cases passed, or were skipped. 1: one failed. 2: wrong input, or nothing to run. Ctrl-C leaves
+    nothing running, and the results of what was done.
+    """
+    if importlib.util.find_spec("pytest") is None:
+        raise InputError("rig campaign", _EXTRA, Words("without pytest"))
+    if jobs > 1 and importlib.util.find_spec("xdist") is None:
+        raise InputError("--jobs", f"1, or {_EXTRA}", jobs)
+    if url is not None and replay is not None:
+        raise InputError("--url", "left out with --replay", url)
+    if url is not None and jobs > 1:
+        raise InputError("--jobs", "1 with --url, as the cases share one rig", jobs)
+    if output is not None:
+        check_folder(output, field="--output")
+    _check(files, against, replay)
+    told = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
+    options = [word for name, value in told.items() if value is not None for word in (name, str(value))]
+    options += ["-k", keyword] if keyword is not None else []
+    options += ["-n", str(jobs)] if jobs > 1 else ["-n", "0"] if importlib.util.find_spec("xdist") else []
+    status = _run(files, options, output)
+    if status:
+        raise typer.Exit(status)
+
+
+def _check(files: list[str], against: Path | None, replay: Path | None) -> None:
+    """Refuse what is wrong with files before anything runs."""
+    from replays.campaigns.campaign import load_campaign
+    from replays.campaigns.results import load_results
+
+    for file in files:
+        name, colons, case = file.partition("::")
+        if name.endswith(_TOML):
+            known = [each.id for each in load_campaign(Path(name)).cases]
+            if colons and case not in known:
+                from rig.errors import UnknownNameError
+
+                raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
+        elif not Path(name).exists():
+            raise InputError("FILE", f"a *{_TOML} file, or tests of pytest, that exists", name)
+        elif Path(name).is_file() and not name.endswith(".py"):
+            raise InputError("FILE", f"a file that ends in {_TOML} or .py, or a folder", name)
+    if against is not None:
+        load_results(against)
+    if replay is not None:
+        from recorder.reader import Recording
+
+        Recording.open(replay)
+
+
+def _run(files: list[str], options: list[str], output: Path | None) -> int:
+    """Run the tests; returns the exit status."""
+    # Installed, the plugin is there by its entry point; out of a checkout, it is named.
+    from importlib.metadata import entry_points
+
+    import pytest
+
+    module = "replays.campaigns.plugin"
+    there = any(each.value == module for each in entry_points(group="pytest11"))
+    quiet = ["-qq", "--no-header", "--no-summary", "-p", "no:cacheprovider", "-o", "console_output_style=classic"]
+    plugins = [] if there else ["-p", module]
+    with progress_bar(transient=True) as bar:
+        progress = _Progress(bar)
+        status = pytest.main([*plugins, *quiet, *options, *files], plugins=[progress])
+    counts = progress.counts
+    told = ", ".join(f"{counts[outcome]} {outcome}" for outcome in _WORDS if counts[outcome]) or "nothing was run"
+    left = len(progress.planned) - sum(counts.values())
+    echo(f"{told}{f', {left} not run' if left > 0 else ''}")
+    if output is not None and (output / "index.html").is_file():
+        echo(f"written  {output / 'index.html'}, results.json, junit.xml")
+    if status == pytest.ExitCode.INTERRUPTED and not progress.collecting_failed:
+        return _INTERRUPTED
+    if status in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+        return int(status)
+    return 2
+
+
+@dataclass
+class _Progress:
+    """Tells how it goes, a line a case and a live one; a plugin of pytest."""
+
+    bar: Any
+    planned: dict[str, None] = field(default_factory=dict)
+    outcomes: dict[str, str] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+    done: set[str] = field(default_factory=set)
+    running: dict[str, None] = field(default_factory=dict)
+    collecting_failed: bool = False
+    task: Any = None
+
+    @property
+    def counts(self) -> Counter[str]:
+        """How many cases came to what."""
+        return Counter(self.outcomes[name] for name in self.done)
+
+    def pytest_collection_finish(self, session: Any) -> None:
+        """What is to be run."""
+        self.planned |= {item.nodeid: None for item in session.items}
+
+    def pytest_xdist_node_collection_finished(self, node: Any, ids: list[str]) -> None:
+        """The same where several processes run it."""
+        self.planned |= dict.fromkeys(ids)
+
+    def pytest_collectreport(self, report: Any) -> None:
+        """What could not be collected."""
+        if report.failed:
+            self.collecting_failed = True
+            echo(f"rig: {printable(str(report.longrepr).strip().splitlines()[-1])}", err=True)
+
+    def pytest_report_teststatus(self, report: Any) -> tuple[str, str, str]:
+        """Nothing is printed but what this prints."""
+        return report.outcome, "", ""
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """A case begins."""
+        self.running[nodeid] = None
+        self._show()
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """A phase of a case is over."""
+        name = report.nodeid
+        before = self.outcomes.get(name, "passed")
+        if report.failed:
+            before = "failed" if report.when == "call" and before != "error" else "error"
+        elif report.skipped:
+            before = "skipped"
+        self.outcomes[name] = before
+        if before != "passed" and name not in self.reasons:
+            from replays.campaigns.results import reason_of
+
+            self.reasons[name] = reason_of(report)
+        if report.when == "teardown":
+            self.done.add(name)
+            self.running.pop(name, None)
+            reason = f": {self.reasons[name]}" if name in self.reasons else ""
+            echo(f"{_WORDS[before]:5} {name}{reason}")
+            self._show()
+
+    def _show(self) -> None:
+        if self.task is None:
+            self.task = self.bar.add_task("", total=len(self.planned) or None)
+        bad = sum(self.counts[each] for each in ("failed", "error"))
+        now = next(iter(self.running), "").rpartition("::")[2]
+        told = f"{len(self.done)} of {len(self.planned)} cases, {bad} bad; {now}"
+        self.bar.update(self.task, description=printable(told, 70), completed=len(self.done))
