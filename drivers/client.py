@@ -14,11 +14,12 @@ machine is.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import queue
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Self
 
@@ -27,22 +28,19 @@ import numpy as np
 from drivers.console import Console
 from drivers.daq import Daq
 from drivers.link import LinkTimeoutError
+from drivers.lockstep import LOST_S, Blocks
 from drivers.samples import Samples, StreamEndedError
 from drivers.sources.rig import RigSource
+from drivers.turns import HALF, Turn, edges, joined, turn_in
 from rig import wire
 from rig.errors import InputError, RefusedError, UnknownNameError, Words
 from rig.intake import Catalogue, event_in
-from rig.orbit import synchronous
 from rig.transport import DEFAULT_ENDPOINT, Client
 
 _PATIENCE_S = 10.0
 """How long a rig that runs may send nothing [s]."""
-_LOST_S = 2.0
-"""Rows of a step that was answered are there, or lost [s]."""
 _STEP_S = 20.0
 """How long a step may take, and ten times what it simulates [s]."""
-_HALF = 0.5
-"""A keyphasor's pulse begins where its signal, 0 to 1, rises through this."""
 
 
 class NotSeenError(TimeoutError):
@@ -64,28 +62,6 @@ class Row:
     tick: int
     index: int
     values: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """One turn of the shaft, from pulse to pulse of the keyphasor.
-
-    Attributes:
-        begin_s: Simulated time at which it begins [s].
-        speed_hz: Turns a second in it [Hz].
-        peak_to_peak: Largest less smallest value of each channel, in its unit.
-        gap: Mean of each channel, in its unit.
-        once: What goes once around with the shaft (1X) of each channel: amplitude in its unit, with the phase from the
-            pulse on (negative lags).
-        samples: Its rows.
-    """
-
-    begin_s: float
-    speed_hz: float
-    peak_to_peak: dict[str, float]
-    gap: dict[str, float]
-    once: dict[str, complex]
-    samples: Samples
 
 
 class Rig(Console):
@@ -128,6 +104,9 @@ class Rig(Console):
         self._block_ticks = round(1e-3 * status["block_ms"] * catalogue.tick_rate_hz)
         self._at: int = status["tick"]
         """Up to where a rig in lockstep was stepped [ticks]."""
+        self.lost: dict[str, str] = {}
+        """Devices under test that were put out while this client stepped the rig, with the reason."""
+        self._blocks: Blocks | None = None
         self._events: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._seen: list[dict[str, Any]] = []
         client.subscribe(wire.EVENTS, self._on_event)
@@ -151,6 +130,7 @@ class Rig(Console):
         self._back: Samples | None = None
         """Rows that were read, and not taken."""
         self._next = math.ceil(self._at * self.daq.rate_hz / self._tick_rate_hz) if channels else 0
+        client.settle()
 
     @classmethod
     def open(
@@ -273,14 +253,14 @@ class Rig(Console):
             while True:
                 fresh = self._take(piece, whole=False)
                 follows = held is not None and fresh.index == held.index + len(held)
-                held, told = (_joined(held, fresh), told) if held is not None and follows else (fresh, 0)
-                edges_s = _edges(held)
-                high = held["keyphasor"] >= _HALF
+                held, told = (joined(held, fresh), told) if held is not None and follows else (fresh, 0)
+                edges_s = edges(held)
+                high = held["keyphasor"] >= HALF
                 if (high[1:-1] & ~high[:-2] & ~high[2:]).any():
                     raise InputError("rate_hz", "high enough for two rows in a pulse of the keyphasor", daq.rate_hz)
                 for begin_s, end_s in pairwise(edges_s):
                     told = int(np.searchsorted(held.times_s, end_s))
-                    yield _turn(held, begin_s, end_s)
+                    yield turn_in(held, begin_s, end_s)
                 if len(edges_s):
                     kept = max(0, int(np.searchsorted(held.times_s, edges_s[-1])) - 1)
                     held, told = held.rows(kept, len(held)), max(0, told - kept)
@@ -293,6 +273,51 @@ class Rig(Console):
             # What is behind the last turn that was told is read by the next call.
             if held is not None:
                 self._give_back(held.rows(told, len(held)))
+
+    def blocks(self, *, patience_s: float = 10.0) -> Iterator[Samples]:
+        """The rows of each block, to the end of the run: what a device under test is made of.
+
+        A rig in lockstep is joined as the device `name`, and goes on when the loop asks for the next rows: a command
+        that was sent before takes effect at the end of the block, however loaded the machine is. It is not stepped:
+        that is for whoever tests the device. Rows that are missing part a block: the rows behind tell of the gap.
+
+        Args:
+            patience_s: How long the rig may wait for the device, wall time [s].
+
+        Raises:
+            InputError: The client was opened without channels.
+            RefusedError: The rig waits for this device no longer, for the reason in the message.
+            NotSeenError: The rig, which runs by itself, sent nothing for long.
+        """
+        daq = self.daq
+        if self.pace == "lockstep":
+            yield from self._blocks_done(patience_s)
+            return
+        while True:
+            try:
+                yield daq.read(timeout_s=_PATIENCE_S)
+            except LinkTimeoutError as error:
+                raise NotSeenError(f"the rig sent no rows: {error}") from error
+            except StreamEndedError:
+                return
+
+    def _blocks_done(self, patience_s: float) -> Iterator[Samples]:
+        """Join, and be done with each block when the next one is asked for."""
+        blocks = self._blocks = self._blocks or Blocks(self._client, self.daq)
+        begin = self.join(patience_s=patience_s).tick
+        try:
+            while (end := blocks.next()) is not None:
+                if end.tick > begin:
+                    yield from blocks.rows(end)
+                    self.done(end.tick)
+        except RefusedError as error:
+            if "a run that ended" not in str(error):
+                raise
+        except ConnectionError:
+            return  # the rig has gone, as at the end of its rows
+        finally:
+            with contextlib.suppress(RefusedError, ConnectionError):
+                self.leave()
 
     def _take(self, rows: int, *, whole: bool = True) -> Samples:
         """The next rows; of a rig in lockstep, stepped as far as that needs. Fewer where they need not be whole."""
@@ -307,7 +332,7 @@ class Rig(Console):
             missing = min(rows - (0 if taken is None else len(taken)), self._room)
             refused = self._step_to(self._next + missing)
             try:
-                fresh = daq.read(missing, timeout_s=_LOST_S if lockstep and refused is None else _PATIENCE_S)
+                fresh = daq.read(missing, timeout_s=LOST_S if lockstep and refused is None else _PATIENCE_S)
             except LinkTimeoutError as error:
                 if refused is not None or not lockstep or time.monotonic() > deadline:
                     raise refused or NotSeenError(f"the rig sent no rows: {error}") from error
@@ -318,7 +343,7 @@ class Rig(Console):
             if taken is not None and fresh.gap:
                 self._give_back(fresh)
                 return taken
-            taken = fresh if taken is None else _joined(taken, fresh)
+            taken = fresh if taken is None else joined(taken, fresh)
         return taken
 
     def _step_to(self, row: int) -> RefusedError | None:
@@ -332,10 +357,15 @@ class Rig(Console):
             try:
                 whole = math.ceil(ticks / self._block_ticks - 1e-9) * self._block_ticks
                 # A rig that was killed never answers.
-                self._at = self.step(whole, timeout_s=_STEP_S + 10.0 * whole / self._tick_rate_hz).tick
+                self._step(whole, timeout_s=_STEP_S + 10.0 * whole / self._tick_rate_hz)
             except RefusedError as error:
                 return error
         return None
+
+    def _step(self, ticks: int, **settings: Any) -> None:
+        taken = self.step(ticks, **settings)
+        self._at = taken.tick
+        self.lost |= taken.lost
 
     def _give_back(self, samples: Samples) -> None:
         self._back = samples if len(samples) else None
@@ -396,14 +426,14 @@ class Rig(Console):
         while found is None or (to_s is not None and found.times_s[-1] + 1.0 / found.rate_hz < to_s - 1e-9):
             if to_s is not None and self.pace == "lockstep" and to_s * self._tick_rate_hz > self._at:
                 blocks = math.ceil((to_s * self._tick_rate_hz - self._at) / self._block_ticks - 1e-9)
-                self._at = self.step(blocks * self._block_ticks).tick
+                self._step(blocks * self._block_ticks)
             try:
                 fresh = made.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
                 raise NotSeenError(f"no truth of {table} came in {timeout_s:g} s") from None
-            found = fresh if found is None else _joined(found, fresh)
+            found = fresh if found is None else joined(found, fresh)
             while to_s is None and not made.empty():
-                found = _joined(found, made.get())
+                found = joined(found, made.get())
         return found
 
     def _listen_to(self, table: str, columns: Sequence[str], units: Sequence[str]) -> None:
@@ -446,29 +476,3 @@ def connect(
         rig.errors.InputError: url must be zenoh:HOST:PORT[?tls=DIR]; instead received 'can:zenoh:can0'
     """
     return Rig.open(url, channels=channels, wait_s=wait_s, **settings)
-
-
-def _joined(first: Samples, second: Samples) -> Samples:
-    return replace(first, values=np.concatenate([first.values, second.values]))
-
-
-def _edges(samples: Samples) -> np.ndarray:
-    """When the keyphasor's pulses begin [s], between rows by a straight line, shape (edges,)."""
-    signal, times_s = samples["keyphasor"], samples.times_s
-    rows = np.flatnonzero((signal[:-1] < _HALF) & (signal[1:] >= _HALF))
-    part = (_HALF - signal[rows]) / (signal[rows + 1] - signal[rows])
-    return times_s[rows] + part / samples.rate_hz
-
-
-def _turn(samples: Samples, begin_s: float, end_s: float) -> Turn:
-    first, last = np.searchsorted(samples.times_s, [begin_s, end_s])
-    rows = samples.rows(int(first), int(last))
-    once = {}
-    for name in rows.names:
-        _, vector = synchronous(rows[name], rows.times_s, [begin_s, end_s])
-        once[name] = complex(vector[0]) if len(vector) else complex(math.nan, math.nan)
-    return Turn(
-        begin_s=float(begin_s), speed_hz=float(1.0 / (end_s - begin_s)),
-        peak_to_peak={name: float(np.ptp(rows[name])) for name in rows.names},
-        gap={name: float(rows[name].mean()) for name in rows.names}, once=once, samples=rows,
-    )  # fmt: skip

@@ -46,6 +46,17 @@ class AcceptedFault(Accepted):
     first_row: Mapping[str, int]
 
 
+@dataclass(frozen=True, slots=True)
+class AcceptedStep(Accepted):
+    """The reply to a step.
+
+    Attributes:
+        lost: Devices under test that were put out meanwhile, with the reason.
+    """
+
+    lost: Mapping[str, str]
+
+
 class Console(Closing):
     """Sends commands to one rig.
 
@@ -154,8 +165,8 @@ class Console(Closing):
         """
         return self._command("stop")
 
-    def step(self, ticks: int, *, timeout_s: float = 600.0) -> Accepted:
-        """Let a rig in lockstep run this many ticks; returns when they have been simulated and published.
+    def step(self, ticks: int, *, timeout_s: float = 600.0) -> AcceptedStep:
+        """Let a rig in lockstep run this many ticks; returns when they were published and all devices are done.
 
         Args:
             ticks: A whole multiple of the simulation's block.
@@ -164,7 +175,37 @@ class Console(Closing):
         Raises:
             RefusedError: The rig refused, for the reason in the message.
         """
-        return self._command("step", timeout_s, ticks=ticks)
+        reply = self._reply("step", timeout_s, ticks=ticks)
+        told = {name: reply[name] for name in ("id", "tick", "time_s")}
+        return AcceptedStep(command="step", lost=reply.get("lost", {}), **told)
+
+    def join(self, device: str | None = None, *, patience_s: float = 10.0) -> Accepted:
+        """Make a rig in lockstep wait, after each block from now on, until a device under test is `done` with it.
+
+        Args:
+            device: Its name; that of this console unless given.
+            patience_s: How long it may take over a block, wall time [s]; then it is put out, and the rig goes on.
+
+        Raises:
+            RefusedError: The rig is not in lockstep, or such a device has joined.
+        """
+        return self._command("join", device=device or self._name, patience_s=float(patience_s))
+
+    def done(self, tick: int, device: str | None = None) -> Accepted:
+        """Say that a device has dealt with everything up to the end of a block [ticks].
+
+        Raises:
+            RefusedError: The device was put out, or is by this: there is no such block.
+        """
+        return self._command("done", device=device or self._name, tick=tick)
+
+    def leave(self, device: str | None = None) -> Accepted:
+        """Make the rig wait for a device no longer.
+
+        Raises:
+            RefusedError: It has not joined.
+        """
+        return self._command("leave", device=device or self._name)
 
     def step_blocks(self, blocks: int, *, timeout_s: float = 600.0) -> Accepted:
         """Let a recording whose replay is paused go on by so many blocks; returns when they have been published.

@@ -225,6 +225,11 @@ class Daq(Closing):
             raise
 
     @property
+    def ended(self) -> str | None:
+        """Why nothing more comes, once that is so; what has come can still be read."""
+        return self._ended
+
+    @property
     def dropped(self) -> int:
         """Rows that were dropped because nobody read them in time."""
         return self._pile.dropped

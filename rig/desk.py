@@ -57,6 +57,27 @@ class Note(Outside):
     tags: list[Annotated[str, a_line(40), AfterValidator(_a_word)]] = Field(default=[], max_length=10)
 
 
+class Join(Outside):
+    """A device under test: no block is run before it is done with the one before."""
+
+    device: Name
+    patience_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 10.0
+    """How long it may take over a block, wall time [s]; a whole number will do."""
+
+
+class Done(Outside):
+    """A device has dealt with everything up to the end of a block."""
+
+    device: Name
+    tick: Annotated[int, Field(ge=0, le=LARGEST)]
+
+
+class Leave(Outside):
+    """A device is waited for no longer."""
+
+    device: Name
+
+
 class Seek(Outside):
     """Another position of a replay."""
 
@@ -73,6 +94,9 @@ REQUESTS: dict[str, type[Outside]] = {
     "stop": Nothing,
     "step": Step,
     "note": Note,
+    "join": Join,
+    "done": Done,
+    "leave": Leave,
     "pause": Nothing,
     "resume": Nothing,
     "seek": Seek,
@@ -118,7 +142,7 @@ class Desk:
         running: What a command that comes too late should have been sent while, such as "the rig runs".
         wake: Makes the thread that runs look for commands.
         tell: Takes each new kind of trouble, on any thread, for an event.
-        limit: How many commands a second are taken, without `step`, which waits for its turn, and `stop`.
+        limit: How many commands a second are taken, without `step` and `done`, which wait for their turn, and `stop`.
     """
 
     def __init__(
@@ -178,7 +202,7 @@ class Desk:
             raise InputError("command", f"one of {', '.join(self._commands)}", name)
         request = read_json(payload, field=name, most_bytes=REQUEST_BYTES)
         sender = check(_Signed, {"from": request.pop("from", "unknown")}, field="").sender
-        if name not in ("step", "stop"):
+        if name not in ("step", "done", "stop"):
             self._limit.check(sender)
         model = REQUESTS.get(name)
         return Pending(name, request, None if model is None else check(model, request, field=name), sender)

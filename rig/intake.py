@@ -54,6 +54,27 @@ class Event(Outside):
     rows: dict[str, Count] | None = None
 
 
+class BlockEnd(Outside):
+    """The end of a block in lockstep: all of it was published before."""
+
+    block: Count
+    """Its number in this run, from 1 on."""
+    tick: Count
+    """Where it ends [ticks]: what a device says that it is done with."""
+    time_s: float
+    messages: dict[str, Annotated[int, Field(ge=-1)]]
+    """Number of the last message, by key, of which any was published since the block before."""
+
+
+def block_end_in(payload: bytes) -> BlockEnd:
+    """The end of a block in a payload.
+
+    Raises:
+        InputError: It is none.
+    """
+    return check(BlockEnd, read_json(payload, field="block", most_bytes=_EVENT_BYTES), field="block")
+
+
 def event_in(payload: bytes) -> dict[str, Any]:
     """The event in a payload.
 

@@ -124,6 +124,9 @@ class Clock:
     def wake(self) -> None:
         """Make a waiting `grant` or `release` return; from any thread."""
 
+    def hold(self, seconds: float) -> None:
+        """Wait for a `wake`, at most so long; only lockstep ever waits for anybody."""
+
     def position(self) -> int:
         """The tick that it is now; without a wall clock the last that was released."""
         return self._last_tick
@@ -272,6 +275,13 @@ class Lockstep(Clock):
         with self._changed:
             self._woken = True
             self._changed.notify()
+
+    def hold(self, seconds: float) -> None:
+        """Wait for a `wake`, at most so long [s]: others are at work, and nothing may run meanwhile."""
+        with self._changed:
+            if not self._woken:
+                self._wait(self._changed, seconds)
+            self._woken = False
 
     def grant(self, ticks: int) -> int:
         """Wait for an allowance and take at most `ticks` of it; 0 after a `wake`.

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 from rig import wire
 from rig.bounded_queue import BoundedQueue
-from rig.desk import Note, Pending, Step
+from rig.desk import Done, Join, Leave, Note, Pending, Step
+from rig.devices import Devices
 from rig.errors import InputError, Words
 from rig.faults import DOORS, Message
 from rig.pacing import Clock, Lockstep, RealTime
@@ -32,12 +33,14 @@ if TYPE_CHECKING:
 
 SIMULATION_COMMANDS = ("hammer", "speed", "release", "fault", "clear")
 """Commands that the simulation itself checks and carries out."""
-COMMANDS = (*SIMULATION_COMMANDS, "stop", "step", "note")
+COMMANDS = (*SIMULATION_COMMANDS, "stop", "step", "note", "join", "done", "leave")
 REPLAY_COMMANDS = ("pause", "resume", "seek", "rate")
 """Commands that only a replayed recording takes (`replays.player`)."""
 
 _STEP_S = 3600
 """Longest single step [s of simulated time]."""
+_HELD_S = 0.1
+"""How long devices are waited for at a time, where none of them must be put out sooner [s]."""
 _HELD_UP_S = 1.0
 """Blocks that wait to be published for longer than this are told [s]."""
 _TAKEN_BYTES = 500_000
@@ -46,11 +49,15 @@ _TAKEN_BYTES = 500_000
 
 @dataclass(slots=True)
 class _Entry:
-    """What the publisher sends in one go: events, a block of everything, events; then replies that waited for it."""
+    """What the publisher sends in one go: events, a block of everything, events, that the block is over; then replies.
+
+    The replies have waited for it.
+    """
 
     before: list[dict[str, Any]]
     frame: Frame | None = None
     after: list[dict[str, Any]] = field(default_factory=list)
+    over: dict[str, Any] | None = None
     replies: list[tuple[Pending, dict[str, Any]]] = field(default_factory=list)
 
 
@@ -131,6 +138,16 @@ class Service(ServedRun):
         self._steps: list[tuple[int, Pending, dict[str, Any]]] = []
         self._step_target: int | None = None
 
+        self._devices = Devices()
+        self._blocks = 0
+        """Blocks that were run."""
+        self._over: tuple[int, float] = (-1, 0.0)
+        """End of the last block that devices were told is over [ticks], and when [s, monotonic]."""
+        self._sent: dict[str, int] = {}
+        """Messages published of each key, as zenoh numbers them."""
+        self._sent_before: dict[str, int] = {}
+        """The same, up to the end of the last block."""
+
         self._rows = wire.Continuity()
         self._samples_rate_hz = 0.0
         self._samples_published = 0
@@ -151,7 +168,7 @@ class Service(ServedRun):
         waiting_s = queue.used * self._block_ticks / self._rate
         if self._may_drop and waiting_s > _HELD_UP_S:
             warnings.append(f"{waiting_s:.1f} s of blocks wait: a client holds up the publisher")
-        return self._status(
+        status = self._status(
             tick=self._tick,
             end_s=None if end_tick is None else end_tick / self._rate,
             pace=self._clock.pace,
@@ -166,6 +183,7 @@ class Service(ServedRun):
             health=self._health,
             warnings=warnings,
         )
+        return {**status, "devices": list(self._devices.rows)}
 
     def _warn(self, text: str) -> None:
         self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
@@ -196,9 +214,22 @@ class Service(ServedRun):
         end = simulation.end_tick
         while True:
             events = self._take_commands()
-            if self._stop_requested or (end is not None and simulation.tick >= end):
+            if self._stop_requested:
                 queue.push(_Entry(events))
-                return "stopped" if self._stop_requested else "completed"
+                return "stopped"
+            if self._devices.behind(simulation.tick):
+                self._hold(events)
+                continue
+            if replies := self._finished_steps():
+                queue.push(_Entry(events, replies=replies))
+                events = []
+            if not self._may_drop:
+                # Whoever is to grant the next block may wait for just that.
+                self._defer(events)
+                events = []
+            if end is not None and simulation.tick >= end:
+                queue.push(_Entry(events))
+                return "completed"
             want = self._block_ticks
             if end is not None:
                 rest = end - simulation.tick
@@ -217,13 +248,30 @@ class Service(ServedRun):
                 answered += self._take_commands()
             self._tick = simulation.tick
             after = [{**event, "wall_s": time.time()} for event in frame.events]
-            self._overflow(queue.push(_Entry(events, frame, [*after, *answered], self._finished_steps())))
+            self._blocks += 1
+            over = {"block": self._blocks, "tick": self._tick, "time_s": self._tick / self._rate}
+            entry = _Entry(events, frame, [*after, *answered], over if self._devices else None, self._finished_steps())
+            self._overflow(queue.push(entry))
             self._refresh_health()
 
     def _defer(self, events: list[dict[str, Any]]) -> None:
         """Publish events without a block, where the next block is not yet to be run."""
         if events:
             self._queue.push(_Entry(events))
+
+    def _hold(self, events: list[dict[str, Any]]) -> None:
+        """Wait for devices that are not yet done with the last block; who takes too long over it is put out."""
+        tick, (over, since_s) = self._simulation.tick, self._over
+        # Their time begins when they can know that the block is over.
+        waited_s = time.monotonic() - since_s if over == tick else 0.0
+        late = self._devices.put_out_late(tick, waited_s)
+        self._defer([*events, *(self._device(name, "lost", reason=reason) for name, reason in late.items())])
+        if not late:
+            left_s = self._devices.patience_s(tick) - waited_s
+            self._clock.hold(min(left_s, _HELD_S) if over == tick else _HELD_S)
+
+    def _device(self, name: str, state: str, **more: Any) -> dict[str, Any]:
+        return self._event("device", self._simulation.tick, device=name, state=state, **more)
 
     def _overflow(self, dropped: int) -> None:
         """Say once for each time that the queue overflows; the count is in the status."""
@@ -232,8 +280,10 @@ class Service(ServedRun):
             self._queue.push(_Entry([self._event("warning", self._simulation.tick, text=text)]))
         self._overflowing = bool(dropped)
 
-    def _carry_out(self, pending: Pending) -> dict[str, Any]:
+    def _carry_out(self, pending: Pending) -> dict[str, Any] | None:
         asked, tick, done_tick = pending.asked, self._simulation.tick, None
+        if isinstance(asked, Join | Done | Leave):
+            return self._take_device(pending, asked)
         told: dict[str, Any] = {}
         if pending.command == "stop":
             self._stop_requested = True
@@ -254,6 +304,31 @@ class Service(ServedRun):
         detail = {"id": self._accepted, "command": pending.command, "request": pending.request, "from": pending.sender}
         return self._event("command", tick, **detail)
 
+    def _take_device(self, pending: Pending, asked: Join | Done | Leave) -> dict[str, Any] | None:
+        """A device under test joins, is done with a block, or leaves."""
+        self._need_lockstep(pending.command)
+        tick, name = self._simulation.tick, asked.device
+        if isinstance(asked, Done):
+            reason = self._devices.done(name, asked.tick, tick)
+            if reason is not None:
+                pending.refuse(InputError("done.tick", f"{tick}, the end of the last block", asked.tick))
+                return self._device(name, "lost", reason=reason)
+            # Not counted, and no event: there is one a block, and who of several is first is chance.
+            pending.answer({"accepted": True, "id": 0, "command": "done", "tick": tick, "time_s": tick / self._rate})
+            return None
+        if isinstance(asked, Join):
+            self._devices.join(name, asked.patience_s, tick)
+            pending.answer(self._accept(pending, tick))
+            return self._device(name, "joined", **{"from": pending.sender}, patience_s=asked.patience_s)
+        self._devices.leave(name)
+        pending.answer(self._accept(pending, tick))
+        return self._device(name, "left", **{"from": pending.sender})
+
+    def _need_lockstep(self, command: str) -> Lockstep:
+        if isinstance(self._clock, Lockstep):
+            return self._clock
+        raise InputError(command, "sent to a rig that runs with --pace lockstep", Words(f"--pace {self._clock.pace}"))
+
     def _keep(self, taken: dict[str, Any]) -> None:
         """Remember a command for latecomers, within bounds."""
         rows = (*self._taken, taken)
@@ -266,10 +341,7 @@ class Service(ServedRun):
 
     def _check_step(self, asked: Step) -> int:
         """Grant a step; returns the tick at which it is done."""
-        if not isinstance(self._clock, Lockstep):
-            raise InputError(
-                "step", "sent to a rig that runs with --pace lockstep", Words(f"--pace {self._clock.pace}")
-            )
+        clock = self._need_lockstep("step")
         ticks, unit = asked.ticks, self._simulation.block_ticks
         most = _STEP_S * self._rate
         if asked.blocks is not None:
@@ -281,14 +353,17 @@ class Service(ServedRun):
         if end is not None and start + ticks > end:
             raise InputError("ticks", f"at most {end - start}, the rest of the scene", ticks)
         self._step_target = start + ticks
-        self._clock.allow(ticks)
+        clock.allow(ticks)
         return self._step_target
 
     def _finished_steps(self) -> list[tuple[Pending, dict[str, Any]]]:
-        """Steps that the last block completed; they are answered once that block is published."""
-        if not self._steps:
+        """Steps that the last block completed; they are answered once it is published and all devices are done."""
+        if not self._steps or self._devices.behind(self._tick):
             return []
-        done = [(reply, document) for tick, reply, document in self._steps if tick <= self._tick]
+        lost = {"lost": dict(self._devices.lost)} if self._devices.lost else {}
+        done = [(reply, {**document, **lost}) for tick, reply, document in self._steps if tick <= self._tick]
+        if done:
+            self._devices.lost.clear()
         self._steps = [row for row in self._steps if row[0] > self._tick]
         if not self._steps:
             self._step_target = None
@@ -352,18 +427,32 @@ class Service(ServedRun):
             self._count_samples(entry.frame)
         for event in entry.after:
             self._guarded("publishing events", self._publish_event, event)
+        if entry.over is not None:
+            self._guarded("publishing the end of a block", self._publish_over, entry.over)
+            self._over = (entry.over["tick"], time.monotonic())
+            self._wake()
+        if entry.frame is not None:
+            self._sent_before = dict(self._sent)
         self._answer(entry)
 
     def _publish_block(self, message: Message) -> None:
         # Whoever does not get it learns from the end what is missing.
         self._rows.follow(message.key, message.row, len(message.block.values), late_rows=math.inf)
+        if "zenoh" in message.doors:
+            self._sent[message.key] = self._sent.get(message.key, 0) + 1
         servers = [self._server]
         if message.doors != DOORS:
             servers = [server for door, server in doors_of(self._server).items() if door in message.doors]
         for server in servers:
             server.publish(message.key, wire.encode_block(message.block))
 
+    def _publish_over(self, over: dict[str, Any]) -> None:
+        """That all of a block was published, and the last message of each key that anything came of since the last."""
+        last = {key: sent - 1 for key, sent in self._sent.items() if sent != self._sent_before.get(key)}
+        self._server.publish(wire.BLOCK, wire.encode_document({**over, "messages": last}))
+
     def _publish_event(self, event: dict[str, Any]) -> None:
+        self._sent[wire.EVENTS] = self._sent.get(wire.EVENTS, 0) + 1
         self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
 
     def _publish_told(self, told: dict[str, Any]) -> None:

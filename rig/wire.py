@@ -29,6 +29,8 @@ EDGES = f"{SENSORS}/keyphasor_edges"
 TRUTH = f"{ROOT}/truth"
 FAULTS = f"{TRUTH}/faults"
 """What is told of faults, row by row: documents, beside the blocks of truth."""
+BLOCK = f"{ROOT}/block"
+"""What is told behind all else of a block while devices have joined: that it is over."""
 COMMAND = f"{ROOT}/command"
 CLIENTS = f"{ROOT}/clients"
 

@@ -95,6 +95,14 @@ class Client(Protocol):
         """
         ...
 
+    def settle(self) -> None:
+        """Return when all subscriptions so far are in effect: what is published from then on arrives."""
+        ...
+
+    def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
+        """Wait until a message was handed on, by its number from 0 on; True at once of a key that is not subscribed."""
+        ...
+
     def watch(self, key: str, callback: Callable[[bool], None]) -> None:
         """Call back with True / False when the rig's token appears / vanishes."""
         ...

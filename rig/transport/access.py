@@ -32,7 +32,11 @@ class Door(NamedTuple):
 
 
 DOCUMENTS = Door("documents and status", Verb.ASK, (wire.CATALOGUE, wire.PARAMETERS, wire.SCENE, wire.STATUS))
-STREAMS = Door("samples, events, status", Verb.RECEIVE, (f"{wire.SENSORS}/**", wire.EVENTS, wire.STATUS))
+STREAMS = Door(
+    "samples, events, status, ends of blocks",
+    Verb.RECEIVE,
+    (f"{wire.SENSORS}/**", wire.EVENTS, wire.STATUS, wire.BLOCK),
+)
 PRESENCE = Door("the rig's token", Verb.WATCH, (wire.ALIVE,))
 REPORTS = Door("reports of clients", Verb.SEND, (f"{wire.CLIENTS}/*",))
 COMMANDS = Door("commands, notes", Verb.ASK, (f"{wire.COMMAND}/*",))

@@ -58,6 +58,13 @@ class Recovery:
         """Without history: last number of a publisher when it was first heard of; what came later belongs to us."""
         self._behind: dict[Publisher, int | None] = {}
         """Where we stood at a publisher's previous heartbeat, if that was behind it."""
+        self._handed: dict[str, int] = {}
+        self._news = threading.Condition()
+
+    def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
+        """Wait until the message of a key that has this number, or a later one, was handed on; False if it was not."""
+        with self._news:
+            return self._news.wait_for(lambda: self._handed.get(key, -1) >= number, timeout_s)
 
     def take(self, sample: Any) -> None:
         """Take the next message that arrived, after all that should have come before it."""
@@ -167,7 +174,11 @@ class Recovery:
 
     def _deliver(self, publisher: Publisher, number: int, sample: Any) -> None:
         self._last[publisher] = number
-        self._on_message(str(sample.key_expr), sample.payload.to_bytes())
+        key = str(sample.key_expr)
+        self._on_message(key, sample.payload.to_bytes())
+        with self._news:
+            self._handed[key] = number
+            self._news.notify_all()
 
 
 def publisher_of(entity: Any) -> Publisher:

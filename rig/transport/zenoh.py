@@ -262,6 +262,7 @@ class ZenohClient(Closing):
         """Rigs that this client is or was linked to: what they sent may still be on its way."""
         self.foreign = 0
         self._streams: Session | None = None
+        self._lossless: list[tuple[str, Recovery]] = []
         self._session = self._open(wait_s)
 
     @property
@@ -401,11 +402,23 @@ class ZenohClient(Closing):
                 stream.heartbeat(sample)
 
         stream = Recovery(ask, on_message, on_miss, history=history)
+        self._lossless.append((key, stream))
         subscriber = session.declare_subscriber(key, zenoh.handlers.FifoChannel(_FIFO))
         heartbeats = session.declare_subscriber(f"{key}/@adv/pub/**", zenoh.handlers.RingChannel(_HEARTBEATS))
         self._declared += [subscriber, heartbeats]
         streams.drain(subscriber, take, f"takes {key}", first=begin)
         streams.drain(heartbeats, heartbeat, f"heartbeats {key}")
+
+    def settle(self) -> None:
+        """Return when all subscriptions so far are in effect: a reply over their link is behind them."""
+        if self._streams is not None:
+            list(self._streams.session.get(wire.STATUS, timeout=PATIENCE_S))
+
+    def wait_for(self, key: str, number: int, *, timeout_s: float) -> bool:
+        """Wait until a message was handed on, by its number; True at once of a key that is not subscribed."""
+        deadline = time.monotonic() + timeout_s
+        streams = [stream for subscribed, stream in self._lossless if subscribed == key]
+        return all(each.wait_for(key, number, timeout_s=max(0.0, deadline - time.monotonic())) for each in streams)
 
     def request(self, key: str, payload: bytes = b"", *, timeout_s: float = 2.0) -> bytes:
         """Ask the rig and return its reply.

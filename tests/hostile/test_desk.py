@@ -114,5 +114,5 @@ def test_whatever_is_reported_the_status_goes_on(served: Any) -> None:
 
 
 def test_every_command_has_a_model() -> None:
-    assert set(COMMANDS) == set(DONE_TO_THE_RIG) | {"stop", "step", "note"}
+    assert set(COMMANDS) == set(DONE_TO_THE_RIG) | {"stop", "step", "note", "join", "done", "leave"}
     assert set(COMMANDS) - set(DONE_TO_THE_RIG) <= set(REQUESTS)

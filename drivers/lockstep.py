@@ -1,0 +1,67 @@
+"""The blocks of a rig in lockstep, one by one, as a device under test is given them."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import time
+from collections.abc import Iterator
+
+from drivers.daq import Daq
+from drivers.link import LinkTimeoutError
+from drivers.samples import Samples, StreamEndedError
+from drivers.turns import joined
+from rig import wire
+from rig.intake import BlockEnd, block_end_in
+from rig.transport import Client
+
+LOST_S = 2.0
+"""Rows of a block that is over are there, or lost [s]."""
+_ENDED_S = 0.2
+"""How often whoever waits for a block looks whether the run is over [s]."""
+
+
+class Blocks:
+    """Follows the blocks of a rig from now on, while a device has joined.
+
+    Args:
+        client: Transport to the rig.
+        daq: What reads the channels; its rows are taken here.
+    """
+
+    def __init__(self, client: Client, daq: Daq) -> None:
+        self._client, self._daq = client, daq
+        self._ends: queue.SimpleQueue[BlockEnd] = queue.SimpleQueue()
+        client.subscribe(wire.BLOCK, self._on_end)
+        client.settle()
+
+    def _on_end(self, _: str, payload: bytes) -> None:
+        with contextlib.suppress(ValueError):
+            self._ends.put(block_end_in(payload))
+
+    def next(self) -> BlockEnd | None:
+        """The end of the next block; None at that of the run."""
+        while True:
+            try:
+                return self._ends.get(timeout=_ENDED_S)
+            except queue.Empty:
+                if self._daq.ended is not None:
+                    return None
+
+    def rows(self, end: BlockEnd) -> Iterator[Samples]:
+        """All rows that have come up to the end of a block, parted where rows are missing."""
+        deadline = time.monotonic() + LOST_S
+        for key, number in end.messages.items():
+            self._client.wait_for(key, number, timeout_s=max(0.0, deadline - time.monotonic()))
+        rows: Samples | None = None
+        with contextlib.suppress(LinkTimeoutError, StreamEndedError):
+            while True:
+                fresh = self._daq.read(timeout_s=0.0)
+                if rows is not None and fresh.gap == 0 and fresh.index == rows.index + len(rows):
+                    rows = joined(rows, fresh)
+                    continue
+                if rows is not None:
+                    yield rows
+                rows = fresh
+        if rows is not None:
+            yield rows

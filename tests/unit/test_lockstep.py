@@ -1,0 +1,223 @@
+"""Devices under test in lockstep: what each command does, and that no device holds up a rig for ever."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from drivers.console import AcceptedStep, Console
+from rig import wire
+from rig.errors import RefusedError
+from rig.pacing import FreeRun, Lockstep
+from rig.transport.memory import MemoryClient
+from tests.unit.service_fake import FakeSimulation
+from tests.unit.test_service import BLOCK, Running
+from tests.waiting import until
+
+
+@contextmanager
+def running(duration_s: float | None = None) -> Iterator[Running]:
+    with Running(FakeSimulation(duration_s=duration_s), Lockstep()) as rig:
+        yield rig
+
+
+class Steps:
+    """Steps that a tester takes on a thread of its own."""
+
+    def __init__(self, rig: Running, *ticks: int) -> None:
+        self.replies: list[AcceptedStep] = []
+        self._thread = threading.Thread(target=lambda: self.replies.extend(rig.console.step(each) for each in ticks))
+        self._thread.start()
+
+    def join(self) -> list[AcceptedStep]:
+        self._thread.join(20.0)
+        assert not self._thread.is_alive()
+        return self.replies
+
+
+class Device(Console):
+    """One that deals with each block as it is told to."""
+
+    def __init__(self, rig: Running, name: str) -> None:
+        super().__init__(MemoryClient(rig.server), name=name)
+        self.ends: list[dict[str, Any]] = []
+        self._client.subscribe(wire.BLOCK, lambda _, payload: self.ends.append(wire.decode_document(payload)))
+
+    def wait(self, blocks: int) -> int:
+        until(lambda: len(self.ends) >= blocks)
+        return self.ends[-1]["tick"]
+
+
+def events_of(rig: Running) -> list[tuple[int, str, str]]:
+    return [(event["tick"], event["device"], event["state"]) for event in rig.listener.named("device")]
+
+
+def test_no_block_is_run_before_all_devices_are_done_and_what_they_sent_before_is_exact() -> None:
+    with running() as rig:
+        one, two = Device(rig, "one"), Device(rig, "two")
+        assert (one.join().tick, two.join().tick) == (0, 0)
+        steps = Steps(rig, 2 * BLOCK)
+        assert one.wait(1) == BLOCK
+        assert one.hammer().tick == BLOCK
+        one.done(BLOCK)
+        one.done(BLOCK)  # told twice is told once
+        assert rig.service.status()["tick"] == BLOCK
+        assert two.speed(3.0).tick == BLOCK
+        two.done(BLOCK)
+        assert one.wait(2) == 2 * BLOCK
+        assert steps.replies == []
+        two.done(2 * BLOCK)
+        one.done(2 * BLOCK)
+        (reply,) = steps.join()
+        assert (reply.tick, reply.lost) == (2 * BLOCK, {})
+        assert [row["tick"] for row in rig.console.status()["devices"]] == [2 * BLOCK, 2 * BLOCK]
+        one.leave()
+        two.leave()
+        assert rig.console.step(BLOCK).tick == 3 * BLOCK
+        ends = one.ends
+    assert [(end["block"], end["tick"], end["time_s"]) for end in ends] == [(1, BLOCK, 0.01), (2, 2 * BLOCK, 0.02)]
+    assert ends[1]["messages"].items() >= {wire.sensor_key("probes"): 1, wire.truth_key("state"): 1}.items()
+    order = rig.listener.order
+    assert order[order.index(wire.BLOCK) - 1] == wire.truth_key("energy"), "behind all of the block"
+    assert events_of(rig) == [
+        (0, "one", "joined"), (0, "two", "joined"), (2 * BLOCK, "one", "left"), (2 * BLOCK, "two", "left"),
+    ]  # fmt: skip
+    assert rig.summary["commands"] == 8, "what is done once a block is not counted"
+
+
+def test_a_device_that_hangs_is_put_out_and_the_rig_goes_on_with_the_others() -> None:
+    with running() as rig:
+        well, ill = Device(rig, "well"), Device(rig, "ill")
+        well.join()
+        ill.join(patience_s=0.05)
+        steps = Steps(rig, 2 * BLOCK)
+        well.done(well.wait(1))
+        well.done(well.wait(2))
+        (reply,) = steps.join()
+        reason = f"it was not done with the block that ends at tick {BLOCK} within 0.05 s"
+        assert reply.lost == {"ill": reason}
+        assert {row["name"]: (row["state"], row["reason"]) for row in rig.console.status()["devices"]} == {
+            "well": ("joined", None),
+            "ill": ("lost", reason),
+        }
+        with pytest.raises(RefusedError, match=rf"one that has joined \(it was put out: {reason}\)"):
+            ill.done(BLOCK)
+        assert ill.join().tick == 2 * BLOCK, "it may come again"
+        ill.leave()
+        steps = Steps(rig, BLOCK)
+        well.done(well.wait(3))
+        assert steps.join()[0].lost == {}, "told once"
+    (lost,) = [event for event in rig.listener.named("device") if event["state"] == "lost"]
+    assert (lost["tick"], lost["reason"]) == (BLOCK, reason)
+
+
+@pytest.mark.parametrize("said", [BLOCK - 1, 2 * BLOCK, 2**62])
+def test_a_device_that_is_done_with_what_is_not_there_is_put_out(said: int) -> None:
+    with running() as rig:
+        device = Device(rig, "a")
+        device.join()
+        steps = Steps(rig, BLOCK)
+        device.wait(1)
+        with pytest.raises(RefusedError, match=f"done.tick must be {BLOCK}, the end of the last block; instead"):
+            device.done(said)
+        (reply,) = steps.join()
+        told = f"it was done with tick {said}; the block that it was given ends at tick {BLOCK}"
+        assert reply.lost == {"a": told}
+        assert rig.console.step(BLOCK).lost == {}
+
+
+def test_a_device_that_leaves_in_the_middle_of_a_step_holds_up_nobody() -> None:
+    with running() as rig:
+        device = Device(rig, "a")
+        device.join()
+        steps = Steps(rig, 3 * BLOCK)
+        device.wait(1)
+        device.leave()
+        assert [(each.tick, each.lost) for each in steps.join()] == [(3 * BLOCK, {})]
+        assert len(device.ends) == 1, "nobody is told where nobody has joined"
+
+
+def test_the_step_to_the_end_of_a_scene_is_answered_when_all_are_done_with_it() -> None:
+    with running(duration_s=0.02) as rig:
+        device = Device(rig, "a")
+        device.join()
+        steps = Steps(rig, 2 * BLOCK)
+        device.done(device.wait(1))
+        device.wait(2)
+        assert steps.replies == []
+        assert device.note("the last").tick == 2 * BLOCK
+        device.done(2 * BLOCK)
+        assert steps.join()[0].tick == 2 * BLOCK
+        rig.join()
+        assert rig.summary["reason"] == "completed"
+
+
+def test_a_stop_does_not_wait_for_devices() -> None:
+    with running() as rig:
+        device = Device(rig, "a")
+        device.join(patience_s=3600.0)
+        caught: list[BaseException] = []
+
+        def step() -> None:
+            try:
+                rig.console.step(BLOCK)
+            except RefusedError as error:
+                caught.append(error)
+
+        thread = threading.Thread(target=step)
+        thread.start()
+        device.wait(1)
+        device.stop()
+        thread.join(20.0)
+        rig.join()
+        assert rig.summary["reason"] == "stopped"
+        assert "a run that ended: stopped" in str(caught[0])
+
+
+@pytest.mark.parametrize(
+    ("command", "fields", "says"),
+    [
+        ("join", {"device": "a"}, "join.device must be a name under which no other device has joined; instead"),
+        ("join", {"device": "b", "patience_s": 0}, "join.patience_s must be greater than 0"),
+        ("join", {"device": "b\n"}, "join.device must be a line of 1 to 100 printable characters"),
+        ("join", {}, "join.device must be given"),
+        ("done", {"device": "b", "tick": 0}, "done.device must be one that has joined; instead received 'b'"),
+        ("done", {"device": "a", "tick": -1}, "done.tick must be greater than or equal to 0"),
+        ("done", {"device": "a", "tick": 1.0}, "done.tick must be a valid integer"),
+        ("leave", {"device": "b"}, "leave.device must be one that has joined"),
+    ],
+)
+def test_what_is_malformed_or_of_nobody_is_refused_and_changes_nothing(
+    command: str, fields: dict[str, Any], says: str
+) -> None:
+    with running() as rig:
+        Device(rig, "a").join()
+        reply = rig.listener.client.request(wire.command_key(command), wire.encode_document(fields))
+        assert says in wire.decode_document(reply)["error"]
+        assert [row["state"] for row in rig.console.status()["devices"]] == ["joined"]
+
+
+def test_nobody_is_waited_for_but_in_lockstep() -> None:
+    with (
+        Running(FakeSimulation(duration_s=None), FreeRun()) as rig,
+        pytest.raises(RefusedError, match="join must be sent to a rig that runs with --pace lockstep; instead"),
+    ):
+        rig.console.join()
+
+
+def test_of_too_many_devices_those_that_are_lost_are_forgotten_first() -> None:
+    with running() as rig:
+        for n in range(64):
+            rig.console.join(f"device {n}")
+        with pytest.raises(RefusedError, match="one of at most 64 devices"):
+            rig.console.join("one more")
+        with pytest.raises(RefusedError, match="the end of the last block"):
+            rig.console.done(7, "device 5")
+        rig.console.join("one more")
+        names = [row["name"] for row in rig.console.status()["devices"]]
+        assert (len(names), names[-1]) == (64, "one more")
+        assert "device 5" not in names
