@@ -268,6 +268,13 @@ class Bench(Closing):
             place = scene.get("set", {}).get(key) if place is None else place
             if json.dumps(place) != json.dumps(wanted) and place != wanted:
                 raise NotThereError(f"{what} has {key} = {place}, not {wanted}")
+        end_s = self.status()["end_s"]
+        if (
+            self.target.replay is not None
+            and settings.duration_s is not None
+            and end_s < settings.duration_s - _SHORT_S
+        ):
+            raise NotThereError(f"{what} ends at {end_s:g} s, before the test at {settings.duration_s:g} s")
         if settings.can:
             raise NotThereError(f"whether {what} is on a CAN bus, and where, is not told")
         if self.target.replay is not None:
@@ -287,6 +294,8 @@ class Bench(Closing):
 
 
 DEFAULT_SCENE = "stable-run"
+_SHORT_S = 0.01
+"""A recording may lack this of a run [s]: the rows behind its last one."""
 _TICK_RATE_HZ = 1_000_000
 _PIECE = 1_000_000
 """Ticks that are stepped at a time."""

@@ -8,7 +8,7 @@ import shlex
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +20,7 @@ from replays.campaigns.expectation import KINDS, Expect, Time, Units
 from replays.campaigns.lines import line_of, lines_of
 from replays.campaigns.measurement import split_quantity
 from rig import units
-from rig.commands import FaultCommand, TimedCommand
+from rig.commands import COMMANDS, FaultCommand, TimedCommand, check_command
 from rig.errors import InputError, UnknownNameError, Words
 from rig.faults import channels_of, stream_of
 from rig.faults.blocks import OfBlocks
@@ -140,7 +140,7 @@ def load_campaign(path: Path) -> Campaign:
         says, _, place = str(error).partition(" (at ")
         line = re.search(r"line (\d+)", place)
         where = f"{path}:{line[1] if line else text.count(chr(10)) + 1}"
-        raise InputError(where, "TOML", Words(says)) from None
+        raise InputError(f"{where}: the text", "TOML", Words(says)) from None
     with _located(path, text):
         file = check(_File, document, field="")
         cases = tuple(_cases(path, file))
@@ -322,19 +322,29 @@ def _step(
         note = check(_Note, one, field=field)
         step = Step(note.at_s, None, note.note, tuple(note.tags))
     else:
-        if not isinstance(one.get("command"), str):
-            raise InputError(field, "with a command (hammer, speed, release, fault, clear) or a note", Words("neither"))
-        step = Step(0.0, timed := check(TimedCommand, one, field=field))
-        step = Step(timed.at_s, timed)
-        if isinstance(timed.request, FaultCommand):
-            _check_fault(timed.request, field, scene, can=file.can)
+        step = Step(check(_At, {"at_s": one.pop("at_s", None)}, field=field).at_s, None)
+        name = one.pop("command", None)
+        if not isinstance(name, str):
+            must = f"given ({', '.join(COMMANDS)}), or a note"
+            raise InputError(f"{field}.command", must, name)
+        try:
+            request = check_command(name, one)
+        except InputError as error:
+            inner = error.field.removeprefix(f"{name}.")
+            raise InputError(f"{field}.{inner}", error.must, error.received) from None
+        if isinstance(request, FaultCommand):
+            _check_fault(request, field, scene, can=file.can)
+        step = replace(step, command=TimedCommand(at_s=step.at_s, request=request))
     if step.at_s >= duration_s:
         raise InputError(f"{field}.at_s", f"before the case's end, {duration_s:g} s", step.at_s)
     return step
 
 
-class _Note(Written):
+class _At(Written):
     at_s: Time
+
+
+class _Note(_At):
     note: Line
     tags: list[str] = Field(default=[])
 
