@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 _SUFFIX = ".campaign.toml"
 _TRIAL = pytest.StashKey["Trial"]()
-_NUMBER = pytest.StashKey[int]()
 _FAILED = pytest.StashKey[bool]()
 _MARKER = (
     'bench(scene="stable-run", pace="lockstep", block_ms=10, set={}, channels=[], faults=[], commands=[], '
@@ -46,13 +45,6 @@ def pytest_configure(config: pytest.Config) -> None:
 
         results = Results(Path(folder), None if against is None else Path(against), config)
         config.pluginmanager.register(results, "rig-results")
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Number the tests, whose results come in any order where several run at once."""
-    for number, item in enumerate(items):
-        item.stash[_NUMBER] = number
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
@@ -132,7 +124,6 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     report = yield
     if report.failed:
         item.stash[_FAILED] = True
-    report.rig_number = item.stash.get(_NUMBER, 0)
     if report.when == "teardown" and (trial := item.stash.get(_TRIAL, None)) is not None:
         title = item.case.title if isinstance(item, CampaignItem) else item.path.name
         report.rig = {"title": title, **trial.document()}

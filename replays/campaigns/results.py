@@ -29,6 +29,7 @@ _JUNIT: dict[str, junit.Outcome] = {
     "failed": "failure", "error": "error", "interrupted": "error", "skipped": "skipped", "passed": "passed",
 }  # fmt: skip
 _LONGEST = 2000
+_UNFINISHED = "it was ended while it ran"
 
 
 class Results:
@@ -60,23 +61,26 @@ class Results:
         if report.failed:
             self._case(report.nodeid).update(outcome="error", reason=_line(str(report.longrepr)))
 
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """A test begins."""
+        self._case(nodeid)["reason"] = _UNFINISHED
+
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """What came of a phase of a test."""
         case = self._case(report.nodeid)
-        case["number"] = getattr(report, "rig_number", 0)
         case["duration_s"] += report.duration
         case |= getattr(report, "rig", {})
         if report.failed:
             case["outcome"] = "failed" if report.when == "call" and case["outcome"] != "error" else "error"
-            case["reason"] = case["reason"] or reason_of(report)
+            case["reason"] = reason_of(report) if case["reason"] == _UNFINISHED else case["reason"]
         elif report.skipped:
             case |= {"outcome": "skipped", "reason": reason_of(report)}
         elif report.when == "teardown" and case["outcome"] == "interrupted":
-            case["outcome"] = "passed"
+            case |= {"outcome": "passed", "reason": ""}
 
     def _case(self, name: str) -> dict[str, Any]:
         return self._cases.setdefault(name, {
-            "number": 0, "outcome": "interrupted", "reason": "", "duration_s": 0.0, "title": "", "measurements": [],
+            "outcome": "interrupted", "reason": "", "duration_s": 0.0, "title": "", "measurements": [],
             "evidence": [], "bench": None, "resolution": "", "troubles": [], "floor_ms": None,
         })  # fmt: skip
 
@@ -95,12 +99,13 @@ class Results:
 
     def document(self) -> dict[str, Any]:
         """All of it as a document for JSON."""
-        for name in self._planned:
-            self._case(name)
-        ordered = sorted(self._cases.items(), key=lambda each: (each[1]["number"], each[0]))
         cases, wall = [], {}
-        for name, case in ordered:
-            told = {key: value for key, value in case.items() if key not in ("number", "duration_s", "floor_ms")}
+        # Several at once come in any order; what was planned has one.
+        for name in [*self._planned, *(name for name in self._cases if name not in self._planned)]:
+            if name not in self._cases:
+                self._case(name)["reason"] = "it was not run"
+            case = self._cases[name]
+            told = {key: value for key, value in case.items() if key not in ("duration_s", "floor_ms")}
             cases.append({"id": name, **told, "repeat": self._repeat(name)})
             wall[name] = {"duration_s": round(case["duration_s"], 3), "floor_ms": case["floor_ms"]}
         counts = {outcome: sum(case["outcome"] == outcome for case in cases) for outcome in OUTCOMES}

@@ -122,18 +122,17 @@ class Trial:
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def _keep_evidence(self) -> None:
-        folder = self.folder
-        if self.evidence is not None:
-            folder = self.evidence / plain(self.id)
-            folder.mkdir(parents=True, exist_ok=True)
+        if self.bench is None:
+            return
+        folder = self.folder if self.evidence is None else self.evidence / plain(self.id)
+        folder.mkdir(parents=True, exist_ok=True)
         for log in sorted(self.folder.glob("*.log")):
             if folder != self.folder:
                 shutil.copyfile(log, folder / log.name)
             self.kept.append(folder / log.name)
-        if self.recording is None:
-            return
         try:
-            self.kept += self._cut(self.recording, folder)
+            if self.recording is not None:
+                self.kept += self._cut(self.recording, folder)
         except (InputError, DiskError, RuntimeError) as error:
             self.troubles.append(f"no evidence of the recording: {error}")
 

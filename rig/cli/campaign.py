@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
-from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from rig.cli.folder import check_folder
 from rig.cli.tables import echo, progress_bar
 from rig.errors import InputError, Words
-from rig.text import printable
 
 _TOML = ".campaign.toml"
 _INTERRUPTED = 130
-_WORDS = {"passed": "pass", "failed": "FAIL", "error": "ERROR", "skipped": "skip"}
 _EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
 
 
@@ -102,15 +98,18 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
 
     import pytest
 
+    from rig.cli.campaign_progress import WORDS, Progress
+
     module = "replays.campaigns.plugin"
     there = any(each.value == module for each in entry_points(group="pytest11"))
-    quiet = ["-qq", "--no-header", "--no-summary", "-p", "no:cacheprovider", "-o", "console_output_style=classic"]
-    plugins = [] if there else ["-p", module]
+    plugins = ["-p", "no:cacheprovider", *([] if there else ["-p", module])]
     with progress_bar(transient=True) as bar:
-        progress = _Progress(bar)
-        status = pytest.main([*plugins, *quiet, *options, *files], plugins=[progress])
+        progress = Progress(bar)
+        status = pytest.main([*plugins, *options, *files], plugins=[progress])
+    if status == pytest.ExitCode.INTERNAL_ERROR:
+        echo(progress.said.getvalue().strip(), err=True)
     counts = progress.counts
-    told = ", ".join(f"{counts[outcome]} {outcome}" for outcome in _WORDS if counts[outcome]) or "nothing was run"
+    told = ", ".join(f"{counts[outcome]} {outcome}" for outcome in WORDS if counts[outcome]) or "nothing was run"
     left = len(progress.planned) - sum(counts.values())
     echo(f"{told}{f', {left} not run' if left > 0 else ''}")
     if output is not None and (output / "index.html").is_file():
@@ -120,73 +119,3 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     if status in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
         return int(status)
     return 2
-
-
-@dataclass
-class _Progress:
-    """Tells how it goes, a line a case and a live one; a plugin of pytest."""
-
-    bar: Any
-    planned: dict[str, None] = field(default_factory=dict)
-    outcomes: dict[str, str] = field(default_factory=dict)
-    reasons: dict[str, str] = field(default_factory=dict)
-    done: set[str] = field(default_factory=set)
-    running: dict[str, None] = field(default_factory=dict)
-    collecting_failed: bool = False
-    task: Any = None
-
-    @property
-    def counts(self) -> Counter[str]:
-        """How many cases came to what."""
-        return Counter(self.outcomes[name] for name in self.done)
-
-    def pytest_collection_finish(self, session: Any) -> None:
-        """What is to be run."""
-        self.planned |= {item.nodeid: None for item in session.items}
-
-    def pytest_xdist_node_collection_finished(self, node: Any, ids: list[str]) -> None:
-        """The same where several processes run it."""
-        self.planned |= dict.fromkeys(ids)
-
-    def pytest_collectreport(self, report: Any) -> None:
-        """What could not be collected."""
-        if report.failed:
-            self.collecting_failed = True
-            echo(f"rig: {printable(str(report.longrepr).strip().splitlines()[-1])}", err=True)
-
-    def pytest_report_teststatus(self, report: Any) -> tuple[str, str, str]:
-        """Nothing is printed but what this prints."""
-        return report.outcome, "", ""
-
-    def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """A case begins."""
-        self.running[nodeid] = None
-        self._show()
-
-    def pytest_runtest_logreport(self, report: Any) -> None:
-        """A phase of a case is over."""
-        name = report.nodeid
-        before = self.outcomes.get(name, "passed")
-        if report.failed:
-            before = "failed" if report.when == "call" and before != "error" else "error"
-        elif report.skipped:
-            before = "skipped"
-        self.outcomes[name] = before
-        if before != "passed" and name not in self.reasons:
-            from replays.campaigns.results import reason_of
-
-            self.reasons[name] = reason_of(report)
-        if report.when == "teardown":
-            self.done.add(name)
-            self.running.pop(name, None)
-            reason = f": {self.reasons[name]}" if name in self.reasons else ""
-            echo(f"{_WORDS[before]:5} {name}{reason}")
-            self._show()
-
-    def _show(self) -> None:
-        if self.task is None:
-            self.task = self.bar.add_task("", total=len(self.planned) or None)
-        bad = sum(self.counts[each] for each in ("failed", "error"))
-        now = next(iter(self.running), "").rpartition("::")[2]
-        told = f"{len(self.done)} of {len(self.planned)} cases, {bad} bad; {now}"
-        self.bar.update(self.task, description=printable(told, 70), completed=len(self.done))
