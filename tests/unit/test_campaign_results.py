@@ -134,7 +134,8 @@ def results(**margins: float) -> dict[str, Any]:
         outcome = "passed" if told.good else "failed"
         cases.append({
             "id": f"x.campaign.toml::{name}", "outcome": outcome, "reason": "" if told.good else told.line,
-            "title": "T", "measurements": [told.document()], "evidence": [], "bench": None, "resolution": "10 ms blocks, in lockstep",
+            "title": "T", "measurements": [told.document()], "evidence": [], "bench": None,
+            "resolution": "10 ms blocks, in lockstep",
             "troubles": [], "repeat": f"rig campaign x.campaign.toml::{name}",
         })  # fmt: skip
     cases.append({**cases[0], "id": "x.py::skipped", "outcome": "skipped", "reason": "no bus", "measurements": []})
