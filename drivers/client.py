@@ -150,12 +150,9 @@ class Rig(Console):
             InputError: The URL is malformed, or there is no such channel or rate.
             ConnectionError: Nothing is there.
         """
-        from rig.transport.zenoh import client_at
+        from rig.transport.zenoh import client_of
 
-        kind, _, address = url.partition(":")
-        if kind != "zenoh" or not address:
-            raise InputError("url", "zenoh:HOST:PORT[?tls=DIR]", url)
-        client = client_at(address, wait_s=wait_s)
+        client = client_of(url, wait_s=wait_s)
         try:
             return cls(client, channels=channels, rate_hz=rate_hz, buffer_s=buffer_s, truth=truth, name=name)
         except BaseException:
@@ -459,7 +456,7 @@ def connect(
     """One client of a running rig: its commands, and what comes back.
 
     Args:
-        url: `zenoh:HOST:PORT`, with `?tls=DIR` for a rig that is exposed.
+        url: `zenoh:HOST:PORT`, with `?tls=DIR` for a rig that is exposed, or the name of a rig of this machine.
         channels: Channels that are read, from now on.
         wait_s: How long to wait for a rig to be there [s].
         settings: More of `Rig`: `rate_hz`, `buffer_s`, `truth`, `name`.

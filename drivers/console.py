@@ -92,12 +92,9 @@ class Console(Closing):
             InputError: The URL is malformed.
             ConnectionError: Nothing is there.
         """
-        from rig.transport.zenoh import client_at
+        from rig.transport.zenoh import client_of
 
-        kind, _, address = url.partition(":")
-        if kind != "zenoh" or not address:
-            raise InputError("url", "zenoh:HOST:PORT[?tls=DIR]", url)
-        return cls(client_at(address, wait_s=wait_s), name=name)
+        return cls(client_of(url, wait_s=wait_s), name=name)
 
     def close(self) -> None:
         """Close the client."""

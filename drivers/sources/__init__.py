@@ -8,7 +8,7 @@ from typing import Protocol
 from drivers.samples import Samples
 from rig.errors import InputError
 
-FORMS = "zenoh:HOST:PORT[?tls=DIR], can:INTERFACE:CHANNEL[?NAME=VALUE&...]"
+FORMS = "zenoh:HOST:PORT[?tls=DIR], the name of a rig, can:INTERFACE:CHANNEL[?NAME=VALUE&...]"
 
 
 class Source(Protocol):
@@ -61,20 +61,20 @@ def open_source(url: str, *, wait_s: float = 3.0) -> Source:
     """The source at a URL.
 
     Args:
-        url: `zenoh:127.0.0.1:7460`, `zenoh:lab.example:7463?tls=keys/viewer` for a rig that is exposed, or
-            `can:zenoh:can0` with settings of python-can's bus as `?NAME=VALUE&...`.
+        url: `zenoh:127.0.0.1:7460`, `zenoh:lab.example:7463?tls=keys/viewer` for a rig that is exposed, the name of a
+            rig of this machine, or `can:zenoh:can0` with settings of python-can's bus as `?NAME=VALUE&...`.
         wait_s: How long to wait for a rig to be there [s].
 
     Raises:
         InputError: The URL is malformed.
         ConnectionError: Nothing is there.
     """
-    kind, _, rest = url.partition(":")
-    if kind == "zenoh" and rest:
+    kind, colon, rest = url.partition(":")
+    if (kind == "zenoh" and rest) or (url and not colon):
         from drivers.sources.rig import RigSource
-        from rig.transport.zenoh import client_at
+        from rig.transport.zenoh import client_of
 
-        client = client_at(rest, wait_s=wait_s)
+        client = client_of(url, wait_s=wait_s)
         return RigSource(client, close=client.close)
     if kind == "can" and rest:
         from drivers.sources.can import CanSource

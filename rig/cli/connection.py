@@ -36,7 +36,9 @@ _LINK_S = 1.0
 class Connection:
     """Which rig a command is for."""
 
-    connect: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where the rig listens.")] = DEFAULT_ENDPOINT
+    connect: Annotated[str, typer.Option(metavar="HOST:PORT|NAME", help="Where the rig listens, or its name.")] = (
+        DEFAULT_ENDPOINT
+    )
     tls: Annotated[
         Path | None,
         typer.Option(metavar="DIR", envvar=_TLS, help="Folder with the keys of a role, for a rig that is exposed."),
@@ -98,9 +100,13 @@ class Connection:
 class Serving:
     """Where a rig is served."""
 
-    listen: Annotated[str, typer.Option("--listen", metavar="HOST:PORT", help="Where to listen, on 127.0.0.1.")] = (
-        DEFAULT_ENDPOINT
-    )
+    listen: Annotated[
+        str,
+        typer.Option("--listen", metavar="HOST:PORT", help="Where to listen, on 127.0.0.1; port 0 takes a free one."),
+    ] = DEFAULT_ENDPOINT
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Name by which commands and clients of this user find the rig.")
+    ] = None
     expose: Annotated[
         str | None,
         _exposure(
@@ -114,6 +120,21 @@ class Serving:
     plaintext: Annotated[
         bool, _exposure("Instead of --tls: let everybody in, and do everything, unencrypted.", "--plaintext")
     ] = False
+
+    def check(self) -> None:
+        """Find out early whether it can be served there, and under that name.
+
+        Raises:
+            InputError: It cannot.
+        """
+        from rig.transport.endpoint import check_free, parse_endpoint, parse_loopback
+        from rig.transport.names import check_name
+
+        check_free(parse_loopback(self.listen, field="--listen", least=0), field="--listen")
+        if (exposed := self.exposure()) is not None:
+            check_free(parse_endpoint(exposed.endpoint, field="--expose"), field="--expose")
+        if self.name is not None:
+            check_name(self.name)
 
     def exposure(self) -> Exposure | None:
         """Where a rig is to listen beyond the loopback, if anywhere.
@@ -164,17 +185,22 @@ def serve(
         wait: Whether it waits for clients that stall.
     """
     from rig.pacing import rare_collections
+    from rig.transport.names import registered
     from rig.transport.zenoh import ZenohServer
 
     exposed = serving.exposure()
-    with ZenohServer(serving.listen, exposed=exposed, wait=wait) as server, bus or nullcontext():
+    with (
+        ZenohServer(serving.listen, exposed=exposed, wait=wait) as server,
+        nullcontext() if serving.name is None else registered(serving.name, server.endpoint),
+        bus or nullcontext(),
+    ):
         with rare_collections():
             run = make(server if bus is None else bus.beside(server))
             run.prepare()
             if bus is not None:
                 bus.start(paced=paced)
                 echo(f"rig: {bus}", err=True)
-        tell_where(server, exposed)
+        tell_where(server, exposed, serving.name)
         with stopping_on_signals(run.stop), showing(run.status, words):
             summary = run.run()
     tell(summary)
@@ -183,7 +209,7 @@ def serve(
     end_with(summary["troubles"])
 
 
-def tell_where(server: ZenohServer, exposed: Exposure | None) -> None:
+def tell_where(server: ZenohServer, exposed: Exposure | None, name: str | None = None) -> None:
     """Where a rig listens, and who may do what there."""
     from rig.transport.access import ROLES, TRUTH
 
@@ -195,4 +221,5 @@ def tell_where(server: ZenohServer, exposed: Exposure | None) -> None:
         doors = ", ".join(door.what for door in (*ROLES["operator"], TRUTH))
         echo(f"rig: WARNING: {exposed.endpoint} is open to everybody who reaches it, unencrypted:", err=True)
         echo(f"rig: WARNING: {doors}", err=True)
-    echo(f"rig: listening on {server.endpoint}; Ctrl-C or `rig stop` ends it", err=True)
+    called = "" if name is None else f" as {name}"
+    echo(f"rig: listening on {server.endpoint}{called}; Ctrl-C or `rig stop` ends it", err=True)

@@ -43,7 +43,7 @@ def run(
     can: CanOptions,
 ) -> None:
     """Run a scene in real time and publish its sensors, until its end, `rig stop` or Ctrl-C."""
-    exposed = serving.exposure()
+    serving.exposure()  # what is wrong with that is said first
     overrides = scene_changes.overrides()
 
     from rig.pacing import rare_collections
@@ -52,16 +52,13 @@ def run(
         from rig.scenes import load_scene
         from rig.service import Service
         from rig.simulation import Simulation
-        from rig.transport.endpoint import check_free, parse_endpoint, parse_loopback
 
         loaded = load_scene(scene, overrides)
         bus = can.output(loaded.table)
         simulation = Simulation(loaded)
         block_ticks = _block_ticks(block_ms, simulation)
         # Last: a wrong line is told as such also where another rig runs.
-        check_free(parse_loopback(serving.listen, field="--listen"), field="--listen")
-        if exposed is not None:
-            check_free(parse_endpoint(exposed.endpoint, field="--expose"), field="--expose")
+        serving.check()
         echo(f"rig: scene {scene}, {pace}; preparing", err=True)
         # Before anybody can connect: whoever does is answered at once.
         with reporting(compiles=True):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig.cli.connection import Connection
-from rig.cli.tables import Form, Table, echo_json, facts, shown
+from rig.cli.tables import Form, Table, echo_json, facts, new_table, shown
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,10 +18,14 @@ if TYPE_CHECKING:
 def status(
     *,
     watch: Annotated[bool, typer.Option("--watch", help="Again twice a second, until Ctrl-C or the end.")] = False,
+    listed: Annotated[bool, typer.Option("--list", help="Show the rigs that run under a name (--name).")] = False,
     form: Form,
     connection: Connection,
 ) -> None:
     """Show how a running rig is doing: time, pace, lateness, losses, clients and doubts."""
+    if listed:
+        _list(form)
+        return
     with connection.console("status") as rig:
         if watch:
             try:
@@ -32,6 +36,19 @@ def status(
             echo_json(_ask(rig))
         else:
             form.console().print(status_table(_ask(rig)))
+
+
+def _list(form: Form) -> None:
+    from rig.transport.names import running
+
+    rigs = [entry.model_dump() for entry in running()]
+    if form.as_json:
+        echo_json(rigs)
+        return
+    table = new_table("rigs by name", "name", "listens on", "process")
+    for entry in rigs:
+        table.add_row(entry["name"], entry["endpoint"], str(entry["pid"]))
+    form.console().print(table)
 
 
 def _watch(rig: Console, form: Form) -> None:
@@ -127,6 +144,9 @@ def status_table(document: dict[str, Any]) -> Table:
             if name.startswith("can_") and name != "can_load"
         ]
         rows.append(("CAN", ", ".join(shares)))
+    for device in document.get("devices", ()):
+        reason = f": {device['reason']}" if device["reason"] else f", done with tick {device['tick']}"
+        rows.append((f"device {device['name']}", f"{device['state']}{reason}"))
     for name, client in document["clients"].items():
         text = f"lag {client['lag_s']:.3f} s, heard {client['last_heard_s']:.1f} s ago, lost {client['lost']}"
         rows.append((f"client {name}", text))

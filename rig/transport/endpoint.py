@@ -15,30 +15,51 @@ from rig.transport import DEFAULT_ENDPOINT
 LOOPBACK_HOSTS = ("127.0.0.1", "localhost")
 
 
-def parse_endpoint(text: str, *, field: str = "endpoint") -> tuple[str, int]:
+def parse_endpoint(text: str, *, field: str = "endpoint", least: int = 1) -> tuple[str, int]:
     """Split HOST:PORT.
+
+    Args:
+        text: What stands there.
+        field: What errors call it.
+        least: Lowest port; with 0, whoever listens takes one that is free.
 
     Raises:
         InputError: It is not of that form.
     """
     host, colon, port = text.rpartition(":")
     plain = "/" not in host and (":" not in host or host.startswith("["))
-    if not colon or not host or not plain or not port.isdecimal() or not 1 <= int(port) <= 65535:
-        raise InputError(field, f"HOST:PORT with a port of 1 to 65535, such as {DEFAULT_ENDPOINT}", text)
+    if not colon or not host or not plain or not port.isdecimal() or not least <= int(port) <= 65535:
+        raise InputError(field, f"HOST:PORT with a port of {least} to 65535, such as {DEFAULT_ENDPOINT}", text)
     return host, int(port)
 
 
-def parse_loopback(text: str, *, field: str) -> tuple[str, int]:
+def parse_loopback(text: str, *, field: str, least: int = 1) -> tuple[str, int]:
     """Split HOST:PORT of a door that asks nobody who they are, and so is not open to other machines.
+
+    Arguments as of `parse_endpoint`.
 
     Raises:
         InputError: It is not of that form, or not of this machine alone.
     """
-    host, port = parse_endpoint(text, field=field)
+    host, port = parse_endpoint(text, field=field, least=least)
     if host not in LOOPBACK_HOSTS:
         tunnel = f"ssh -L {port}:127.0.0.1:{port} USER@HOST"
         must = f"on 127.0.0.1, since there is no password; from another machine: {tunnel} (a rig also takes --expose)"
         raise InputError(field, must, text)
+    return host, port
+
+
+def place_to_listen(text: str, *, field: str) -> tuple[str, int]:
+    """Split HOST:PORT as `parse_loopback` does; for port 0 one that is free now.
+
+    Raises:
+        InputError: It is not of that form, or not of this machine alone.
+    """
+    host, port = parse_loopback(text, field=field, least=0)
+    with socket.socket() as probe:
+        if port == 0:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
     return host, port
 
 

@@ -20,7 +20,8 @@ from rig.closing import Closing
 from rig.errors import InputError
 from rig.transport import DEFAULT_ENDPOINT, NoReplyError
 from rig.transport.access import Verb, allows, rules
-from rig.transport.endpoint import backlog_of, hang_up, not_free, parse_endpoint, parse_loopback
+from rig.transport.endpoint import backlog_of, hang_up, not_free, parse_endpoint, place_to_listen
+from rig.transport.names import address_in, endpoint_of
 from rig.transport.recovery import CACHE, Publisher, Recovery
 from rig.transport.session import PATIENCE_S, Session, config_of, encoding_of, fifo, locator
 
@@ -71,7 +72,7 @@ class ZenohServer(Closing):
     Whoever connects may do what `rig.transport.access` says.
 
     Args:
-        endpoint: HOST:PORT to listen on, on the loopback.
+        endpoint: HOST:PORT to listen on, on the loopback; with port 0, one that is free.
         exposed: Where else.
         wait: Make `publish` wait for slow subscribers (at most 2 s, then their link is closed and they recover from
             the cache) instead of letting them recover later. For runs that are not paced by the wall clock: there the
@@ -86,7 +87,8 @@ class ZenohServer(Closing):
     ) -> None:
         import zenoh
 
-        host, port = parse_loopback(endpoint, field="listen")
+        host, port = place_to_listen(endpoint, field="listen")
+        self.endpoint = f"{host}:{port}"
         self._ports = {port}
         locators = [locator(host, port)]
         settings: dict[str, Any] = dict(_FROM_CLIENTS)
@@ -100,11 +102,10 @@ class ZenohServer(Closing):
         try:
             self._session = Session(config_of(listen__endpoints=locators, access_control=rules(), **settings))
         except zenoh.ZError as error:
-            field, where = "listen", endpoint
+            field, where = "listen", self.endpoint
             if exposed is not None and f"{host}:{port}" in str(error):
                 field, where = "expose", exposed.endpoint
             raise not_free(field, where, in_use="in use" in str(error)) from None
-        self.endpoint = endpoint
         self._congestion_control = zenoh.CongestionControl.BLOCK if wait else zenoh.CongestionControl.DROP
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []
@@ -240,23 +241,23 @@ class ZenohClient(Closing):
     must not hold up requests and the token, and least of all the recovery that this very subscription waits for.
 
     Args:
-        endpoint: HOST:PORT of the rig.
+        endpoint: HOST:PORT of the rig, or its name.
         wait_s: How long to wait for a rig to be there [s]; may be infinite.
         tls: Folder with the keys of a role (`rig keys init`), for a rig that is exposed; None connects without.
 
     Raises:
-        InputError: The endpoint is malformed, or the folder holds no keys.
+        InputError: The endpoint is malformed, no rig has that name, or the folder holds no keys.
         NoReplyError: No rig was there in time, or it does not let us in.
     """
 
     def __init__(self, endpoint: str = DEFAULT_ENDPOINT, *, wait_s: float = 1.0, tls: Path | str | None = None) -> None:
-        self._host, self._port = parse_endpoint(endpoint, field="connect")
+        self._host, self._port = endpoint_of(endpoint, field="connect", wait_s=wait_s)
         self._holder: Holder | None = None
         if tls is not None:
             from rig.transport.certificates import holder_in
 
             self._holder = holder_in(tls, server=False)
-        self.endpoint = endpoint
+        self.endpoint = f"{self._host}:{self._port}"
         self._declared: list[Any] = []
         self._rigs: set[str] = set()
         """Rigs that this client is or was linked to: what they sent may still be on its way."""
@@ -493,8 +494,7 @@ class ZenohClient(Closing):
         self._session.close()
 
 
-def client_at(address: str, *, wait_s: float) -> ZenohClient:
-    """A client of the rig at HOST:PORT, or HOST:PORT?tls=DIR with the keys of a role; errors as of `ZenohClient`."""
-    endpoint, query, folder = address.partition("?tls=")
-    parse_endpoint(endpoint, field="zenoh")
+def client_of(url: str, *, wait_s: float) -> ZenohClient:
+    """A client of the rig at a URL (`names.address_in`), with the keys of a role in ?tls=DIR; errors as of these."""
+    endpoint, query, folder = address_in(url).partition("?tls=")
     return ZenohClient(endpoint, wait_s=wait_s, tls=folder if query else None)

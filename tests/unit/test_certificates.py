@@ -160,5 +160,5 @@ def test_plain_exposure_says_what_is_open(capsys: pytest.CaptureFixture[str]) ->
 def test_the_url_of_a_daq_names_its_keys_too(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^--tls must be a folder with the keys of one role .*nowhere'"):
         open_source(f"zenoh:127.0.0.1:7463?tls={tmp_path}/nowhere")
-    with pytest.raises(InputError, match=r"^zenoh must be HOST:PORT"):
+    with pytest.raises(InputError, match=r"^connect must be HOST:PORT"):
         open_source("zenoh:127.0.0.1?tls=keys")

@@ -1,0 +1,99 @@
+"""Protect a rig: `python -m drivers.protection URL --alert-um 500 --danger-um 1500`; Ctrl-C ends it.
+
+One line for each alarm, with its simulated time. What it says is a note in the stream too, with the tags `protection`
+and its kind, such as `danger` and `trip`: a contact that others read. A note of others with the tag `reset` resets it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Literal, get_args, get_origin
+
+from drivers.protection.monitor import Action, Protection
+from drivers.protection.settings import Settings
+from rig.errors import InputError
+from rig.outside import check
+from rig.transport import DEFAULT_ENDPOINT
+
+
+def protect(machine: Any, protection: Protection, show: Callable[[str], object] = print) -> None:
+    """Watch a rig to the end of its run.
+
+    Args:
+        machine: A `drivers.client.Rig` that reads the settings' channels.
+        protection: The monitor.
+        show: Is told each line.
+    """
+    for samples in machine.blocks():
+        if any("reset" in event.get("tags", ()) and "protection" not in event["tags"] for event in _events(machine)):
+            protection.reset()
+        obey(machine, protection.settings, protection.feed(samples), show)
+
+
+def obey(machine: Any, settings: Settings, actions: Iterable[Action], show: Callable[[str], object] = print) -> None:
+    """Do what the monitor says: the trip, then the notes, and the end of the run last, as it ends the notes too."""
+    actions = list(actions)
+    trips = [action for action in actions if action.kind == "trip"]
+    if trips and settings.trip == "speed 0":
+        machine.speed(0.0)
+    for action in actions:
+        show(str(action))
+        machine.note(str(action), tags=["protection", action.kind])
+    if trips and settings.trip == "stop":
+        machine.stop()
+
+
+def _events(machine: Any) -> list[dict[str, Any]]:
+    """What has come since the last time."""
+    found = []
+    try:
+        while True:
+            found.append(machine.event(lambda _: True, timeout_s=0.0))
+    except TimeoutError:
+        return found
+
+
+def parse(arguments: Sequence[str]) -> tuple[str, Settings]:
+    """URL and settings of a command line: each setting is an option.
+
+    Raises:
+        InputError: A setting has a value that it must not have.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m drivers.protection", description=(__doc__ or "").partition("\n")[0]
+    )
+    parser.add_argument("url", nargs="?", default="zenoh:" + DEFAULT_ENDPOINT)
+    for name, field in Settings.model_fields.items():
+        kind: Any = field.annotation
+        option: dict[str, Any] = {"type": kind, "required": field.is_required()}
+        if kind is bool:
+            option = {"action": argparse.BooleanOptionalAction}
+        elif get_origin(kind) is Literal:
+            option = {"choices": get_args(kind)}
+        elif get_origin(kind) is tuple:
+            option = {"action": "append", "metavar": "CHANNEL"}
+        parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, **option)
+    given = vars(parser.parse_args(arguments))
+    return given.pop("url"), check(Settings, given, field="")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Protect the rig at a URL until its run ends, or Ctrl-C."""
+    from drivers.client import connect
+
+    try:
+        url, settings = parse(sys.argv[1:] if arguments is None else arguments)
+        with connect(url, channels=settings.channels, name="protection") as machine:
+            print(f"protecting {url}: {', '.join(settings.channels)}", flush=True)
+            protect(machine, Protection(settings), lambda line: print(line, flush=True))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (ConnectionError, EOFError, InputError) as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""From condition to trip in real time: `python -m tests.system.protection_latency [TRIPS [BLOCK_MS]]`.
+
+A rig and the protection monitor run in processes of their own; a third one moves a probe by 500 um by a fault, whose
+first row is in the reply, and the monitor's set point is 300 um without delay. The latency is the simulated time from
+that row to the tick at which the trip's speed command takes effect: it holds the block in which the row is, the way to
+the monitor, its work, and the way back. Nothing is asserted: it depends on the machine.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+import rig
+from drivers.client import NotSeenError, Rig
+from tests import processes
+
+OPTIONS = (
+    "--alert-um", "300", "--danger-um", "300", "--alert-delay-s", "0", "--danger-delay-s", "0", "--window-s", "0.05",
+    "--startup-s", "0.1",
+)  # fmt: skip
+PARTS = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "most": 100.0}
+
+
+def latencies_ms(trips: int, block_ms: str) -> tuple[np.ndarray, dict]:
+    """Of each trip [ms], shape (trips,); and the rig's status at the end."""
+    endpoint, found = processes.free_endpoint(), []
+    rng = np.random.default_rng(1)
+    with (
+        processes.rig(
+            "run", "stable-run", "--listen", endpoint, "--block-ms", block_ms, "--duration-s", str(60 + trips),
+            stdout=None, stderr=None,
+        ) as child,
+        rig.connect(url := f"zenoh:{endpoint}", wait_s=processes.COMPILE_S) as machine,
+        # Nobody reads what it says: a pipe would be full one day, and it would wait.
+        processes.python("-m", "drivers.protection", url, *OPTIONS, stdout=subprocess.DEVNULL, stderr=None),
+    ):  # fmt: skip
+        time.sleep(5.0)  # it starts
+        while len(found) < trips:
+            fault = machine.fault("disk_x", "offset", value=0.5, for_s=0.02)
+            tick = fault.first_row["probes"] * 50
+            trip = machine.event(lambda event, tick=tick: event["event"] == "speed" and event["tick"] > tick)
+            found.append(1e-3 * (trip["tick"] - tick))
+            time.sleep(0.1 + rng.uniform(0.0, 0.01))
+            assert any(_again(machine) for _ in range(20)), "it is reset once the step has left the window"
+        status = machine.status()
+        child.terminate()
+    return np.array(found), status
+
+
+def _again(machine: Rig) -> bool:
+    machine.note("again", tags=["reset"])
+    try:
+        machine.event(
+            lambda event: event["event"] == "note" and event["text"].endswith("reset  trip  0"), timeout_s=0.5
+        )
+    except NotSeenError:
+        return False
+    return True
+
+
+def main(trips: str = "1000", block_ms: str = "1") -> None:
+    """Print the latency's distribution."""
+    found, status = latencies_ms(int(trips), block_ms)
+    told = [f"p{part:g} {np.percentile(found, part):.2f} ms" for part in (50, 99, 99.9, 100)]
+    print(
+        f"{trips} trips, blocks of {block_ms} ms: {', '.join(told)}; lateness of the rig [ms]: {status['lateness_ms']}"
+    )
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

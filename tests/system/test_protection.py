@@ -1,0 +1,60 @@
+"""The protection monitor in its own process trips a rig: at an exact tick in lockstep, with a contact in the stream."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import rig
+from drivers.protection import Protection
+from drivers.protection.__main__ import parse
+from drivers.samples import Samples
+from tests import processes
+
+OPTIONS = ("--alert-um", "500", "--danger-um", "1500", "--startup-s", "0.02", "--danger-delay-s", "0.0123")  # 246 rows
+BLOCK_TICKS = 10_000
+
+
+def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
+    """Lines of the monitor, events of the stream by it, and the rows before and after a blow."""
+    endpoint = processes.free_endpoint()
+    changes = ("--set", "commands=[]", "--duration-s", "4", "--block-ms", str(BLOCK_TICKS // 1000))
+    with processes.rig("run", "hammer", "--pace", "lockstep", "--listen", endpoint, *changes) as child:
+        url = f"zenoh:{endpoint}"
+        with rig.connect(url, channels=["disk_x", "disk_y", "speed"], wait_s=processes.COMPILE_S) as machine:
+            with processes.python("-m", "drivers.protection", url, *OPTIONS) as device:
+                assert machine.event("device", timeout_s=60.0)["state"] == "joined"
+                rows = [machine.advance(0.1)]
+                machine.hammer(force_n=120.0, direction=30.0)
+                rows.append(machine.advance(0.4))
+                machine.stop()
+                said, errors = device.communicate(timeout=30.0)
+                assert (device.returncode, errors) == (0, "")
+            lines = said.splitlines()[1:]
+            # A note for each line, and the trip's command.
+            events = [machine.event(lambda event: event["event"] in ("speed", "note")) for _ in range(len(lines) + 1)]
+        child.communicate(timeout=30.0)
+    return lines, [{**event, "wall_s": 0.0} for event in events], rows
+
+
+def test_a_blow_trips_the_rig_at_the_end_of_the_block_with_its_row_twice_alike() -> None:
+    lines, events, rows = trip()
+    again = trip()
+    assert (again[0], again[1]) == (lines, events)
+    assert all(np.array_equal(one.values, other.values) for one, other in zip(rows, again[2], strict=True))
+    # The same rows at once, fed to the same rules.
+    whole = Samples(0, 0, 20_000.0, 1e6, rows[0].names, rows[0].units, np.vstack([each.values for each in rows]))
+    actions = Protection(parse(OPTIONS)[1]).feed(whole)
+    assert lines == [str(action) for action in actions]
+    danger, tripped = actions[0], next(action for action in actions if action.kind == "trip")
+    assert (danger.kind, danger.row) == ("danger", tripped.row)
+    end = tripped.tick // BLOCK_TICKS * BLOCK_TICKS + BLOCK_TICKS
+    speed = next(event for event in events if event["event"] == "speed")
+    assert (speed["tick"], speed["speed_hz"]) == (end, 0.0)
+    contact = next(event for event in events if "trip" in event.get("tags", ()))
+    assert (contact["tick"], contact["tags"], contact["from"]) == (end, ["protection", "trip"], "protection")
+    # Its level passed 1500 um the delay before, a row or two apart, as the gap is taken away slowly.
+    level = 1e3 * (np.maximum.accumulate(whole[danger.name]) - np.minimum.accumulate(whole[danger.name]))
+    assert abs(int(np.argmax(level > 1500.0)) + 246 - danger.row) <= 2
+    assert (whole["speed"][tripped.row] > 5.0, whole["speed"][-1] < 5.6) == (True, True)

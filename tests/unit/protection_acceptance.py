@@ -1,0 +1,223 @@
+"""What a protection monitor is accepted by, as tables: alarms, channel values, corners, OK limits, faults and votes.
+
+Signals are test scenes, put to the converters' inputs, with the rig's own faults on the probe disk_x; expected outcomes
+are told beside each table. `python -m tests.unit.protection_acceptance [HOURS]` feeds noise for an hour: no alarm.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drivers.protection import Action, Protection, Settings
+from drivers.samples import Samples
+from rig.kernels.signals import COLUMN
+from rig.scenes import load_scene
+from rig.simulation import Simulation
+from rig.wire import Block
+
+ALERT_UM, DANGER_UM = 500.0, 1000.0
+BEGIN_S, END_S = 0.25, 0.75
+"""When a fault acts [s]: behind the start-up, and for longer than all delays."""
+
+
+def monitor(**changes: Any) -> Settings:
+    """Settings of the set: alarms after 0.1 s, over 0.25 s."""
+    base = {
+        "alert_um": ALERT_UM,
+        "danger_um": DANGER_UM,
+        "alert_delay_s": 0.05,
+        "danger_delay_s": 0.05,
+        "startup_s": 0.15,
+        "window_s": 0.1,
+    }
+    return Settings(**{**base, **changes})
+
+
+def stream(group: str, changes: dict[str, Any], scene: str = "test-sine") -> Iterator[Samples]:
+    """Blocks of a group of channels, as they are sent."""
+    simulation = Simulation(load_scene(scene, {"sensors.groups": [group], "drive.speed_hz": 6.2, **changes}))
+    while simulation.tick < simulation.end_tick:
+        for message in simulation.advance(min(100_000, simulation.end_tick - simulation.tick)).messages:
+            if message.key.endswith(f"/{group}") and len(message.block.values):
+                yield samples_of(simulation, group, message.block)
+
+
+def samples_of(simulation: Simulation, group: str, block: Block) -> Samples:
+    """A block in engineering units."""
+    table = simulation.table.groups[group]
+    units = tuple(channel.unit for channel in table.channels)
+    values = table.engineering(block.values)
+    return Samples(block.index, block.tick, block.rate_hz, block.tick_rate_hz, table.names, units, values)
+
+
+def outcome(settings: Settings, rows: list[Samples]) -> list[Action]:
+    """What the monitor says of rows."""
+    device = Protection(settings)
+    return [action for samples in rows for action in device.feed(samples)]
+
+
+def sine(peak_to_peak_um: float, frequency_hz: float = 10.0, duration_s: float = 1.5, **changes: Any) -> list[Samples]:
+    """Rows of a sine on both probes, the y one a quarter of a turn behind."""
+    signal = {
+        "generator.amplitude_v": 3.94 * 0.5e-3 * peak_to_peak_um, "generator.frequency_hz": frequency_hz,
+        "duration_s": duration_s, "generator.channels": {"disk_y": {"phase_deg": -90.0}},
+    }  # fmt: skip
+    return list(stream("probes", {**signal, **changes}))
+
+
+ALARMS = {
+    # peak-to-peak [um]: alarms of both probes
+    0.99 * ALERT_UM: set(),
+    1.01 * ALERT_UM: {"alert"},
+    0.99 * DANGER_UM: {"alert"},
+    1.01 * DANGER_UM: {"alert", "danger", "trip"},
+}
+
+VALUES = [
+    # frequency [Hz], measure, level of a sine of 800 um peak-to-peak on x and, a quarter behind, on y [um]
+    (10.0, "peak-to-peak", 800.0),
+    (83.0, "peak-to-peak", 800.0),
+    (997.0, "peak-to-peak", 800.0),
+    (83.0, "smax", 400.0),
+]
+
+CORNER = [
+    # frequency [times the corner], gain 1 / sqrt(1 + (corner / f)^2)
+    (1.0, 0.7071),
+    (2.0, 0.8944),
+    (10.0, 0.9950),
+]
+
+LIMITS = [
+    # volts at which disk_x is held, whether it is OK: the limits are -17.5 and -2.5 V
+    (-17.6, False),
+    (-17.4, True),
+    (-2.6, True),
+    (-2.4, False),
+]
+
+
+def fault(kind: str, **numbers: Any) -> dict[str, Any]:
+    """A fault of disk_x as a command of a scene."""
+    given = {"channel": "disk_x", **numbers}
+    return {"at_s": BEGIN_S, "command": "fault", "kind": kind, "for_s": END_S - BEGIN_S, **given}
+
+
+VOTES = (("1oo2", "leaves"), ("2oo2", "leaves"), ("2oo2", "for"), ("1oo2", "for"))
+_BENIGN, _ONE, _BROKEN, _BLIND = ("-",) * 4, ("T", "a", "a", "T"), ("N", "N", "N", "TN"), ("N", "N", "TN", "TN")
+FAULTS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    # kind: its numbers, what comes of it by the votes above; the signal is 200 um peak-to-peak at 10 Hz.
+    # A level of its own above 1000 um, within the OK limits: one probe in danger.
+    "gain": ({"factor": 8.0}, _ONE),
+    "offset": ({"value": 1.2}, _ONE),
+    "hum": ({"amplitude_v": 2.5}, _ONE),
+    "stuck-bit": ({"bit": 21}, _ONE),  # 2^21 of 2^24 counts over 40 V: 5 V, 1.27 mm
+    # An output at 0 V, or beyond what the converter still gives: NOT OK in time, no alarm of this probe.
+    "open": ({}, _BROKEN),
+    "short": ({}, _BROKEN),
+    "intermittent": ({"part": 0.2}, _BROKEN),
+    "clip": ({"part": 0.05}, _BROKEN),  # at -1 V
+    # On its way to the OK limit, 1.9 mm at 20 mm/s, it is above 500 um for longer than the delay; above 1000, not.
+    "drift": ({"rate": 20.0}, ("aN", "aN", "aN", "TN")),
+    # What leaves the level where it is, or makes it less.
+    **{kind: ({}, _BENIGN) for kind in ("polarity", "stuck", "freeze")},
+    "nonlinear": ({"end": 0.02}, _BENIGN),
+    "resonance": ({"frequency_hz": 200.0}, _BENIGN),
+    "crosstalk": ({"source": "disk_y", "db": -6.0}, _BENIGN),
+    "saturation": ({"part": 0.01}, _BENIGN),
+    "swap": ({"other": "disk_y"}, _BENIGN),
+    "late": ({"late_us": 1000.0}, _BENIGN),
+    "clock": ({"ppm": 100.0}, _BENIGN),
+    "jitter": ({"rms_us": 5.0}, _BENIGN),
+    "wander": ({"amplitude_us": 100.0}, _BENIGN),
+    "noise": ({"factor": 100.0}, _BENIGN),  # 25 um rms
+    "spikes": ({"rate_hz": 10.0, "size_v": 1.0}, _BENIGN),  # 250 um
+    "bits": ({"lost": 8}, _BENIGN),
+    # Of blocks: half a second without any is longer than the window, and so are numbers that begin anew.
+    "dropout": ({"channel": "probes"}, _BLIND),
+    "restart": ({"channel": "probes"}, _BLIND),
+    **{kind: ({"channel": "probes"}, _BENIGN) for kind in ("lose-blocks", "duplicate-blocks", "reorder-blocks")},
+    "late-blocks": ({"channel": "probes", "delay_s": 0.1}, _BENIGN),
+    "stale-stamps": ({"channel": "probes"}, _BENIGN),
+}
+
+PULSES: dict[str, tuple[dict[str, Any], set[str]]] = {
+    # kind: its numbers, what comes of it at 6.2 Hz, where 7 Hz for three turns are too fast, and 0.3 s without a pulse.
+    "miss-pulses": ({"part": 1.0}, {"speed-lost"}),
+    "extra-pulses": ({"part": 1.0}, {"overspeed", "trip"}),
+    "edge-jitter": ({"rms_us": 100.0}, set()),
+}
+
+
+def keyphasor(kind: str, **numbers: Any) -> list[Samples]:
+    """Rows of a shaft at rest between its probes that turns at 6.2 Hz, with a fault of its keyphasor."""
+    command = {"at_s": 0.4, "command": "fault", "channel": "keyphasor", "kind": kind, **numbers}
+    rows = stream("drive", {"duration_s": 1.2, "commands": [command]}, "stable-run")
+    return [
+        replace(each, names=("disk_x", "disk_y", "keyphasor"), units=("mm", "mm", "1"),
+                values=np.column_stack([np.zeros((len(each), 2)), each["keyphasor"]]))
+        for each in rows
+    ]  # fmt: skip
+
+
+def judged(rows: list[Samples], vote: str, not_ok: str) -> str:
+    """T: a trip; N: NOT OK; a: an alarm without a trip; -: nothing."""
+    kinds = {each.kind for each in outcome(monitor(vote=vote, not_ok=not_ok), rows)}
+    found = "T" if "trip" in kinds else "a" if kinds & {"alert", "danger"} else ""
+    return (found + ("N" if "not-ok" in kinds else "")) or "-"
+
+
+WHIRL = [
+    # Ramp of the drive [Hz/s], delay of danger [s], whether whirl is established after a blow of 100 N at 6.2 Hz.
+    (2.0, 0.0, True),  # the rig's own drive: as fast as a monitor may be, the shaft goes on turning
+    (300.0, 0.02, False),
+    (300.0, 0.1, True),
+]
+FULL_S = 0.05
+"""Whirl is established where the contact lasts so long, but for a twentieth of it, and goes round backward [s]."""
+
+
+def whirls(ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks: int = 10_000) -> tuple[float, bool]:
+    """A blow at 0.1 s with the monitor in the loop: from the blow to the trip [s], and whether whirl is established."""
+    blow = {"at_s": 0.1, "command": "hammer", "force_n": force_n}
+    changes = {"duration_s": 0.4, "drive.ramp_rate": ramp_hz_s, "commands": [blow], "sensors.groups": ["probes"]}
+    simulation = Simulation(load_scene("hammer", changes))
+    device = Protection(
+        Settings(alert_um=1500, danger_um=1500, alert_delay_s=delay_s, danger_delay_s=delay_s, startup_s=0.05)
+    )
+    rows, trip_s = [], math.nan
+    while simulation.tick < simulation.end_tick:
+        frame = simulation.advance(block_ticks)
+        rows.append(frame.rows[:, [COLUMN[name] for name in ("normal_force", "ring_x", "ring_y")]])
+        if any(
+            action.kind == "trip" for action in device.feed(samples_of(simulation, "probes", frame.samples["probes"]))
+        ):
+            simulation.submit("speed", {"speed_hz": 0.0})
+            trip_s = 1e-6 * simulation.tick - 0.1
+    force, x, y = np.vstack(rows).T
+    span = round(FULL_S * 1e6 / simulation.row_ticks)
+    contact = np.convolve(force > 0.0, np.ones(span) / span, "valid")
+    angle = np.unwrap(np.arctan2(y, x))
+    turns = (angle[span - 1 :] - angle[: 1 - span]) / (2.0 * math.pi)
+    return trip_s, bool(((contact > 0.95) & (turns < -0.25)).any())
+
+
+def noise(hours: float) -> tuple[list[Action], float]:
+    """What the monitor says of so many hours of the probes' own noise, and how long it took [s]."""
+    begin = time.monotonic()
+    device, actions = Protection(monitor()), []
+    for samples in stream("probes", {"duration_s": 3600.0 * hours}, "test-quiet"):
+        actions += device.feed(samples)
+    return actions, time.monotonic() - begin
+
+
+if __name__ == "__main__":
+    found, took_s = noise(float((sys.argv[1:] or ["1"])[0]))
+    print(*found, f"{len(found)} actions, {took_s:.0f} s", sep="\n")

@@ -1,0 +1,188 @@
+"""Broken monitors, each with the scenario that is meant to tell it; `python -m tests.unit.protection_mutants` has all.
+
+A mutant is the source of the monitor, or of what obeys it, with one text in it replaced.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+from drivers.protection import __main__ as runner
+from drivers.protection import monitor
+from tests.unit.protection_scenarios import SCENARIOS, sound
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """What is wrong, the scenario that tells it, and the text that stands in place of another one."""
+
+    name: str
+    told_by: str
+    text: str
+    instead: str
+    source: ModuleType = monitor
+
+    def device(self) -> Any:
+        """It, as a scenario takes it."""
+        assert self.source.__file__ is not None
+        text = Path(self.source.__file__).read_text(encoding="utf-8")
+        assert text.count(self.text) == 1, f"{self.name}: its text stands there {text.count(self.text)} times"
+        module = ModuleType(self.source.__name__)
+        exec(compile(text.replace(self.text, self.instead), self.name, "exec"), module.__dict__)
+        made = {name: getattr(module, name) for name in ("Protection", "obey") if hasattr(module, name)}
+        return SimpleNamespace(**{**vars(sound()), **made})
+
+    def fails(self, scenario: str) -> bool:
+        """Whether a scenario tells it: it does something else, and does not just break down."""
+        try:
+            SCENARIOS[scenario](self.device())
+        except AssertionError:
+            return True
+        return False
+
+
+_LATCHED = "np.logical_or.accumulate(on) | (alarm in self.active) if alarm[0] in self._latching else on, value"
+MUTANTS = [
+    Mutant("delay ignored", "an_alarm_comes_after_its_delay", "run > self._rows(delay_s)", "run > 0"),
+    Mutant(
+        "a row early", "an_alarm_comes_after_its_delay",
+        "run > self._rows(delay_s)", "run >= max(1, self._rows(delay_s))",
+    ),
+    Mutant(
+        "delay rounded down", "an_alarm_comes_after_its_delay",
+        "math.ceil(duration_s * self._rate_hz - 1e-6)",
+        "math.floor(duration_s * self._rate_hz + 1e-6)",
+    ),
+    Mutant(
+        "delay goes on after a break", "a_delay_begins_anew", "run = self._run((kind, name), above)",
+        "run = np.cumsum(above) + 0 * self._run((kind, name), above)",
+    ),
+    Mutant("latch lost", "a_danger_stays_and_an_alert_goes", _LATCHED, "on, value"),
+    Mutant("all latched", "a_danger_stays_and_an_alert_goes", _LATCHED.partition(" if ")[2], "True else on, value"),
+    Mutant("reset during the alarm", "no_reset_while_the_cause_lasts", "and not self._causes[alarm]]", "]"),
+    Mutant("reset does nothing", "a_reset_ends_what_is_over", "self._to_reset = True", "self._to_reset = False"),
+    Mutant(
+        "OK limits ignored", "a_probe_beyond_its_ok_limits_is_not_ok",
+        "(volts >= settings.ok_low_v) & (volts <= settings.ok_high_v)", "volts > -1e9",
+    ),
+    Mutant(
+        "upper OK limit alone", "a_probe_beyond_its_ok_limits_is_not_ok",
+        "(volts >= settings.ok_low_v) & (volts <= settings.ok_high_v)", "volts <= settings.ok_high_v",
+    ),
+    Mutant(
+        "OK again at once", "ok_comes_back_after_its_time_without_a_break", "each) > recovery for", "each) > 0 for",
+    ),
+    Mutant(
+        "alarm of a probe that is NOT OK", "a_probe_that_is_not_ok_raises_no_alarm",
+        "okay & armed &", "armed &",
+    ),
+    Mutant(
+        "NOT OK stays in the vote", "a_probe_that_is_not_ok_votes_as_is_told", "np.array(dangers), off | bad",
+        "np.array(dangers), off & bad",
+    ),
+    Mutant("2oo2 as 1oo2", "two_out_of_two_need_both", 'if self.settings.vote == "1oo2":', "if True:"),
+    Mutant("1oo2 as 2oo2", "one_out_of_two_needs_one", 'if self.settings.vote == "1oo2":', "if False:"),
+    Mutant(
+        "peak instead of peak-to-peak", "a_sine_is_measured_from_peak_to_peak",
+        "_sliding(np.fmax, rows, self._window) - _sliding(np.fmin, rows, self._window)",
+        "_sliding(np.fmax, abs(rows), self._window)",
+    ),
+    Mutant(
+        "gap not taken away", "an_orbit_is_measured_from_its_mean", "probes - np.array(means)[:, 1:]",
+        "probes - 0.0 * np.array(means)[:, 1:]",
+    ),
+    Mutant(
+        "corner in rad/s", "at_its_corner_the_high_pass_leaves_1_in_root_2", "-2.0 * math.pi * settings.corner_hz",
+        "-settings.corner_hz",
+    ),
+    Mutant(
+        "wrong axis", "an_alarm_is_of_its_own_probe",
+        "zip(probes, levels, good", "zip(probes, levels[::-1], good",
+    ),
+    Mutant("a thousandth of a unit", "set_points_are_in_micrometres", '"um", field=', '"mm", field='),
+    Mutant(
+        "no hysteresis", "an_alarm_ends_below_its_set_point_by_the_hysteresis",
+        "high * (1.0 - settings.hysteresis)", "high",
+    ),
+    Mutant(
+        "overspeed the wrong way", "turns_that_are_too_fast_trip", "self._speed_hz > settings.overspeed_hz",
+        "0.0 < self._speed_hz < settings.overspeed_hz",
+    ),
+    Mutant(
+        "overspeed of one turn", "turns_that_are_too_fast_trip", "fast >= settings.overspeed_turns", "fast >= 1",
+    ),
+    Mutant(
+        "edges counted twice", "a_pulse_is_counted_once",
+        " if high[row]]", "]",
+    ),
+    Mutant("pulse without hysteresis", "a_pulse_is_counted_once", "_PULSE = (0.6, 0.4)", "_PULSE = (0.5, 0.5)"),
+    Mutant(
+        "speed lost is not told", "pulses_that_stay_away_are_an_alarm", "(lost & enabled", "(lost & ~enabled",
+    ),
+    Mutant("bypass ignored", "a_bypassed_channel_raises_no_alarm", " & (name not in self.bypassed)", ""),
+    Mutant("multiply ignored", "a_trip_multiply_raises_the_set_points", "self.multiply * set_um", "set_um"),
+    Mutant(
+        "first-out lost", "what_came_first_is_known", "self.first_out.append(alarm)",
+        "self.first_out = sorted([*self.first_out, alarm])",
+    ),
+    Mutant("start-up for ever", "no_alarm_while_it_starts", "index >= self._armed", "index >= 10**9"),
+    Mutant("no start-up", "no_alarm_while_it_starts", "first + self._rows(settings.startup_s)", "first"),
+    Mutant("trips again and again", "it_trips_once", "np.logical_or.accumulate(trip) | self.tripped", "trip"),
+    Mutant(
+        "trip not sent", "a_trip_is_sent_once_and_first", "        machine.speed(0.0)", "        pass", runner,
+    ),
+    Mutant(
+        "trip sent with each note", "a_trip_is_sent_once_and_first", "        show(str(action))",
+        "        show(str(action))\n        machine.speed(0.0)", runner,
+    ),
+    Mutant(
+        "trip sent by each danger", "a_trip_is_sent_once_and_first", 'if action.kind == "trip"]',
+        'if action.kind != "clear"]\n    machine.speed(0.0) if len(trips) > 1 else None', runner,
+    ),
+    Mutant(
+        "state of each block", "blocks_change_nothing",
+        "if not known or not 0 <= missing", "if missing == 0 or not 0 <= missing",
+    ),
+    Mutant(
+        "delay of each block", "blocks_change_nothing",
+        "-1 - self._runs.get(what, 0)", '-1 - self._runs.get(what, 0) * (what[0] == "ok")',
+    ),
+    Mutant(
+        "window of each block", "blocks_change_nothing",
+        "rows[:, rows.shape[1] - self._window + 1 :]", "0 * self._tail",
+    ),
+    Mutant(
+        "a row off in all blocks but the first", "blocks_change_nothing",
+        "first = samples.index + len(samples) - signals.shape[1]",
+        "first = samples.index + len(samples) - signals.shape[1] + (samples.index > 0)",
+    ),
+    Mutant("missing rows left out", "rows_that_are_missing_are_taken_as_the_last", "elif missing:", "elif False:"),
+    Mutant(
+        "rows that come twice", "rows_that_come_twice_count_once", "fresh = follow(self._came, samples)",
+        "fresh = samples",
+    ),
+    Mutant(
+        "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "            self._runs = {}",
+        '            self._runs = {("ok", name): recovery for name in (settings.x, settings.y)}',
+    ),
+]  # fmt: skip
+
+
+def matrix() -> dict[str, list[str]]:
+    """Of each mutant, the scenarios that tell it."""
+    return {mutant.name: [name for name in SCENARIOS if mutant.fails(name)] for mutant in MUTANTS}
+
+
+if __name__ == "__main__":
+    found = matrix()
+    for mutant in MUTANTS:
+        others = [name for name in found[mutant.name] if name != mutant.told_by]
+        mark = "killed" if mutant.told_by in found[mutant.name] else "LIVES"
+        print(f"{mark}  {mutant.name}: {mutant.told_by}; and {len(others)} more: {', '.join(others) or '-'}")
+    killed = sum(mutant.told_by in found[mutant.name] for mutant in MUTANTS)
+    print(f"{killed} of {len(MUTANTS)} killed by the scenario that is meant")
+    sys.exit(killed < len(MUTANTS))

@@ -1,0 +1,416 @@
+"""What a protection monitor has to do: scenarios whose rows are worked out by hand, for the sound one and for mutants.
+
+Rows are a millisecond. `swing` makes a signal whose peak-to-peak over two rows is told row by row, so that a level is
+above a set point exactly when it is meant to be: where its amplitude steps at row n, the level is half way at n, and
+there at n + 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from drivers.protection import Settings
+from drivers.samples import Samples
+
+RATE = 1000.0
+SCENARIOS: dict[str, Callable[[Any], None]] = {}
+"""By name: each takes a device (`Protection`, `obey`), and raises AssertionError if that is not right."""
+
+
+def scenario(function: Callable[[Any], None]) -> Callable[[Any], None]:
+    SCENARIOS[function.__name__] = function
+    return function
+
+
+def settings(**changes: Any) -> Settings:
+    base = {
+        "alert_um": 500.0, "danger_um": 1000.0, "alert_delay_s": 0.0, "danger_delay_s": 0.0, "hysteresis": 0.0,
+        "window_s": 0.002, "corner_hz": 1e-6, "ok_recovery_s": 0.5, "startup_s": 0.0,
+    }  # fmt: skip
+    return Settings(**{**base, **changes})
+
+
+def swing(rows: int, *steps: tuple[int, float]) -> np.ndarray:
+    """Signal [mm] of a level [um] that is told from some rows on."""
+    level = np.zeros(rows)
+    for row, um in steps:
+        level[row:] = um
+    return 0.5e-3 * level * (-1.0) ** np.arange(rows)
+
+
+def pulses(rows: int, *begins: int, length: int = 10) -> np.ndarray:
+    signal = np.zeros(rows)
+    for row in begins:
+        signal[row : row + length] = 1.0
+    return signal
+
+
+def samples(first: int = 0, **channels: Any) -> Samples:
+    rows = max(np.size(each) for each in channels.values())
+    values = np.column_stack([np.broadcast_to(each, rows) for each in channels.values()]).astype(float)
+    units = tuple("1" if name == "keyphasor" else "mm" for name in channels)
+    return Samples(first, 1000 * first, RATE, 1e6, tuple(channels), units, values)
+
+
+def run(device: Any, given: Settings, x: Any, y: Any = 0.0, **more: Any) -> tuple[Any, list[Any]]:
+    monitor = device.Protection(given)
+    return monitor, monitor.feed(samples(disk_x=x, disk_y=y, **more))
+
+
+def told(actions: list[Any], *kinds: str) -> list[tuple[str, str, int]]:
+    return [(each.kind, each.name, each.row) for each in actions if not kinds or each.kind in kinds]
+
+
+@scenario
+def a_sine_is_measured_from_peak_to_peak(device: Any) -> None:
+    # 800 um at 10 Hz: from its peak on, the level is 800 (1 - sin); it passes 1000 where sin = -1/4, at 54.02 ms.
+    x = 0.8 * np.sin(2.0 * math.pi * 10.0 * np.arange(200) / RATE)
+    _, actions = run(device, settings(window_s=0.1), x)
+    assert told(actions, "danger") == [("danger", "disk_x", 55)]
+    danger = next(each for each in actions if each.kind == "danger")
+    assert (danger.tick, danger.time_s) == (55_000, 0.055)
+    assert abs(danger.value - 800.0 * (1.0 - math.sin(2.0 * math.pi * 0.55))) < 0.1
+
+
+@scenario
+def set_points_are_in_micrometres(device: Any) -> None:
+    _, actions = run(device, settings(), swing(300, (100, 490.0), (200, 510.0)))
+    assert told(actions) == [("alert", "disk_x", 201)]
+
+
+@scenario
+def an_alarm_is_of_its_own_probe(device: Any) -> None:
+    _, actions = run(device, settings(), 0.0, swing(200, (100, 1200.0)))
+    assert told(actions, "alert", "danger") == [("alert", "disk_y", 100), ("danger", "disk_y", 101)]
+
+
+@scenario
+def an_orbit_is_measured_from_its_mean(device: Any) -> None:
+    # A circle of 510 um, 700 um off the middle: after a high-pass of 1 Hz, 510 / sqrt(1 + 0.1^2) = 507.5 um.
+    turn = 2.0 * math.pi * 10.0 * np.arange(8000) / RATE
+    for radius, expected in ((0.51, ["disk_x", "disk_y"]), (0.49, [])):
+        x, y = 0.7 + radius * np.cos(turn), 0.2 + radius * np.sin(turn)
+        given = settings(measure="smax", window_s=0.1, corner_hz=1.0, startup_s=5.0)
+        _, actions = run(device, given, x, y)
+        assert [each.name for each in actions] == expected
+        assert all(abs(each.value - 507.5) < 2.0 for each in actions)
+
+
+@scenario
+def at_its_corner_the_high_pass_leaves_1_in_root_2(device: Any) -> None:
+    x = 0.5 * np.sin(2.0 * math.pi * 2.0 * np.arange(6000) / RATE)
+    for part, expected in ((0.69, 2), (0.725, 0)):
+        given = settings(alert_um=1000.0 * part, danger_um=1e6, window_s=0.5, corner_hz=2.0, startup_s=4.0)
+        assert len(run(device, given, x, x)[1]) == expected
+
+
+@scenario
+def an_alarm_comes_after_its_delay(device: Any) -> None:
+    # Above 500 at row 100, above 1000 at row 101.
+    _, actions = run(device, settings(alert_delay_s=0.02, danger_delay_s=0.0495), swing(300, (100, 1200.0)))
+    assert told(actions, "alert", "danger") == [("alert", "disk_x", 120), ("danger", "disk_x", 151)]
+    _, actions = run(device, settings(danger_delay_s=0.05), swing(300, (100, 1200.0), (150, 0.0)))
+    assert told(actions, "danger") == [], "it lasted from row 101 to 149"
+
+
+@scenario
+def a_delay_begins_anew(device: Any) -> None:
+    x = swing(300, (100, 1200.0), (130, 0.0), (140, 1200.0))
+    _, actions = run(device, settings(danger_delay_s=0.05), x)
+    assert told(actions, "danger") == [("danger", "disk_x", 191)]
+
+
+@scenario
+def a_danger_stays_and_an_alert_goes(device: Any) -> None:
+    monitor, actions = run(device, settings(), swing(400, (100, 1200.0), (200, 0.0)))
+    assert told(actions, "clear") == [("clear", "alert disk_x", 201)]
+    assert set(monitor.active) == {("danger", "disk_x"), ("trip", "")}
+    _, actions = run(device, settings(latch_alert=True, latch_danger=False), swing(400, (100, 1200.0), (200, 0.0)))
+    assert told(actions, "clear") == [("clear", "danger disk_x", 200)]
+
+
+@scenario
+def a_reset_ends_what_is_over(device: Any) -> None:
+    monitor, _ = run(device, settings(), swing(300, (100, 1200.0), (200, 0.0)))
+    monitor.reset()
+    actions = monitor.feed(samples(300, disk_x=swing(100, (50, 1200.0)), disk_y=0.0))
+    assert told(actions) == [
+        ("reset", "danger disk_x", 300), ("reset", "trip", 300), ("alert", "disk_x", 350), ("danger", "disk_x", 351),
+        ("trip", "danger disk_x", 351),
+    ]  # fmt: skip
+
+
+@scenario
+def no_reset_while_the_cause_lasts(device: Any) -> None:
+    monitor, actions = run(device, settings(), swing(200, (100, 1200.0)))
+    assert monitor.tripped
+    before = dict(monitor.active)
+    monitor.reset()
+    assert monitor.feed(samples(200, disk_x=swing(100, (0, 1200.0)), disk_y=0.0)) == []
+    assert monitor.active == before
+    assert monitor.tripped
+    assert len(told(actions, "trip")) == 1
+
+
+@scenario
+def an_alarm_ends_below_its_set_point_by_the_hysteresis(device: Any) -> None:
+    x = swing(400, (100, 600.0), (200, 460.0), (300, 430.0))
+    _, actions = run(device, settings(hysteresis=0.1), x)
+    assert told(actions) == [("alert", "disk_x", 101), ("clear", "alert disk_x", 300)]
+
+
+@scenario
+def a_probe_beyond_its_ok_limits_is_not_ok(device: Any) -> None:
+    # The output is -10 V + 3.94 V/mm: -2.5 V is 1.9036 mm, -17.5 V as much the other way. Out from row 100 to 199.
+    for end_mm in (1.91, -1.91):
+        x = np.zeros(1000)
+        x[100:200] = end_mm
+        _, actions = run(device, settings(danger_um=1e6, alert_um=1e6), x)
+        assert told(actions) == [("not-ok", "disk_x", 100), ("clear", "not-ok disk_x", 700)]
+        assert abs(actions[0].value - (-10.0 + 3.94 * end_mm)) < 1e-9
+    assert run(device, settings(danger_um=1e6, alert_um=1e6), 1.90 * pulses(1000, 100))[1] == []
+
+
+@scenario
+def ok_comes_back_after_its_time_without_a_break(device: Any) -> None:
+    x = np.zeros(1500)
+    x[100:200] = x[400] = 2.5
+    _, actions = run(device, settings(danger_um=1e6, alert_um=1e6), x)
+    assert told(actions) == [("not-ok", "disk_x", 100), ("clear", "not-ok disk_x", 901)]
+
+
+@scenario
+def a_probe_that_is_not_ok_raises_no_alarm(device: Any) -> None:
+    x = swing(900, (150, 1200.0), (250, 0.0))
+    x[100] = 2.5
+    _, actions = run(device, settings(), x)
+    assert told(actions) == [("not-ok", "disk_x", 100), ("clear", "not-ok disk_x", 601)]
+
+
+@scenario
+def two_out_of_two_need_both(device: Any) -> None:
+    both = swing(300, (100, 1200.0)), swing(300, (150, 1200.0))
+    assert told(run(device, settings(vote="2oo2"), *both)[1], "trip") == [("trip", "danger disk_x", 151)]
+    assert told(run(device, settings(vote="2oo2"), both[0])[1], "trip") == []
+
+
+@scenario
+def one_out_of_two_needs_one(device: Any) -> None:
+    both = swing(300, (150, 1200.0)), swing(300, (100, 1200.0))
+    assert told(run(device, settings(vote="1oo2"), *both)[1], "trip") == [("trip", "danger disk_y", 101)]
+
+
+VOTES = {
+    # vote, rule: trips with (x in danger, y NOT OK), (x in danger, y bypassed), (both NOT OK), (y NOT OK alone)
+    ("1oo2", "leaves"): (True, True, False, False),
+    ("1oo2", "against"): (True, True, False, False),
+    ("1oo2", "for"): (True, True, True, True),
+    ("2oo2", "leaves"): (True, True, False, False),
+    ("2oo2", "against"): (False, False, False, False),
+    ("2oo2", "for"): (True, True, True, False),
+}
+
+
+@scenario
+def a_probe_that_is_not_ok_votes_as_is_told(device: Any) -> None:
+    danger, broken, still = swing(300, (100, 1200.0)), 2.5 * (np.arange(300) >= 50), np.zeros(300)
+    for (vote, rule), expected in VOTES.items():
+        given = {"vote": vote, "not_ok": rule}
+        found = (
+            run(device, settings(**given), danger, broken)[0].tripped,
+            run(device, settings(**given, bypass=("disk_y",)), danger, broken)[0].tripped,
+            run(device, settings(**given), broken, broken)[0].tripped,
+            run(device, settings(**given), still, broken)[0].tripped,
+        )
+        assert found == expected, (vote, rule)
+
+
+@scenario
+def a_bypassed_channel_raises_no_alarm(device: Any) -> None:
+    x = swing(300, (100, 1200.0))
+    assert run(device, settings(bypass=("disk_x",)), x)[1] == []
+    monitor = device.Protection(settings())
+    monitor.bypassed.add("disk_x")
+    assert monitor.feed(samples(disk_x=x, disk_y=0.0)) == []
+    monitor.bypassed.clear()
+    assert told(monitor.feed(samples(300, disk_x=-x[:1] + x[-10:], disk_y=0.0)), "danger") == [
+        ("danger", "disk_x", 300)
+    ]
+
+
+@scenario
+def a_trip_multiply_raises_the_set_points(device: Any) -> None:
+    monitor = device.Protection(settings())
+    monitor.multiply = 3.0
+    assert told(monitor.feed(samples(disk_x=swing(300, (100, 1400.0), (200, 1600.0)), disk_y=0.0))) == [
+        ("alert", "disk_x", 201)
+    ]
+
+
+@scenario
+def turns_that_are_too_fast_trip(device: Any) -> None:
+    given = settings(overspeed_hz=9.0, overspeed_turns=3)
+    # Turns of 125 ms, then, from row 425, of 100 ms: the third ends at row 725.
+    key = pulses(1500, 50, 175, 300, 425, 525, 625, 725, 825)
+    monitor, actions = run(device, given, 0.0, keyphasor=key)
+    assert told(actions) == [("overspeed", "keyphasor", 725), ("trip", "overspeed keyphasor", 725)]
+    assert abs(actions[0].value - 10.0) < 1e-9
+    monitor.reset()
+    assert told(monitor.feed(samples(1500, disk_x=0.0, disk_y=0.0, keyphasor=0.0)), "reset") != [], "it stands"
+    one_more = pulses(1500, *range(50, 1500, 125), 50 + 3 * 125 + 60)
+    assert run(device, given, 0.0, keyphasor=one_more)[1] == [], "a pulse too many makes two turns that are too fast"
+
+
+@scenario
+def a_pulse_is_counted_once(device: Any) -> None:
+    # Noise about the threshold as a pulse rises and falls.
+    key = pulses(1500, *range(50, 1500, 125))
+    for row in range(50, 1475, 125):
+        key[row - 3 : row + 2] = (0.45, 0.55, 0.45, 0.7, 0.55)
+        key[row + 9 : row + 12] = (0.45, 0.55, 0.3)
+    for turns in (1, 2):
+        assert run(device, settings(overspeed_hz=9.0, overspeed_turns=turns), 0.0, keyphasor=key)[1] == []
+
+
+@scenario
+def pulses_that_stay_away_are_an_alarm(device: Any) -> None:
+    monitor, actions = run(device, settings(speed_lost_s=0.2), 0.0, keyphasor=pulses(900, 50, 150, 250, 700))
+    assert told(actions) == [
+        ("speed-lost", "keyphasor", 450), ("clear", "speed-lost keyphasor", 700), ("speed-lost", "keyphasor", 900)
+    ][:2]  # fmt: skip
+    assert not monitor.tripped
+
+
+@scenario
+def what_came_first_is_known(device: Any) -> None:
+    monitor, actions = run(device, settings(), swing(300, (110, 1200.0)), swing(300, (100, 1200.0), (250, 0.0)))
+    order = [("alert", "disk_y"), ("danger", "disk_y"), ("alert", "disk_x"), ("danger", "disk_x")]
+    assert monitor.first_out == order
+    assert told(actions, "trip") == [("trip", "danger disk_y", 101)]
+    monitor.reset()
+    monitor.feed(samples(300, disk_x=swing(10, (0, 1200.0)), disk_y=0.0))
+    assert monitor.first_out == order[2:]
+
+
+@scenario
+def no_alarm_while_it_starts(device: Any) -> None:
+    given = settings(startup_s=0.3, danger_delay_s=0.05, speed_lost_s=0.1)
+    _, actions = run(device, given, swing(600, (0, 1200.0)), keyphasor=0.0)
+    assert told(actions) == [
+        ("alert", "disk_x", 300), ("danger", "disk_x", 350), ("trip", "danger disk_x", 350),
+        ("speed-lost", "keyphasor", 400),
+    ]  # fmt: skip
+    # What was above a set point then is not held by the hysteresis.
+    assert run(device, settings(startup_s=0.3, hysteresis=0.1), swing(600, (0, 600.0), (100, 470.0)))[1] == []
+
+
+@scenario
+def it_trips_once(device: Any) -> None:
+    x = swing(500, (100, 1200.0), (200, 0.0), (300, 1200.0))
+    _, actions = run(device, settings(latch_danger=False), x)
+    assert told(actions, "danger", "trip") == [
+        ("danger", "disk_x", 101), ("trip", "danger disk_x", 101), ("danger", "disk_x", 301)
+    ]  # fmt: skip
+
+
+class Machine:
+    """A rig that keeps what it is asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, Any]] = []
+
+    def speed(self, hz: float) -> None:
+        self.asked.append(("speed", hz))
+
+    def stop(self) -> None:
+        self.asked.append(("stop", None))
+
+    def note(self, text: str, *, tags: list[str]) -> None:
+        self.asked.append(("note", tags))
+
+
+@scenario
+def a_trip_is_sent_once_and_first(device: Any) -> None:
+    notes = [("note", ["protection", kind]) for kind in ("alert", "danger", "trip")]
+    for trip, expected in (("speed 0", [("speed", 0.0), *notes]), ("stop", [*notes, ("stop", None)])):
+        given, machine, lines = settings(trip=trip), Machine(), []
+        monitor = device.Protection(given)
+        for first in (0, 200, 400):
+            x = swing(200, (100 if first == 0 else 0, 1200.0))
+            device.obey(machine, given, monitor.feed(samples(first, disk_x=x, disk_y=0.0)), lines.append)
+        assert machine.asked == expected
+        assert lines[1] == "0.101000 s  danger  disk_x  1200"
+
+
+def eventful(rows: int = 6000) -> tuple[Settings, Samples]:
+    """Rows in which most things happen."""
+    rng = np.random.default_rng(1)
+    x = 0.3 * np.sin(2.0 * math.pi * 10.0 * np.arange(rows) / RATE) * np.repeat(rng.uniform(0.2, 3.0, rows // 300), 300)
+    y = 0.6 * x[::-1] + 0.02 * rng.standard_normal(rows)
+    x[2500:2520] = 2.6
+    key = pulses(rows, *np.cumsum(rng.integers(90, 140, rows // 150)))
+    key[:] += 0.02 * rng.standard_normal(rows)
+    given = settings(
+        window_s=0.12, corner_hz=0.5, hysteresis=0.05, danger_delay_s=0.033, alert_delay_s=0.1, startup_s=0.4,
+        overspeed_hz=9.0, overspeed_turns=2, speed_lost_s=0.13, latch_danger=False, danger_um=1200.0,
+    )  # fmt: skip
+    return given, samples(disk_x=x, disk_y=y, keyphasor=key)
+
+
+@scenario
+def blocks_change_nothing(device: Any) -> None:
+    given, rows = eventful()
+    whole = device.Protection(given).feed(rows)
+    assert {each.kind for each in whole} == {"alert", "danger", "trip", "clear", "not-ok", "overspeed", "speed-lost"}
+    rng = np.random.default_rng(2)
+    by_chance = np.sort(rng.integers(0, 6000, 40))
+    for cuts in (np.arange(0, 6001, 20), np.arange(0, 6000, 37), by_chance, np.arange(2400, 2900)):
+        monitor, found = device.Protection(given), []
+        for begin, end in zip([0, *cuts], [*cuts, 6000], strict=True):
+            found += monitor.feed(rows.rows(int(begin), int(end)))
+        assert found == whole
+
+
+@scenario
+def rows_that_are_missing_are_taken_as_the_last(device: Any) -> None:
+    given, x = settings(window_s=0.1, danger_delay_s=0.05), np.zeros(400)
+    x[100:300] = 1.2
+    parts = [samples(0, disk_x=x[:120], disk_y=0.0), samples(180, disk_x=x[180:], disk_y=0.0)]
+    monitor = device.Protection(given)
+    actions = [each for part in parts for each in monitor.feed(part)]
+    # The step is in the window from row 100 to 199; danger after 50 rows, in the middle of what is missing.
+    assert told(actions, "rows-lost", "danger") == [("rows-lost", "", 180), ("danger", "disk_x", 150)]
+    assert actions[-1].kind == "clear"
+
+
+@scenario
+def rows_that_come_twice_count_once(device: Any) -> None:
+    given, rows = eventful()
+    whole, monitor = device.Protection(given).feed(rows), device.Protection(given)
+    parts = [rows.rows(begin, begin + 100) for begin in range(0, 6000, 100)]
+    # Row 0 once more would be that of another run.
+    again = [part for number, part in enumerate(parts) for part in (part, parts[max(1, number - 3)])][2:]
+    assert [each for part in (parts[0], *again) for each in monitor.feed(part)] == whole
+
+
+@scenario
+def where_too_many_rows_are_missing_no_probe_is_ok(device: Any) -> None:
+    for first in (900, 0):
+        monitor, _ = run(device, settings(window_s=0.1), np.zeros(400))
+        actions = monitor.feed(samples(first, disk_x=swing(700, (100, 1200.0), (300, 0.0)), disk_y=0.0))
+        assert told(actions) == [
+            ("rows-lost", "", first), ("not-ok", "disk_x", first), ("not-ok", "disk_y", first),
+            ("clear", "not-ok disk_x", first + 500), ("clear", "not-ok disk_y", first + 500),
+        ]  # fmt: skip
+
+
+def sound() -> Any:
+    from drivers.protection import Protection
+    from drivers.protection.__main__ import obey
+
+    return SimpleNamespace(Protection=Protection, obey=obey)

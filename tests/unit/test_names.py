@@ -1,0 +1,88 @@
+"""Rigs by name: found while they run, whoever asks, and forgotten with their process, however it ended."""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+
+from drivers.console import Console
+from drivers.daq import Daq
+from rig.errors import InputError
+from rig.transport import names
+from rig.transport.endpoint import parse_loopback
+from rig.transport.zenoh import ZenohServer
+from tests import processes
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / "rig"
+
+
+def test_a_name_is_there_while_it_is_held_and_of_one_only(runtime: Path) -> None:
+    with names.registered("one", "127.0.0.1:7777"):
+        assert names.running() == [names.Named(name="one", endpoint="127.0.0.1:7777", pid=os.getpid())]
+        assert names.endpoint_of("one", field="connect") == ("127.0.0.1", 7777)
+        with pytest.raises(
+            InputError, match=r"--name must be one that no other rig has \(process \d+ at 127.0.0.1:7777"
+        ):
+            names.check_name("one")
+        assert stat.S_IMODE(runtime.stat().st_mode) == 0o700
+        assert stat.S_IMODE((runtime / "one.json").stat().st_mode) == 0o600
+    names.check_name("one")
+    assert names.running() == []
+
+
+def test_what_a_process_that_was_killed_has_left_is_forgotten(runtime: Path) -> None:
+    hold = "with registered('gone', '127.0.0.1:1'): print(1, flush=True); time.sleep(60)"
+    code = f"import time; from rig.transport.names import registered\n{hold}"
+    with processes.python("-c", code) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "1\n"
+        assert [entry.pid for entry in names.running()] == [child.pid]
+        child.kill()
+        child.wait()
+    assert (runtime / "gone.json").exists()
+    assert names.running() == []
+    with names.registered("gone", "127.0.0.1:2"):
+        assert names.endpoint_of("gone", field="connect") == ("127.0.0.1", 2)
+
+
+@pytest.mark.parametrize("name", ["", ".lock", "../x", "a b", "a:1", "é", "x" * 65])
+def test_what_can_be_no_name_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match="--name must be 1 to 64 letters, digits"):
+        names.check_name(name)
+
+
+def test_who_asks_for_a_name_that_is_not_there_is_told_those_that_are() -> None:
+    with pytest.raises(
+        InputError, match=r"HOST:PORT such as 127.0.0.1:7460, or the name of a rig that runs \(none does\)"
+    ):
+        Console.open("bench", wait_s=0.0)
+    with names.registered("bench-2", "127.0.0.1:7777"), pytest.raises(InputError, match="such as bench-2; instead"):
+        Daq.open("bench", wait_s=0.0)
+    with pytest.raises(InputError, match="url must be zenoh:HOST:PORT"):
+        Console.open("http://x")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="folders have no modes there")
+def test_a_folder_that_others_may_write_to_is_not_believed(runtime: Path) -> None:
+    runtime.mkdir(mode=0o700)
+    runtime.chmod(0o777)
+    with pytest.raises(InputError, match=r"a folder that is its owner's alone \(chmod 700"):
+        names.running()
+
+
+def test_a_free_port_is_taken_where_none_is_asked_for_and_only_on_the_loopback() -> None:
+    with ZenohServer("127.0.0.1:0") as one, ZenohServer("127.0.0.1:0") as two:
+        assert one.endpoint != two.endpoint
+        assert parse_loopback(one.endpoint, field="listen")[1] > 0
+    with pytest.raises(InputError, match=r"on 127\.0\.0\.1"):
+        ZenohServer("0.0.0.0:0")
+    with pytest.raises(InputError, match="a port of 1 to 65535"):
+        parse_loopback("127.0.0.1:0", field="--connect")

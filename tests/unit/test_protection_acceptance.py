@@ -1,0 +1,82 @@
+"""The protection monitor does what it is accepted by: tables of `protection_acceptance`, with the rig's own faults."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from rig.faults import KINDS
+from tests.unit import protection_acceptance as table
+from tests.unit.protection_acceptance import monitor, outcome, sine
+
+SETTLED = {"startup_s": 2.0}
+"""The high-pass of 0.5 Hz has forgotten where it began."""
+
+
+def kinds(settings: Any, rows: list[Any]) -> set[str]:
+    return {action.kind for action in outcome(settings, rows)}
+
+
+@pytest.mark.parametrize(("peak_to_peak_um", "expected"), table.ALARMS.items())
+def test_alarms_come_within_1_percent_of_their_set_points(peak_to_peak_um: float, expected: set[str]) -> None:
+    actions = outcome(monitor(**SETTLED), sine(peak_to_peak_um, duration_s=2.5))
+    assert {(action.kind, action.name) for action in actions if action.kind != "trip"} == {
+        (kind, name) for kind in expected - {"trip"} for name in ("disk_x", "disk_y")
+    }
+    assert any(action.kind == "trip" for action in actions) == ("trip" in expected)
+
+
+@pytest.mark.parametrize(("frequency_hz", "measure", "level_um"), table.VALUES)
+def test_channel_values_are_right_to_1_percent(frequency_hz: float, measure: Any, level_um: float) -> None:
+    rows = sine(800.0, frequency_hz, duration_s=2.5)
+    assert kinds(monitor(**SETTLED, measure=measure, alert_um=0.99 * level_um), rows) == {"alert"}
+    assert kinds(monitor(**SETTLED, measure=measure, alert_um=1.01 * level_um, danger_um=2000.0), rows) == set()
+
+
+@pytest.mark.parametrize(("times", "gain"), table.CORNER)
+def test_the_corner_is_where_it_is_told(times: float, gain: float) -> None:
+    rows = sine(800.0, 4.0 * times, duration_s=1.5)
+    for part, expected in ((0.99, {"alert"}), (1.01, set())):
+        given = monitor(corner_hz=4.0, window_s=0.3, startup_s=1.0, alert_um=part * gain * 800.0)
+        assert kinds(given, rows) == expected
+
+
+@pytest.mark.parametrize(("volts", "okay"), table.LIMITS)
+def test_ok_limits_are_where_they_are_told(volts: float, okay: bool) -> None:
+    rows = sine(0.0, duration_s=0.6, commands=[table.fault("open", level_v=volts)])
+    found = [(action.name, action.row) for action in outcome(monitor(alert_um=1e5, danger_um=1e5), rows)]
+    assert found == ([] if okay else [("disk_x", 5000)]), "the fault begins at 0.25 s"
+
+
+@pytest.mark.parametrize("kind", table.FAULTS)
+def test_a_fault_comes_to_what_the_vote_says(kind: str) -> None:
+    numbers, expected = table.FAULTS[kind]
+    rows = sine(200.0, duration_s=0.8, commands=[table.fault(kind, **numbers)])
+    assert tuple(table.judged(rows, *vote) for vote in table.VOTES) == expected
+
+
+@pytest.mark.parametrize("kind", table.PULSES)
+def test_a_fault_of_the_keyphasor_comes_to_what_is_told(kind: str) -> None:
+    numbers, expected = table.PULSES[kind]
+    given = monitor(overspeed_hz=7.0, speed_lost_s=0.3)
+    assert kinds(given, table.keyphasor(kind, **numbers)) - {"clear"} == expected
+
+
+def test_all_kinds_of_faults_are_judged() -> None:
+    assert set(KINDS) - set(table.FAULTS) - set(table.PULSES) == {"no-filter", "bandwidth"}, (
+        "test signals have no filter"
+    )
+
+
+@pytest.mark.parametrize(("ramp_hz_s", "delay_s", "established"), table.WHIRL)
+def test_a_trip_stops_whirl_where_drive_and_delay_are_fast(ramp_hz_s: float, delay_s: float, established: bool) -> None:
+    trip_s, found = table.whirls(ramp_hz_s, delay_s)
+    assert found == established
+    # The level is above its set point 6.3 ms after the blow begins; the trip is at the end of a block.
+    assert math.isclose(trip_s, 0.01 * math.ceil(100.0 * (0.0063 + delay_s)))
+
+
+def test_noise_raises_no_alarm() -> None:
+    assert table.noise(1.0 / 3600.0)[0] == []
