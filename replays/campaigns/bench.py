@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -109,7 +110,7 @@ class Bench(Closing):
 
     def __init__(self, settings: BenchSettings, folder: Path, target: Target = Target()) -> None:
         self.settings, self.target = settings, target
-        self.name = f"bench-{os.getpid()}-{time.monotonic_ns() % 10**9}"
+        self.name = f"bench-{os.getpid()}-{next(_NUMBERS)}"
         self._program: Program | None = None
         self._clients: list[Rig] = []
         self.can_url: str | None = None
@@ -123,7 +124,7 @@ class Bench(Closing):
                 said = self._program.last_line
                 self._program.end()
                 raise BenchError(f"the rig did not start: {said}")
-            self.url = f"zenoh:{line.partition('listening on ')[2].partition(';')[0]}"
+            self.url = f"zenoh:{line.partition('listening on ')[2].split()[0].rstrip(';')}"
         try:
             self._console = self.connect(name="campaign", channels=())
             self.pace: str = self._console.pace
@@ -135,7 +136,7 @@ class Bench(Closing):
 
     def _command(self) -> list[str]:
         settings, rig = self.settings, [sys.executable, "-m", "rig"]
-        listen = ["--listen", f"127.0.0.1:{_free_port()}"]
+        listen = ["--listen", "127.0.0.1:0", "--name", self.name]
         if self.target.replay is not None:
             return [*rig, "replay", str(self.target.replay), "--pause", *listen]
         if settings.can:
@@ -286,14 +287,15 @@ class Bench(Closing):
 
     def scene_document(self) -> dict[str, Any]:
         """The scene of the rig that is there, with its name."""
-        from rig.transport.zenoh import client_at
+        from rig.transport.zenoh import client_of
 
-        with client_at(self.url.removeprefix("zenoh:"), wait_s=30.0) as client:
+        with client_of(self.url, wait_s=30.0) as client:
             document = wire.decode_document(client.request(wire.SCENE))
         return {**document.get("scene", {}), "name": document.get("name")}
 
 
 DEFAULT_SCENE = "stable-run"
+_NUMBERS = itertools.count(1)
 _SHORT_S = 0.01
 """A recording may lack this of a run [s]: the rows behind its last one."""
 _TICK_RATE_HZ = 1_000_000

@@ -29,6 +29,8 @@ from rig.outside import Written, check, open_file, parse_toml, unreadable
 from rig.scenes import Scene, load_scene
 
 SUFFIX = ".campaign.toml"
+FOLDER = Path(__file__).parent
+"""Where the campaigns are that come with the rig."""
 _PLACE = re.compile(r"\{(\w+)(?::([^{}]*))?\}")
 _MOST_CASES = 10_000
 _BLOCK_MS = (1.0, 1000.0)
@@ -119,6 +121,12 @@ class Campaign:
     title: str
     about: str
     cases: tuple[Case, ...]
+
+
+def campaign_path(name_or_path: str) -> Path:
+    """The file of a campaign that comes with the rig, by its name, or of a user's own."""
+    shipped = FOLDER / f"{name_or_path}{SUFFIX}"
+    return shipped if re.fullmatch(r"[\w-]+", name_or_path) and shipped.is_file() else Path(name_or_path)
 
 
 def load_campaign(path: Path) -> Campaign:

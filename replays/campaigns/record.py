@@ -29,10 +29,10 @@ class Record:
 
     def __init__(self, bench: Bench, path: Path) -> None:
         from recorder.session import RecordingSession
-        from rig.transport.zenoh import client_at
+        from rig.transport.zenoh import client_of
 
         self.path, self._bench = path, bench
-        self._client = client_at(bench.url.removeprefix("zenoh:"), wait_s=_BEGIN_S)
+        self._client = client_of(bench.url, wait_s=_BEGIN_S)
         own = bench.target.own
         # Plots are made of the evidence alone, so none are kept of the whole.
         self._session: RecordingSession = RecordingSession(

@@ -10,7 +10,7 @@ import typer
 
 from rig.cli.folder import check_folder
 from rig.cli.tables import echo, progress_bar
-from rig.errors import InputError, Words
+from rig.errors import InputError, UnknownNameError, Words
 
 _TOML = ".campaign.toml"
 _INTERRUPTED = 130
@@ -20,7 +20,10 @@ _EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
 def campaign(
     files: Annotated[
         list[str],
-        typer.Argument(metavar="FILE...", help="NAME.campaign.toml, or tests of pytest; FILE::CASE for one case."),
+        typer.Argument(
+            metavar="FILE...",
+            help="A *.campaign.toml, one of the rig's by name (hammer), or tests of pytest; FILE::CASE for one case.",
+        ),
     ],
     *,
     keyword: Annotated[
@@ -56,7 +59,7 @@ def campaign(
         raise InputError("--jobs", "1 with --url, as the cases share one rig", jobs)
     if output is not None:
         check_folder(output, field="--output")
-    _check(files, against, replay)
+    files = _checked(files, against, replay)
     told = {"--rig-results": output, "--rig-against": against, "--rig-url": url, "--rig-replay": replay}
     options = [word for name, value in told.items() if value is not None for word in (name, str(value))]
     options += ["-k", keyword] if keyword is not None else []
@@ -66,18 +69,19 @@ def campaign(
         raise typer.Exit(status)
 
 
-def _check(files: list[str], against: Path | None, replay: Path | None) -> None:
-    """Refuse what is wrong with files before anything runs."""
-    from replays.campaigns.campaign import load_campaign
+def _checked(files: list[str], against: Path | None, replay: Path | None) -> list[str]:
+    """The files by their paths; what is wrong with them is refused before anything runs."""
+    from replays.campaigns.campaign import campaign_path, load_campaign
     from replays.campaigns.results import load_results
 
+    paths = []
     for file in files:
         name, colons, case = file.partition("::")
+        name = str(campaign_path(name))
+        paths.append(f"{name}{colons}{case}")
         if name.endswith(_TOML):
             known = [each.id for each in load_campaign(Path(name)).cases]
             if colons and case not in known:
-                from rig.errors import UnknownNameError
-
                 raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
         elif not Path(name).exists():
             raise InputError("FILE", f"a *{_TOML} file, or tests of pytest, that exists", name)
@@ -89,6 +93,7 @@ def _check(files: list[str], against: Path | None, replay: Path | None) -> None:
         from recorder.reader import Recording
 
         Recording.open(replay)
+    return paths
 
 
 def _run(files: list[str], options: list[str], output: Path | None) -> int:
