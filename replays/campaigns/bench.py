@@ -184,6 +184,11 @@ class Bench(Closing):
         """The rig's status document."""
         return self._console.status()
 
+    @property
+    def links(self) -> int:
+        """How many links clients have to the rig."""
+        return int(self.status()["congestion"].get("links", 0))
+
     def wait_for(self, device: str, *, timeout_s: float = JOIN_S) -> None:
         """Wait until a device under test takes part in lockstep.
 

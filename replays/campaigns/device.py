@@ -13,6 +13,8 @@ from replays.campaigns.bench import JOIN_S, Bench, BenchError
 from replays.campaigns.process import Program
 from rig.errors import InputError
 
+_LINK_S = 10.0
+"""Longest that is waited for a device's link [s]."""
 PLACES = ("url", "can", "name", "folder")
 """What stands between braces in a command, and is filled in when it is started."""
 
@@ -61,6 +63,17 @@ class Device:
                     raise
             else:
                 return
+
+    def wait_until_linked(self, before: int) -> None:
+        """Wait until there is one link more to the rig than before; not for long, as on a CAN bus it has none.
+
+        Raises:
+            BenchError: It has ended.
+        """
+        deadline = time.monotonic() + _LINK_S
+        while self._bench.links <= before and time.monotonic() < deadline:
+            self.check_running()
+            time.sleep(0.02)
 
     def check_running(self) -> None:
         """Refuse one that has ended.

@@ -109,7 +109,7 @@ class CampaignItem(pytest.Item):
 
         if isinstance(excinfo.value, MeasurementError):
             return "\n".join(each.line for each in self.stash[_TRIAL].measurements if not each.good)
-        if isinstance(excinfo.value, BenchError | InputError | DiskError):
+        if isinstance(excinfo.value, BenchError | InputError | DiskError | ConnectionError | TimeoutError):
             return str(excinfo.value)
         return super().repr_failure(excinfo, style)
 

@@ -51,9 +51,8 @@ def run_case(case: Case, trial: Trial) -> None:
     record.wait_until_there()
     device: Device | None = None
     if case.device is not None:
-        device = trial.start_device(
-            case.device.command, name=case.device.name, where=case.file.parent, joins=case.device.joins and None
-        )
+        joins = None if case.device.joins else False
+        device = trial.start_device(case.device.command, name=case.device.name, where=case.file.parent, joins=joins)
     trial.origin_s = bench.begin()
     with bench.connect(name="campaign", channels=()) as machine:
         for step in live:

@@ -70,19 +70,21 @@ class Trial:
     def start_device(
         self, command: str | Sequence[str], *, name: str, where: Path, joins: bool | None = None
     ) -> Device:
-        """The program under test, begun; in lockstep once it takes part, if it is to.
+        """The program under test, begun; in lockstep once it takes part, if it is to, else once it has a link.
 
         Raises:
             BenchError: It ended, or did not take part in time.
         """
         assert self.bench is not None
-        bench = self.bench
+        bench, before = self.bench, self.bench.links
         device = Device(
             command, name=name, bench=bench, log=self.folder / f"{name}.log", where=where, files=self.folder
         )
         self.devices.append(device)
         if bench.pace == "lockstep" if joins is None else joins:
             device.wait_until_joined()
+        else:
+            device.wait_until_linked(before)
         return device
 
     def start_record(self) -> Record:

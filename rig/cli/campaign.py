@@ -103,14 +103,16 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
 
     import pytest
 
-    from rig.cli.campaign_progress import WORDS, Progress
+    from rig.cli.campaign_progress import WORDS, Progress, beside_pytest
 
     module = "replays.campaigns.plugin"
     there = any(each.value == module for each in entry_points(group="pytest11"))
     plugins = ["-p", "no:cacheprovider", *([] if there else ["-p", module])]
-    with progress_bar(transient=True) as bar:
+    with beside_pytest(progress_bar(transient=True)) as bar:
         progress = Progress(bar)
         status = pytest.main([*plugins, *options, *files], plugins=[progress])
+    if progress.unheard:
+        raise BrokenPipeError
     if status == pytest.ExitCode.INTERNAL_ERROR:
         echo(progress.said.getvalue().strip(), err=True)
     counts = progress.counts

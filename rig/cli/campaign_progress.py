@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import io
+import os
+import sys
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
 
-from rig.cli.tables import echo
+from rig.cli.tables import echo, plain
 from rig.text import printable
 
 WORDS = {"passed": "pass", "failed": "FAIL", "error": "ERROR", "skipped": "skip"}
 """What is said of a case that came to this."""
+
+
+def beside_pytest(bar: Any) -> Any:
+    """A bar that shows on the terminal while pytest holds stdout and stderr back."""
+    if bar.console.is_terminal:
+        bar.console.file = os.fdopen(os.dup(sys.stderr.fileno()), "w", encoding="utf-8")
+    return bar
 
 
 @dataclass
@@ -28,6 +37,8 @@ class Progress:
     running: dict[str, None] = field(default_factory=dict)
     collecting_failed: bool = False
     task: Any = None
+    unheard: bool = False
+    """Whoever read what is told has gone."""
     said: io.StringIO = field(default_factory=io.StringIO)
     """What pytest itself would have printed."""
 
@@ -79,8 +90,18 @@ class Progress:
             self.done.add(name)
             self.running.pop(name, None)
             reason = f": {self.reasons[name]}" if name in self.reasons else ""
-            echo(f"{WORDS[before]:5} {name}{reason}")
+            self._tell(f"{WORDS[before]:5} {name}{reason}")
             self._show()
+
+    def _tell(self, line: str) -> None:
+        if self.bar.console.is_terminal and sys.stdout.isatty():
+            self.bar.console.print(plain(printable(line)))  # above what is live
+            return
+        try:
+            echo(line)
+        except BrokenPipeError:
+            self.unheard = True
+            raise
 
     def _show(self) -> None:
         if self.task is None:

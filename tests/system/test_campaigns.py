@@ -169,3 +169,52 @@ def test_ctrl_c_leaves_nothing_running_and_tells_what_was_done(tmp_path: Path) -
     results = json.loads((tmp_path / "out/results.json").read_text(encoding="utf-8"))
     assert results["counts"] == {"failed": 0, "error": 0, "interrupted": 3, "skipped": 0, "passed": 1}
     assert (tmp_path / "out/index.html").is_file()
+
+
+THERE = """
+title = "On a rig that is there"
+duration_s = 0.5
+
+[device]
+command = "python device.py {url} {name} 0.5 well"
+name = "protection"
+
+[matrix]
+scene = ["stable-run", "hammer"]
+
+[[steps]]
+at_s = 0.1
+command = "hammer"
+
+[[expect]]
+event = "hammer"
+must = "0.1 to 0.4 s"
+
+[[expect]]
+event = "note"
+where = { tags = "trip" }
+since = { signal = "disk_x", beyond = "0.5 mm" }
+must = "<= 2 s"
+"""
+
+
+def test_a_campaign_runs_on_a_recording_and_on_a_rig_that_is_there(folder: Path) -> None:
+    session = processes.ROOT / "replays/sessions/hammer-6.2.mcap"
+    _, played = campaign(folder, "hammer", "--replay", str(session), status=0)
+    assert [(case["outcome"], case["reason"]) for case in played["cases"]] == [
+        ("skipped", "the recording has drive.speed_hz = 6.2, not 5.2"),
+        ("passed", ""),
+    ]
+    assert played["cases"][1]["measurements"][2]["value"] == pytest.approx(-81.7, abs=0.5)
+    (folder / "there.campaign.toml").write_text(THERE, encoding="utf-8")
+    with processes.rig("run", "stable-run", "--listen", "127.0.0.1:0", "--name", "there-for-a-campaign") as rig:
+        processes.line_of(rig, "listening on")
+        _, there = campaign(folder, "there.campaign.toml", "--url", "there-for-a-campaign", status=0)
+        rig.terminate()
+        rig.communicate(timeout=60.0)
+    assert [(case["outcome"], case["reason"]) for case in there["cases"]] == [
+        ("passed", ""),
+        ("skipped", "the rig there has scene stable-run, not hammer"),
+    ]
+    median_ms, longest_ms = there["wall"]["cases"]["there.campaign.toml::stable-run"]["floor_ms"]
+    assert 0.0 < median_ms <= longest_ms
