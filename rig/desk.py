@@ -13,7 +13,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from rig import wire
 from rig.bounded_queue import BoundedQueue
@@ -69,7 +69,16 @@ class Done(Outside):
     """A device has dealt with everything up to the end of a block."""
 
     device: Name
-    tick: Annotated[int, Field(ge=0, le=LARGEST)]
+    tick: Annotated[int, Field(ge=0, le=LARGEST)] | None = None
+    """Where that block ends, or:"""
+    block: Annotated[int, Field(ge=0, le=LARGEST)] | None = None
+    """its number."""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Done:
+        if (self.tick is None) == (self.block is None):
+            raise ValueError("told by a tick or by a block")
+        return self
 
 
 class Leave(Outside):

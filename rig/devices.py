@@ -54,13 +54,14 @@ class Devices:
         self._devices[name] = _Device(patience_s, tick)
         self._tell()
 
-    def done(self, name: str, tick: int, end: int) -> str | None:
+    def done(self, name: str, tick: int | None, end: int, said: str) -> str | None:
         """Take note that a device is done with a block.
 
         Args:
             name: The device.
-            tick: End of the block, as the device says.
+            tick: End of the block, as the device says; None where there was no such block.
             end: End of the last block that was run.
+            said: What the device said.
 
         Returns:
             Why the device was put out for that; None where it was not.
@@ -69,9 +70,9 @@ class Devices:
             InputError: It has not joined.
         """
         device = self._joined("done", name)
-        if tick not in (device.tick, end):
-            return self._put_out(name, f"it was done with tick {tick}; the block that it was given ends at tick {end}")
-        device.tick = tick
+        if tick is None or tick not in (device.tick, end):
+            return self._put_out(name, f"it was done with {said}; the block that it was given ends at tick {end}")
+        device.tick = max(tick, device.tick)
         self._tell()
         return None
 

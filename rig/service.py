@@ -141,6 +141,8 @@ class Service(ServedRun):
         self._devices = Devices()
         self._blocks = 0
         """Blocks that were run."""
+        self._ends: dict[int | None, int] = {}
+        """Ends of the last two [ticks], by number."""
         self._over: tuple[int, float] = (-1, 0.0)
         """End of the last block that devices were told is over [ticks], and when [s, monotonic]."""
         self._sent: dict[str, int] = {}
@@ -249,6 +251,7 @@ class Service(ServedRun):
             self._tick = simulation.tick
             after = [{**event, "wall_s": time.time()} for event in frame.events]
             self._blocks += 1
+            self._ends = {self._blocks - 1: frame.tick, self._blocks: self._tick}
             over = {"block": self._blocks, "tick": self._tick, "time_s": self._tick / self._rate}
             entry = _Entry(events, frame, [*after, *answered], over if self._devices else None, self._finished_steps())
             self._overflow(queue.push(entry))
@@ -309,9 +312,13 @@ class Service(ServedRun):
         self._need_lockstep(pending.command)
         tick, name = self._simulation.tick, asked.device
         if isinstance(asked, Done):
-            reason = self._devices.done(name, asked.tick, tick)
+            by_block = asked.block is not None
+            said = self._ends.get(asked.block) if by_block else asked.tick
+            word = f"block {asked.block}" if by_block else f"tick {said}"
+            reason = self._devices.done(name, said, tick, word)
             if reason is not None:
-                pending.refuse(InputError("done.tick", f"{tick}, the end of the last block", asked.tick))
+                must = f"with tick {tick}, the end of the last block ({self._blocks})"
+                pending.refuse(InputError("done", must, Words(word)))
                 return self._device(name, "lost", reason=reason)
             # Not counted, and no event: there is one a block, and who of several is first is chance.
             pending.answer({"accepted": True, "id": 0, "command": "done", "tick": tick, "time_s": tick / self._rate})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,8 @@ import numpy as np
 
 from rig.channels import Channel
 
+KEY = 0x9D
+"""What every command carries."""
 ABSENT = -32768
 """Value of a channel that a run does not have, in a classic frame; counts stop one above it."""
 
@@ -137,7 +140,8 @@ class Message:
         identifier: 11 bits.
         length: Bytes.
         fd: A CAN FD frame with bit rate switch.
-        period_s: How often it is sent, or at most sent where nothing but events sends it [s].
+        period_s: How often it is sent, or at most sent where nothing but events sends it [s]; infinite: in lockstep
+            alone, where the samples wait for it, so that it takes no share of the bus.
         periodic: Whether it is sent by the clock.
         sender: Node.
         label: What it is.
@@ -238,7 +242,7 @@ class MessageTable:
             classic_hz: Rate of the classic layout [Hz], or None where it is not sent.
             fd_hz: Rate of the FD layout [Hz], or None where it is not sent.
         """
-        rows = {row: row.period_s for row in self.others}
+        rows = {row: row.period_s for row in self.others if row.period_s < math.inf}
         for messages, rate in ((self.classic, classic_hz), (self.fd, fd_hz)):
             if rate is not None:
                 rows |= {row: row.samples.rows / rate for row in messages if row.samples is not None}

@@ -25,8 +25,9 @@ from functools import cache
 from typing import Any
 
 from drivers.can.bus.frame import FD_LENGTHS
+from drivers.can.devices import Said, device_messages, said_in
 from drivers.can.faults import FaultKind, fault_raw, fault_request, fault_signals
-from drivers.can.message import ABSENT, Message, MessageTable, Samples, Signal, checksum
+from drivers.can.message import ABSENT, KEY, Message, MessageTable, Samples, Signal, checksum
 from rig.channels import Channel, ChannelTable, default_table
 from rig.errors import InputError
 
@@ -38,8 +39,6 @@ CLASSIC_SHARE = 0.7
 
 _FD_CHANNELS = 20
 """As many of 24 bits fit into a frame with their number."""
-KEY = 0x9D
-"""What every command carries."""
 AHEAD = 15
 """How far the counter of a command may be ahead of that of the last one that reached the rig."""
 ODDS = 2.7e9
@@ -91,6 +90,7 @@ class State(IntEnum):
     PREPARING = 0
     RUNNING = 1
     ENDED = 2
+    LOCKSTEP = 3
 
 
 class EventKind(IntEnum):
@@ -105,6 +105,7 @@ class EventKind(IntEnum):
     END = 7
     FAULT = 8
     CLEAR = 9
+    DEVICE = 10
     OTHER = 15
 
 
@@ -321,7 +322,9 @@ def _classic_messages(table: ChannelTable) -> list[Message]:
 
 def make_table(channels: ChannelTable) -> MessageTable:
     """All messages for a channel table."""
-    rows = [*_other_messages(), _fault_message(channels), *_fd_messages(channels), *_classic_messages(channels)]
+    devices = device_messages(RIG, CONTROLLER, _TIME)
+    samples = [*_fd_messages(channels), *_classic_messages(channels)]
+    rows = [*_other_messages(), _fault_message(channels), *devices, *samples]
     return MessageTable(tuple(sorted(rows, key=lambda row: row.identifier)))
 
 
@@ -451,11 +454,11 @@ def _signed(message: Message, counter: int, **raw: int) -> tuple[int, bytes]:
 
 def parse_command(
     identifier: int, data: bytes, last_counter: int, table: MessageTable | None = None
-) -> Command | Result:
+) -> Command | Said | Result:
     """A command from the bus, or why it is none.
 
     Args:
-        identifier: Of Stop, Command or Fault.
+        identifier: Of Stop, Command, Fault or Device.
         data: What came.
         last_counter: Counter of the last command that reached the rig.
         table: Messages; those of the rig's own channel table unless given.
@@ -467,6 +470,8 @@ def parse_command(
     if data[6] != KEY:
         return Result.BAD_KEY
     message = (table or default_messages()).by_identifier[identifier]
+    if message.name == "Device":
+        return said_in(message.decode(data)) or Result.BAD_KIND
     try:
         kind = FaultKind(data[0]) if message.name == "Fault" else Kind(data[0])
     except ValueError:

@@ -12,6 +12,7 @@ import pytest
 
 from drivers.can import dbc
 from drivers.can.bus.timing import speed
+from drivers.can.schedule import Schedule
 from drivers.can.signals import (
     CLASSIC_HZ,
     FD_HZ,
@@ -44,7 +45,7 @@ def test_the_command_shows_and_writes_it(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_the_load_command_shows_every_message(capsys: pytest.CaptureFixture[str]) -> None:
     output = shown(capsys, "can", "load")
-    for name in (row.name for row in (*TABLE.others, *TABLE.classic)):
+    for name in (row.name for row in Schedule().messages()):
         assert name in output
     assert "load: at most 69.2 % of the bus" in output
     assert "load: at most 126.1 % of the bus" in shown(capsys, "can", "load", "--can-fd", "--can-bitrate", "1M/5M")

@@ -55,9 +55,9 @@ def test_signals_do_not_overlap_and_fit_their_message() -> None:
 
 def test_commands_win_the_bus_and_slow_messages_lose_it() -> None:
     order = [row.name for row in TABLE.messages]
-    assert order[:5] == ["Stop", "Command", "Acknowledge", "Fault", "Sync"]
+    assert order[:7] == ["Stop", "Command", "Acknowledge", "Fault", "Device", "DeviceState", "Sync"]
     # The end, an event, must not overtake samples.
-    assert order[-5:] == ["Keyphasor", "Event", "Status", "Heartbeat", "Rates"]
+    assert order[-6:] == ["Keyphasor", "Event", "Block", "Status", "Heartbeat", "Rates"]
     assert [row.identifier for row in TABLE.messages] == sorted(row.identifier for row in TABLE.messages)
 
 

@@ -122,7 +122,10 @@ def test_a_device_that_is_done_with_what_is_not_there_is_put_out(said: int) -> N
         device.join()
         steps = Steps(rig, BLOCK)
         device.wait(1)
-        with pytest.raises(RefusedError, match=f"done.tick must be {BLOCK}, the end of the last block; instead"):
+        with pytest.raises(
+            RefusedError,
+            match=rf"done must be with tick {BLOCK}, the end of the last block \(1\); instead received tick {said}",
+        ):
             device.done(said)
         (reply,) = steps.join()
         told = f"it was done with tick {said}; the block that it was given ends at tick {BLOCK}"
@@ -188,6 +191,8 @@ def test_a_stop_does_not_wait_for_devices() -> None:
         ("done", {"device": "b", "tick": 0}, "done.device must be one that has joined; instead received 'b'"),
         ("done", {"device": "a", "tick": -1}, "done.tick must be greater than or equal to 0"),
         ("done", {"device": "a", "tick": 1.0}, "done.tick must be a valid integer"),
+        ("done", {"device": "a"}, "done must be told by a tick or by a block"),
+        ("done", {"device": "a", "tick": 0, "block": 0}, "done must be told by a tick or by a block"),
         ("leave", {"device": "b"}, "leave.device must be one that has joined"),
     ],
 )

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import pydantic
 
 from drivers.can.bus.frame import STANDARD_MASK
+from drivers.can.devices import Standing, node_of
 from drivers.can.gateway.commands import IDENTIFIERS, Commands
 from drivers.can.gateway.outbox import Outbox
 from drivers.can.gateway.samples import sample_frames, steps
@@ -26,6 +27,7 @@ from drivers.can.signals import EventKind, State
 from drivers.health import Guard, Rising
 from rig import wire
 from rig.channels import ChannelTable
+from rig.intake import block_end_in
 from rig.outside import DOCUMENT_BYTES, Outside, check, input_error
 from rig.transport import Client
 
@@ -41,6 +43,8 @@ _WAIT_S = 0.25
 _FAREWELL_S = 0.5
 """How long a bus without room is waited for at the end [s]."""
 _WORD_32 = 0xFFFFFFFF
+_WORDS = (wire.EVENTS, wire.STATUS, wire.FAULTS, wire.BLOCK)
+"""Keys of documents, which are few, and never dropped."""
 
 
 class _Catalogue(Outside, extra="ignore"):
@@ -138,7 +142,13 @@ class Gateway:
         room = math.ceil(_WAIT_S * sum(1.0 / period_s for period_s in schedule.messages().values()))
         self.outbox = Outbox(bus, room=room, paced=paced, now=now)
         self.commands = Commands(
-            client, self._acknowledge, timeout_s=command_timeout_s, now=now, guard=self.guard, table=schedule.table
+            client,
+            self._acknowledge,
+            lambda node: self._tell_device(node, Standing.REFUSED, self._time_us),
+            timeout_s=command_timeout_s,
+            now=now,
+            guard=self.guard,
+            table=schedule.table,
         )
         self._threads = [
             threading.Thread(target=target, name=f"can gateway {name}", daemon=True)
@@ -156,7 +166,7 @@ class Gateway:
         self._bus.set_filters([{"can_id": each, "can_mask": STANDARD_MASK, "extended": False} for each in IDENTIFIERS])
         for group in self._groups:
             self._client.subscribe(wire.sensor_key(group), self._take)
-        for key in (wire.EDGES, wire.EVENTS, wire.STATUS, wire.FAULTS):
+        for key in (wire.EDGES, *_WORDS):
             self._client.subscribe(key, self._take)
         for thread in self._threads:
             thread.start()
@@ -215,7 +225,7 @@ class Gateway:
             if not self._paced:
                 while len(self._queue) >= self._capacity and not self._stopping:
                     self._changed.wait(0.1)
-            while len(self._queue) >= self._capacity and key not in (wire.EVENTS, wire.STATUS, wire.FAULTS):
+            while len(self._queue) >= self._capacity and key not in _WORDS:
                 self._queue.popleft()
                 self.blocks_dropped += 1
             self._queue.append((key, payload))
@@ -276,6 +286,13 @@ class Gateway:
             self._told |= {one.key.rpartition("/")[2]: one.row + one.rows for one in told.blocks}
         elif key == wire.STATUS:
             self._status = wire.decode_document(payload)
+            self._follow_pace(self._status)
+        elif key == wire.BLOCK:
+            end = block_end_in(payload)
+            time_us = round(1e6 * end.time_s)
+            self.outbox.put_one(
+                self._messages["Block"], end.time_s, block=end.block & _WORD_32, time=time_us & _WORD_32
+            )
         elif key == wire.EDGES:
             self._on_edges(wire.decode_block(payload, wire.TRUTH_SCHEMA))
         else:
@@ -346,6 +363,20 @@ class Gateway:
             value=min(max(round(10 * value), 0), 0xFFFF),
         )
         self._event_number += 1
+        if kind is EventKind.START:
+            self._follow_pace(event)
+        if kind is EventKind.DEVICE and (node := node_of(event.get("device"))) is not None:
+            self._tell_device(node, Standing[str(event["state"]).upper()], time_us)
+
+    def _tell_device(self, node: int, standing: Standing, time_us: int) -> None:
+        message = self._messages["DeviceState"]
+        self.outbox.put_one(message, time_us * 1e-6, node=node, state=standing, time=time_us & _WORD_32)
+
+    def _follow_pace(self, document: dict[str, Any]) -> None:
+        """A rig in lockstep is told as such before its first block: whoever is to join must not wait for that."""
+        if document.get("pace") == "lockstep" and self.state in (State.PREPARING, State.RUNNING):
+            self.state = State.LOCKSTEP
+            self._next_heartbeat_s = self._now()
 
     def _send_periodic(self, now: float) -> None:
         if now >= self._next_status_s:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import pydantic
 
+from drivers.can.devices import Said
 from drivers.can.message import MessageTable
 from drivers.can.signals import FIELDS, LIMITS, Command, Field, Kind, Result, default_messages, parse_command
 from drivers.health import Guard
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 _PENDING = 16
 """Commands that may wait for the rig."""
-IDENTIFIERS = [default_messages().by_name[name].identifier for name in ("Stop", "Command", "Fault")]
+IDENTIFIERS = [default_messages().by_name[name].identifier for name in ("Stop", "Command", "Fault", "Device")]
 _REFUSALS_A_SECOND = 50.0
 _REFUSALS_AT_ONCE = 20.0
 
@@ -34,7 +35,7 @@ _REFUSALS_AT_ONCE = 20.0
 class _Asked:
     """A command that waits for the rig."""
 
-    command: Command
+    command: Command | Said
     deadline_s: float
     answered: bool = False
 
@@ -68,6 +69,7 @@ class Commands:
     Args:
         client: Transport to the rig.
         acknowledge: Sends an acknowledge with these raw values.
+        turn_down: Tells a device, by its number, that what it said was refused.
         timeout_s: How long the rig may take for a command [s].
         now: Clock [s].
         guard: Takes what fails.
@@ -78,6 +80,7 @@ class Commands:
         self,
         client: Client,
         acknowledge: Callable[..., None],
+        turn_down: Callable[[int], None],
         *,
         timeout_s: float,
         now: Callable[[], float] = time.monotonic,
@@ -87,6 +90,7 @@ class Commands:
         self._client = client
         self._table = table
         self._acknowledge = acknowledge
+        self._turn_down = turn_down
         self._timeout_s = timeout_s
         self._now = now
         self._guard = guard
@@ -119,15 +123,16 @@ class Commands:
         """A classic data frame with the identifier of a command."""
         command = parse_command(identifier, data, self.counter, self._table)
         if isinstance(command, Result):
-            self._refuse(command, data[1] if len(data) > 1 else 0)
+            self._refuse(command, None if len(data) < 2 else data[1])
             return
         asked = _Asked(command, self._now() + self._timeout_s)
         with self._work:
             if len(self.waiting) >= _PENDING:
-                self._refuse(Result.BUSY, command.counter)
+                self._refuse(Result.BUSY, command)
                 return
-            # Used up, whatever the rig says: the same frame once more must not be taken.
-            self.counter = command.counter
+            if isinstance(command, Command):
+                # Used up, whatever the rig says: the same frame once more must not be taken.
+                self.counter = command.counter
             self.waiting.append(asked)
             if command.kind is not Kind.STOP:
                 self._work.notify_all()
@@ -160,7 +165,11 @@ class Commands:
         if not self._settle(asked):
             return
         if reply is None:
-            self._refuse(Result.TIMED_OUT, command.counter)
+            self._refuse(Result.TIMED_OUT, command)
+        elif isinstance(command, Said):
+            # What became of a device that the rig knows, events tell.
+            if not reply.accepted:
+                self._refuse(Result.REFUSED, command)
         elif reply.accepted:
             self.accepted += 1
             self._acknowledge(
@@ -188,17 +197,17 @@ class Commands:
             late = [row for row in self.waiting if self._now() > row.deadline_s]
         for row in late:
             if self._settle(row):
-                self._refuse(Result.TIMED_OUT, row.command.counter)
+                self._refuse(Result.TIMED_OUT, row.command)
 
     def _refuse_for(self, reply: _Reply, command: Command) -> None:
         """Tell the bus what the rig's own check says: which field, and which limit it passed."""
         name = reply.field.rpartition(".")[2]
         if name not in FIELDS or name not in command.values:
-            self._refuse(Result.REFUSED, command.counter)
+            self._refuse(Result.REFUSED, command)
             return
         low, high = LIMITS.get(name, (0.0, self._top_speed() if name == "speed_hz" else 0.0))
         limit = round(min(10 * (low if command.values[name] < low else high), 0xFFFF))
-        self._refuse(Result.OUT_OF_RANGE, command.counter, field=FIELDS[name], limit=limit)
+        self._refuse(Result.OUT_OF_RANGE, command, field=FIELDS[name], limit=limit)
 
     def _top_speed(self) -> float:
         """The drive's highest speed, as the rig's parameters have it [Hz]; 0 where they do not tell."""
@@ -208,9 +217,16 @@ class Commands:
             return max(0.0, parameters.values.top_speed.value)
         return 0.0
 
-    def _refuse(self, result: Result, counter: int, *, field: Field = Field.NONE, limit: int = 0) -> None:
+    def _refuse(
+        self, result: Result, what: Command | Said | int | None, *, field: Field = Field.NONE, limit: int = 0
+    ) -> None:
+        """Count and tell that a command, or a frame with that counter, was refused."""
         self.refused[result.name.lower()] += 1
         if self._answers.left(self._now()) >= 1.0:
             # A flood of nonsense must not become a flood of answers.
             self._answers.take()
+            if isinstance(what, Said):
+                self._turn_down(what.node)
+                return
+            counter = what.counter if isinstance(what, Command) else what or 0
             self._acknowledge(counter=counter, result=result, field=field, limit=limit)
