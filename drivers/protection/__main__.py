@@ -86,11 +86,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         url, settings = parse(sys.argv[1:] if arguments is None else arguments)
         with connect(url, channels=settings.channels, name="protection") as machine:
-            print(f"protecting {url}: {', '.join(settings.channels)}", flush=True)
+            machine.note(f"protection of {settings.x}, {settings.y} is on", tags=["protection", "on"])
+            print(f"Connected to {url}: {', '.join(settings.channels)}; Ctrl-C ends it", flush=True)
             protect(machine, Protection(settings), lambda line: print(line, flush=True))
     except KeyboardInterrupt:
-        sys.exit(130)
-    except (ConnectionError, EOFError, InputError) as error:
+        return
+    except (ConnectionError, TimeoutError, EOFError, InputError) as error:
         print(error, file=sys.stderr)
         sys.exit(2)
 

@@ -148,12 +148,9 @@ class Protection:
     def _begin(self, first: int, rate_hz: float) -> None:
         """Forget all rows; probes are OK at power-up, and not where rows are lost."""
         settings, self._rate_hz = self.settings, rate_hz
-        recovery = self._rows(settings.ok_recovery_s)
-        if self._next is None:
-            self._armed = first + self._rows(settings.startup_s)
-            self._runs = {("ok", name): recovery for name in (settings.x, settings.y)}
-        else:
-            self._runs = {}
+        known, probes = self._next is not None, (settings.x, settings.y)
+        self._armed = self._armed if known else first + self._rows(settings.startup_s)
+        self._runs = {("ok", name): 0 if known else self._rows(settings.ok_recovery_s) for name in probes}
         self._window = max(2, self._rows(settings.window_s))
         self._part = 1.0 - math.exp(-2.0 * math.pi * settings.corner_hz / rate_hz)
         self._means: list[float] = []

@@ -77,6 +77,7 @@ BREACHES = [
     ("drivers.link", "drivers.daq", "Inside the drivers"),
     ("drivers.daq", "drivers.twins", "Inside the drivers"),
     ("drivers.can.bus.model", "drivers.can.gateway", "Inside the virtual bus"),
+    ("drivers.protection.monitor", "drivers.protection.__main__", "Inside the protection monitor"),
     ("drivers.hammer.driver", "drivers.hammer.twin", "Inside a device"),
     ("recorder.reader", "recorder.viewer.live", "Inside the recorder"),
     ("recorder.writer", "recorder.viewer.file", "Inside the recorder"),

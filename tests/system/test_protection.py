@@ -32,8 +32,8 @@ def trip() -> tuple[list[str], list[dict[str, Any]], list[Samples]]:
                 said, errors = device.communicate(timeout=30.0)
                 assert (device.returncode, errors) == (0, "")
             lines = said.splitlines()[1:]
-            # A note for each line, and the trip's command.
-            events = [machine.event(lambda event: event["event"] in ("speed", "note")) for _ in range(len(lines) + 1)]
+            # A note that it is there, one for each line, and the trip's command.
+            events = [machine.event(lambda event: event["event"] in ("speed", "note")) for _ in range(len(lines) + 2)]
         child.communicate(timeout=30.0)
     return lines, [{**event, "wall_s": 0.0} for event in events], rows
 

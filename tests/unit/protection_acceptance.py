@@ -1,7 +1,8 @@
 """What a protection monitor is accepted by, as tables: alarms, channel values, corners, OK limits, faults and votes.
 
 Signals are test scenes, put to the converters' inputs, with the rig's own faults on the probe disk_x; expected outcomes
-are told beside each table. `python -m tests.unit.protection_acceptance [HOURS]` feeds noise for an hour: no alarm.
+are told beside each table. `python -m tests.unit.protection_acceptance [HOURS]` feeds an hour just below
+an alert: none comes.
 """
 
 from __future__ import annotations
@@ -63,13 +64,17 @@ def outcome(settings: Settings, rows: list[Samples]) -> list[Action]:
     return [action for samples in rows for action in device.feed(samples)]
 
 
-def sine(peak_to_peak_um: float, frequency_hz: float = 10.0, duration_s: float = 1.5, **changes: Any) -> list[Samples]:
-    """Rows of a sine on both probes, the y one a quarter of a turn behind."""
-    signal = {
+def signal(peak_to_peak_um: float, frequency_hz: float, duration_s: float) -> dict[str, Any]:
+    """Changes that make `test-sine` a sine on both probes, the y one a quarter of a turn behind."""
+    return {
         "generator.amplitude_v": 3.94 * 0.5e-3 * peak_to_peak_um, "generator.frequency_hz": frequency_hz,
         "duration_s": duration_s, "generator.channels": {"disk_y": {"phase_deg": -90.0}},
     }  # fmt: skip
-    return list(stream("probes", {**signal, **changes}))
+
+
+def sine(peak_to_peak_um: float, frequency_hz: float = 10.0, duration_s: float = 1.5, **changes: Any) -> list[Samples]:
+    """Rows of such a sine."""
+    return list(stream("probes", {**signal(peak_to_peak_um, frequency_hz, duration_s), **changes}))
 
 
 ALARMS = {
@@ -210,10 +215,10 @@ def whirls(ramp_hz_s: float, delay_s: float, force_n: float = 100.0, block_ticks
 
 
 def noise(hours: float) -> tuple[list[Action], float]:
-    """What the monitor says of so many hours of the probes' own noise, and how long it took [s]."""
+    """What the monitor says of so many hours at 98 % of its alert with the probes' noise, and how long it took [s]."""
     begin = time.monotonic()
-    device, actions = Protection(monitor()), []
-    for samples in stream("probes", {"duration_s": 3600.0 * hours}, "test-quiet"):
+    device, actions = Protection(monitor(startup_s=2.0)), []
+    for samples in stream("probes", signal(0.98 * ALERT_UM, 83.0, 3600.0 * hours)):
         actions += device.feed(samples)
     return actions, time.monotonic() - begin
 

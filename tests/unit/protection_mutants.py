@@ -33,7 +33,7 @@ class Mutant:
         assert text.count(self.text) == 1, f"{self.name}: its text stands there {text.count(self.text)} times"
         module = ModuleType(self.source.__name__)
         exec(compile(text.replace(self.text, self.instead), self.name, "exec"), module.__dict__)
-        made = {name: getattr(module, name) for name in ("Protection", "obey") if hasattr(module, name)}
+        made = {name: getattr(module, name) for name in ("Protection", "obey", "protect") if hasattr(module, name)}
         return SimpleNamespace(**{**vars(sound()), **made})
 
     def fails(self, scenario: str) -> bool:
@@ -144,6 +144,9 @@ MUTANTS = [
         'if action.kind != "clear"]\n    machine.speed(0.0) if len(trips) > 1 else None', runner,
     ),
     Mutant(
+        "its own notes reset it", "a_note_of_others_resets_it", ' and "protection" not in event["tags"]', "", runner,
+    ),
+    Mutant(
         "state of each block", "blocks_change_nothing",
         "if not known or not 0 <= missing", "if missing == 0 or not 0 <= missing",
     ),
@@ -166,8 +169,8 @@ MUTANTS = [
         "fresh = samples",
     ),
     Mutant(
-        "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "            self._runs = {}",
-        '            self._runs = {("ok", name): recovery for name in (settings.x, settings.y)}',
+        "OK where rows are lost", "where_too_many_rows_are_missing_no_probe_is_ok", "0 if known else self._rows",
+        "self._rows",
     ),
 ]  # fmt: skip
 

@@ -8,7 +8,7 @@ there at n + 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +19,7 @@ from drivers.samples import Samples
 
 RATE = 1000.0
 SCENARIOS: dict[str, Callable[[Any], None]] = {}
-"""By name: each takes a device (`Protection`, `obey`), and raises AssertionError if that is not right."""
+"""By name: each takes a device (`Protection`, `obey`, `protect`), and raises AssertionError if that is not right."""
 
 
 def scenario(function: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -347,6 +347,39 @@ def a_trip_is_sent_once_and_first(device: Any) -> None:
         assert lines[1] == "0.101000 s  danger  disk_x  1200"
 
 
+class Watched(Machine):
+    """A rig with blocks, and events that come between them."""
+
+    def __init__(self, *blocks: tuple[list[dict[str, Any]], Samples]) -> None:
+        super().__init__()
+        self.parts, self.events = blocks, []
+
+    def blocks(self) -> Iterator[Samples]:
+        for events, rows in self.parts:
+            self.events += events
+            yield rows
+
+    def event(self, _: Any, *, timeout_s: float) -> dict[str, Any]:
+        if not self.events:
+            raise TimeoutError
+        return self.events.pop(0)
+
+
+@scenario
+def a_note_of_others_resets_it(device: Any) -> None:
+    blow, still = swing(200, (100, 1200.0), (150, 0.0)), np.zeros(200)
+    command = {"event": "speed", "speed_hz": 1.0}
+    for tags, expected in ((["reset"], ["reset", "reset"]), (["protection", "reset"], []), (["again"], [])):
+        machine = Watched(
+            ([], samples(disk_x=blow, disk_y=0.0)),
+            ([command, {"event": "note", "tags": tags}], samples(200, disk_x=still, disk_y=0.0)),
+            ([], samples(400, disk_x=still, disk_y=0.0)),
+        )
+        device.protect(machine, device.Protection(settings(alert_um=1000.0)), lambda _: None)
+        notes = [tags[1] for what, tags in machine.asked if what == "note"]
+        assert notes == ["alert", "danger", "trip", "clear", *expected]
+
+
 def eventful(rows: int = 6000) -> tuple[Settings, Samples]:
     """Rows in which most things happen."""
     rng = np.random.default_rng(1)
@@ -411,6 +444,6 @@ def where_too_many_rows_are_missing_no_probe_is_ok(device: Any) -> None:
 
 def sound() -> Any:
     from drivers.protection import Protection
-    from drivers.protection.__main__ import obey
+    from drivers.protection.__main__ import obey, protect
 
-    return SimpleNamespace(Protection=Protection, obey=obey)
+    return SimpleNamespace(Protection=Protection, obey=obey, protect=protect)

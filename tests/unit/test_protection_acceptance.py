@@ -57,6 +57,15 @@ def test_a_fault_comes_to_what_the_vote_says(kind: str) -> None:
     assert tuple(table.judged(rows, *vote) for vote in table.VOTES) == expected
 
 
+def test_the_edge_of_a_cable_that_breaks_is_a_danger_without_a_delay_alone() -> None:
+    changes = {"duration_s": 0.4, "commands": [table.fault("open")]}
+    rows = list(table.stream("probes", changes, "stable-run"))  # behind the low-pass, which test signals have not
+    for delay_s, expected in ((0.0, True), (1e-4, False)):
+        actions = outcome(monitor(danger_delay_s=delay_s), rows)
+        assert any(action.kind == "trip" for action in actions) == expected
+        assert [(action.name, action.row) for action in actions if action.kind == "not-ok"] == [("disk_x", 5003)]
+
+
 @pytest.mark.parametrize("kind", table.PULSES)
 def test_a_fault_of_the_keyphasor_comes_to_what_is_told(kind: str) -> None:
     numbers, expected = table.PULSES[kind]
@@ -79,4 +88,4 @@ def test_a_trip_stops_whirl_where_drive_and_delay_are_fast(ramp_hz_s: float, del
 
 
 def test_noise_raises_no_alarm() -> None:
-    assert table.noise(1.0 / 3600.0)[0] == []
+    assert table.noise(4.0 / 3600.0)[0] == []
