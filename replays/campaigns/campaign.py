@@ -245,11 +245,12 @@ def _case(
     with _field("steps"):
         load_scene(scene_name, {**changes, **({"channels": table} if table else {}), "commands": [*own, *timed]})
     known: Units = {"": {key: each.unit for key, each in scene.table.channels.items()}, **_TRUTH}
+    axes = {axis.rpartition(" ")[2]: [label for label, _ in each] for axis, each in _axes(file)}
     expects = []
     for n, one in enumerate(file.expect):
         expect = _expect(one, f"expect.{n}", places, known, duration_s)
-        _check_when(expect, f"expect.{n}.when", file, picked)
-        if all(named.get(axis.rpartition(".")[2]) == label for axis, label in _when(expect).items()):
+        _check_when(expect, f"expect.{n}.when", axes)
+        if all(named[axis] in labels for axis, labels in _when(expect)):
             expects.append(expect)
     if not expects:
         raise InputError("expect", "with something for each case", Words(f"nothing for {name}"))
@@ -389,18 +390,21 @@ def _expect(
     return expect
 
 
-def _when(expect: Expect) -> Mapping[str, str]:
-    return {axis: label if "=" in label or axis in ("scene", "fault") else f"{axis.rpartition('.')[2]}={label}"
-            for axis, label in expect.when.items()}  # fmt: skip
+def _when(expect: Expect) -> Iterator[tuple[str, list[str]]]:
+    """Axes that an expectation is kept to, each with its values as cases are named by them."""
+    for axis, given in expect.when.items():
+        labels = [_short(each) for each in (given if isinstance(given, list) else [given])]
+        short = "" if axis in ("scene", "fault") else f"{axis.rpartition('.')[2]}="
+        yield axis, [label if label.startswith(short) else f"{short}{label}" for label in labels]
 
 
-def _check_when(expect: Expect, field: str, file: _File, picked: _Picked) -> None:
-    axes = {name.rpartition(" ")[2]: [label for label, _ in values] for name, values in _axes(file)}
-    for axis, label in _when(expect).items():
+def _check_when(expect: Expect, field: str, axes: Mapping[str, list[str]]) -> None:
+    for axis, labels in _when(expect):
         if axis not in axes:
             raise UnknownNameError(f"{field}.{axis}", "an axis of the matrix", axis, axes)
-        if label not in axes[axis]:
-            raise UnknownNameError(f"{field}.{axis}", f"a value of {axis} in the matrix", label, axes[axis])
+        for label in labels:
+            if label not in axes[axis]:
+                raise UnknownNameError(f"{field}.{axis}", f"a value of {axis} in the matrix", label, axes[axis])
 
 
 def _device(file: _File, places: Mapping[str, str], path: Path) -> _Device:

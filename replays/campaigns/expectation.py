@@ -133,8 +133,8 @@ class Since(_Signal):
 class _Expect(Written):
     name: str = ""
     source: str = ""
-    when: dict[str, str] = Field(default={})
-    """Only in the cases that have these values on the matrix's axes."""
+    when: dict[str, Any] = Field(default={})
+    """Only in the cases that have these values, or one of several, on the matrix's axes."""
 
 
 class _Within(_Expect):
