@@ -110,7 +110,7 @@ class CampaignItem(pytest.Item):
         if isinstance(excinfo.value, MeasurementError):
             return "\n".join(each.line for each in self.stash[_TRIAL].measurements if not each.good)
         if isinstance(excinfo.value, BenchError | InputError | DiskError | ConnectionError | TimeoutError):
-            return str(excinfo.value)
+            return self.stash[_TRIAL].lasting(str(excinfo.value))
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import shutil
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,6 +45,8 @@ class Results:
     def __init__(self, folder: Path, against: Path | None, config: pytest.Config) -> None:
         self._folder, self._config = folder, config
         self._earlier = None if against is None else load_results(against)
+        if (folder / "results.json").is_file():  # what is written anew has none of the old evidence
+            shutil.rmtree(folder / "evidence", ignore_errors=True)
         self._cases: dict[str, dict[str, Any]] = {}
         self._planned: dict[str, None] = {}
         self._begun_s = time.time()

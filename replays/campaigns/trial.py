@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 AROUND_S = 1.0
 """Simulated time that is kept before and after an event [s]."""
+
+_LARGE_BYTES = 100 << 20
+"""A file that a device has left is kept as evidence if it is smaller."""
 
 
 class MeasurementError(AssertionError):
@@ -102,8 +105,15 @@ class Trial:
 
     def take(self, measurement: Measurement) -> Measurement:
         """Keep a measurement, whatever comes of it."""
-        self.measurements.append(measurement)
-        return measurement
+        self.measurements.append(replace(measurement, note=self.lasting(measurement.note)))
+        return self.measurements[-1]
+
+    def lasting(self, text: str) -> str:
+        """A text of this run without what is another in the next: folders, ports and names."""
+        found = text.replace(str(self.folder), "{folder}")
+        for address in () if self.bench is None else (self.bench.can_url, self.bench.url, self.bench.name):
+            found = found.replace(address.partition(":")[2] or address, "{rig}") if address else found
+        return found
 
     def close(self, *, failed: bool) -> None:
         """End all that runs; keep the evidence of a failure, and remove the rest."""
@@ -124,14 +134,16 @@ class Trial:
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def _keep_evidence(self) -> None:
-        if self.bench is None:
+        if self.settings is None:
             return
         folder = self.folder if self.evidence is None else self.evidence / plain(self.id)
         folder.mkdir(parents=True, exist_ok=True)
-        for log in sorted(self.folder.glob("*.log")):
-            if folder != self.folder:
-                shutil.copyfile(log, folder / log.name)
-            self.kept.append(folder / log.name)
+        # Logs, and what devices have left; of the session that was recorded a piece is enough.
+        for left in sorted(self.folder.iterdir()):
+            if left.is_file() and left.suffix != ".mcap" and left.stat().st_size < _LARGE_BYTES:
+                if folder != self.folder:
+                    shutil.copyfile(left, folder / left.name)
+                self.kept.append(folder / left.name)
         try:
             if self.recording is not None:
                 self.kept += self._cut(self.recording, folder)
