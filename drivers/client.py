@@ -30,6 +30,7 @@ from drivers.daq import Daq
 from drivers.link import LinkTimeoutError
 from drivers.lockstep import LOST_S, Blocks
 from drivers.samples import Samples, StreamEndedError
+from drivers.sources import Source
 from drivers.sources.rig import RigSource
 from drivers.turns import HALF, Turn, edges, joined, turn_in
 from rig import wire
@@ -75,6 +76,7 @@ class Rig(Console):
         truth: Tables of the truth that come too, such as `contact`: a device under test must not see it, and so none
             comes unasked.
         name: Who asks; appears in the stream's events.
+        source: Where the rows come from; the rig's own keys unless given.
 
     Raises:
         ConnectionError: No rig answers.
@@ -90,6 +92,7 @@ class Rig(Console):
         buffer_s: float = 60.0,
         truth: Sequence[str] = (),
         name: str | None = None,
+        source: Source | None = None,
     ) -> None:
         super().__init__(client, name=name)
         if isinstance(channels, str):
@@ -101,12 +104,15 @@ class Rig(Console):
         """real-time, lockstep or free."""
         catalogue = Catalogue.read(document)
         self._tick_rate_hz = catalogue.tick_rate_hz
-        self._block_ticks = round(1e-3 * status["block_ms"] * catalogue.tick_rate_hz)
+        self._block_ticks = round(1e-3 * (status["block_ms"] or 0.0) * catalogue.tick_rate_hz)
+        self._steps = self.pace == "lockstep" and self._block_ticks > 0
+        """Over CAN a rig in lockstep cannot be stepped."""
         self._at: int = status["tick"]
         """Up to where a rig in lockstep was stepped [ticks]."""
         self.lost: dict[str, str] = {}
         """Devices under test that were put out while this client stepped the rig, with the reason."""
         self._blocks: Blocks | None = None
+        self._joined = False
         self._events: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._seen: list[dict[str, Any]] = []
         client.subscribe(wire.EVENTS, self._on_event)
@@ -120,7 +126,7 @@ class Rig(Console):
             self._listen_to(table, [one["name"] for one in columns], [one["unit"] for one in columns])
         self._daq: Daq | None = None
         if channels:
-            source = RigSource(client)
+            source = source or RigSource(client)
             try:
                 self._daq = Daq(source, channels=channels, rate_hz=rate_hz, buffer_s=buffer_s)
             except BaseException:
@@ -150,17 +156,28 @@ class Rig(Console):
             InputError: The URL is malformed, or there is no such channel or rate.
             ConnectionError: Nothing is there.
         """
-        from rig.transport.zenoh import client_of
+        given: dict[str, Any] = {"channels": channels, "rate_hz": rate_hz, "buffer_s": buffer_s}
+        if url.startswith("can:"):
+            from drivers.sources.can_client import CanClient
 
-        client = client_of(url, wait_s=wait_s)
+            if truth:
+                raise InputError("truth", "left out over CAN: a bus carries none", list(truth))
+            client = CanClient(url.removeprefix("can:"), wait_s=wait_s)
+            given |= {"name": f"CAN {client.node}", "source": client.source}
+        else:
+            from rig.transport.zenoh import client_of
+
+            client = client_of(url, wait_s=wait_s)
+            given |= {"name": name, "truth": truth}
         try:
-            return cls(client, channels=channels, rate_hz=rate_hz, buffer_s=buffer_s, truth=truth, name=name)
+            return cls(client, **given)
         except BaseException:
             client.close()
             raise
 
     def close(self) -> None:
         """End, and leave the rig running."""
+        self._part()
         if self._daq is not None:
             self._daq.close()
         super().close()
@@ -289,8 +306,7 @@ class Rig(Console):
         daq = self.daq
         if self.pace == "lockstep":
             yield from self._blocks_done(patience_s)
-            return
-        while True:
+        while self.pace != "lockstep":
             try:
                 yield daq.read(timeout_s=_PATIENCE_S)
             except LinkTimeoutError as error:
@@ -300,8 +316,8 @@ class Rig(Console):
 
     def _blocks_done(self, patience_s: float) -> Iterator[Samples]:
         """Join, and be done with each block when the next one is asked for."""
-        blocks = self._blocks = self._blocks or Blocks(self._client, self.daq)
-        begin = self.join(patience_s=patience_s).tick
+        blocks = self._blocks = self._blocks or Blocks(self._client, self.daq, self._name)
+        begin, self._joined = self.join(patience_s=patience_s).tick, True
         try:
             while (end := blocks.next()) is not None:
                 if end.tick > begin:
@@ -311,8 +327,15 @@ class Rig(Console):
             if "a run that ended" not in str(error):
                 raise
         except ConnectionError:
-            return  # the rig has gone, as at the end of its rows
+            if self.daq.ended is None:
+                raise
         finally:
+            self._part()
+
+    def _part(self) -> None:
+        """Leave, where the rig may wait for this device."""
+        joined, self._joined = self._joined, False
+        if joined:
             with contextlib.suppress(RefusedError, ConnectionError):
                 self.leave()
 
@@ -323,15 +346,15 @@ class Rig(Console):
         if taken is not None and len(taken) >= rows:
             self._give_back(taken.rows(rows, len(taken)))
             return taken.rows(0, rows)
-        lockstep, deadline = self.pace == "lockstep", time.monotonic() + _PATIENCE_S
+        deadline = time.monotonic() + _PATIENCE_S
         while taken is None or (whole and len(taken) < rows):
             # No more at a time than there is room for.
             missing = min(rows - (0 if taken is None else len(taken)), self._room)
             refused = self._step_to(self._next + missing)
             try:
-                fresh = daq.read(missing, timeout_s=LOST_S if lockstep and refused is None else _PATIENCE_S)
+                fresh = daq.read(missing, timeout_s=LOST_S if self._steps and refused is None else _PATIENCE_S)
             except LinkTimeoutError as error:
-                if refused is not None or not lockstep or time.monotonic() > deadline:
+                if refused is not None or not self._steps or time.monotonic() > deadline:
                     raise refused or NotSeenError(f"the rig sent no rows: {error}") from error
                 # What was published and has not come is lost: what comes behind it tells of the gap.
                 self._next = max(self._next + 1, math.floor(self._at * daq.rate_hz / self._tick_rate_hz))
@@ -350,7 +373,7 @@ class Rig(Console):
             Why it refused: a run that is over tells that by its rows.
         """
         ticks = row * self._tick_rate_hz / self.daq.rate_hz - self._at
-        if self.pace == "lockstep" and ticks > 0.0:
+        if self._steps and ticks > 0.0:
             try:
                 whole = math.ceil(ticks / self._block_ticks - 1e-9) * self._block_ticks
                 # A rig that was killed never answers.
@@ -421,7 +444,7 @@ class Rig(Console):
         deadline, made = time.monotonic() + timeout_s, self._truth[table]
         found: Samples | None = None
         while found is None or (to_s is not None and found.times_s[-1] + 1.0 / found.rate_hz < to_s - 1e-9):
-            if to_s is not None and self.pace == "lockstep" and to_s * self._tick_rate_hz > self._at:
+            if to_s is not None and self._steps and to_s * self._tick_rate_hz > self._at:
                 blocks = math.ceil((to_s * self._tick_rate_hz - self._at) / self._block_ticks - 1e-9)
                 self._step(blocks * self._block_ticks)
             try:
@@ -456,7 +479,9 @@ def connect(
     """One client of a running rig: its commands, and what comes back.
 
     Args:
-        url: `zenoh:HOST:PORT`, with `?tls=DIR` for a rig that is exposed, or the name of a rig of this machine.
+        url: `zenoh:HOST:PORT`, with `?tls=DIR` for a rig that is exposed, the name of a rig of this machine, or
+            `can:INTERFACE:CHANNEL[?NAME=VALUE&...]`, with `node=N` for the number as a device under test: there
+            commands, events and rows are those that frames carry, and the name is `CAN N`.
         channels: Channels that are read, from now on.
         wait_s: How long to wait for a rig to be there [s].
         settings: More of `Rig`: `rate_hz`, `buffer_s`, `truth`, `name`.
@@ -468,8 +493,8 @@ def connect(
     Example:
         Of a rig that runs: `with rig.connect(channels=["disk_x"]) as machine`.
 
-        >>> connect("can:zenoh:can0")
+        >>> connect("can:zenoh:can0", truth=["contact"])
         Traceback (most recent call last):
-        rig.errors.InputError: url must be zenoh:HOST:PORT[?tls=DIR]; instead received 'can:zenoh:can0'
+        rig.errors.InputError: truth must be left out over CAN: a bus carries none; instead received ['contact']
     """
     return Rig.open(url, channels=channels, wait_s=wait_s, **settings)

@@ -12,7 +12,8 @@ from drivers.link import LinkTimeoutError
 from drivers.samples import Samples, StreamEndedError
 from drivers.turns import joined
 from rig import wire
-from rig.intake import BlockEnd, block_end_in
+from rig.errors import RefusedError
+from rig.intake import BlockEnd, block_end_in, event_in
 from rig.transport import Client
 
 LOST_S = 2.0
@@ -27,24 +28,40 @@ class Blocks:
     Args:
         client: Transport to the rig.
         daq: What reads the channels; its rows are taken here.
+        device: Name under which the device joins.
     """
 
-    def __init__(self, client: Client, daq: Daq) -> None:
-        self._client, self._daq = client, daq
+    def __init__(self, client: Client, daq: Daq, device: str) -> None:
+        self._client, self._daq, self._device = client, daq, device
         self._ends: queue.SimpleQueue[BlockEnd] = queue.SimpleQueue()
+        self._lost = ""
         client.subscribe(wire.BLOCK, self._on_end)
+        client.subscribe(wire.EVENTS, self._on_event)
         client.settle()
 
     def _on_end(self, _: str, payload: bytes) -> None:
         with contextlib.suppress(ValueError):
             self._ends.put(block_end_in(payload))
 
+    def _on_event(self, _: str, payload: bytes) -> None:
+        with contextlib.suppress(ValueError):
+            event = event_in(payload)
+            if event["event"] == "device" and event.get("device") == self._device:
+                lost = event.get("state") == "lost"
+                self._lost = str(event.get("reason", "not done in time, or with another block")) if lost else ""
+
     def next(self) -> BlockEnd | None:
-        """The end of the next block; None at that of the run."""
+        """The end of the next block; None at that of the run.
+
+        Raises:
+            RefusedError: The device was put out.
+        """
         while True:
             try:
                 return self._ends.get(timeout=_ENDED_S)
             except queue.Empty:
+                if self._lost:
+                    raise RefusedError(f"the rig waits for {self._device} no longer: {self._lost}") from None
                 if self._daq.ended is not None:
                     return None
 

@@ -17,9 +17,11 @@ import numpy as np
 
 from drivers.can.message import Message, MessageTable
 from drivers.can.signals import State, default_messages, messages_for
+from drivers.link import LinkTimeoutError
 from drivers.samples import Samples
 from drivers.stream import RIG_GONE, whole_step
 from rig.channel_file import read_channels
+from rig.channels import default_table
 from rig.errors import InputError
 
 _PATIENCE_S = 3.0
@@ -103,32 +105,51 @@ class CanSource:
 
     Args:
         spec: INTERFACE:CHANNEL?NAME=VALUE&... of python-can's bus; `layout=fd` or `layout=classic` chooses one where
-            both are sent, and `channels=FILE.toml` says which channel table the rig runs with.
+            both are sent, `channels=FILE.toml` says which channel table the rig runs with, and `node=N` is the number
+            as a device under test.
         wait_s: How long to wait for a rig to be there [s]; it tells of itself once a second.
         table: Messages; by default those of the rig's own channel table.
+        on_frame: Takes name and raw values of each frame of the rig that carries no samples, behind those that came
+            before it; on the thread that reads.
 
     Raises:
         InputError: There is no such bus.
     """
 
-    def __init__(self, spec: str, *, wait_s: float = 3.0, table: MessageTable | None = None) -> None:
+    def __init__(
+        self,
+        spec: str,
+        *,
+        wait_s: float = 3.0,
+        table: MessageTable | None = None,
+        on_frame: Callable[[str, dict[str, int]], None] | None = None,
+    ) -> None:
         from drivers.link.can import open_bus, parse_spec
 
         interface, channel, settings = parse_spec(spec)
         self._wish = settings.pop("layout", None)
         if self._wish not in (None, "fd", "classic"):
             raise InputError("layout", "fd or classic", self._wish)
+        self.node = settings.pop("node", 1)
+        """Number as a device under test."""
+        self.channels = default_table()
+        """The channel table that is believed."""
         if (channels := settings.pop("channels", None)) is not None:
-            table = messages_for(read_channels(Path(channels)))
-        self._table = table or default_messages()
+            self.channels = read_channels(Path(channels))
+            table = messages_for(self.channels)
+        self.table = self._table = table or default_messages()
+        self._on_frame = on_frame
         self._other_layout = 0
         self._wait_s = wait_s
         self._bus = open_bus(spec, interface, channel, **settings)
         self._lock = threading.RLock()
         self.rates: dict[str, int] | None = None
         """How samples are picked, as the rig tells it last."""
+        self.lockstep = False
+        """Whether the rig runs in lockstep, where nothing comes before it is stepped."""
         self._started = (0, 0)
         self._sync: int | None = None
+        self._end_us = 0
         self._known = threading.Event()
         self._early: deque[tuple[int, bytes]] = deque(maxlen=_EARLY)
         self._portion: dict[int, list[bytes]] = {}
@@ -149,9 +170,8 @@ class CanSource:
         Raises:
             InputError: No rig is on that bus.
         """
-        if not self._known.wait(self._wait_s) or self.rates is None:
-            must = f"a bus with a rig on it (no Rates and Sync in {self._wait_s:g} s)"
-            raise InputError("can", must, self._bus.channel_info)
+        self.wait()
+        assert self.rates is not None
         if self._other_layout:
             must = f"a rig with the sample messages {self._table.layout} (?channels=FILE.toml tells of others)"
             raise InputError("can", must, self._other_layout)
@@ -160,17 +180,40 @@ class CanSource:
             raise InputError("layout", "one that the rig sends", layout)
         self._wish = layout
         rows = self._table.fd if layout == "fd" else self._table.classic
-        # A run may lack groups: only what has been seen is there.
+        # A run may lack groups: only what has been seen is there; of lockstep, all that may come.
         deadline = time.monotonic() + _PATIENCE_S
         count = -1
-        while count < max(1, len(self._seen)) and time.monotonic() < deadline:
+        while not self.lockstep and count < max(1, len(self._seen)) and time.monotonic() < deadline:
             count = len(self._seen)
             time.sleep(_SETTLED_S)
         return {
             row.name: tuple(channel.name for channel in row.samples.channels)
             for row in rows
-            if row.samples and row.identifier in self._seen
+            if row.samples and (self.lockstep or row.identifier in self._seen)
         }
+
+    def wait(self) -> None:
+        """Wait until a rig is there, and it is known how samples are picked.
+
+        Raises:
+            InputError: No rig is on that bus.
+        """
+        if not self._known.wait(self._wait_s) or self.rates is None:
+            must = f"a bus with a rig on it (no Rates and Sync in {self._wait_s:g} s)"
+            raise InputError("can", must, self._bus.channel_info)
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Send one classic frame.
+
+        Raises:
+            LinkTimeoutError: The bus does not take it.
+        """
+        import can
+
+        try:
+            self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=1.0)
+        except (can.CanError, OSError, ValueError) as error:
+            raise LinkTimeoutError(f"can: the bus does not take a frame ({error})") from None
 
     def start(
         self,
@@ -236,17 +279,25 @@ class CanSource:
         row = self._table.by_identifier.get(identifier)
         if row is None or len(data) != row.length:
             return None
+        raw, state = row.decode(data), None
         if row.name == "Sync":
-            self._sync = row.decode(data)["index"]
+            self._sync = raw["index"]
         elif row.name == "Rates":
-            self.rates = row.decode(data)
+            self.rates = raw
         elif row.name == "Heartbeat":
-            beat = row.decode(data)
-            self._other_layout = beat["layout"] if beat["layout"] not in (0, self._table.layout) else 0
-            return beat["state"]
+            state = raw["state"]
+            self._other_layout = raw["layout"] if raw["layout"] not in (0, self._table.layout) else 0
+            self.lockstep |= state == State.LOCKSTEP
+            self._end_us = raw["time"]
+        if self.lockstep and self._sync is None and self.rates is not None:
+            # No Sync before the first step: what comes next is behind the last block.
+            self._sync = self._end_us * self.rates["rate"] // 1_000_000
+        if self._on_frame is not None:
+            self.hand_on()
+            self._on_frame(row.name, raw)
         if self._sync is not None and self.rates is not None and self.rates["rate"]:
             self._known.set()
-        return None
+        return state
 
     def hand_on(self) -> None:
         """Give what has come to whoever takes it."""

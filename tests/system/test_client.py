@@ -123,3 +123,16 @@ def test_a_client_without_channels_says_so() -> None:
             machine.advance(0.1)
         with pytest.raises(UnknownNameError, match="table must be one that was named"):
             machine.truth("contact")
+
+
+def test_blocks_of_a_rig_that_runs_by_itself_are_read_alike_and_end_with_it() -> None:
+    with connected("real-time", channels=["disk_x", "P_E"]) as machine:
+        rows, first = 0, None
+        for samples in machine.blocks():
+            first = samples.index if first is None else first
+            assert (samples.index, samples.gap) == (first + rows, 0)
+            rows += len(samples)
+            if rows == 4000:
+                machine.stop()
+        assert rows >= 4000
+        assert machine.status()["devices"] == []

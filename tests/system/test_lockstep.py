@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
+
 import rig
 from drivers.client import Rig
+from drivers.console import AcceptedStep
+from rig.errors import InputError, RefusedError
 from tests import processes
 
 DEVICE = """
@@ -33,7 +38,7 @@ with rig.connect(sys.argv[1], channels=["P_E"], name="a") as machine:
     for _ in machine.blocks(patience_s=0.5):
         pass
 """
-PLAIN = str(processes.ROOT / "drivers/examples/plain_device.py")
+PLAIN = str(processes.ROOT / "docs/plain_device.py")
 
 
 @contextmanager
@@ -80,7 +85,7 @@ def test_devices_over_zenoh_and_over_can_react_at_the_same_ticks_however_slow_th
     tick, rows = map(int, guard.split())
     assert tick == rows * 50, "at the end of the block in which it saw it"
     assert (slower["tick"], slower["speed_hz"]) == (tick, 2.0)
-    assert plain == f"stopped at {halt['tick']} us, with block {halt['tick'] // 10_000}\n"
+    assert plain == f"joined\nstopped at {halt['tick']} us, with block {halt['tick'] // 10_000}\n"
     assert halt["speed_hz"] == 0.0
     assert 50_000 < tick < 100_000 < halt["tick"] < 300_000
     assert [(each["device"], each["state"], each["tick"]) for each in (guard_left, plain_left)] == [
@@ -99,3 +104,38 @@ def test_a_device_that_is_killed_is_told_and_the_rig_goes_on() -> None:
         assert machine.step(50_000).lost == {"a": reason}
         lost = machine.event("device")
         assert (lost["state"], lost["tick"], lost["reason"]) == ("lost", 20_000, reason)
+
+
+def test_a_program_of_the_client_is_the_same_device_over_can() -> None:
+    hub = processes.free_port()
+    spec = f"can:zenoh:can0?endpoint=127.0.0.1:{hub}&node=3"
+    with bench("--can", spec.removeprefix("can:").partition("&")[0]) as (machine, _):
+        with rig.connect(spec, channels=["disk_x", "P_E"]) as device:
+            with pytest.raises(InputError, match="command must be one that a CAN bus has a frame for"):
+                device.note("over CAN")
+            with pytest.raises(InputError, match="fault must be with its main number alone"):
+                device.fault("P_E", "gain", factor=2.0, for_s=1.0)
+            with pytest.raises(RefusedError, match="speed was refused over CAN: out of range"):
+                device.speed(1000.0)
+            stepped: list[AcceptedStep] = []
+            steps = threading.Thread(target=lambda: stepped.append(machine.step(30_000)))
+            # The first rows are asked for, and so the device joins, before anybody steps.
+            waits = threading.Timer(0.5, steps.start)
+            waits.start()
+            ticks = []
+            for samples in device.blocks():
+                assert len(samples) == 10
+                ticks.append((samples.tick, device.hammer(force_n=80.0).tick))
+                if len(ticks) == 3:
+                    break
+            fault = device.fault("P_E", "gain", factor=2.0)
+            steps.join(20.0)
+            assert ticks == [(0, 10_000), (10_000, 20_000), (20_000, 30_000)]
+            assert (fault.fault, fault.channels, fault.first_row) == (1, ("P_E",), {"forces": 600})
+            assert [device.event("hammer")["force_n"] for _ in range(2)] == [80.0] * 2
+            assert stepped[0].lost == {}
+        told = [machine.event("device") for _ in range(2)]
+        assert [(each["device"], each["state"], each["tick"]) for each in told] == [
+            ("CAN 3", "joined", 0),
+            ("CAN 3", "left", 30_000),
+        ]

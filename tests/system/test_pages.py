@@ -42,6 +42,7 @@ _READY = {
     "twins": "Ctrl-C ends",
     "view": "Ctrl-C ends",
     "-m": "Connected to",  # python -m can.logger
+    "plain_device.py": "joined",
 }
 """What a command prints that goes on, once others can count on it."""
 

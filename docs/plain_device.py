@@ -3,7 +3,7 @@
 Nothing of this project is imported: what it knows stands in rig.dbc, and the text protocol is socketcand's. For a rig
 that runs with `--pace lockstep --can zenoh:can0 --can-socketcand 127.0.0.1:29536`, which somebody else steps:
 
-    python drivers/examples/plain_device.py 29536
+    python plain_device.py 29536
 """
 
 import socket
@@ -60,6 +60,7 @@ def main(port: int, channel: str = "can0") -> None:
         state = next(data[1] for identifier, data in heard if identifier == DEVICE_STATE and data[0] == NODE)
         if state != 1:
             raise SystemExit("the rig did not let it join")
+        print("joined", flush=True)
         furthest_mm = 0.0
         for identifier, data in heard:
             if identifier == SAMPLES_1:
@@ -83,4 +84,4 @@ def main(port: int, channel: str = "can0") -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), *sys.argv[2:])
