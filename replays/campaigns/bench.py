@@ -189,20 +189,22 @@ class Bench(Closing):
         """How many links clients have to the rig."""
         return int(self.status()["congestion"].get("links", 0))
 
+    @property
+    def joined(self) -> list[str]:
+        """Devices that take part in lockstep, by what the rig calls them."""
+        return [row["name"] for row in self.status().get("devices", []) if row["state"] == "joined"]
+
     def wait_for(self, device: str, *, timeout_s: float = JOIN_S) -> None:
-        """Wait until a device under test takes part in lockstep.
+        """Wait until a device under test takes part in lockstep, whoever has started it.
 
         Raises:
             BenchError: It does not in time.
         """
         deadline = time.monotonic() + timeout_s
-        while True:
-            rows = {row["name"]: row for row in self.status().get("devices", [])}
-            if rows.get(device, {}).get("state") == "joined":
-                return
+        while device not in (now := self.joined):
             if time.monotonic() > deadline:
-                others = ", ".join(rows) or "nobody"
-                raise BenchError(f"device {device} did not join in {timeout_s:g} s; what did: {others}")
+                others = ", ".join(now) or "nobody"
+                raise BenchError(f"device {device} did not join in {timeout_s:g} s; what has: {others}")
             time.sleep(0.02)
 
     def advance_to(self, time_s: float) -> None:

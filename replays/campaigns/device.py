@@ -44,6 +44,9 @@ class Device:
             words = [word.replace(f"{{{place}}}", places[place]) for word in words]
         check_program(words, where, field="command")
         self.name, self.log, self._bench = name, log, bench
+        self.joined_as = name
+        """What the rig calls it, which over CAN is a number."""
+        self._others = bench.joined
         self.program = Program(words, log, folder=where)
 
     def wait_until_joined(self) -> None:
@@ -54,15 +57,15 @@ class Device:
         """
         deadline = time.monotonic() + JOIN_S
         while True:
-            self.check_running()
-            try:
-                self._bench.wait_for(self.name, timeout_s=0.2)
-            except BenchError:
-                self.check_running()
-                if time.monotonic() > deadline:
-                    raise
-            else:
+            now = self._bench.joined
+            if new := [name for name in now if name not in self._others]:
+                self.joined_as = new[0]
                 return
+            self.check_running()
+            if time.monotonic() > deadline:
+                others = ", ".join(now) or "nobody"
+                raise BenchError(f"device {self.name} did not join in {JOIN_S:g} s; what has: {others}")
+            time.sleep(0.02)
 
     def wait_until_linked(self, before: int) -> None:
         """Wait until there is one link more to the rig than before; not for long, as on a CAN bus it has none.

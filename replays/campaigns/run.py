@@ -125,12 +125,12 @@ def _end(device: Device, trial: Trial, case: Case) -> None:
 def _measure_device(seen: Seen, trial: Trial) -> None:
     """A device that hung, died or answered late in lockstep is a verdict, with the rig's reason."""
     for device in trial.devices:
-        lost = EventOf(event="device", where={"device": device.name, "state": "lost"})
+        lost = EventOf(event="device", where={"device": device.joined_as, "state": "lost"})
         times_s = lost.times_s(seen)
         if trial.bench is not None and trial.bench.pace == "lockstep":
             reasons = [
                 str(event.get("reason", "")) for _, event in seen.events
-                if (event.get("event"), event.get("device"), event.get("state")) == ("device", device.name, "lost")
+                if (event.get("event"), event.get("device"), event.get("state")) == ("device", device.joined_as, "lost")
             ]  # fmt: skip
             at_s = times_s[0] if times_s else None
             name = f"times that {device.name} was lost"
