@@ -32,8 +32,9 @@ def free_endpoint() -> str:
 def python(*arguments: str, **settings: Any) -> Iterator[subprocess.Popen[str]]:
     """A Python process in the tree's root, both of its outputs as pipes unless the settings say else."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
-    chosen: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": environment, **settings}
-    with subprocess.Popen([sys.executable, *arguments], text=True, cwd=ROOT, **chosen) as child:
+    usual = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": environment, "cwd": ROOT}
+    chosen: dict[str, Any] = {**usual, **settings}
+    with subprocess.Popen([sys.executable, *arguments], text=True, **chosen) as child:
         try:
             yield child
         finally:

@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from rig.errors import UnknownNameError, whole_file
+from replays.report import junit
+from rig.errors import UnknownNameError
 from rig.text import finite
 
 PASS, FAIL, NOT_SHOWN, NO_LIMIT = "pass", "fail", "this run does not show it", "no limit"
@@ -260,26 +261,16 @@ def write_junit(card: Scorecard, path: Path) -> None:
     Raises:
         DiskError: The disk refused.
     """
-    from xml.etree.ElementTree import Element, ElementTree, SubElement, indent
+    junit.write_junit(path, [junit.Suite(f"rig score, {card.path}", [_case(card, row) for row in card.rows])])
 
-    verdicts = Counter(row.verdict for row in card.rows)
-    skipped = verdicts[NOT_SHOWN] + verdicts[NO_LIMIT]
-    counts = {"tests": len(card.rows), "failures": verdicts[FAIL], "errors": 0, "skipped": skipped}
-    root = Element("testsuites")
-    told = {"name": f"rig score, {card.path}", **{name: str(count) for name, count in counts.items()}, "time": "0"}
-    suite = SubElement(root, "testsuite", told)
-    for row in card.rows:
-        name = f"{row.quantity} {row.channel}".strip()
-        case = SubElement(suite, "testcase", {"classname": f"score.{card.path}", "name": name, "time": "0"})
-        _, _, value, interval, unit, limit, verdict = row.cells()
-        line = f"{value} {unit} ({interval or 'exact'}); limit {limit or 'none'}"
-        if row.verdict == FAIL:
-            source = "" if row.limit is None else row.limit.source
-            SubElement(case, "failure", {"message": line}).text = f"{line}\nsource: {source}\n{row.note}"
-        elif row.verdict != PASS:
-            SubElement(case, "skipped", {"message": f"{verdict}{': ' if row.run else ''}{row.run}"})
-        else:
-            SubElement(case, "system-out").text = line
-    indent(root)
-    with whole_file(path) as draft:
-        ElementTree(root).write(draft, encoding="utf-8", xml_declaration=True)
+
+def _case(card: Scorecard, row: ScoreRow) -> junit.Case:
+    _, _, value, interval, unit, limit, verdict = row.cells()
+    classname, name = f"score.{card.path}", f"{row.quantity} {row.channel}".strip()
+    line = f"{value} {unit} ({interval or 'exact'}); limit {limit or 'none'}"
+    if row.verdict == FAIL:
+        source = "" if row.limit is None else row.limit.source
+        return junit.Case(classname, name, "failure", line, f"{line}\nsource: {source}\n{row.note}")
+    if row.verdict != PASS:
+        return junit.Case(classname, name, "skipped", f"{verdict}{': ' if row.run else ''}{row.run}")
+    return junit.Case(classname, name, text=line)

@@ -65,6 +65,7 @@ COMMANDS = {
         "validate": "Do a recording again and hold it against the model",
         "identify": "Fit numbers of the rig to a recording",
         "score": "Judge a DAQ by what it recorded, against what the rig sent",
+        "campaign": "Run scripted tests of a device in the loop, and judge them",
         "sessions": "Make the reference sessions anew",
     },
     "Without a clock": {
@@ -95,7 +96,7 @@ GROUPS = {
 
 NEED_FULL = (
     "demo", "scenes", "params", "laws", "magnets", "keys", "run", "can", "view", "import", "validate", "identify",
-    "score", "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
+    "score", "campaign", "sessions", "simulate", "bench", "ladder", "chart", "stability", "paper",
 )  # fmt: skip
 """The commands that a lean install does without; of `keys` it has `init`."""
 

@@ -56,7 +56,8 @@ def test_what_needs_the_whole_rig_says_how_to_get_it() -> None:
 NEEDING = {
     "score": "{rec} --against {rec}",
     "import": "{rec} --template x.toml", "validate": "{rec}", "identify": "{rec} --fit contact.friction",
-    "view": "{rec}", "sessions": "-o {folder}", "run": "hammer", "simulate": "hammer -o {folder}/x.mcap",
+    "view": "{rec}", "sessions": "-o {folder}", "campaign": "hammer", "run": "hammer",
+    "simulate": "hammer -o {folder}/x.mcap",
     "can": "hub c0", "ladder": "hammer -q whirl_frequency -t 0.1", "paper": "-o {folder}/x.html",
 }  # fmt: skip
 """What commands are given that do not go without."""

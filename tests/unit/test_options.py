@@ -95,7 +95,7 @@ def test_help_is_told_once_and_fits_80_columns(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("rnu", "command must be one of `rig -h`, such as run (40 in all); instead received 'rnu'"),
+        ("rnu", "command must be one of `rig -h`, such as run (41 in all); instead received 'rnu'"),
         ("can lod", "command must be one of `rig can -h`, such as load (3 in all); instead received 'lod'"),
         (
             "run x --sed 1",

@@ -1,0 +1,123 @@
+"""On which line of a TOML text each key stands, which its parser does not tell."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+
+_TOKEN = re.compile(
+    r'"""(?:[^\\]|\\.)*?"""|\'\'\'.*?\'\'\'|"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|#[^\n]*|[\[\]{},=\n]|[^\s\[\]{},=#"\']+',
+    re.DOTALL,
+)
+_Token = tuple[str, int]
+
+
+def lines_of(text: str) -> dict[str, int]:
+    r"""Line of each key and of each element of a list, by its path with dots between, counted from 1.
+
+    Args:
+        text: A text that is TOML.
+
+    Example:
+        >>> lines_of('a = 1\n[[b]]\nc = [\n  2,\n  { d = 3 },\n]')
+        {'a': 1, 'b': 2, 'b.0': 2, 'b.0.c': 3, 'b.0.c.0': 4, 'b.0.c.1': 5, 'b.0.c.1.d': 5}
+    """
+    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
+    tokens = _Tokens(text)
+    table = ""
+    while (token := tokens.next()) is not None:
+        word, line = token
+        if word == "\n":
+            continue
+        if word == "[":
+            several = (tokens.peek() or ("", 0))[0] == "["
+            name = _joined(_real(counts, tokens.key(("]",))))
+            if several:
+                tokens.next()
+                number = counts[name] = counts.get(name, -1) + 1
+                found.setdefault(name, line)
+                name = f"{name}.{number}"
+            found.setdefault(name, line)
+            table = name
+            continue
+        path = _joined([table, *tokens.key(("=",), word)])
+        found.setdefault(path, line)
+        _value(tokens, path, found)
+    return found
+
+
+def line_of(field: str, lines: Mapping[str, int]) -> int | None:
+    """Line of a field, or of the nearest thing that it stands in; None where nothing of it is there."""
+    while field not in lines and "." in field:
+        field = field.rpartition(".")[0]
+    return lines.get(field)
+
+
+class _Tokens:
+    def __init__(self, text: str) -> None:
+        self._all = list(_tokens(text))
+        self._at = 0
+
+    def peek(self) -> _Token | None:
+        return self._all[self._at] if self._at < len(self._all) else None
+
+    def next(self) -> _Token | None:
+        self._at += 1
+        return self._all[self._at - 1] if self._at <= len(self._all) else None
+
+    def key(self, ends: tuple[str, ...], word: str = "") -> list[str]:
+        """Parts of a key up to what ends it, which is taken."""
+        parts = _parts(word)
+        while (token := self.next()) is not None and token[0] not in ends:
+            parts += _parts(token[0]) if token[0] != "[" else []
+        return parts
+
+
+def _tokens(text: str) -> Iterator[_Token]:
+    line, last = 1, 0
+    for match in _TOKEN.finditer(text):
+        line += text.count("\n", last, match.start())
+        last = match.start()
+        if not match[0].startswith("#"):
+            yield match[0], line
+
+
+def _parts(word: str) -> list[str]:
+    if word[:1] in "\"'" and word:
+        return [word[1:-1]]
+    return [part for part in word.split(".") if part]
+
+
+def _joined(parts: list[str]) -> str:
+    return ".".join(part for part in parts if part)
+
+
+def _real(counts: Mapping[str, int], parts: list[str]) -> list[str]:
+    """A heading's path with the number of the latest table of each list that it stands in."""
+    found: list[str] = []
+    for number, part in enumerate(parts):
+        found.append(part)
+        name = _joined(found)
+        if name in counts and number < len(parts) - 1:
+            found.append(str(counts[name]))
+    return found
+
+
+def _value(tokens: _Tokens, path: str, found: dict[str, int]) -> None:
+    """Pass over a value, with the lines of what is in it."""
+    opening = tokens.next()
+    if opening is None or opening[0] not in "[{":
+        return
+    listed, number = opening[0] == "[", 0
+    while (upcoming := tokens.peek()) is not None:
+        word, line = upcoming
+        if word in ("]", "}", ",", "\n"):
+            tokens.next()
+            if word in "]}":
+                return
+            continue
+        inner = f"{path}.{number}" if listed else _joined([path, *tokens.key(("=",))])
+        number += 1
+        found.setdefault(inner, line)
+        _value(tokens, inner, found)

@@ -1,0 +1,149 @@
+"""The page of a campaign: first what failed and why, with pictures; then what changed, and all that was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from replays.campaigns.measurement import with_unit
+from replays.report import Mark, Report, Row
+from replays.report.document import Picture
+
+Document = Mapping[str, Any]
+_MARKS: dict[str, Mark] = {
+    "failed": "bad", "error": "bad", "interrupted": "open", "skipped": "open", "passed": "good",
+}  # fmt: skip
+_SMALL = 1e-9
+"""Part of a margin that is no change."""
+
+
+def make_page(results: Document, folder: Path, earlier: Document | None = None) -> Report:
+    """The page of a campaign's results.
+
+    Args:
+        results: As results.json.
+        folder: Where its evidence is.
+        earlier: Those of an earlier campaign.
+    """
+    counts, cases = results["counts"], results["cases"]
+    bad = [case for case in cases if _MARKS[case["outcome"]] == "bad"]
+    mark: Mark = "bad" if bad else "open" if counts["interrupted"] or not counts["passed"] else "good"
+    told = ", ".join(f"{count} {outcome}" for outcome, count in counts.items() if count) or "no case"
+    wall = results["wall"]
+    origin = {
+        "begun": f"{wall['begun']} UTC, {wall['duration_s']:.1f} s",
+        "machine": wall["machine"],
+        "rig": wall["rig"],
+    }
+    report = Report("; ".join(results["titles"]) or "Campaign", f"{told}.", origin=origin, mark=mark)
+    for case in bad:
+        _failure(report, case, folder)
+    if earlier is not None:
+        _trend(report, results, earlier)
+    report.heading("Cases")
+    rows = sorted(cases, key=lambda case: list(_MARKS).index(case["outcome"]))
+    report.table(
+        ("case", "why", "time [s]", "outcome"),
+        [Row((case["id"], case["reason"], _seconds(results, case), case["outcome"]), _MARKS[case["outcome"]])
+         for case in rows],
+    )  # fmt: skip
+    report.heading("Measurements")
+    for case in cases:
+        if case["measurements"]:
+            report.heading(case["id"], level=2)
+            _measurements(report, results, case)
+    return report
+
+
+def _seconds(results: Document, case: Document) -> str:
+    return f"{results['wall']['cases'].get(case['id'], {}).get('duration_s', 0.0):.1f}"
+
+
+def _failure(report: Report, case: Document, folder: Path) -> None:
+    report.heading(f"{case['outcome']}: {case['id']}")
+    failed = [each for each in case["measurements"] if not each["good"]]
+    if not failed:
+        report.text(case["reason"])
+    for each in failed:
+        limit, value = _limit(each), _number(each["value"], each["unit"], "nothing")
+        margin = f", margin {_number(each['margin'], each['unit'])}" if each["margin"] is not None else ""
+        told = f" Source: {each['source']}." if each["source"] else ""
+        note = f" ({each['note']})" if each["note"] else ""
+        report.text(f"{each['name']} must be {limit}; it is {value}{margin}{note}.{told}")
+    for file in case["evidence"]:
+        path = folder / file
+        if path.suffix == ".png" and path.is_file():
+            caption = "The signals about the moment where it failed, with the events there."
+            report.parts.append(Picture(path.read_bytes(), caption))
+    for trouble in case["troubles"]:
+        report.text(trouble)
+    files = ", ".join(f"`{file}`" for file in case["evidence"])
+    report.text(f"Again: `{case['repeat']}`" + (f". Evidence: {files}" if files else ""))
+
+
+def _measurements(report: Report, results: Document, case: Document) -> None:
+    floor = results["wall"]["cases"].get(case["id"], {}).get("floor_ms")
+    measured = "" if floor is None else f" Floor of a round trip: median {floor[0]:g} ms, longest {floor[1]:g} ms."
+    caption = f"Reactions are exact to {case['resolution']}.{measured}" if case["resolution"] else ""
+    rows = [
+        Row((
+            each["name"], _number(each["value"], each["unit"], "nothing"), _limit(each),
+            "" if each["margin"] is None else _number(each["margin"], each["unit"]), each["source"], each["note"],
+            "pass" if each["good"] else "fail",
+        ), "good" if each["good"] else "bad")
+        for each in case["measurements"]
+    ]  # fmt: skip
+    headings = ("measurement", "value", "must be", "margin", "source", "note", "verdict")
+    report.table(headings, rows, caption=caption)
+
+
+def _number(value: float | None, unit: str, none: str = "") -> str:
+    return none if value is None else with_unit(f"{value:.6g}", unit)
+
+
+def _limit(each: Document) -> str:
+    limit = each["limit"]
+    if isinstance(limit, list):
+        return with_unit(f"{limit[0]:.6g} to {limit[1]:.6g}", each["unit"])
+    return with_unit(f"{each['op']} {limit:.6g}", each["unit"])
+
+
+def _trend(report: Report, results: Document, earlier: Document) -> None:
+    report.heading("Against the earlier campaign")
+    rows = sorted(changes(earlier, results), key=lambda row: ("worse", "gone", "new", "better").index(row.cells[-1]))
+    begun = earlier.get("wall", {}).get("begun", "")
+    if not rows:
+        report.text(f"Nothing changed since that of {begun}.")
+        return
+    caption = f"What changed since that of {begun}: outcomes, and margins to the limits."
+    report.table(("case", "of", "then", "now", "change"), rows, caption=caption)
+
+
+def changes(then: Document, now: Document) -> Iterator[Row]:
+    """What got better or worse from one campaign to another, what is new in it, and what is gone."""
+    old, new = ({case["id"]: case for case in each["cases"]} for each in (then, now))
+    for name in [*new, *(name for name in old if name not in new)]:
+        if name not in old or name not in new:
+            there, change = (new[name], "new") if name in new else (old[name], "gone")
+            cells = ("", there["outcome"]) if name in new else (there["outcome"], "")
+            yield Row((name, "outcome", *cells, change), "plain")
+            continue
+        before, after = old[name], new[name]
+        if before["outcome"] != after["outcome"]:
+            order = list(_MARKS)
+            better = order.index(after["outcome"]) > order.index(before["outcome"])
+            yield _row(name, "outcome", before["outcome"], after["outcome"], better=better)
+        margins = {each["name"]: each for each in before["measurements"]}
+        for each in after["measurements"]:
+            past = margins.get(each["name"])
+            if past is None or each["unit"] != past["unit"] or None in (past["margin"], each["margin"]):
+                continue
+            moved = each["margin"] - past["margin"]
+            if abs(moved) > _SMALL * max(abs(each["margin"]), abs(past["margin"])):
+                shown = (_number(one["margin"], one["unit"]) for one in (past, each))
+                yield _row(name, f"margin of {each['name']}", *shown, better=moved > 0.0)
+
+
+def _row(case: str, of: str, then: str, now: str, *, better: bool) -> Row:
+    return Row((case, of, then, now, "better" if better else "worse"), "good" if better else "bad")

@@ -1,0 +1,204 @@
+"""What pytest loads: the fixtures `bench`, `dut`, `record` and `measure`, and campaigns in TOML as ordinary tests.
+
+All that is heavy is imported where it is used, as every run of pytest in the same environment loads this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from replays.campaigns.bench import Bench
+    from replays.campaigns.campaign import Case
+    from replays.campaigns.device import Device
+    from replays.campaigns.record import Record
+    from replays.campaigns.trial import Trial
+
+_SUFFIX = ".campaign.toml"
+_TRIAL = pytest.StashKey["Trial"]()
+_FAILED = pytest.StashKey[bool]()
+_MARKER = (
+    'bench(scene="stable-run", pace="lockstep", block_ms=10, set={}, channels=[], faults=[], commands=[], '
+    "duration_s=None, can=False): the rig that a test is run on"
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of campaigns."""
+    group = parser.getgroup("rig", "campaigns on a rotor-stator rig")
+    group.addoption("--rig-results", metavar="FOLDER", help="write results.json, junit.xml, index.html and evidence/")
+    group.addoption("--rig-against", metavar="FOLDER", help="results of an earlier campaign to compare with")
+    group.addoption("--rig-url", metavar="URL", help="run on the rig there instead of on rigs of the tests' own")
+    group.addoption("--rig-replay", metavar="FILE", help="run on a recording that is played")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the marker, and on the process that gathers them the results."""
+    config.addinivalue_line("markers", _MARKER)
+    folder, against = config.option.rig_results, config.option.rig_against
+    if folder and not hasattr(config, "workerinput"):
+        from replays.campaigns.results import Results
+
+        results = Results(Path(folder), None if against is None else Path(against), config)
+        config.pluginmanager.register(results, "rig-results")
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """Collect a campaign's file."""
+    return CampaignFile.from_parent(parent, path=file_path) if file_path.name.endswith(_SUFFIX) else None
+
+
+class CampaignFile(pytest.File):
+    """A campaign in TOML."""
+
+    def collect(self) -> Iterator[pytest.Item]:
+        """Its cases."""
+        from replays.campaigns.campaign import load_campaign
+        from rig.errors import InputError
+
+        try:
+            campaign = load_campaign(self.path)
+        except InputError as error:
+            raise self.CollectError(str(error)) from None
+        for case in campaign.cases:
+            yield CampaignItem.from_parent(self, name=case.id, case=case)
+
+
+class CampaignItem(pytest.Item):
+    """A case of a campaign in TOML."""
+
+    def __init__(self, *, case: Case, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.case = case
+
+    def setup(self) -> None:
+        """Make its trial."""
+        self.stash[_TRIAL] = _trial_of(self)
+
+    def runtest(self) -> None:
+        """Run it."""
+        from replays.campaigns.bench import NotThereError
+        from replays.campaigns.run import run_case
+        from replays.campaigns.trial import MeasurementError
+
+        trial = self.stash[_TRIAL]
+        try:
+            run_case(self.case, trial)
+        except NotThereError as error:
+            pytest.skip(str(error))
+        finally:
+            for measurement in trial.measurements:
+                self.user_properties.extend(measurement.properties())
+        if trial.first_bad:
+            raise MeasurementError(trial.first_bad)
+
+    def teardown(self) -> None:
+        """End what runs, and keep the evidence of a failure."""
+        if (trial := self.stash.get(_TRIAL, None)) is not None:
+            trial.close(failed=self.stash.get(_FAILED, False))
+
+    def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
+        """A line for each value that is not as it must be, or the one of what failed."""
+        from replays.campaigns.bench import BenchError
+        from replays.campaigns.trial import MeasurementError
+        from rig.errors import DiskError, InputError
+
+        if isinstance(excinfo.value, MeasurementError):
+            return "\n".join(each.line for each in self.stash[_TRIAL].measurements if not each.good)
+        if isinstance(excinfo.value, BenchError | InputError | DiskError | ConnectionError | TimeoutError):
+            return self.stash[_TRIAL].lasting(str(excinfo.value))
+        return super().repr_failure(excinfo, style)
+
+    def reportinfo(self) -> tuple[Path, int | None, str]:
+        """Where it stands."""
+        return self.path, None, f"{self.case.title}: {self.name}"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
+    """Note what failed, and put what a trial has left into the last report of its test."""
+    report = yield
+    if report.failed:
+        item.stash[_FAILED] = True
+    if report.when == "teardown" and (trial := item.stash.get(_TRIAL, None)) is not None:
+        title = item.case.title if isinstance(item, CampaignItem) else item.path.name
+        report.rig = {"title": title, **trial.document()}
+        if trial.kept:
+            report.sections.append(("evidence", "\n".join(map(str, trial.kept))))
+    return report
+
+
+def _trial_of(item: pytest.Item) -> Trial:
+    from replays.campaigns.bench import Target
+    from replays.campaigns.trial import Trial
+
+    options = item.config.option
+    replay = None if options.rig_replay is None else Path(options.rig_replay).absolute()
+    evidence = None if options.rig_results is None else Path(options.rig_results).absolute() / "evidence"
+    return Trial(item.nodeid, evidence, Target(options.rig_url, replay))
+
+
+@pytest.fixture
+def rig_trial(request: pytest.FixtureRequest) -> Iterator[Trial]:
+    """What the other fixtures share; ends all of it."""
+    item = request.node
+    trial = item.stash[_TRIAL] = _trial_of(item)
+    yield trial
+    trial.close(failed=item.stash.get(_FAILED, False))
+
+
+@pytest.fixture
+def bench(request: pytest.FixtureRequest, rig_trial: Trial) -> Bench:
+    """A rig of the test's own, in lockstep unless `@pytest.mark.bench(...)` says else: `bench.connect(...)`."""
+    from replays.campaigns.bench import NotThereError
+    from replays.campaigns.marker import settings_of
+
+    marker = request.node.get_closest_marker("bench")
+    try:
+        made = rig_trial.start_bench(settings_of({} if marker is None else marker.kwargs))
+    except NotThereError as error:
+        pytest.skip(str(error))
+    made.begin()
+    return made
+
+
+@pytest.fixture
+def dut(bench: Bench, rig_trial: Trial, request: pytest.FixtureRequest) -> Callable[..., Device]:
+    """Starts a device under test: `dut("python protection.py {url} --name {name}", name="protection")`."""
+
+    def start(command: str | Sequence[str], *, name: str = "device", joins: bool | None = None) -> Device:
+        return rig_trial.start_device(command, name=name, where=request.node.path.parent, joins=joins)
+
+    return start
+
+
+@pytest.fixture
+def record(bench: Bench, rig_trial: Trial) -> Record:
+    """A recording of the bench from the start of the test on; `record.stop()` gives it."""
+    return rig_trial.start_record()
+
+
+@pytest.fixture
+def measure(request: pytest.FixtureRequest, rig_trial: Trial) -> Callable[..., float]:
+    """Holds a value against a limit, puts it into all results, and asserts."""
+
+    def hold(
+        name: str, value: float, unit: str, op: str, limit: Any, *, unit_of_limit: str | None = None, source: str = "",
+        at_s: float | None = None, channels: Sequence[str] = (),
+    ) -> float:  # fmt: skip
+        __tracebackhide__ = True
+        from replays.campaigns.measurement import measured
+        from replays.campaigns.trial import MeasurementError
+
+        told = {"source": source, "resolution": rig_trial.resolution, "at_s": at_s, "channels": tuple(channels)}
+        made = rig_trial.take(measured(name, value, unit, op, limit, unit_of_limit=unit_of_limit, **told))
+        request.node.user_properties.extend(made.properties())
+        if not made.good:
+            raise MeasurementError(made.line)
+        return value
+
+    return hold

@@ -1,0 +1,220 @@
+"""Campaigns as processes: a device in the loop in lockstep, the fixtures, several at once, and Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from recorder.reader import Recording
+from tests import processes, waiting
+from tests.unit.test_campaign_results import check_junit
+
+pytestmark = [pytest.mark.wallclock]
+
+DEVICE = """
+import sys
+import numpy as np
+import rig
+
+url, name, level_mm, how = sys.argv[1:]
+with rig.connect(url, channels=["disk_x"], name=name) as machine:
+    for samples in machine.blocks():
+        if how != "deaf" and (np.abs(samples["disk_x"]) > float(level_mm)).any():
+            if how == "dies":
+                raise SystemExit("out of order")
+            machine.speed(0.0)
+            machine.note("trip", tags=["trip"])
+            how = "deaf"
+print("ended")
+"""
+CAMPAIGN = """
+title = "A device that trips"
+scene = "stable-run"
+duration_s = 0.4
+limits = { danger = "500 um" }
+
+[device]
+command = "python device.py {url} {name} {danger:mm} {how}"
+name = "protection"
+
+[matrix.device]
+how = ["well", "dies", "again"]
+
+[[steps]]
+at_s = 0.2
+command = "hammer"
+
+[[steps]]
+at_s = 0.205
+note = "hit"
+
+[[expect]]
+name = "time to trip"
+event = "note"
+where = { tags = "trip" }
+since = { signal = "disk_x", beyond = "{danger}" }
+must = "<= 20 ms"
+source = "two blocks"
+
+[[expect]]
+event = "command"
+where = { command = "speed", from = "protection", "request.speed_hz" = 0.0 }
+
+[[expect]]
+order = [{ event = "hammer" }, { event = "note", text = "hit" }, { event = "note", where = { tags = "trip" } }]
+"""
+TESTS = """
+import pytest
+
+@pytest.mark.bench(scene="stable-run", block_ms=20, channels=["disk_x", "P_E"], duration_s=0.3,
+                   faults=[{"at_s": 0.1, "channel": "disk_x", "kind": "stuck"}])
+def test_fixtures(bench, dut, record, measure):
+    device = dut("python device.py {url} {name} 9.0 well", name="watcher")
+    with bench.connect(truth=["contact"]) as machine:
+        rows = machine.advance(0.2)
+        measure("moves while it is sound", rows["disk_x"][:1500].std(), "mm", ">", 0.0)
+        measure("moves while it is stuck", rows["disk_x"][2500:].std(), "mm", "<=", 2, unit_of_limit="um")
+        recording = record.stop()
+        assert len(recording.samples("disk_x")) == 4000
+        assert device.program.status is None
+        measure("force", rows["P_E"].max(), "N", "<=", 1.0, at_s=0.15, channels=["P_E"])
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, text in (("device.py", DEVICE), ("x.campaign.toml", CAMPAIGN), ("test_x.py", TESTS)):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def campaign(folder: Path, *arguments: str, status: int) -> tuple[str, dict[str, Any]]:
+    """What a campaign prints, and its results by case."""
+    with processes.rig("campaign", *arguments, "-o", "out", cwd=folder) as child:
+        out, err = child.communicate(timeout=processes.COMPILE_S)
+    assert child.returncode == status, out + err
+    document = json.loads((folder / "out/results.json").read_text(encoding="utf-8"))
+    return out, document
+
+
+def test_a_device_in_lockstep_is_judged_alike_each_time(folder: Path) -> None:
+    out, both = campaign(folder, "x.campaign.toml", "test_x.py", status=1)
+    well, dies, again, fixtures = both["cases"]
+    assert [case["outcome"] for case in both["cases"]] == ["passed", "failed", "passed", "failed"]
+    told = {each["name"]: each for each in well["measurements"]}
+    assert told["time to trip"]["good"]
+    assert told["time to trip"]["resolution"] == "1 tick, 1 us; 10 ms blocks, in lockstep"
+    assert 1e3 * told["time to trip"]["at_s"] % 10.0 == 0.0  # the end of a block
+    assert "exit status of protection must be == 0; instead received 1 (its last line: out of order)" in out
+    assert dies["reason"].startswith("exit status of protection must be == 0")
+    assert [each["good"] for each in fixtures["measurements"]] == [True, True, False]
+    assert fixtures["reason"].startswith("force must be <= 1 N; instead received ")
+    assert fixtures["resolution"] == "20 ms blocks, in lockstep"
+    # The evidence: of the case that failed, about the moment where it did.
+    logs = folder / "out/evidence/test_x.py_test_fixtures"
+    assert [Path(file).name for file in fixtures["evidence"]] == ["rig.log", "watcher.log", "event.mcap", "event.png"]
+    assert Recording.open(logs / "event.mcap").span_s == (0.0, pytest.approx(0.2, abs=1e-3))
+    assert len(check_junit(folder / "out/junit.xml")) == 4
+    assert "<img" in (folder / "out/index.html").read_text(encoding="utf-8")
+    # Another run is the same, byte for byte.
+    assert well["repeat"] == "rig campaign x.campaign.toml::how=well"
+    assert json.dumps(again).replace("how=again", "how=well") == json.dumps(well)
+
+
+LONG = """
+title = "It takes long"
+scene = "stable-run"
+pace = "real-time"
+duration_s = 600.0
+
+[device]
+command = "python -c 'import time; print(1, flush=True); time.sleep(600.0)'"
+
+[matrix.set]
+seed = [1, 2, 3]
+
+[[expect]]
+signal = "disk_x"
+must = "<= 2 mm"
+"""
+
+
+def descendants(pid: int) -> list[Any]:
+    import psutil
+
+    return list(psutil.Process(pid).children(recursive=True))
+
+
+def test_ctrl_c_leaves_nothing_running_and_tells_what_was_done(tmp_path: Path) -> None:
+    (tmp_path / "long.campaign.toml").write_text(LONG, encoding="utf-8")
+    (tmp_path / "test_a.py").write_text("def test_a(measure):\n    measure('a', 1, 'mm', '<=', 2)\n", encoding="utf-8")
+    arguments = ("campaign", "test_a.py", "long.campaign.toml", "-j", "2", "-o", "out")
+    with processes.rig(*arguments, cwd=tmp_path, start_new_session=True) as child:
+
+        def devices() -> int:
+            return sum("time.sleep" in " ".join(each.cmdline()) for each in descendants(child.pid))
+
+        waiting.until(lambda: devices() >= 4, timeout_s=processes.COMPILE_S, every_s=0.1)  # each with its keeper
+        left = descendants(child.pid)
+        os.killpg(child.pid, signal.SIGINT)
+        out, err = child.communicate(timeout=60.0)
+    assert child.returncode == 130, out + err
+    waiting.until(lambda: not any(each.is_running() and each.status() != "zombie" for each in left), every_s=0.1)
+    assert "1 passed, 3 not run" in out
+    results = json.loads((tmp_path / "out/results.json").read_text(encoding="utf-8"))
+    assert results["counts"] == {"failed": 0, "error": 0, "interrupted": 3, "skipped": 0, "passed": 1}
+    assert (tmp_path / "out/index.html").is_file()
+
+
+THERE = """
+title = "On a rig that is there"
+duration_s = 0.5
+
+[device]
+command = "python device.py {url} {name} 0.5 well"
+name = "protection"
+
+[matrix]
+scene = ["stable-run", "hammer"]
+
+[[steps]]
+at_s = 0.1
+command = "hammer"
+
+[[expect]]
+event = "hammer"
+must = "0.1 to 0.4 s"
+
+[[expect]]
+event = "note"
+where = { tags = "trip" }
+since = { signal = "disk_x", beyond = "0.5 mm" }
+must = "<= 2 s"
+"""
+
+
+def test_a_campaign_runs_on_a_recording_and_on_a_rig_that_is_there(folder: Path) -> None:
+    session = processes.ROOT / "replays/sessions/hammer-6.2.mcap"
+    _, played = campaign(folder, "hammer", "--replay", str(session), status=0)
+    assert [(case["outcome"], case["reason"]) for case in played["cases"]] == [
+        ("skipped", "the recording has drive.speed_hz = 6.2, not 5.2"),
+        ("passed", ""),
+    ]
+    assert played["cases"][1]["measurements"][2]["value"] == pytest.approx(-81.7, abs=0.5)
+    (folder / "there.campaign.toml").write_text(THERE, encoding="utf-8")
+    with processes.rig("run", "stable-run", "--listen", "127.0.0.1:0", "--name", "there-for-a-campaign") as rig:
+        processes.line_of(rig, "listening on")
+        _, there = campaign(folder, "there.campaign.toml", "--url", "there-for-a-campaign", status=0)
+        rig.terminate()
+        rig.communicate(timeout=60.0)
+    assert [(case["outcome"], case["reason"]) for case in there["cases"]] == [
+        ("passed", ""),
+        ("skipped", "the rig there has scene stable-run, not hammer"),
+    ]
+    median_ms, longest_ms = there["wall"]["cases"]["there.campaign.toml::stable-run"]["floor_ms"]
+    assert 0.0 < median_ms <= longest_ms

@@ -1,0 +1,251 @@
+"""Campaigns in TOML: what their cases are, and that what is wrong in a file is told in a line with file and line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from replays.campaigns.campaign import Campaign, load_campaign
+from replays.campaigns.lines import lines_of
+from rig.errors import InputError
+from tests.commands import said
+
+HEAD = 'title = "T"\nscene = "hammer"\n'
+PEAK = '[[expect]]\nsignal = "disk_x"\nmust = "<= 2 mm"\n'
+
+
+def load(folder: Path, text: str) -> Campaign:
+    file = folder / "x.campaign.toml"
+    file.write_text(text, encoding="utf-8")
+    return load_campaign(file)
+
+
+WRONG = {
+    "no TOML": (HEAD + "duration_s 3\n", 3, "must be TOML"),
+    "unknown key": (
+        HEAD + "durations_s = 3\n" + PEAK,
+        3,
+        "durations_s must be a field that there is, such as duration_s",
+    ),
+    "no title": ('scene = "hammer"\n' + PEAK, 1, "title must be given"),
+    "unknown scene": ('title = "T"\nscene = "hamer"\n' + PEAK, 2, "scene must be one of"),
+    "unknown parameter": (HEAD + '[set]\n"drive.sped_hz" = 3.0\n' + PEAK, 4, "such as drive.speed_hz"),
+    "value out of its range": (HEAD + "[set]\nduration_s = -3\n" + PEAK, 4, "duration_s must be greater than 0"),
+    "value of the matrix": (
+        HEAD + '[matrix.set]\n"drive.speed_hz" = [\n  3.0,\n  900.0]\n' + PEAK,
+        4,
+        "at most drive.top_speed",
+    ),
+    "pace": (HEAD + 'pace = "fast"\n' + PEAK, 3, "pace must be"),
+    "block": (HEAD + "block_ms = 0\n" + PEAK, 3, "block_ms must be"),
+    "nothing expected": (HEAD, 1, "expect must be"),
+    "unknown signal": (
+        HEAD + '[[expect]]\nmust = "<= 2 mm"\nsignal = "disk_z"\n',
+        5,
+        "expect.signal must be one of the channels, such as disk_",
+    ),
+    "unknown truth": (
+        HEAD + PEAK + 'truth = "contacts"\n',
+        6,
+        "expect.truth must be one of the tables of the truth, such as contact",
+    ),
+    "unit of another quantity": (
+        HEAD + PEAK.replace("mm", "N"),
+        5,
+        "must be in a unit of length, as peak of disk_x is in mm",
+    ),
+    "limit without unit": (HEAD + PEAK.replace(" mm", ""), 5, "must be with a unit, as peak of disk_x is in mm"),
+    "unit of what has none": (
+        HEAD + PEAK.replace("disk_x", "keyphasor"),
+        5,
+        "must be without a unit, as peak of keyphasor has none",
+    ),
+    "no comparison": (HEAD + PEAK.replace("<= 2", "under 2"), 5, "a comparison with a number and its unit"),
+    "interval turned round": (HEAD + PEAK.replace("<= 2", "4 to 2"), 5, "from the lower number to the higher"),
+    "step behind the end": (
+        HEAD + '[[steps]]\ncommand = "hammer"\nat_s = 2.5\n' + PEAK,
+        5,
+        "steps.at_s must be before the case's end, 2 s",
+    ),
+    "step before the start": (
+        HEAD + '[[steps]]\nat_s = -1.0\ncommand = "hammer"\n' + PEAK,
+        4,
+        "steps.at_s must be greater than or equal to 0",
+    ),
+    "window turned round": (HEAD + PEAK + "from_s = 1.5\nto_s = 1.0\n", 7, "expect.to_s must be behind from_s, 1.5 s"),
+    "window behind the end": (
+        HEAD + PEAK + "from_s = 3.0\n",
+        6,
+        "expect.from_s must be within the case, which ends at 2 s",
+    ),
+    "unknown command": (HEAD + '[[steps]]\nat_s = 1.0\ncommand = "hit"\n' + PEAK, 5, "hammer"),
+    "number of a command": (
+        HEAD + '[[steps]]\nat_s = 1.0\ncommand = "hammer"\nforce_n = 5000.0\n' + PEAK,
+        6,
+        "steps.force_n must be less than or equal to 1000",
+    ),
+    "two pulses at once": (
+        HEAD + '[[steps]]\nat_s = 0.021\ncommand = "hammer"\n' + PEAK,
+        3,
+        "steps.hammer must be idle",
+    ),
+    "fault of no channel": (
+        HEAD + '[[steps]]\nat_s = 1.0\ncommand = "fault"\nchannel = "disk_z"\nkind = "stuck"\n' + PEAK,
+        6,
+        "one of the channels, or of their groups, such as disk_",
+    ),
+    "no such fault": (
+        HEAD + '[matrix]\nfault = [\n  { id = "none" },\n  { channel = "disk_x", kind = "stuk" },\n]\n' + PEAK,
+        6,
+        "one of the kinds, such as stuck",
+    ),
+    "two cases of one name": (
+        HEAD + '[matrix]\nscene = ["hammer", "hammer"]\n' + PEAK,
+        3,
+        "of cases with different names",
+    ),
+    "missing program": (
+        HEAD + '[device]\ncommand = "protction {url}"\n' + PEAK,
+        4,
+        "device.command must be a program that there is; instead received 'protction'",
+    ),
+    "missing script": (HEAD + '[device]\ncommand = "python protction.py"\n' + PEAK, 4, "whose script is there"),
+    "unknown place": (
+        HEAD + '[device]\ncommand = "python -m json.tool {danger}"\n' + PEAK,
+        4,
+        "of places that are filled in",
+    ),
+    "place in another unit": (
+        HEAD + '[limits]\ndanger = "2 mm"\n[device]\ncommand = "python -m json.tool {danger:N}"\n' + PEAK,
+        6,
+        "with danger in a unit of length",
+    ),
+    "limit that is none": (
+        HEAD + '[limits]\ndanger = "much"\n' + PEAK,
+        4,
+        "limits.danger must be a number with its unit",
+    ),
+    "CAN without a bus": (
+        HEAD + '[device]\ncommand = "python -m json.tool {can}"\n' + PEAK,
+        4,
+        "without {can} unless can = true",
+    ),
+    "about nothing": (
+        HEAD + '[[expect]]\nmust = "<= 2 mm"\n',
+        3,
+        "expect must be about one of signal, event, order, score",
+    ),
+    "about two things": (HEAD + PEAK + 'event = "hammer"\n', 3, "instead received signal and event"),
+    "no level": (HEAD + PEAK + 'take = "first beyond"\n', 3, "expect.beyond must be given"),
+    "orbit of two units": (
+        HEAD + PEAK.replace('"disk_x"', '["disk_x", "P_E"]'),
+        4,
+        "two of one unit; instead received disk_x in mm and P_E in N",
+    ),
+    "when of no axis": (
+        HEAD + PEAK + 'when = { vote = "1oo2" }\n',
+        6,
+        "expect.when.vote must be an axis of the matrix",
+    ),
+    "when of no value": (
+        HEAD + PEAK + 'when = { scene = "drop" }\n[matrix]\nscene = ["hammer", "stable-run"]\n',
+        6,
+        "a value of scene in the matrix",
+    ),
+    "since nothing": (
+        HEAD + '[[expect]]\nevent = "note"\nsince = {}\nmust = "<= 1 s"\n',
+        5,
+        "given by one of at_s, event and signal",
+    ),
+    "no such quantity": (HEAD + '[[expect]]\nscore = "gian"\nfile = "x.csv"\n', 4, "such as gain"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_told_in_a_line_with_file_and_line(name: str, tmp_path: Path) -> None:
+    text, line, says = WRONG[name]
+    with pytest.raises(InputError) as caught:
+        load(tmp_path, text)
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'x.campaign.toml'}:{line}: "), message
+    assert says in message
+    assert "\n" not in message
+
+
+def test_the_command_tells_it_and_ends_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "x.campaign.toml"
+    file.write_text(HEAD + PEAK.replace("mm", "N"), encoding="utf-8")
+    status, out, err = said(capsys, "campaign", file)
+    assert (status, out) == (2, "")
+    assert err.startswith(f"rig: {file}:5: expect.must must be in a unit of length")
+    file.write_text(HEAD + PEAK, encoding="utf-8")
+    for arguments, says in (
+        ([f"{file}::y"], "FILE must be one of the cases"),
+        ([tmp_path / "y.campaign.toml"], "file must be a file that can be read, such as"),
+        ([tmp_path / "y.py"], "FILE must be a *.campaign.toml file, or tests of pytest, that exists"),
+        ([file, "--url", "zenoh:127.0.0.1:1", "-j", "2"], "--jobs must be 1 with --url"),
+        ([file, "--against", tmp_path], "results.json"),
+    ):
+        status, _, err = said(capsys, "campaign", *arguments)
+        assert (status, err.count("\n")) == (2, 1), err
+        assert says in err
+
+
+MATRIX = """
+title = "T"
+about = "A device with two votes, sound and with a fault"
+duration_s = 0.5
+limits = { danger = "0.2 mm" }
+
+[device]
+command = "python -m json.tool {url} --danger-um {danger:um} --vote {vote} {name}"
+name = "protection"
+
+[matrix]
+scene = ["hammer", "stable-run"]
+fault = [{ id = "sound" }, { channel = "disk_x", kind = "stuck", at_s = 0.1, for_s = 0.2 }]
+
+[matrix.device]
+vote = ["1oo2", "2oo2"]
+
+[matrix.limits]
+danger = ["0.2 mm", "300 um"]
+
+[[steps]]
+at_s = 0.2
+note = "danger is {danger}"
+
+[[expect]]
+signal = ["disk_x", "disk_y"]
+take = "first beyond"
+beyond = "{danger}"
+must = "<= 400 ms"
+
+[[expect]]
+event = "note"
+when = { vote = "1oo2", fault = ["disk_x-stuck", "sound"], danger = "300um" }
+"""
+
+
+def test_a_matrix_is_the_product_of_its_axes(tmp_path: Path) -> None:
+    campaign = load(tmp_path, MATRIX)
+    assert len(campaign.cases) == 2 * 2 * 2 * 2
+    case = {each.id: each for each in campaign.cases}["stable-run,disk_x-stuck,danger=300um,vote=1oo2"]
+    assert case.device is not None
+    assert case.device.command == "python -m json.tool {url} --danger-um 300 --vote 1oo2 {name}"
+    assert [(step.at_s, step.note or step.command.request.channel) for step in case.steps if step] == [
+        (0.1, "disk_x"),
+        (0.2, "danger is 300 um"),
+    ]
+    assert [len(each.expects) for each in campaign.cases] == [1, 1, 2, 1] * 4
+    assert (case.bench.scene, case.duration_s) == ("stable-run", 0.5)
+
+
+def test_lines_of_what_stands_in_tables_lists_and_inline_tables() -> None:
+    text = 'a.b = """\n x = 1\n"""\n[[c]]\nd = [1, # [\n  { "e.f" = "}" },\n]\n[c.g]\nh = 2\n[[c]]\ni = \'[\'\n'
+    found = lines_of(text)
+    assert found == {
+        "a.b": 1, "c": 4, "c.0": 4, "c.0.d": 5, "c.0.d.0": 5, "c.0.d.1": 6, "c.0.d.1.e.f": 6, "c.0.g": 8, "c.0.g.h": 9,
+        "c.1": 10, "c.1.i": 11,
+    }  # fmt: skip

@@ -1,0 +1,237 @@
+"""What is measured of a recording, and what becomes of measurements: JUnit, JSON, the page, what changed."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from recorder.reader import Recording
+from replays.campaigns.expectation import KINDS, Seen
+from replays.campaigns.measurement import Measurement, Must, measured
+from replays.campaigns.page import changes, make_page
+from replays.campaigns.picture import draw
+from replays.campaigns.results import load_results, write_junit
+from replays.report import junit
+from rig.errors import InputError
+from rig.orbit import whirl_frequency
+from rig.outside import check
+from tests.processes import ROOT
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    """A hammer at 0.02 s, 0.6 s at 5 kHz."""
+    return Seen(Recording.open(ROOT / "replays/sessions/hammer-6.2.mcap"), Path())
+
+
+def one(seen: Seen, **given: Any) -> Measurement:
+    kind = next(key for key in KINDS if key in given)
+    (found,) = check(KINDS[kind], given, field="").measure(seen, seen.units)
+    return found
+
+
+def test_values_of_signals_are_those_of_their_rows(seen: Seen) -> None:
+    rows = seen.recording.samples("disk_x", "disk_y", "P_E")
+    x, y, times_s = rows["disk_x"], rows["disk_y"], rows.times_s
+    late = (times_s >= 0.3) & (times_s < 0.5)
+    window: dict[str, Any] = {"signal": "disk_x", "from_s": 0.3, "to_s": 0.5}
+    for take, value in (
+        ("peak", np.abs(x[late]).max()), ("max", x[late].max()), ("min", x[late].min()), ("mean", x[late].mean()),
+        ("rms", math.sqrt(np.mean(x[late] ** 2))), ("std", x[late].std()), ("peak to peak", np.ptp(x[late])),
+    ):  # fmt: skip
+        assert one(seen, **window, take=take, must="<= 9 mm").value == pytest.approx(value, rel=1e-11)
+    assert one(seen, signal="disk_x", take="value", at_s=0.3, must="<= 9 mm").value == pytest.approx(x[1500], rel=1e-11)
+    radius = np.hypot(x, y)
+    first = times_s[np.argmax(radius > 0.5)]
+    told = one(seen, signal=["disk_x", "disk_y"], take="first beyond", beyond="500 um", must="< 1 s")
+    assert (told.value, told.at_s, told.resolution) == (pytest.approx(first), pytest.approx(first), "1 row, 200 us")
+    since = one(
+        seen,
+        signal=["disk_x", "disk_y"],
+        take="first beyond",
+        beyond="0.5 mm",
+        must="<= 9 ms",
+        since={"event": "hammer"},
+    )
+    assert since.value == pytest.approx(1e3 * (first - 0.02))
+    beyond = one(seen, signal="P_E", take="time beyond", beyond="3.2 kN", must="<= 1 s")
+    assert beyond.value == pytest.approx(np.count_nonzero(np.abs(rows["P_E"]) > 3200.0) / 5000.0)
+    whirl = one(seen, signal=["disk_x", "disk_y"], take="whirl frequency", from_s=0.45, must="-100 to -60 Hz")
+    assert whirl.value == pytest.approx(whirl_frequency(x[2250:], y[2250:], times_s[2250:]), rel=1e-6)
+    assert (whirl.good, whirl.must.unit) == (True, "Hz")
+    force = one(seen, signal="normal_force", truth="contact", take="max", must=">= 0.1 kN")
+    assert force.value == pytest.approx(1e-3 * seen.recording.truth("contact")["normal_force"].max())
+    never = one(seen, signal="disk_x", take="first beyond", beyond="9 mm", must="<= 1 s")
+    assert (math.isnan(never.value), never.good, never.note) == (True, False, "it never is beyond 9 mm")
+    assert "nothing" in never.line
+
+
+def test_events_come_or_not_in_time_and_in_order(seen: Seen) -> None:
+    assert one(seen, event="hammer").value == 1.0
+    assert not one(seen, event="hammer", appears=False).good
+    assert one(seen, event="note", appears=False).good
+    assert one(seen, event="hammer", must="== 20 ms").good
+    assert not one(seen, event="hammer", must="== 20.001 ms").good
+    assert one(seen, event="hammer", where={"force_n": 100.0}, take="count", must="== 1").good
+    assert one(seen, event="hammer", where={"force_n": 50.0}, take="count", must="== 0").good
+    late = one(seen, event="hammer", since={"at_s": 0.1}, must="<= 1 s")
+    assert (late.good, late.note) == (False, "no hammer came")
+    level = {"signal": "disk_x", "beyond": "99 mm"}
+    assert one(seen, event="hammer", since=level, must="<= 1 s").note == "what it is counted from never came"
+    start, hammer = {"event": "start"}, {"event": "hammer", "where": {"direction": "x"}}
+    assert one(seen, order=[start, hammer]).good
+    turned = one(seen, order=[hammer, start])
+    assert (turned.good, turned.value) == (False, 1.0)
+
+
+def test_a_scorecard_is_an_expectation(seen: Seen) -> None:
+    itself = Seen(seen.recording, seen.recording.path.parent)
+    assert one(itself, score="missing rows", file="hammer-6.2.mcap").good
+    assert one(itself, score="all", file="hammer-6.2.mcap").good
+    absent = one(itself, score="all", file="nothing.csv")
+    assert not absent.good
+    assert "nothing.csv" in absent.note
+
+
+@pytest.mark.parametrize(("op", "limit", "value", "margin", "good"), [
+    ("<=", 3.0, 3.0, 0.0, True), ("<", 3.0, 3.0, 0.0, False), (">=", 3.0, 2.5, -0.5, False),
+    (">", 3.0, 3.5, 0.5, True), ("==", 3.0, 3.0, 0.0, True), ("==", 3.0, 3.5, -0.5, False),
+    ("!=", 3.0, 3.0, 0.0, False), ("between", (1.0, 3.0), 2.5, 0.5, True), ("between", (1.0, 3.0), 0.5, -0.5, False),
+])  # fmt: skip
+def test_margin_and_verdict(op: str, limit: Any, value: float, margin: float, good: bool) -> None:
+    told = measured("time", value, "ms", op, limit)
+    assert (told.good, told.document()["margin"]) == (good, margin)
+    text = f"{limit[0]} to {limit[1]} ms" if op == "between" else f"{op} {limit} ms"
+    assert Must.parse(text, field="") == told.must
+
+
+def test_a_measurement_takes_units_and_refuses_wrong_ones() -> None:
+    told = measured("gap", 0.15, "mm", "<=", 200, unit_of_limit="um", source="datasheet")
+    assert (told.good, told.must.limit, told.document()["margin"]) == (True, pytest.approx(0.2), pytest.approx(0.05))
+    assert dict(told.properties())["gap.source"] == "datasheet"
+    for given, says in (
+        (("gap", 0.15, "mm", "<=", 2.0, "N"), "unit_of_limit must be in a unit of length, as gap is in mm"),
+        (("gap", 0.15, "mm", "=<", 2.0, None), "op must be one of"),
+        (("gap", 0.15, "mm", "between", 2.0, None), "two numbers, the lower first"),
+        (("gap", 0.15, "mm", "<=", "much", None), "limit must be a number"),
+    ):
+        with pytest.raises(InputError, match=re.escape(says)):
+            measured(*given[:5], unit_of_limit=given[5])
+    assert not measured("gap", math.nan, "mm", "<=", 1.0).good
+
+
+def results(**margins: float) -> dict[str, Any]:
+    cases = []
+    for name, margin in margins.items():
+        told = measured("peak", 1.0 - margin, "mm", "<=", 1.0, source="a datasheet", note="a <note>\x1b", at_s=0.3)
+        outcome = "passed" if told.good else "failed"
+        cases.append({
+            "id": f"x.campaign.toml::{name}", "outcome": outcome, "reason": "" if told.good else told.line,
+            "title": "T", "measurements": [told.document()], "evidence": [], "bench": None,
+            "resolution": "10 ms blocks, in lockstep",
+            "troubles": [], "repeat": f"rig campaign x.campaign.toml::{name}",
+        })  # fmt: skip
+    cases.append({**cases[0], "id": "x.py::skipped", "outcome": "skipped", "reason": "no bus", "measurements": []})
+    cases.append({**cases[0], "id": "x.py::broken", "outcome": "error", "reason": "no rig", "measurements": []})
+    wall = {case["id"]: {"duration_s": 1.25, "floor_ms": [0.3, 0.9]} for case in cases}
+    return {
+        "format": 1, "titles": ["T"], "counts": {"failed": 1, "error": 1, "interrupted": 0, "skipped": 1, "passed": 1},
+        "cases": cases,
+        "wall": {"begun": "2026-01-01T08:00:00", "duration_s": 2.5, "machine": "M", "rig": "0", "cases": wall},
+    }  # fmt: skip
+
+
+# The common schema, that of Jenkins, as rules: of each element the attributes that must and may be there, and what may
+# stand in it.
+_SCHEMA: dict[str, tuple[set[str], set[str], set[str]]] = {
+    "testsuites": (set(), {"name", "time", "tests", "failures", "errors"}, {"testsuite"}),
+    "testsuite": (
+        {"name", "tests", "failures", "errors"},
+        {"group", "time", "skipped", "timestamp", "hostname", "id", "package", "file", "log", "url"},
+        {"testsuite", "properties", "testcase", "system-out", "system-err"},
+    ),
+    "properties": (set(), set(), {"property"}),
+    "property": ({"name", "value"}, set(), set()),
+    "testcase": ({"name"}, {"time", "classname", "group"}, {"skipped", "error", "failure", "system-out", "system-err"}),
+    **{name: (set(), {"message", "type"}, set()) for name in ("skipped", "error", "failure")},
+    **{name: (set(), set(), set()) for name in ("system-out", "system-err")},
+}
+
+
+def check_junit(path: Path) -> list[ElementTree.Element]:
+    """Hold a file against the schema; its suites."""
+    root = ElementTree.parse(path).getroot()
+    assert root.tag == "testsuites"
+    for element in root.iter():
+        must, may, within = _SCHEMA[element.tag]
+        assert must <= set(element.keys()) <= must | may, element.attrib
+        assert {each.tag for each in element} <= within, element.tag
+        if (time_s := element.get("time")) and element.tag != "testcase":
+            assert re.fullmatch(r"(([0-9]{0,3},)*[0-9]{3}|[0-9]{0,3})*(\.[0-9]*)?", time_s)
+    for suite in root:
+        cases = suite.findall("testcase")
+        for count, tag in (("failures", "failure"), ("errors", "error"), ("skipped", "skipped")):
+            assert int(suite.get(count, "")) == sum(case.find(tag) is not None for case in cases)
+        assert int(suite.get("tests", "")) == len(cases)
+    return list(root)
+
+
+def test_junit_is_as_its_schema_has_it(tmp_path: Path) -> None:
+    write_junit(results(good=0.4, bad=-0.25), tmp_path / "junit.xml")
+    good, bad, skipped, broken = check_junit(tmp_path / "junit.xml")
+    properties = {each.get("name"): each.get("value") for each in bad.iter("property")}
+    assert properties["peak.margin"] == "-0.25"
+    assert properties["peak.source"] == "a datasheet"
+    assert properties["peak.note"] == "a <note>"  # without what XML cannot hold
+    failure = bad.find("testcase/failure")
+    assert failure is not None
+    assert str(failure.get("message")).startswith("peak must be <= 1 mm; instead received 1.25 mm (a <note>")
+    assert good.find("testcase/system-out") is not None
+    assert skipped.get("skipped") == "1"
+    assert broken.get("errors") == "1"
+    junit.write_junit(tmp_path / "empty.xml", [junit.Suite("s", [])])
+    check_junit(tmp_path / "empty.xml")
+
+
+def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> None:
+    then, now = results(good=0.4, bad=0.1, gone=0.2), results(good=0.5, bad=-0.25, fresh=0.1)
+    rows = {row.cells[:2]: row.cells[2:] for row in changes(then, now)}
+    assert rows == {
+        ("x.campaign.toml::good", "margin of peak"): ("0.4 mm", "0.5 mm", "better"),
+        ("x.campaign.toml::bad", "outcome"): ("passed", "failed", "worse"),
+        ("x.campaign.toml::bad", "margin of peak"): ("0.1 mm", "-0.25 mm", "worse"),
+        ("x.campaign.toml::fresh", "outcome"): ("", "passed", "new"),
+        ("x.campaign.toml::gone", "outcome"): ("passed", "", "gone"),
+    }
+    folder = tmp_path / "evidence/bad"
+    folder.mkdir(parents=True)
+    session = Recording.open(ROOT / "replays/sessions/hammer-6.2.mcap")
+    failed = measured("peak", 1.5, "mm", "<=", 1.0, channels=("disk_x",))
+    draw(session, folder / "event.png", [failed], origin_s=0.0, channels=["disk_x", "none"], about_s=0.03)
+    now["cases"][1]["evidence"] = ["evidence/bad/event.png"]
+    make_page(now, tmp_path, then).write(tmp_path / "index.html")
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    order = (
+        "1 failed, 1 error, 1 skipped, 1 passed.", "failed: x.campaign.toml::bad</h2>", "it is 1.25 mm", "<img",
+        "rig campaign x.campaign.toml::bad", "Against the earlier campaign</h2>", "Measurements</h2>", "median 0.3 ms",
+    )  # fmt: skip
+    places = [page.index(words) for words in order]
+    assert places == sorted(places)
+
+
+def test_results_that_are_none_are_told(tmp_path: Path) -> None:
+    file = tmp_path / "results.json"
+    file.write_text(json.dumps(results(good=0.4)), encoding="utf-8")
+    assert load_results(tmp_path) == load_results(file)
+    file.write_text('{"format": 7}', encoding="utf-8")
+    with pytest.raises(InputError, match="results of a campaign by this version"):
+        load_results(tmp_path)
+    with pytest.raises(InputError, match="a file that can be read"):
+        load_results(tmp_path / "nowhere")
