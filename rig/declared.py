@@ -81,6 +81,10 @@ class Declared(Continuity):
         self._before: dict[str, list[tuple[int, int]]] = {}
         self._holes: dict[str, deque[tuple[int, int]]] = {}
         self._never: dict[str, deque[tuple[int, int]]] = {}
+        self._untold: dict[str, deque[tuple[int, int, int]]] = {}
+        """Number, tick and length of the blocks since numbers began anew, of which nothing was told."""
+        self._anew: dict[str, tuple[int, int]] = {}
+        """Number behind the last of these that was told since, as it was sent, and as it is."""
 
     def declare(self, document: Mapping[str, Any], *, door: str = "zenoh") -> bool:
         """Take note of a document on faults, for those behind a door; whether it is one."""
@@ -99,7 +103,11 @@ class Declared(Continuity):
                 else:
                     never.append((one.row, one.rows))
             for each in sent:
-                known.setdefault((each.index, each.tick, one.rows), [one.row, 0])[1] += 1
+                if (which := (each.index, each.tick, one.rows)) in self._untold.get(one.key, ()):
+                    self._untold[one.key].remove(which)
+                    self._tell(one.key, each.index + one.rows, one.row + one.rows)
+                else:
+                    known.setdefault(which, [one.row, 0])[1] += 1
             while len(known) > _MOST:
                 del known[next(iter(known))]
             self._settle(one.key)
@@ -124,6 +132,12 @@ class Declared(Continuity):
         row = block.index if told is None else told[0]
         due = self.next.get(key, row)
         self._first.setdefault(key, due)
+        if told is None and (row < due or key in self._untold):
+            self._untold.setdefault(key, deque(maxlen=_AHEAD)).append(which)
+        if (told is not None and row > due == block.index and key in self._untold) or (due, row) == self._anew.get(key):
+            # Those before it, of which nothing was told in time, were numbered as it is.
+            self.next[key] = due = row
+            self._know(key)
         gap = self.follow(key, row, rows) if told is None or row >= due else None
         if gap is not None and gap.size > 0:
             self._holes.setdefault(key, deque(maxlen=_MOST)).append((due, row))
@@ -135,6 +149,20 @@ class Declared(Continuity):
                 del known[which]
         self._settle(key)
         return gap
+
+    def _know(self, key: str) -> None:
+        """What seemed to be numbers that began anew was told to be none."""
+        self.runs[key] = max(0, self.runs.get(key, 0) - 1)
+        self._untold.pop(key, None)
+        self._anew.pop(key, None)
+
+    def _tell(self, key: str, number: int, row: int) -> None:
+        """The block before a number, as it was sent, was taken, and is the one before a row."""
+        self._anew[key] = number, row
+        if (number, row) in self._holes.get(key, ()):
+            self._holes[key].remove((number, row))
+            self.declared[key] = self.declared.get(key, 0) + row - number
+            self._know(key)
 
     def _fill(self, key: str, row: int, rows: int) -> None:
         """Count a block that came behind later ones: late where its rows were missing, else a second time."""

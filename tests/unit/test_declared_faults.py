@@ -107,7 +107,8 @@ def test_who_records_all_that_is_sent_ends_well_and_has_it_as_it_came(kind: str,
 
 
 @pytest.mark.parametrize(
-    ("kind", "behind"), [("duplicate-blocks", 5), ("reorder-blocks", 5), ("stale-stamps", 5), ("restart", 0)]
+    ("kind", "behind"),
+    [("duplicate-blocks", 5), ("reorder-blocks", 5), ("stale-stamps", 5), ("restart", 0), ("restart", 5)],
 )
 def test_what_is_told_late_counts_nevertheless(kind: str, behind: int, tmp_path: Path) -> None:
     """Blocks and what is told of them come on threads of their own; `behind` so many blocks."""
