@@ -33,8 +33,8 @@ _GOOD = 0.9
 """Part of the power that the known signal, behind the channel's filter, must explain for a fit to be one of it."""
 _SOME = 0.05
 """The same without the filter, for one to be looked for."""
-_OWN_CLOCK = 6.0, 1e-6
-"""A clock is a channel's own where it is off the others' by more than so many deviations, and by so much."""
+_OWN_CLOCK = 3.0, 1e-6
+"""A clock is a channel's own where it is off the others' by more than so many half intervals, and by so much."""
 _PURER = 1.5
 """Noises of a channel that what is not the sine in a sine may come to."""
 _BETTER = 0.5
@@ -166,8 +166,8 @@ def _fit(
     return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact)
 
 
-def _about(value: float, spread: float, quantile: float, size: float = 1.0) -> Interval:
-    return size * value, size * (value - quantile * spread), size * (value + quantile * spread)
+def _about(value: float, half: float, size: float = 1.0) -> Interval:
+    return size * value, size * (value - half), size * (value + half)
 
 
 def score_analogue(
@@ -198,43 +198,43 @@ def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire])
     if not inner:
         return
     reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else found[0]
-    spreads = np.maximum([one.low.spread[3] for one in found], 1e-15)
+    halves = np.maximum([one.low.half[3] for one in found], 1e-15)
     drifts = np.array([one.low.drift for one in found])
     middle = np.sort(drifts)[(len(found) - 1) // 2] if len(found) > 2 else reference.low.drift
-    own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * spreads, _OWN_CLOCK[1])
-    weights = np.where(own, 0.0, spreads**-2.0)
-    quantile = student(reference.low.freedom)
+    own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * halves, _OWN_CLOCK[1])
+    weights = np.where(own, 0.0, halves**-2.0)
     told = [("", float(weights @ drifts / weights.sum()), float(weights.sum() ** -0.5))]
-    told += [(found[n].name, drifts[n], spreads[n]) for n in np.flatnonzero(own)]
-    for name, drift, spread in told:
+    told += [(found[n].name, drifts[n], halves[n]) for n in np.flatnonzero(own)]
+    for name, drift, half in told:
         # Its clock runs fast where the session's time goes slowly over its own.
         note = "off the clock of the others" if name else ""
-        card.add("clock", name, _about(-drift / (1.0 + drift), spread, quantile, 1e6), note=note)
+        card.add("clock", name, _about(-drift / (1.0 + drift), half, 1e6), note=note)
     turned = any(wires[one.name].turned for one in found)
     note = "a periodic signal: up to whole periods" if turned else ""
+    back = np.array([0.0, 0.0, 1.0, -reference.low.middle_s])  # to time zero of the file, at its own clock
+    spread = math.sqrt(back @ reference.low.covariance @ back)
     begin_s = reference.low.late_s - reference.low.drift * reference.low.middle_s
-    start = _about(begin_s, reference.low.spread[2], quantile)
+    start = _about(begin_s, float(student(reference.low.freedom[2:].min())) * spread)
     card.add("start", reference.name, start, of=reference.channel, note=note)
     for one in found:
         if one is not reference:
             apart = one.low.late_s - reference.low.late_s
-            both = math.hypot(one.low.spread[2], reference.low.spread[2])
+            both = math.hypot(one.low.half[2], reference.low.half[2])
             odd = _ODD if one.odd or reference.odd else ""
             said = "; ".join(each for each in (f"against {reference.name}", note, odd) if each)
-            skew = None if odd else _about(apart, both, quantile, 1e9)
+            skew = None if odd else _about(apart, both, 1e9)
             card.add("skew", one.name, skew, of=one.channel, note=said)
 
 
 def _score_fit(card: Scorecard, one: Fitted) -> None:
     low, channel = one.low, one.channel
-    quantile = student(low.freedom)
 
     def add(quantity: str, estimate: Interval | None, note: str = "") -> None:
         card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
     note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
-    add("gain", None if note else _about(abs(low.gain) - 1.0, low.spread[0], quantile, 1e6), note)
-    add("offset", _about(low.offset, low.spread[1], quantile) if one.good else None)
+    add("gain", None if note else _about(abs(low.gain) - 1.0, low.half[0], 1e6), note)
+    add("offset", _about(low.offset, low.half[1]) if one.good else None)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
     brought = 0.0 if one.exact else channel.noise_v / abs(channel.sensitivity_v)
     split = split_noise(one.clean, floor=brought)

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from replays.score.stimulus import Stimulus
 
@@ -48,7 +51,7 @@ class Waveform:
     Attributes:
         gain, offset, late_s, drift: The four [1, unit, s, s/s], `late_s` in the middle of the record.
         covariance: Of the four, shape (4, 4).
-        freedom: Degrees of freedom of that covariance.
+        freedom: Degrees of freedom of the four variances, shape (4,).
         middle_s: The middle of the record by the clock of the file [s].
         times_s: Of the rows that were fitted, by the clock of the file, shape (n,).
         values: As recorded [unit], shape (n,).
@@ -61,7 +64,7 @@ class Waveform:
     late_s: float
     drift: float
     covariance: np.ndarray
-    freedom: int
+    freedom: np.ndarray
     middle_s: float
     times_s: np.ndarray
     values: np.ndarray
@@ -73,6 +76,11 @@ class Waveform:
     def spread(self) -> np.ndarray:
         """Standard deviation of the four, shape (4,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def half(self) -> np.ndarray:
+        """Half of the 95 % interval of the four, shape (4,)."""
+        return student(self.freedom) * self.spread
 
     @property
     def likeness(self) -> float:
@@ -183,27 +191,43 @@ def _solve(
         if number > 1 and (small.all() or number >= _ROUNDS + (_FINAL if final else 0)):
             break
     residual = residual - jacobian @ step
-    covariance, freedom = _sandwich(jacobian, residual, inverse)
+    covariance, freedom = _sandwich(jacobian, residual)
     return Waveform(
         float(gain + step[0] / scale), float(offset + step[1]), float(late), float(drift),
         covariance / np.outer(units, units), freedom, middle, t[use], y[use], s, ds, residual,
     )  # fmt: skip
 
 
-def _sandwich(jacobian: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, int]:
-    """Covariance of a linear fit, and its degrees of freedom."""
-    edges = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)[:-1]
-    sums = np.add.reduceat(jacobian * residual[:, None], edges, axis=0)
-    n, parts = jacobian.shape
-    correction = _BLOCKS / (_BLOCKS - 1) * n / (n - parts)
-    return correction * inverse @ (sums.T @ sums) @ inverse, _BLOCKS - 1
+def _sandwich(matrix: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of a linear fit by blocks, and the degrees of freedom of each variance.
+
+    A block that has more say in the fit leaves less of its own noise: each is lifted by the root of what it leaves, and
+    variances of which few blocks decide have few degrees of freedom (Bell & McCaffrey 2002, Survey Methodology 28).
+    """
+    edges = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)
+    rows = [slice(*ends) for ends in pairwise(edges)]
+    grams = np.array([matrix[part].T @ matrix[part] for part in rows])
+    scores = np.array([matrix[part].T @ residual[part] for part in rows])
+    sizes, turn = np.linalg.eigh(grams.sum(axis=0))
+    white = turn * np.where(sizes > 1e-14 * sizes[-1], np.maximum(sizes, 1e-300) ** -0.5, 0.0)
+    shares = white.T @ grams @ white
+    say, axes = np.linalg.eigh(shares)
+    lift = (axes / np.sqrt(np.maximum(1.0 - say, 1.0 / _BLOCKS))[:, None, :]) @ axes.transpose(0, 2, 1)
+    pulls = (lift @ (scores @ white)[:, :, None])[:, :, 0] @ white.T
+    # Of each parameter, how the blocks' pulls vary together if noise is the same everywhere.
+    lifted = np.einsum("bij,kj->kbi", lift @ shares, white)
+    apart = -lifted @ lifted.transpose(0, 2, 1)
+    apart[:, np.arange(_BLOCKS), np.arange(_BLOCKS)] += np.einsum("kbi,bij,kj->kb", lifted, lift, white)
+    squares = np.sum(apart**2, axis=(1, 2))
+    freedom = np.trace(apart, axis1=1, axis2=2) ** 2 / np.maximum(squares, 1e-300)
+    return pulls.T @ pulls, np.maximum(1.0, freedom)
 
 
-def student(freedom: int) -> float:
-    """The 97.5 % quantile of Student's t."""
+def student(freedom: ArrayLike) -> Any:
+    """The 97.5 % quantile of Student's t, one for each number of degrees of freedom."""
     from scipy.stats import t
 
-    return float(t.ppf(0.975, freedom))
+    return t.ppf(0.975, freedom)
 
 
 @dataclass(frozen=True)
@@ -252,7 +276,8 @@ def _powers(squared: np.ndarray, columns: list[np.ndarray], floor: float) -> lis
         # A square of normal noise spreads as its own mean.
         total = float(np.mean(squared))
         weights = np.maximum(matrix @ parts, 0.05 * total) ** -2.0 * total**2
-    covariance, freedom = _sandwich(weighted, squared - matrix @ parts, inverse)
+    root = np.sqrt(weights)
+    covariance, freedom = _sandwich(matrix * root[:, None], (squared - matrix @ parts) * root)
     half = student(freedom) * np.sqrt(np.diag(covariance))
     roots = np.sqrt(np.maximum(0.0, [parts, parts - half, parts + half]))
     roots[1, 0] = math.sqrt(max(0.0, roots[1, 0] ** 2 - floor**2))
@@ -440,13 +465,13 @@ def _behind(found: Waveform, corner_hz: float, order: int, late_s: float | None)
     assert solved is not None
     s, ds, matrix, jacobian, sizes, parts = solved
     residual = y[kept] - matrix @ parts
-    covariance, freedom = _sandwich(jacobian, residual, np.linalg.pinv(jacobian.T @ jacobian))
+    covariance, freedom = _sandwich(jacobian, residual)
     sizes = sizes * np.array([1.0, 1.0, 1.0, 0.5 * span_s, 1.0])
     covariance = covariance / np.outer(sizes, sizes)
-    half = student(freedom) * math.sqrt(covariance[4, 4])
+    half = float(student(freedom[4])) * math.sqrt(covariance[4, 4])
     fitted = Waveform(
         float(parts[0]), float(parts[1]), found.late_s + float(late_s or 0.0),
         found.drift + float(parts[3]) / (0.5 * span_s),
-        covariance[:4, :4], freedom, found.middle_s, found.times_s[kept], y[kept], s, ds, residual,
+        covariance[:4, :4], freedom[:4], found.middle_s, found.times_s[kept], y[kept], s, ds, residual,
     )  # fmt: skip
     return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))
