@@ -84,8 +84,7 @@ def fit_channels(
     remarks: list[str],
 ) -> list[Fitted]:  # fmt: skip
     """Fit all signals that are connected; those of which it is not sure to what, only where that explains them."""
-    begins = [signal.times_s[0] for signal in recorded.values() if signal.times_s is not None and signal.rows]
-    zero_s = min(begins, default=0.0)
+    zero_s = min((signal.first_s for signal in recorded.values() if signal.first_s is not None), default=0.0)
 
     def fit(name: str, wire: Wire) -> Fitted | None:
         signal, channel = recorded[name], session.channels[wire.channel]
@@ -94,7 +93,7 @@ def fit_channels(
         formula = formulas.get(wire.channel)
         span = (first_s, first_s + len(sent) / sent_hz)
         stimulus: Stimulus = Sampled(sent, first_s, sent_hz) if formula is None else Exact(formula, span, rate)
-        begin_s = 0.0 if signal.times_s is None else float(signal.times_s[0] - zero_s)
+        begin_s = 0.0 if signal.first_s is None else signal.first_s - zero_s
         times_s = begin_s + np.arange(signal.rows) / rate
         within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
         wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
-from replays.score.recorded import Recorded, in_parts
+from replays.score.recorded import Recorded, Table
 from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
@@ -32,6 +33,8 @@ _LOOKED = 1 << 16
 _ENOUGH = 0.99
 _BATCHES, _APART = 256, 32
 """Of stamps that are shown, and that are judged."""
+_MOST_BATCH = 1 << 12
+"""Rows of a batch."""
 _SAME_CLOCK_S = 10.0
 """Stamps that are farther from the wall time of the session are of another clock."""
 _NAMED = 5
@@ -146,7 +149,7 @@ def settle(
         """Values and counts of the same rows: row j of the file was sent `begin` and j steps behind the first one."""
         channel, signal, step = session.channels[of], recorded[name], step_of(name, of)
         skipped = max(0, -(begin // step))
-        values = signal.values[skipped:]
+        values = signal.early[skipped:]
         counts = held[channel.group][1][begin + skipped * step :: step, session.place(of)]
         few = min(len(values), len(counts), _LOOKED)
         return values[:few], signal.unit, counts[:few] >> signal.lost_bits << signal.lost_bits, channel
@@ -158,7 +161,7 @@ def settle(
     def taken_of(name: str, of: str) -> Taken | None:
         """By where its table begins, as far as that is known; else by where its counts are."""
         signal, channel, step = recorded[name], session.channels[of], step_of(name, of)
-        table = id(signal.like or signal)
+        table = id(signal.table)
         index, counts = held[channel.group]
         late = [round(each * session.rate_hz(channel.group)) for each in (wires[name].late_s, wires[name].own_s)]
         for begin in dict.fromkeys([begins.get(table, late[0]), *late]):
@@ -169,7 +172,7 @@ def settle(
         if table not in begins:
             there = counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
             for scale in _candidates(signal.unit, channel):
-                begin = located(scale.counts(signal.values[:_LOOKED]), there, step)
+                begin = located(scale.counts(signal.early[:_LOOKED]), there, step)
                 if begin is not None:
                     begins[table] = begin
                     return Taken(scale, step, (index + begin) % step)
@@ -187,7 +190,7 @@ def settle(
         named = name if name in session.channels else "" if wire.rivals else wire.channel
         if name not in settled and named:
             step = step_of(name, named)
-            begin = begins.get(id(recorded[name].like or recorded[name]), 0)
+            begin = begins.get(id(recorded[name].table), 0)
             values, unit, counts, channel = tried(name, named, begin)
 
             def apart(scale: Scale) -> float:
@@ -242,12 +245,21 @@ def _score_rows(
     sent = Sent(session, groups, one.step, one.phase)
     columns = [sent.names.index(wires[name].channel) for name in names]
 
+    tables: dict[Table, list[str]] = {}
+    for name in names:
+        tables.setdefault(recorded[name].table, []).append(name)
+    stamps = Stamps(recorded[names[0]].table)
+
     def counts() -> Iterator[np.ndarray]:
-        for part in in_parts([recorded[name].values for name in names]):
-            yield np.column_stack([scales[name].counts(values) for name, values in zip(names, part, strict=True)])
+        for parts in zip(
+            *(each.parts([recorded[name].column for name in inside]) for each, inside in tables.items()), strict=True
+        ):
+            stamps.times_s = parts[0][:, 0]
+            columns = zip(chain(*tables.values()), chain(*(part.T[1:] for part in parts)), strict=True)
+            found = {name: scales[name].counts(values) for name, values in columns}
+            yield np.column_stack([found[name] for name in names])
 
     bits = np.array([recorded[name].lost_bits for name in names])
-    stamps = Stamps(recorded[names[0]].times_s)
     found, trigger, at = Followed(), None, 0
     for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound):  # noqa: B007
         known = np.flatnonzero(places >= 0)
@@ -283,26 +295,28 @@ def _score_rows(
 
 
 class Stamps:
-    """Time stamps against the times of the rows that they stand beside: offset and rate are two questions."""
+    """Time stamps against the times of the rows that they stand beside: offset and rate are two questions.
 
-    def __init__(self, times_s: np.ndarray | None) -> None:
-        """Take stamps [s]; None where there are none."""
-        self._times_s = times_s
-        self._at, self._back, self._last_s = 0, 0, -math.inf
+    Attributes:
+        times_s: Those of the next rows [s], shape (n,).
+    """
+
+    def __init__(self, table: Table) -> None:
+        """Take what they stand in."""
+        self.times_s = np.empty(0)
+        self._stamped, self._size = table.stamped, max(4, min(table.rows // _BATCHES, _MOST_BATCH))
+        self._back, self._last_s = 0, -math.inf
         self._means: list[np.ndarray] = []
         self._squares, self._freedom = 0.0, 0
 
     def take(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
         """Take when the first row was sent, how long after it those of the next that are known [s], and which are."""
-        part = slice(self._at, self._at + rows)
-        self._at = part.stop
-        if self._times_s is None or not rows:
+        if not self._stamped or not rows:
             return
-        times_s = self._times_s[part]
+        times_s, size = self.times_s, self._size
         self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) < 0.0))
         self._last_s = float(times_s[-1])
         apart = times_s[known] - first_s - since_s
-        size = max(4, len(self._times_s) // _BATCHES)
         for begin in range(0, len(apart) - size + 1, size):
             late = apart[begin : begin + size]
             self._means.append(np.array([since_s[begin : begin + size].mean(), late.mean()]))
@@ -316,7 +330,7 @@ class Stamps:
             wall_s: Wall time at which what was sent at time zero came to who recorded the session [s].
         """
         names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
-        if self._times_s is None:
+        if not self._stamped:
             return dict.fromkeys(names)
         found: dict[str, Interval | None] = dict.fromkeys(names)
         found["stamps that go back"] = _exact(self._back)

@@ -198,7 +198,7 @@ def _solve(
     )  # fmt: skip
 
 
-def _sandwich(matrix: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Covariance of a linear fit by blocks, and the degrees of freedom of each variance.
 
     A block that has more say in the fit leaves less of its own noise: each is lifted by the root of what it leaves, and
@@ -214,10 +214,12 @@ def _sandwich(matrix: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.
     say, axes = np.linalg.eigh(shares)
     lift = (axes / np.sqrt(np.maximum(1.0 - say, 1.0 / _BLOCKS))[:, None, :]) @ axes.transpose(0, 2, 1)
     pulls = (lift @ (scores @ white)[:, :, None])[:, :, 0] @ white.T
-    # Of each parameter, how the blocks' pulls vary together if noise is the same everywhere.
+    # Of each parameter, how the blocks' pulls vary together, each with the noise that it has, or all with the same.
+    noise = np.array([1.0 if even else math.sqrt(float(residual[part] @ residual[part])) for part in rows])
     lifted = np.einsum("bij,kj->kbi", lift @ shares, white)
     apart = -lifted @ lifted.transpose(0, 2, 1)
     apart[:, np.arange(_BLOCKS), np.arange(_BLOCKS)] += np.einsum("kbi,bij,kj->kb", lifted, lift, white)
+    apart *= np.outer(noise, noise) / max(float(noise @ noise), 1e-300)
     squares = np.sum(apart**2, axis=(1, 2))
     freedom = np.trace(apart, axis1=1, axis2=2) ** 2 / np.maximum(squares, 1e-300)
     return pulls.T @ pulls, np.maximum(1.0, freedom)
@@ -277,7 +279,7 @@ def _powers(squared: np.ndarray, columns: list[np.ndarray], floor: float) -> lis
         total = float(np.mean(squared))
         weights = np.maximum(matrix @ parts, 0.05 * total) ** -2.0 * total**2
     root = np.sqrt(weights)
-    covariance, freedom = _sandwich(matrix * root[:, None], (squared - matrix @ parts) * root)
+    covariance, freedom = _sandwich(matrix * root[:, None], (squared - matrix @ parts) * root, even=True)
     half = student(freedom) * np.sqrt(np.diag(covariance))
     roots = np.sqrt(np.maximum(0.0, [parts, parts - half, parts + half]))
     roots[1, 0] = math.sqrt(max(0.0, roots[1, 0] ** 2 - floor**2))

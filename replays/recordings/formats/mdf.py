@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from replays.recordings.formats import export
+from replays.recordings.formats.columnar import PIECE
 from replays.recordings.formats.source import DOCUMENTS, Entry, FileSignal, Source, damaged, even_rate_hz, library
 from rig import units
 
@@ -51,14 +52,20 @@ def look_into(path: Path, options: FileOptions) -> Source:
         entries, texts = _entries(mdf)
 
     def read(entry: Entry) -> FileSignal:
-        group, index = entry.place
         with _quiet():
-            return _signal(mdf, group, index)
+            return _signal(mdf, *entry.place)
+
+    def pieces(signals: Sequence[Entry]) -> Iterator[list[FileSignal]]:
+        for begin in range(0, signals[0].rows, PIECE):
+            with _quiet():
+                told = {"record_offset": begin, "record_count": min(PIECE, signals[0].rows - begin)}
+                found = [_signal(mdf, *entry.place, **told) for entry in signals]
+            yield found
 
     remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
     about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
     return Source(
-        path=path, format=f"MDF {mdf.version}", entries=tuple(entries), read=read, start=mdf.header.start_time,
+        path, f"MDF {mdf.version}", tuple(entries), read, pieces, start=mdf.header.start_time,
         about={key: text for key, text in about.items() if text}, remarks=remarks,
     )  # fmt: skip
 
@@ -95,7 +102,8 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
             continue
         name = str(getattr(group.channel_group, "acq_name", "") or f"group {number}")
         scale = _second(mdf, number)
-        rate = None if scale is None else even_rate_hz(mdf.get_master(number) * scale)
+        ends = [mdf.get_master(number, record_offset=at, record_count=1) for at in (0, rows - 1)]
+        rate = None if scale is None else even_rate_hz(np.concatenate(ends) * scale, rows)
         master = mdf.masters_db.get(number)
         for index, channel in enumerate(group.channels):
             if index == master:
@@ -133,8 +141,10 @@ def _numeric(mdf: Any, group: int, index: int) -> bool:
     return few.ndim == 1 and few.dtype.kind in "iufb"
 
 
-def _signal(mdf: Any, group: int, index: int) -> FileSignal:
-    raw = mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
+def _signal(mdf: Any, group: int, index: int, **told: int) -> FileSignal:
+    """A signal, or some of its records."""
+    told |= {"group": group, "index": index, "ignore_invalidation_bits": True}
+    raw = mdf.get(raw=True, **told)
     kind = _IDENTITY if raw.conversion is None else raw.conversion.conversion_type
     scale, offset = 1.0, 0.0
     if raw.samples.dtype.kind in "iu" and kind in (_IDENTITY, _LINEAR):
@@ -142,7 +152,7 @@ def _signal(mdf: Any, group: int, index: int) -> FileSignal:
         if kind == _LINEAR and raw.conversion is not None:
             scale, offset = float(raw.conversion.a), float(raw.conversion.b)
     else:
-        values = mdf.get(group=group, index=index, ignore_invalidation_bits=True).samples.astype(float)
+        values = mdf.get(**told).samples.astype(float)
     invalid = raw.invalidation_bits
     if invalid is not None and np.any(invalid):
         values = values.astype(float)
