@@ -270,25 +270,26 @@ def _score_rows(
             trigger = at + int(known[behind[0]]) if len(behind) and at + known[behind[0]] else None
         at += len(places)
 
-    def add(quantity: str, channel: str, rows: int, runs: np.ndarray, *, numbered: bool = True) -> None:
+    def add(quantity: str, channel: str, runs: np.ndarray, rows: float | None = None, *, numbered: bool = True) -> None:
         note = ""
         if len(runs):
             told = [(a, b) for a, b in (sent.numbers(runs) if numbered else runs).tolist()]
             card.runs[f"{quantity} {channel}"] = told
             note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in told[:_NAMED])
             note += f" and {len(told) - _NAMED} more stretches" if len(told) > _NAMED else ""
-        card.add(quantity, channel, _exact(rows), note=note)
+        card.add(quantity, channel, _exact(np.sum(runs[:, 1] - runs[:, 0] + 1) if rows is None else rows), note=note)
 
-    add("missing rows", table, len(found.missing), stretches(found.missing))
+    add("missing rows", table, found.lost)
     for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
-        add(quantity, table, len(pairs), stretches(np.unique(pairs[:, 0])))
-    add("foreign rows", table, len(found.foreign), stretches(found.foreign), numbered=False)
+        add(quantity, table, stretches(np.unique(pairs[:, 0])), len(pairs))
+    add("foreign rows", table, stretches(found.foreign), numbered=False)
     for name, altered in zip(names, found.altered, strict=True):
-        add("altered values", name, altered.rows, altered.pairs())
-    none = stretches(np.empty(0, dtype=np.int64))
-    add("rows before the first", table, max(0, found.first), none)
-    add("rows after the last", table, found.sent - 1 - found.last, none)
-    told = {**stamps.judged(session.wall_s), "trigger row": None if trigger is None else _exact(trigger)}
+        add("altered values", name, altered.pairs(), altered.rows)
+    told = {
+        "rows before the first": _exact(max(0, found.first)),
+        "rows after the last": _exact(found.sent - 1 - found.last), **stamps.judged(session.wall_s),
+        "trigger row": None if trigger is None else _exact(trigger),
+    }  # fmt: skip
     for quantity, estimate in told.items():
         card.add(quantity, table, estimate)
     card.pictures[f"stamps {table}"] = stamps.picture()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -15,7 +15,7 @@ from replays.recordings.formats import export
 from replays.recordings.formats.dialect import parse_heading, time_column
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz
 
-PIECE = 1 << 18
+_PIECE = 1 << 16
 """Rows of a piece."""
 
 if TYPE_CHECKING:
@@ -39,17 +39,18 @@ def look_into(path: Path, options: FileOptions) -> Source:
     if stamps is None and options.time_column is None:  # as pandas names an index of instants
         stamps = next((c for c in range(len(names)) if _is_clock(schema.field(c).type)), None)
 
-    def batches(columns: Sequence[int], **told: Any) -> Iterator[list[Any]]:
+    def batches(columns: Sequence[int], groups: Iterable[int]) -> Iterator[list[Any]]:
         wanted = [schema.field(c).name for c in columns]
-        for batch in file.iter_batches(PIECE, columns=wanted, use_threads=False, **told):
-            yield [batch.column(batch.schema.names.index(name)) for name in wanted]
+        for group in groups:  # of several at once, pyarrow keeps those that it has read
+            for batch in file.iter_batches(_PIECE, row_groups=[group], columns=wanted, use_threads=False):
+                yield [batch.column(batch.schema.names.index(name)) for name in wanted]
 
     scale, start, rate, base = 1.0, None, None, 0
     if stamps is not None:
         scale = options.time_scale(headings[stamps][1])
-        ((first,), *_), last = batches([stamps], row_groups=[0]), None
+        ((first,), *_), last = batches([stamps], [0]), None
         start, base = first_instant(first), base_ns(first)
-        for (last,) in batches([stamps], row_groups=[file.num_row_groups - 1]):  # noqa: B007
+        for (last,) in batches([stamps], [file.num_row_groups - 1]):  # noqa: B007
             pass
         ends_s = [numbers(part, base)[at] * scale for part, at in ((first, 0), (last, -1))]
         rate = even_rate_hz(np.array(ends_s), file.metadata.num_rows)
@@ -75,7 +76,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
 
     def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
         wanted = [entry.place for entry in entries]
-        for columns in batches(wanted if stamps is None else [*wanted, stamps]):
+        for columns in batches(wanted if stamps is None else [*wanted, stamps], range(file.num_row_groups)):
             found = [numbers(column, base) for column in columns]
             part_s = None if stamps is None else found.pop() * scale
             yield [FileSignal(values=values, times_s=part_s) for values in found]
