@@ -71,7 +71,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
         ]
         while True:
             with _quiet():
-                found = [next(stream, None) for stream in streams]
+                found: list[Any] = [next(stream, None) for stream in streams]
             if found[0] is None:
                 return
             times_s = None if second is None else np.asarray(found[0][0], dtype=float) * second
@@ -168,7 +168,7 @@ def _plain(mdf: Any, group: int) -> bool:
 def _linear(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
     """What one and none of a channel's integers are; None where they are not integers, or not linear."""
     told = {"group": group, "index": index, "record_offset": 0, "record_count": 1}
-    raw = mdf.get(raw=True, ignore_invalidation_bits=True, **told)
+    raw: Any = mdf.get(raw=True, ignore_invalidation_bits=True, **told)
     kind = _IDENTITY if raw.conversion is None else raw.conversion.conversion_type
     if raw.samples.dtype.kind not in "iu" or kind not in (_IDENTITY, _LINEAR):
         return None
