@@ -66,16 +66,16 @@ def look_into(path: Path, options: FileOptions) -> Source:
         second, master = _second(mdf, group), mdf.masters_db[group]
         kinds = [_linear(mdf, *entry.place) for entry in signals]
         columns = [(master, None), *zip((entry.place[1] for entry in signals), kinds, strict=True)]
-        streams = [
+        streams: list[Iterator[Any]] = [
             mdf.iter_get(group=group, index=index, samples_only=True, raw=kind is not None) for index, kind in columns
         ]
         while True:
             with _quiet():
-                found: list[Any] = [next(stream, None) for stream in streams]
-            if found[0] is None:
+                found = [next(stream, ()) for stream in streams]
+            if not found[0]:
                 return
             times_s = None if second is None else np.asarray(found[0][0], dtype=float) * second
-            yield [_of_records(*part, kind, times_s) for part, kind in zip(found[1:], kinds, strict=True)]
+            yield [_of_records(part, kind, times_s) for part, kind in zip(found[1:], kinds, strict=True)]
 
     remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
     about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
@@ -168,23 +168,23 @@ def _plain(mdf: Any, group: int) -> bool:
 def _linear(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
     """What one and none of a channel's integers are; None where they are not integers, or not linear."""
     told = {"group": group, "index": index, "record_offset": 0, "record_count": 1}
-    raw: Any = mdf.get(raw=True, ignore_invalidation_bits=True, **told)
-    kind = _IDENTITY if raw.conversion is None else raw.conversion.conversion_type
+    raw = mdf.get(raw=True, ignore_invalidation_bits=True, **told)
+    law = raw.conversion
+    kind = _IDENTITY if law is None else law.conversion_type
     if raw.samples.dtype.kind not in "iu" or kind not in (_IDENTITY, _LINEAR):
         return None
-    return (float(raw.conversion.a), float(raw.conversion.b)) if kind == _LINEAR else (1.0, 0.0)
+    return (1.0, 0.0) if law is None or kind == _IDENTITY else (float(law.a), float(law.b))
 
 
 def _signal(mdf: Any, group: int, index: int) -> FileSignal:
     kind, second = _linear(mdf, group, index), _second(mdf, group)
     found = mdf.get(group=group, index=index, raw=kind is not None, ignore_invalidation_bits=True)
     times_s = None if second is None else np.asarray(found.timestamps, dtype=float) * second
-    return _of_records(found.samples, found.invalidation_bits, kind, times_s)
+    return _of_records((found.samples, found.invalidation_bits), kind, times_s)
 
 
-def _of_records(
-    values: np.ndarray, invalid: np.ndarray | None, linear: tuple[float, float] | None, times_s: np.ndarray | None
-) -> FileSignal:
+def _of_records(record: Sequence[Any], linear: tuple[float, float] | None, times_s: np.ndarray | None) -> FileSignal:
+    values, invalid = record
     if linear is None:
         values = values.astype(float)
     if invalid is not None and np.any(invalid):
