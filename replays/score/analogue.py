@@ -16,6 +16,7 @@ from replays.score.stimulus import Exact, Sampled, Stimulus
 from replays.score.waveform import (
     Response,
     Waveform,
+    beginnings,
     behind_filter,
     fit_waveform,
     response,
@@ -37,7 +38,7 @@ _OWN_CLOCK = 3.0, 1e-6
 """A clock is a channel's own where it is off the others' by more than so many half intervals, and by so much."""
 _PURER = 1.5
 """Noises of a channel that what is not the sine in a sine may come to."""
-_BETTER = 0.5
+_BETTER = 0.8
 """A fit of less than this part of what another leaves is the better one."""
 _SINE = ("SINAD", "ENOB", "THD", "SFDR")
 _LONGEST = 1 << 14
@@ -86,22 +87,27 @@ def fit_channels(
     """Fit all signals that are connected; those of which it is not sure to what, only where that explains them."""
     zero_s = min((signal.first_s for signal in recorded.values() if signal.first_s is not None), default=0.0)
 
+    def known(name: str, wire: Wire) -> Stimulus:
+        sent, first_s, sent_hz = session.whole(wire.channel)
+        formula = formulas.get(wire.channel)
+        if formula is None:
+            return Sampled(sent, first_s, sent_hz)
+        return Exact(formula, (first_s, first_s + len(sent) / sent_hz), recorded[name].rate_hz or sent_hz)
+
     def fit(name: str, wire: Wire) -> Fitted | None:
         signal, channel = recorded[name], session.channels[wire.channel]
-        sent, first_s, sent_hz = session.whole(wire.channel)
+        _, first_s, sent_hz = session.whole(wire.channel)
         rate = signal.rate_hz or sent_hz
-        formula = formulas.get(wire.channel)
-        span = (first_s, first_s + len(sent) / sent_hz)
-        stimulus: Stimulus = Sampled(sent, first_s, sent_hz) if formula is None else Exact(formula, span, rate)
         begin_s = 0.0 if signal.first_s is None else signal.first_s - zero_s
         times_s = begin_s + np.arange(signal.rows) / rate
         within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
         wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
-        exact = formula is not None or not session.noisy
-        return _fit(name, channel, in_unit(signal, channel)[0], times_s, stimulus, first_s, wire, exact=exact)
+        exact = wire.channel in formulas or not session.noisy
+        values = in_unit(signal, channel)[0]
+        return _fit(name, channel, values, times_s, known(name, wire), first_s, wire, exact=exact)
 
     wires = {name: wire for name, wire in wires.items() if wire.channel}
-    wires |= _begun(fit, wires, remarks)
+    wires |= _begun(fit, known, wires, remarks)
     found = []
     for name, wire in wires.items():
         signal, channel = recorded[name], session.channels[wire.channel]
@@ -115,22 +121,29 @@ def fit_channels(
     return found
 
 
-def _begun(fit: Callable[[str, Wire], Fitted | None], wires: Mapping[str, Wire], remarks: list[str]) -> dict[str, Wire]:
+def _begun(
+    fit: Callable[[str, Wire], Fitted | None], known: Callable[[str, Wire], Stimulus], wires: Mapping[str, Wire],
+    remarks: list[str],
+) -> dict[str, Wire]:  # fmt: skip
     """Wires with another beginning, where what is nearly periodic fits better from there."""
     if not wires:
         return {}
     name = max(wires, key=lambda each: (len(wires[each].others_s) > 0, wires[each].likeness))
-    late_s, best = wires[name].late_s, (math.inf, 0.0)
-    for other_s in (late_s, *wires[name].others_s):
-        shift = other_s - late_s
-        one = fit(name, replace(wires[name], own_s=wires[name].own_s + shift))
+    wire, best = wires[name], (math.inf, 0.0)
+    shifts = [0.0, *(other_s - wire.late_s for other_s in wire.others_s)]
+    tried: list[float] = []
+    while shifts:
+        tried.append(shift := shifts.pop(0))
+        one = fit(name, replace(wire, own_s=wire.own_s + shift))
         if one is not None:
+            if len(tried) == 1 and wire.others_s:
+                shifts = [shift + each for each in beginnings(one.clean, known(name, wire))] + shifts
             left = float(np.std(one.clean.residual))
             best = (left, shift) if left < _BETTER * best[0] else best
-            if left < _PURER / _BETTER * one.channel.noise_v / abs(one.channel.sensitivity_v):
+            if left < _PURER * one.channel.noise_v / abs(one.channel.sensitivity_v):
                 break
     else:
-        if len(set(wires[name].others_s) - {late_s}) > 1:
+        if len(set(wire.others_s) - {wire.late_s}) > 1:
             remarks.append(_NOT_SURE)
     return {each: replace(wire, own_s=wire.own_s + best[1]) for each, wire in wires.items() if wire.others_s}
 

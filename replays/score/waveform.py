@@ -31,6 +31,8 @@ _SETTLED = 1e-3
 _MOST_DRIFT = 0.02
 _LEAST = 400
 """Fewest samples that are fitted."""
+_MOST, _FINER, _LIKE = 1 << 17, 4, 12
+"""Samples by which other beginnings are looked for, places between two of them, and how many are told."""
 _TAPS = 96
 _PASSES = 3
 """Rounds in which a fit behind a filter takes the signal at the times that the last one found."""
@@ -196,6 +198,33 @@ def _solve(
         float(gain + step[0] / scale), float(offset + step[1]), float(late), float(drift),
         covariance / np.outer(units, units), freedom, middle, t[use], y[use], s, ds, residual,
     )  # fmt: skip
+
+
+def beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
+    """Shifts of time after which the known signal is as like what was recorded, by the clock of a fit [s].
+
+    The likeliest are first. Where a signal nearly repeats, a fit finds its clock from any beginning.
+    """
+    from scipy.signal import correlate
+
+    y, n = found.values[:_MOST], len(found.values[:_MOST])
+    low, high = stimulus.span_s
+    step_s = (1.0 + found.drift) * (found.times_s[-1] - found.times_s[0]) / (len(found.times_s) - 1)
+    rows = math.floor((high - low) / step_s)
+    curve = np.zeros((rows - n, _FINER))
+    for phase in range(_FINER if rows > n else 0):
+        s, _ = stimulus(low + (np.arange(rows - 1) + phase / _FINER) * step_s)
+        sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (s, s**2))
+        power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
+        alike = correlate(s, y - y.mean(), "valid", "fft") / np.sqrt(np.maximum(power, 1e-12 * power.max()))
+        curve[:, phase] = np.abs(alike)
+    curve = curve.ravel()
+    at = np.flatnonzero((curve[1:-1] > curve[:-2]) & (curve[1:-1] >= curve[2:])) + 1
+    bend = curve[at - 1] - 2.0 * curve[at] + curve[at + 1]
+    aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
+    best = np.argsort(-(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside))[:_LIKE]
+    began_s = found.times_s[0] + found.late_s + found.drift * (found.times_s[0] - found.middle_s)
+    return (low + (at[best] + aside[best]) * (step_s / _FINER) - began_s).tolist()
 
 
 def _sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) -> tuple[np.ndarray, np.ndarray]:
