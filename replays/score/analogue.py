@@ -12,13 +12,14 @@ from replays.score.recorded import Recorded
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
-from replays.score.stimulus import Exact, Sampled, Stimulus
+from replays.score.stimulus import Exact, Sampled, Stimulus, parted
 from replays.score.waveform import (
     Response,
     Waveform,
     beginnings,
     behind_filter,
     fit_waveform,
+    folded,
     response,
     split_noise,
     student,
@@ -41,6 +42,8 @@ _PURER = 1.5
 _BETTER = 0.8
 """A fit of less than this part of what another leaves is the better one."""
 _SINE = ("SINAD", "ENOB", "THD", "SFDR")
+_SEEN = 4.0
+"""Noises of a channel that what is above half of the rate has to come to."""
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
 
@@ -62,6 +65,8 @@ class Fitted:
         odd: Whether there is a low-pass that is none of the known ones.
         values: As recorded, in the channel's unit.
         exact: Whether the known signal has no noise of its own.
+        folds: What is left of the signal above half of the rate, over its part below [1]; None where it has nothing.
+        alias: The same as recorded [unit], shape (n,).
     """
 
     name: str
@@ -73,6 +78,8 @@ class Fitted:
     odd: bool
     values: np.ndarray
     exact: bool
+    folds: Interval | None
+    alias: np.ndarray | float
 
     @property
     def good(self) -> bool:
@@ -104,7 +111,7 @@ def fit_channels(
         wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
         exact = wire.channel in formulas or not session.noisy
         values = in_unit(signal, channel)[0]
-        return _fit(name, channel, values, times_s, known(name, wire), first_s, wire, exact=exact)
+        return _fit(name, channel, values, times_s, known(name, wire), first_s, wire, sent_hz, exact=exact)
 
     wires = {name: wire for name, wire in wires.items() if wire.channel}
     wires |= _begun(fit, known, wires, remarks)
@@ -161,8 +168,13 @@ def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
 
 def _fit(
     name: str, channel: Channel, values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, first_s: float,
-    wire: Wire, *, exact: bool,
+    wire: Wire, sent_hz: float, *, exact: bool,
 ) -> Fitted | None:  # fmt: skip
+    rate = (len(times_s) - 1) / (times_s[-1] - times_s[0])
+    parts = parted(
+        stimulus, rate, sent_hz, _SEEN * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
+    )
+    stimulus = stimulus if parts is None else parts[0]
     whole = fit_waveform(values, times_s, stimulus, wire.own_s + first_s, within_s=wire.within_s)
     if whole is None:
         return None
@@ -175,7 +187,13 @@ def _fit(
         if behind is not None and np.var(behind[0].residual) < _AS_WELL * np.var(clean.residual):
             (low, corner_hz), odd = behind, False
             clean = low
-    return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact)
+    folds, alias = None, 0.0
+    if parts is not None:
+        at_s = clean.times_s + low.late_s + low.drift * (clean.times_s - low.middle_s)
+        alias, amounts = folded(clean, [each(at_s)[0] for each in parts[1:]])
+        folds = _scaled(amounts, 1.0 / abs(low.gain))
+        clean = replace(clean, residual=clean.residual - alias)
+    return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact, folds, alias)
 
 
 def _about(value: float, half: float, size: float = 1.0) -> Interval:
@@ -199,7 +217,10 @@ def score_analogue(
         _score_fit(card, one)
         sines.append(_score_sine(card, one))
         card.pictures[f"analogue {one.name}"] = one
-    for quantity in (*(() if any(sines) else _SINE), "alias rejection", "trigger row"):
+    for quantity in (
+        *(() if any(sines) else _SINE), *(() if any(one.folds for one in found) else ("alias rejection",)),
+        "trigger row",
+    ):  # fmt: skip
         card.add(quantity, "", None)
 
 
@@ -254,7 +275,8 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
     add("noise", noise)
     add("jitter", _scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
     full = channel.adc_v / abs(channel.sensitivity_v)
-    bits = [math.log2(full / max(split.left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
+    left = split_noise(replace(one.clean, residual=one.clean.residual + one.alias), floor=brought).left
+    bits = [math.log2(full / max(left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
     ranges = [20.0 * math.log10(full / max(noise[n], 1e-12 * full) / math.sqrt(2.0)) for n in (0, 2, 1)]
     add("effective bits", (bits[0], bits[1], bits[2]))
     add("dynamic range", (ranges[0], ranges[1], ranges[2]))
@@ -267,6 +289,9 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
         else:
             note = f"no fall by 3 dB up to {highest:.0f} Hz, beyond which the signal shows nothing"
     add("corner", estimate, note)
+    if one.folds is not None:
+        value, low_db, high_db = (-20.0 * math.log10(each) if each else math.inf for each in one.folds)
+        add("alias rejection", (value, high_db, low_db))
 
 
 def _score_sine(card: Scorecard, one: Fitted) -> bool:

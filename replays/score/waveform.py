@@ -8,6 +8,7 @@ signal itself, as of samples between which it is interpolated, are part of what 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -207,12 +208,13 @@ def beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
     """
     from scipy.signal import correlate
 
-    y, n = found.values[:_MOST], len(found.values[:_MOST])
     low, high = stimulus.span_s
     step_s = (1.0 + found.drift) * (found.times_s[-1] - found.times_s[0]) / (len(found.times_s) - 1)
     rows = math.floor((high - low) / step_s)
+    y = found.values[: min(_MOST, rows // 2)]
+    n = len(y)
     curve = np.zeros((rows - n, _FINER))
-    for phase in range(_FINER if rows > n else 0):
+    for phase in range(_FINER):
         s, _ = stimulus(low + (np.arange(rows - 1) + phase / _FINER) * step_s)
         sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (s, s**2))
         power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
@@ -259,6 +261,25 @@ def student(freedom: ArrayLike) -> Any:
     from scipy.stats import t
 
     return t.ppf(0.975, freedom)
+
+
+def folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """What of a residual is of frequencies above half of the rate, and times what was sent with its 95 % interval.
+
+    Args:
+        found: A fit of what is below.
+        above: What is above at the fitted instants, and that a quarter of a period later, each shape (n,).
+    """
+    columns = [*above, found.known, found.slope, np.ones(len(found.known))]
+    sizes = np.maximum([np.sqrt(np.mean(each**2)) for each in columns], 1e-300)
+    matrix = np.column_stack(columns) / sizes
+    parts = np.linalg.lstsq(matrix, found.residual, rcond=None)[0]
+    covariance, freedom = _sandwich(matrix, found.residual - matrix @ parts)
+    both = parts[:2] / sizes[:2]
+    amount = max(float(np.linalg.norm(both)), 1e-300)
+    way = both / amount / sizes[:2]
+    half = float(student(freedom[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
+    return matrix @ parts, (amount, max(0.0, amount - half), amount + half)
 
 
 @dataclass(frozen=True)
