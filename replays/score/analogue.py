@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from replays.score.intervals import student
 from replays.score.recorded import Recorded
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Formula, Session
@@ -22,7 +23,6 @@ from replays.score.waveform import (
     folded,
     response,
     split_noise,
-    student,
     through,
 )
 from replays.score.wiring import Wire

@@ -13,11 +13,11 @@ from itertools import chain
 
 import numpy as np
 
+from replays.score.intervals import student
 from replays.score.recorded import Recorded, Table
 from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
-from replays.score.waveform import student
 from replays.score.wiring import Wire
 from rig import units
 from rig.channels import Channel
@@ -343,14 +343,13 @@ class Stamps:
         several = max(1, len(self._means) // _APART)
         whole = np.array(self._means[: len(self._means) // several * several])
         since, late = whole.reshape(-1, several, 2).mean(axis=1).T
-        matrix = np.column_stack([np.ones(len(since)), since])
-        parts = np.linalg.lstsq(matrix, late, rcond=None)[0]
-        left = late - matrix @ parts
-        freedom = len(left) - 2
-        covariance = np.linalg.inv(matrix.T @ matrix) * float(left @ left) / freedom
-        half = student(freedom) * np.sqrt(np.diag(covariance))
-        for name, n, size in (("stamp offset", 0, 1.0), ("stamp rate", 1, 1e6)):
-            found[name] = size * parts[n], size * (parts[n] - half[n]), size * (parts[n] + half[n])
+        (rate, offset), covariance = np.polyfit(since, late - late[0], 1, cov=True)
+        half = student(len(since) - 2) * np.sqrt(np.diag(covariance))
+        for name, at, wide, size in (
+            ("stamp offset", late[0] + offset, half[1], 1.0),
+            ("stamp rate", rate, half[0], 1e6),
+        ):
+            found[name] = size * at, size * (at - wide), size * (at + wide)
         if wall_s is not None and abs(late.mean() - wall_s) < _SAME_CLOCK_S:
             value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
             found["latency"] = float(value), float(value - wide), float(value + wide)

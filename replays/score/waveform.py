@@ -10,15 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from replays.score.intervals import sandwich, student
 from replays.score.stimulus import Stimulus
 
-_BLOCKS = 64
 _FIRST_S = (0.25, 0.03)
 """Where the signal is steepest, a stretch this long is fitted first; it is doubled until it is all.
 
@@ -194,7 +191,7 @@ def _solve(
         if number > 1 and (small.all() or number >= _ROUNDS + (_FINAL if final else 0)):
             break
     residual = residual - jacobian @ step
-    covariance, freedom = _sandwich(jacobian, residual)
+    covariance, freedom = sandwich(jacobian, residual)
     return Waveform(
         float(gain + step[0] / scale), float(offset + step[1]), float(late), float(drift),
         covariance / np.outer(units, units), freedom, middle, t[use], y[use], s, ds, residual,
@@ -229,40 +226,6 @@ def beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
     return (low + (at[best] + aside[best]) * (step_s / _FINER) - began_s).tolist()
 
 
-def _sandwich(matrix: np.ndarray, residual: np.ndarray, *, even: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance of a linear fit by blocks, and the degrees of freedom of each variance.
-
-    A block that has more say in the fit leaves less of its own noise: each is lifted by the root of what it leaves, and
-    variances of which few blocks decide have few degrees of freedom (Bell & McCaffrey 2002, Survey Methodology 28).
-    """
-    edges = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)
-    rows = [slice(*ends) for ends in pairwise(edges)]
-    grams = np.array([matrix[part].T @ matrix[part] for part in rows])
-    scores = np.array([matrix[part].T @ residual[part] for part in rows])
-    sizes, turn = np.linalg.eigh(grams.sum(axis=0))
-    white = turn * np.where(sizes > 1e-14 * sizes[-1], np.maximum(sizes, 1e-300) ** -0.5, 0.0)
-    shares = white.T @ grams @ white
-    say, axes = np.linalg.eigh(shares)
-    lift = (axes / np.sqrt(np.maximum(1.0 - say, 1.0 / _BLOCKS))[:, None, :]) @ axes.transpose(0, 2, 1)
-    pulls = (lift @ (scores @ white)[:, :, None])[:, :, 0] @ white.T
-    # Of each parameter, how the blocks' pulls vary together, each with the noise that it has, or all with the same.
-    noise = np.array([1.0 if even else math.sqrt(float(residual[part] @ residual[part])) for part in rows])
-    lifted = np.einsum("bij,kj->kbi", lift @ shares, white)
-    apart = -lifted @ lifted.transpose(0, 2, 1)
-    apart[:, np.arange(_BLOCKS), np.arange(_BLOCKS)] += np.einsum("kbi,bij,kj->kb", lifted, lift, white)
-    apart *= np.outer(noise, noise) / max(float(noise @ noise), 1e-300)
-    squares = np.sum(apart**2, axis=(1, 2))
-    freedom = np.trace(apart, axis1=1, axis2=2) ** 2 / np.maximum(squares, 1e-300)
-    return pulls.T @ pulls, np.maximum(1.0, freedom)
-
-
-def student(freedom: ArrayLike) -> Any:
-    """The 97.5 % quantile of Student's t, one for each number of degrees of freedom."""
-    from scipy.stats import t
-
-    return t.ppf(0.975, freedom)
-
-
 def folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
     """What of a residual is of frequencies above half of the rate, and times what was sent with its 95 % interval.
 
@@ -274,7 +237,7 @@ def folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tu
     sizes = np.maximum([np.sqrt(np.mean(each**2)) for each in columns], 1e-300)
     matrix = np.column_stack(columns) / sizes
     parts = np.linalg.lstsq(matrix, found.residual, rcond=None)[0]
-    covariance, freedom = _sandwich(matrix, found.residual - matrix @ parts)
+    covariance, freedom = sandwich(matrix, found.residual - matrix @ parts)
     both = parts[:2] / sizes[:2]
     amount = max(float(np.linalg.norm(both)), 1e-300)
     way = both / amount / sizes[:2]
@@ -329,7 +292,7 @@ def _powers(squared: np.ndarray, columns: list[np.ndarray], floor: float) -> lis
         total = float(np.mean(squared))
         weights = np.maximum(matrix @ parts, 0.05 * total) ** -2.0 * total**2
     root = np.sqrt(weights)
-    covariance, freedom = _sandwich(matrix * root[:, None], (squared - matrix @ parts) * root, even=True)
+    covariance, freedom = sandwich(matrix * root[:, None], (squared - matrix @ parts) * root, even=True)
     half = student(freedom) * np.sqrt(np.diag(covariance))
     roots = np.sqrt(np.maximum(0.0, [parts, parts - half, parts + half]))
     roots[1, 0] = math.sqrt(max(0.0, roots[1, 0] ** 2 - floor**2))
@@ -396,21 +359,17 @@ def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, 
     near = (f > 0.7 * at) & (f < 1.4 * at)
     if near.sum() < 8:
         return None
-    x = np.log(f[near] / at)
-    matrix = np.column_stack([np.ones(len(x)), x, x**2])
-    weights = spread[near] ** -2.0
-    weighted = matrix * weights[:, None]
-    inverse = np.linalg.inv(weighted.T @ matrix)
-    parts = inverse @ (weighted.T @ log[near])
-    left = log[near] - matrix @ parts
-    inverse *= max(1.0, float(np.sum(weights * left**2)) / (len(x) - 3))
-    roots = [r.real for r in np.roots([parts[2], parts[1], parts[0] - level]) if abs(r.imag) < 1e-9]
+    x, weights = np.log(f[near] / at), 1.0 / spread[near]
+    parts, inverse = np.polyfit(x, log[near], 2, w=weights, cov="unscaled")
+    left = weights * (log[near] - np.polyval(parts, x))
+    inverse *= max(1.0, float(left @ left) / (len(x) - 3))
+    roots = [r.real for r in np.roots(parts - [0.0, 0.0, level]) if abs(r.imag) < 1e-9]
     if not roots:
         return None
     root = min(roots, key=abs)
-    row = np.array([1.0, root, root**2])
+    row = np.array([root**2, root, 1.0])
     # Lines of a Hann window are not independent: 1.9 of them are one.
-    half = 1.96 * math.sqrt(1.9 * float(row @ inverse @ row)) / max(abs(parts[1] + 2.0 * parts[2] * root), 1e-300)
+    half = 1.96 * math.sqrt(1.9 * float(row @ inverse @ row)) / max(abs(parts[1] + 2.0 * parts[0] * root), 1e-300)
     return at * math.exp(root), at * math.exp(root - half), at * math.exp(root + half)
 
 
@@ -517,7 +476,7 @@ def _behind(found: Waveform, corner_hz: float, order: int, late_s: float | None)
     assert solved is not None
     s, ds, matrix, jacobian, sizes, parts = solved
     residual = y[kept] - matrix @ parts
-    covariance, freedom = _sandwich(jacobian, residual)
+    covariance, freedom = sandwich(jacobian, residual)
     sizes = sizes * np.array([1.0, 1.0, 1.0, 0.5 * span_s, 1.0])
     covariance = covariance / np.outer(sizes, sizes)
     half = float(student(freedom[4])) * math.sqrt(covariance[4, 4])
