@@ -48,7 +48,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     scale, start, rate, base = 1.0, None, None, 0
     if stamps is not None:
         scale = options.time_scale(headings[stamps][1])
-        ((first,), *_), last = batches([stamps], [0]), None
+        (first,), last = next(batches([stamps], [0])), None
         start, base = first_instant(first), base_ns(first)
         for (last,) in batches([stamps], [file.num_row_groups - 1]):  # noqa: B007
             pass
