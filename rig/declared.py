@@ -159,7 +159,10 @@ class Declared(Continuity):
     def _tell(self, key: str, number: int, row: int) -> None:
         """The block before a number, as it was sent, was taken, and is the one before a row."""
         self._anew[key] = number, row
-        if (number, row) in self._holes.get(key, ()):
+        if self.next.get(key) == number:
+            self.next[key] = row
+            self._know(key)
+        elif (number, row) in self._holes.get(key, ()):
             self._holes[key].remove((number, row))
             self.declared[key] = self.declared.get(key, 0) + row - number
             self._know(key)

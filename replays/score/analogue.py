@@ -8,19 +8,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from replays.score.intervals import student
 from replays.score.recorded import Recorded
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Formula, Session
 from replays.score.sine import fit_sine, is_sine, quality
-from replays.score.stimulus import Exact, Sampled, Stimulus
+from replays.score.stimulus import Exact, Sampled, Stimulus, parted
 from replays.score.waveform import (
     Response,
     Waveform,
+    beginnings,
     behind_filter,
     fit_waveform,
+    folded,
     response,
     split_noise,
-    student,
     through,
 )
 from replays.score.wiring import Wire
@@ -33,13 +35,15 @@ _GOOD = 0.9
 """Part of the power that the known signal, behind the channel's filter, must explain for a fit to be one of it."""
 _SOME = 0.05
 """The same without the filter, for one to be looked for."""
-_OWN_CLOCK = 6.0, 1e-6
-"""A clock is a channel's own where it is off the others' by more than so many deviations, and by so much."""
+_OWN_CLOCK = 3.0, 1e-6
+"""A clock is a channel's own where it is off the others' by more than so many half intervals, and by so much."""
 _PURER = 1.5
 """Noises of a channel that what is not the sine in a sine may come to."""
-_BETTER = 0.5
+_BETTER = 0.8
 """A fit of less than this part of what another leaves is the better one."""
 _SINE = ("SINAD", "ENOB", "THD", "SFDR")
+_SEEN = 4.0
+"""Noises of a channel that what is above half of the rate has to come to."""
 _LONGEST = 1 << 14
 """Samples by which a signal is told to be a sine."""
 
@@ -61,6 +65,8 @@ class Fitted:
         odd: Whether there is a low-pass that is none of the known ones.
         values: As recorded, in the channel's unit.
         exact: Whether the known signal has no noise of its own.
+        folds: What is left of the signal above half of the rate, over its part below [1]; None where it has nothing.
+        alias: The same as recorded [unit], shape (n,).
     """
 
     name: str
@@ -72,6 +78,8 @@ class Fitted:
     odd: bool
     values: np.ndarray
     exact: bool
+    folds: Interval | None
+    alias: np.ndarray | float
 
     @property
     def good(self) -> bool:
@@ -84,25 +92,29 @@ def fit_channels(
     remarks: list[str],
 ) -> list[Fitted]:  # fmt: skip
     """Fit all signals that are connected; those of which it is not sure to what, only where that explains them."""
-    begins = [signal.times_s[0] for signal in recorded.values() if signal.times_s is not None and signal.rows]
-    zero_s = min(begins, default=0.0)
+    zero_s = min((signal.first_s for signal in recorded.values() if signal.first_s is not None), default=0.0)
+
+    def known(name: str, wire: Wire) -> Stimulus:
+        sent, first_s, sent_hz = session.whole(wire.channel)
+        formula = formulas.get(wire.channel)
+        if formula is None:
+            return Sampled(sent, first_s, sent_hz)
+        return Exact(formula, (first_s, first_s + len(sent) / sent_hz), recorded[name].rate_hz or sent_hz)
 
     def fit(name: str, wire: Wire) -> Fitted | None:
         signal, channel = recorded[name], session.channels[wire.channel]
-        sent, first_s, sent_hz = session.whole(wire.channel)
+        _, first_s, sent_hz = session.whole(wire.channel)
         rate = signal.rate_hz or sent_hz
-        formula = formulas.get(wire.channel)
-        span = (first_s, first_s + len(sent) / sent_hz)
-        stimulus: Stimulus = Sampled(sent, first_s, sent_hz) if formula is None else Exact(formula, span, rate)
-        begin_s = 0.0 if signal.times_s is None else float(signal.times_s[0] - zero_s)
+        begin_s = 0.0 if signal.first_s is None else signal.first_s - zero_s
         times_s = begin_s + np.arange(signal.rows) / rate
         within_s = wire.within_s[0] + begin_s, wire.within_s[1] + begin_s
         wire = replace(wire, own_s=wire.own_s - begin_s, within_s=within_s)
-        exact = formula is not None or not session.noisy
-        return _fit(name, channel, in_unit(signal, channel)[0], times_s, stimulus, first_s, wire, exact=exact)
+        exact = wire.channel in formulas or not session.noisy
+        values = in_unit(signal, channel)[0]
+        return _fit(name, channel, values, times_s, known(name, wire), first_s, wire, sent_hz, exact=exact)
 
     wires = {name: wire for name, wire in wires.items() if wire.channel}
-    wires |= _begun(fit, wires, remarks)
+    wires |= _begun(fit, known, wires, remarks)
     found = []
     for name, wire in wires.items():
         signal, channel = recorded[name], session.channels[wire.channel]
@@ -116,22 +128,29 @@ def fit_channels(
     return found
 
 
-def _begun(fit: Callable[[str, Wire], Fitted | None], wires: Mapping[str, Wire], remarks: list[str]) -> dict[str, Wire]:
+def _begun(
+    fit: Callable[[str, Wire], Fitted | None], known: Callable[[str, Wire], Stimulus], wires: Mapping[str, Wire],
+    remarks: list[str],
+) -> dict[str, Wire]:  # fmt: skip
     """Wires with another beginning, where what is nearly periodic fits better from there."""
     if not wires:
         return {}
     name = max(wires, key=lambda each: (len(wires[each].others_s) > 0, wires[each].likeness))
-    late_s, best = wires[name].late_s, (math.inf, 0.0)
-    for other_s in (late_s, *wires[name].others_s):
-        shift = other_s - late_s
-        one = fit(name, replace(wires[name], own_s=wires[name].own_s + shift))
+    wire, best = wires[name], (math.inf, 0.0)
+    shifts = [0.0, *(other_s - wire.late_s for other_s in wire.others_s)]
+    tried: list[float] = []
+    while shifts:
+        tried.append(shift := shifts.pop(0))
+        one = fit(name, replace(wire, own_s=wire.own_s + shift))
         if one is not None:
+            if len(tried) == 1 and wire.others_s:
+                shifts = [shift + each for each in beginnings(one.clean, known(name, wire))] + shifts
             left = float(np.std(one.clean.residual))
             best = (left, shift) if left < _BETTER * best[0] else best
-            if left < _PURER / _BETTER * one.channel.noise_v / abs(one.channel.sensitivity_v):
+            if left < _PURER * one.channel.noise_v / abs(one.channel.sensitivity_v):
                 break
     else:
-        if len(set(wires[name].others_s) - {late_s}) > 1:
+        if len(set(wire.others_s) - {wire.late_s}) > 1:
             remarks.append(_NOT_SURE)
     return {each: replace(wire, own_s=wire.own_s + best[1]) for each, wire in wires.items() if wire.others_s}
 
@@ -149,8 +168,13 @@ def in_unit(signal: Recorded, channel: Channel) -> tuple[np.ndarray, bool]:
 
 def _fit(
     name: str, channel: Channel, values: np.ndarray, times_s: np.ndarray, stimulus: Stimulus, first_s: float,
-    wire: Wire, *, exact: bool,
+    wire: Wire, sent_hz: float, *, exact: bool,
 ) -> Fitted | None:  # fmt: skip
+    rate = (len(times_s) - 1) / (times_s[-1] - times_s[0])
+    parts = parted(
+        stimulus, rate, sent_hz, _SEEN * math.hypot(channel.noise_v, channel.lsb_v) / abs(channel.sensitivity_v)
+    )
+    stimulus = stimulus if parts is None else parts[0]
     whole = fit_waveform(values, times_s, stimulus, wire.own_s + first_s, within_s=wire.within_s)
     if whole is None:
         return None
@@ -163,11 +187,17 @@ def _fit(
         if behind is not None and np.var(behind[0].residual) < _AS_WELL * np.var(clean.residual):
             (low, corner_hz), odd = behind, False
             clean = low
-    return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact)
+    folds, alias = None, 0.0
+    if parts is not None:
+        at_s = clean.times_s + low.late_s + low.drift * (clean.times_s - low.middle_s)
+        alias, amounts = folded(clean, [each(at_s)[0] for each in parts[1:]])
+        folds = _scaled(amounts, 1.0 / abs(low.gain))
+        clean = replace(clean, residual=clean.residual - alias)
+    return Fitted(name, channel, low, clean, shown, corner_hz, odd, values, exact, folds, alias)
 
 
-def _about(value: float, spread: float, quantile: float, size: float = 1.0) -> Interval:
-    return size * value, size * (value - quantile * spread), size * (value + quantile * spread)
+def _about(value: float, half: float, size: float = 1.0) -> Interval:
+    return size * value, size * (value - half), size * (value + half)
 
 
 def score_analogue(
@@ -187,7 +217,10 @@ def score_analogue(
         _score_fit(card, one)
         sines.append(_score_sine(card, one))
         card.pictures[f"analogue {one.name}"] = one
-    for quantity in (*(() if any(sines) else _SINE), "alias rejection", "trigger row"):
+    for quantity in (
+        *(() if any(sines) else _SINE), *(() if any(one.folds for one in found) else ("alias rejection",)),
+        "trigger row",
+    ):  # fmt: skip
         card.add(quantity, "", None)
 
 
@@ -198,43 +231,43 @@ def _score_time(card: Scorecard, found: list[Fitted], wires: Mapping[str, Wire])
     if not inner:
         return
     reference = inner[(len(inner) - 1) // 2] if len(inner) > 2 else found[0]
-    spreads = np.maximum([one.low.spread[3] for one in found], 1e-15)
+    halves = np.maximum([one.low.half[3] for one in found], 1e-15)
     drifts = np.array([one.low.drift for one in found])
     middle = np.sort(drifts)[(len(found) - 1) // 2] if len(found) > 2 else reference.low.drift
-    own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * spreads, _OWN_CLOCK[1])
-    weights = np.where(own, 0.0, spreads**-2.0)
-    quantile = student(reference.low.freedom)
+    own = np.abs(drifts - middle) > np.maximum(_OWN_CLOCK[0] * halves, _OWN_CLOCK[1])
+    weights = np.where(own, 0.0, halves**-2.0)
     told = [("", float(weights @ drifts / weights.sum()), float(weights.sum() ** -0.5))]
-    told += [(found[n].name, drifts[n], spreads[n]) for n in np.flatnonzero(own)]
-    for name, drift, spread in told:
+    told += [(found[n].name, drifts[n], halves[n]) for n in np.flatnonzero(own)]
+    for name, drift, half in told:
         # Its clock runs fast where the session's time goes slowly over its own.
         note = "off the clock of the others" if name else ""
-        card.add("clock", name, _about(-drift / (1.0 + drift), spread, quantile, 1e6), note=note)
+        card.add("clock", name, _about(-drift / (1.0 + drift), half, 1e6), note=note)
     turned = any(wires[one.name].turned for one in found)
     note = "a periodic signal: up to whole periods" if turned else ""
+    back = np.array([0.0, 0.0, 1.0, -reference.low.middle_s])  # to time zero of the file, at its own clock
+    spread = math.sqrt(back @ reference.low.covariance @ back)
     begin_s = reference.low.late_s - reference.low.drift * reference.low.middle_s
-    start = _about(begin_s, reference.low.spread[2], quantile)
+    start = _about(begin_s, float(student(reference.low.freedom[2:].min())) * spread)
     card.add("start", reference.name, start, of=reference.channel, note=note)
     for one in found:
         if one is not reference:
             apart = one.low.late_s - reference.low.late_s
-            both = math.hypot(one.low.spread[2], reference.low.spread[2])
+            both = math.hypot(one.low.half[2], reference.low.half[2])
             odd = _ODD if one.odd or reference.odd else ""
             said = "; ".join(each for each in (f"against {reference.name}", note, odd) if each)
-            skew = None if odd else _about(apart, both, quantile, 1e9)
+            skew = None if odd else _about(apart, both, 1e9)
             card.add("skew", one.name, skew, of=one.channel, note=said)
 
 
 def _score_fit(card: Scorecard, one: Fitted) -> None:
     low, channel = one.low, one.channel
-    quantile = student(low.freedom)
 
     def add(quantity: str, estimate: Interval | None, note: str = "") -> None:
         card.add(quantity, one.name, estimate, of=channel, unit=channel.unit, note=note)
 
     note = _ODD if one.odd else "" if one.good else f"what was sent explains {max(0.0, one.clean.likeness):.1%} of it"
-    add("gain", None if note else _about(abs(low.gain) - 1.0, low.spread[0], quantile, 1e6), note)
-    add("offset", _about(low.offset, low.spread[1], quantile) if one.good else None)
+    add("gain", None if note else _about(abs(low.gain) - 1.0, low.half[0], 1e6), note)
+    add("offset", _about(low.offset, low.half[1]) if one.good else None)
     # Nothing tells whether the rig's own noise, which is in its samples, was in what the DAQ was given.
     brought = 0.0 if one.exact else channel.noise_v / abs(channel.sensitivity_v)
     split = split_noise(one.clean, floor=brought)
@@ -242,7 +275,8 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
     add("noise", noise)
     add("jitter", _scaled(split.jitter_s, 1e9) if one.good and split.jitter_s is not None else None)
     full = channel.adc_v / abs(channel.sensitivity_v)
-    bits = [math.log2(full / max(split.left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
+    left = split_noise(replace(one.clean, residual=one.clean.residual + one.alias), floor=brought).left
+    bits = [math.log2(full / max(left[n], 1e-12 * full) / math.sqrt(3.0)) for n in (0, 2, 1)]
     ranges = [20.0 * math.log10(full / max(noise[n], 1e-12 * full) / math.sqrt(2.0)) for n in (0, 2, 1)]
     add("effective bits", (bits[0], bits[1], bits[2]))
     add("dynamic range", (ranges[0], ranges[1], ranges[2]))
@@ -255,6 +289,9 @@ def _score_fit(card: Scorecard, one: Fitted) -> None:
         else:
             note = f"no fall by 3 dB up to {highest:.0f} Hz, beyond which the signal shows nothing"
     add("corner", estimate, note)
+    if one.folds is not None:
+        value, low_db, high_db = (-20.0 * math.log10(each) if each else math.inf for each in one.folds)
+        add("alias rejection", (value, high_db, low_db))
 
 
 def _score_sine(card: Scorecard, one: Fitted) -> bool:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from replays.score.recorded import Recorded
+from replays.score.recorded import Pieces, Recorded, Table
 from rig.channels import ChannelTable
 from rig.errors import InputError, Words
 from rig.outside import unreadable
@@ -72,18 +71,15 @@ def open_can_log(path: Path, table: ChannelTable) -> list[Recorded]:
         parts = Layout({name: message}).decode(name, data, rates["rate"], step, 0)
         values = np.concatenate([part.values for part in parts])
         times_s = np.repeat(stamps, form.rows)
-        like = None
+        # Its stamps are those of frames: when they came, not how often samples were taken.
+        whole = Table(len(values), values.shape[1], _reading(values, times_s))
         for column, (channel, bits) in enumerate(zip(form.channels, form.shifts.tolist(), strict=True)):
             if not np.isnan(values[:, column]).all():
-                read = _reading(values[:, column], times_s)
-                # Its stamps are those of frames: when they came, not how often samples were taken.
-                rate_hz = rates["rate"] / step
-                found.append(Recorded(channel.name, channel.unit, len(values), rate_hz, read, bits, like))
-                like = like or found[-1]
+                found.append(Recorded(channel.name, channel.unit, whole, column, rates["rate"] / step, bits))
     if not found:
         raise InputError("FILE", "a CAN log with samples of the rig", str(path))
     return found
 
 
-def _reading(values: np.ndarray, times_s: np.ndarray) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
-    return lambda: (values, times_s)
+def _reading(values: np.ndarray, times_s: np.ndarray) -> Pieces:
+    return lambda columns: [np.column_stack([times_s, values[:, columns]])]

@@ -9,14 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
-from replays.score.recorded import Recorded, in_parts
+from replays.score.intervals import student
+from replays.score.recorded import Recorded, Table
 from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
 from replays.score.scorecard import Interval, Scorecard
 from replays.score.sent import Sent, Session
-from replays.score.waveform import student
 from replays.score.wiring import Wire
 from rig import units
 from rig.channels import Channel
@@ -32,6 +33,8 @@ _LOOKED = 1 << 16
 _ENOUGH = 0.99
 _BATCHES, _APART = 256, 32
 """Of stamps that are shown, and that are judged."""
+_MOST_BATCH = 1 << 12
+"""Rows of a batch."""
 _SAME_CLOCK_S = 10.0
 """Stamps that are farther from the wall time of the session are of another clock."""
 _NAMED = 5
@@ -146,7 +149,7 @@ def settle(
         """Values and counts of the same rows: row j of the file was sent `begin` and j steps behind the first one."""
         channel, signal, step = session.channels[of], recorded[name], step_of(name, of)
         skipped = max(0, -(begin // step))
-        values = signal.values[skipped:]
+        values = signal.early[skipped:]
         counts = held[channel.group][1][begin + skipped * step :: step, session.place(of)]
         few = min(len(values), len(counts), _LOOKED)
         return values[:few], signal.unit, counts[:few] >> signal.lost_bits << signal.lost_bits, channel
@@ -158,7 +161,7 @@ def settle(
     def taken_of(name: str, of: str) -> Taken | None:
         """By where its table begins, as far as that is known; else by where its counts are."""
         signal, channel, step = recorded[name], session.channels[of], step_of(name, of)
-        table = id(signal.like or signal)
+        table = id(signal.table)
         index, counts = held[channel.group]
         late = [round(each * session.rate_hz(channel.group)) for each in (wires[name].late_s, wires[name].own_s)]
         for begin in dict.fromkeys([begins.get(table, late[0]), *late]):
@@ -169,7 +172,7 @@ def settle(
         if table not in begins:
             there = counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
             for scale in _candidates(signal.unit, channel):
-                begin = located(scale.counts(signal.values[:_LOOKED]), there, step)
+                begin = located(scale.counts(signal.early[:_LOOKED]), there, step)
                 if begin is not None:
                     begins[table] = begin
                     return Taken(scale, step, (index + begin) % step)
@@ -187,7 +190,7 @@ def settle(
         named = name if name in session.channels else "" if wire.rivals else wire.channel
         if name not in settled and named:
             step = step_of(name, named)
-            begin = begins.get(id(recorded[name].like or recorded[name]), 0)
+            begin = begins.get(id(recorded[name].table), 0)
             values, unit, counts, channel = tried(name, named, begin)
 
             def apart(scale: Scale) -> float:
@@ -242,12 +245,21 @@ def _score_rows(
     sent = Sent(session, groups, one.step, one.phase)
     columns = [sent.names.index(wires[name].channel) for name in names]
 
+    tables: dict[Table, list[str]] = {}
+    for name in names:
+        tables.setdefault(recorded[name].table, []).append(name)
+    stamps = Stamps(recorded[names[0]].table)
+
     def counts() -> Iterator[np.ndarray]:
-        for part in in_parts([recorded[name].values for name in names]):
-            yield np.column_stack([scales[name].counts(values) for name, values in zip(names, part, strict=True)])
+        for parts in zip(
+            *(each.parts([recorded[name].column for name in inside]) for each, inside in tables.items()), strict=True
+        ):
+            stamps.times_s = parts[0][:, 0]
+            columns = zip(chain(*tables.values()), chain(*(part.T[1:] for part in parts)), strict=True)
+            found = {name: scales[name].counts(values) for name, values in columns}
+            yield np.column_stack([found[name] for name in names])
 
     bits = np.array([recorded[name].lost_bits for name in names])
-    stamps = Stamps(recorded[names[0]].times_s)
     found, trigger, at = Followed(), None, 0
     for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound):  # noqa: B007
         known = np.flatnonzero(places >= 0)
@@ -258,51 +270,54 @@ def _score_rows(
             trigger = at + int(known[behind[0]]) if len(behind) and at + known[behind[0]] else None
         at += len(places)
 
-    def add(quantity: str, channel: str, rows: int, runs: np.ndarray, *, numbered: bool = True) -> None:
+    def add(quantity: str, channel: str, runs: np.ndarray, rows: float | None = None, *, numbered: bool = True) -> None:
         note = ""
         if len(runs):
             told = [(a, b) for a, b in (sent.numbers(runs) if numbered else runs).tolist()]
             card.runs[f"{quantity} {channel}"] = told
             note = "rows " + ", ".join(f"{a}" if a == b else f"{a} to {b}" for a, b in told[:_NAMED])
             note += f" and {len(told) - _NAMED} more stretches" if len(told) > _NAMED else ""
-        card.add(quantity, channel, _exact(rows), note=note)
+        card.add(quantity, channel, _exact(np.sum(runs[:, 1] - runs[:, 0] + 1) if rows is None else rows), note=note)
 
-    add("missing rows", table, len(found.missing), stretches(found.missing))
+    add("missing rows", table, found.lost)
     for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
-        add(quantity, table, len(pairs), stretches(np.unique(pairs[:, 0])))
-    add("foreign rows", table, len(found.foreign), stretches(found.foreign), numbered=False)
+        add(quantity, table, stretches(np.unique(pairs[:, 0])), len(pairs))
+    add("foreign rows", table, stretches(found.foreign), numbered=False)
     for name, altered in zip(names, found.altered, strict=True):
-        add("altered values", name, altered.rows, altered.pairs())
-    none = stretches(np.empty(0, dtype=np.int64))
-    add("rows before the first", table, max(0, found.first), none)
-    add("rows after the last", table, found.sent - 1 - found.last, none)
-    told = {**stamps.judged(session.wall_s), "trigger row": None if trigger is None else _exact(trigger)}
+        add("altered values", name, altered.pairs(), altered.rows)
+    told = {
+        "rows before the first": _exact(max(0, found.first)),
+        "rows after the last": _exact(found.sent - 1 - found.last), **stamps.judged(session.wall_s),
+        "trigger row": None if trigger is None else _exact(trigger),
+    }  # fmt: skip
     for quantity, estimate in told.items():
         card.add(quantity, table, estimate)
     card.pictures[f"stamps {table}"] = stamps.picture()
 
 
 class Stamps:
-    """Time stamps against the times of the rows that they stand beside: offset and rate are two questions."""
+    """Time stamps against the times of the rows that they stand beside: offset and rate are two questions.
 
-    def __init__(self, times_s: np.ndarray | None) -> None:
-        """Take stamps [s]; None where there are none."""
-        self._times_s = times_s
-        self._at, self._back, self._last_s = 0, 0, -math.inf
+    Attributes:
+        times_s: Those of the next rows [s], shape (n,).
+    """
+
+    def __init__(self, table: Table) -> None:
+        """Take what they stand in."""
+        self.times_s = np.empty(0)
+        self._stamped, self._size = table.stamped, max(4, min(table.rows // _BATCHES, _MOST_BATCH))
+        self._back, self._last_s = 0, -math.inf
         self._means: list[np.ndarray] = []
         self._squares, self._freedom = 0.0, 0
 
     def take(self, first_s: float, since_s: np.ndarray, known: np.ndarray, rows: int) -> None:
         """Take when the first row was sent, how long after it those of the next that are known [s], and which are."""
-        part = slice(self._at, self._at + rows)
-        self._at = part.stop
-        if self._times_s is None or not rows:
+        if not self._stamped or not rows:
             return
-        times_s = self._times_s[part]
+        times_s, size = self.times_s, self._size
         self._back += int(np.count_nonzero(np.diff(times_s, prepend=self._last_s) < 0.0))
         self._last_s = float(times_s[-1])
         apart = times_s[known] - first_s - since_s
-        size = max(4, len(self._times_s) // _BATCHES)
         for begin in range(0, len(apart) - size + 1, size):
             late = apart[begin : begin + size]
             self._means.append(np.array([since_s[begin : begin + size].mean(), late.mean()]))
@@ -316,7 +331,7 @@ class Stamps:
             wall_s: Wall time at which what was sent at time zero came to who recorded the session [s].
         """
         names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
-        if self._times_s is None:
+        if not self._stamped:
             return dict.fromkeys(names)
         found: dict[str, Interval | None] = dict.fromkeys(names)
         found["stamps that go back"] = _exact(self._back)
@@ -328,14 +343,13 @@ class Stamps:
         several = max(1, len(self._means) // _APART)
         whole = np.array(self._means[: len(self._means) // several * several])
         since, late = whole.reshape(-1, several, 2).mean(axis=1).T
-        matrix = np.column_stack([np.ones(len(since)), since])
-        parts = np.linalg.lstsq(matrix, late, rcond=None)[0]
-        left = late - matrix @ parts
-        freedom = len(left) - 2
-        covariance = np.linalg.inv(matrix.T @ matrix) * float(left @ left) / freedom
-        half = student(freedom) * np.sqrt(np.diag(covariance))
-        for name, n, size in (("stamp offset", 0, 1.0), ("stamp rate", 1, 1e6)):
-            found[name] = size * parts[n], size * (parts[n] - half[n]), size * (parts[n] + half[n])
+        (rate, offset), covariance = np.polyfit(since, late - late[0], 1, cov=True)
+        half = student(len(since) - 2) * np.sqrt(np.diag(covariance))
+        for name, at, wide, size in (
+            ("stamp offset", late[0] + offset, half[1], 1.0),
+            ("stamp rate", rate, half[0], 1e6),
+        ):
+            found[name] = size * at, size * (at - wide), size * (at + wide)
         if wall_s is not None and abs(late.mean() - wall_s) < _SAME_CLOCK_S:
             value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
             found["latency"] = float(value), float(value - wide), float(value + wide)

@@ -90,8 +90,8 @@ def _connect(
     tables: dict[int, dict[str, tuple[np.ndarray, float]]] = {}
     for name, signal in recorded.items():
         if signal.rows > 1:
-            own = id(signal.like or signal) if signal.times_s is not None else 0
-            tables.setdefault(own, {})[name] = signal.values, rates[name]
+            own = id(signal.table) if signal.table.stamped else 0
+            tables.setdefault(own, {})[name] = signal.early, rates[name]
     wires = {name: wire for part in tables.values() for name, wire in find_wires(part, sent).items()}
     return {name: wires[name] for name in recorded if name in wires}
 

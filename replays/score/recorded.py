@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,19 +12,73 @@ import numpy as np
 
 from recorder.reader import Recording
 from replays.recordings.formats.mapping import FileOptions
-from replays.recordings.formats.source import Entry, Source, even_rate_hz, open_source
+from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz, open_source
 from rig import units
-from rig.channels import Channel
+from rig.channels import Group
 from rig.errors import InputError
 from rig.wire import sensor_key
 
 _PART = 1 << 16
-_KEPT = 1 << 20
-"""Longer signals are kept on the disk."""
+_EARLY = 1 << 18
+"""Rows by which signals are found, and their scales."""
 _MOST = 1e30
 """Values that a measurement can have, in any unit."""
 _ALIKE = 0.2
 """Part by which steps of time stamps that are alike may differ."""
+Pieces = Callable[[Sequence[int]], Iterable[np.ndarray]]
+
+
+class Table:
+    """Signals of a file that have the same time stamps.
+
+    Attributes:
+        rows: Number of values of each.
+        stamped: Whether there are stamps.
+    """
+
+    def __init__(self, rows: int, columns: int, pieces: Pieces) -> None:
+        """Take what gives stamps [s], nan where there are none, and some columns, in pieces, each shape (n, 1 + k)."""
+        self.rows, self._columns, self._pieces = rows, columns, pieces
+
+    def parts(self, columns: Sequence[int]) -> Iterator[np.ndarray]:
+        """Stamps [s] and columns, nan where there is no value that a measurement can have, in parts of one length."""
+        held: list[np.ndarray] = []
+        for piece in self._pieces(columns):
+            with np.errstate(invalid="ignore"):
+                piece[:, 1:][~(np.abs(piece[:, 1:]) <= _MOST)] = np.nan
+            held.append(piece)
+            if (rows := sum(map(len, held))) >= _PART:
+                whole, cut = np.concatenate(held), rows // _PART * _PART
+                yield from np.split(whole[:cut], cut // _PART)
+                held = [whole[cut:].copy()]
+        if held and len(rest := np.concatenate(held)):
+            yield rest
+
+    @cached_property
+    def early(self) -> np.ndarray:
+        """Stamps and all columns of its first rows, shape (n, 1 + columns)."""
+        found: list[np.ndarray] = []
+        for part in self.parts(range(self._columns)):
+            found.append(part)
+            if sum(map(len, found)) >= _EARLY:
+                break
+        return np.concatenate(found) if found else np.empty((0, 1 + self._columns))
+
+    @property
+    def stamped(self) -> bool:
+        """Whether it has time stamps."""
+        return not np.isnan(self.early[:1, 0]).any()
+
+    @cached_property
+    def rate_hz(self) -> float | None:
+        """Rate by those steps of its stamps that are alike [Hz], if they are most of it; None where it is not so."""
+        times_s = self.early[:, 0]
+        if not self.stamped or len(times_s) < 2:
+            return None
+        steps = np.diff(times_s)
+        usual = float(np.median(steps))
+        alike = steps[np.abs(steps - usual) < _ALIKE * usual]
+        return len(alike) / float(alike.sum()) if 2.0 * alike.sum() > times_s[-1] - times_s[0] else None
 
 
 @dataclass(frozen=True)
@@ -34,62 +88,44 @@ class Recorded:
     Attributes:
         name: Its name in the file.
         unit: As the file spells it; empty where it tells none.
-        rows: Number of values.
+        table: What it stands in.
+        column: Where there.
         told_hz: Rate as the file tells it [Hz]; None where it does not.
-        read: Gives values in that unit, shape (rows,), and their time stamps [s] or None.
         lost_bits: Lowest bits of the counts that it leaves out by its definition.
-        like: Another signal of the file that has the same stamps.
     """
 
     name: str
     unit: str
-    rows: int
+    table: Table
+    column: int
     told_hz: float | None
-    read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
     lost_bits: int = 0
-    like: Recorded | None = None
+
+    @property
+    def rows(self) -> int:
+        """Number of its values."""
+        return self.table.rows
+
+    @property
+    def early(self) -> np.ndarray:
+        """Its first values, shape (n,)."""
+        return self.table.early[:, 1 + self.column]
+
+    @property
+    def first_s(self) -> float | None:
+        """Time stamp of the first value [s]; None where there are none."""
+        return float(self.table.early[0, 0]) if self.table.stamped and self.rows else None
 
     @cached_property
     def values(self) -> np.ndarray:
-        """Values in its unit, nan where there is none that a measurement can have, shape (rows,)."""
-        values, times_s = self.read()
-        if self.like is None:
-            self.__dict__["times_s"] = None if times_s is None else _spooled(times_s)
-        del times_s
-        for begin in range(0, len(values), _KEPT):
-            part = values[begin : begin + _KEPT]
-            with np.errstate(invalid="ignore"):
-                part[~(np.abs(part) <= _MOST)] = np.nan
-        return _spooled(values)
+        """All values in its unit, nan where there is none that a measurement can have, shape (rows,)."""
+        return np.concatenate([part[:, 1] for part in self.table.parts([self.column])])
 
-    @cached_property
-    def times_s(self) -> np.ndarray | None:
-        """Time stamps [s], shape (rows,); None where the file has none."""
-        return self.read()[1] if self.like is None else self.like.times_s
-
-    @cached_property
+    @property
     def rate_hz(self) -> float | None:
-        """Rate by its file [Hz]: of those steps of its stamps that are alike, if they are most of it; else as told."""
-        if self.like is not None:
-            return self.like.rate_hz
-        if self.times_s is None or self.rows < 2:
-            return self.told_hz
-        times_s = self.times_s[:_KEPT]
-        steps = np.diff(times_s)
-        usual = float(np.median(steps))
-        alike = steps[np.abs(steps - usual) < _ALIKE * usual]
-        if 2.0 * alike.sum() > times_s[-1] - times_s[0]:
-            return len(alike) / float(alike.sum())
-        return self.told_hz or even_rate_hz(self.times_s)
-
-
-def _spooled(values: np.ndarray) -> np.ndarray:
-    """The same values, on the disk where there are many."""
-    if len(values) <= _KEPT:
-        return values
-    with tempfile.TemporaryFile() as file:
-        values.tofile(file)
-        return np.memmap(file, values.dtype, "r", shape=values.shape)
+        """Rate by its file [Hz]."""
+        told = self.told_hz
+        return self.table.rate_hz or told or (even_rate_hz(self.table.early[:, 0]) if self.table.stamped else None)
 
 
 def open_recorded(path: Path, options: FileOptions | None = None) -> list[Recorded]:
@@ -100,47 +136,71 @@ def open_recorded(path: Path, options: FileOptions | None = None) -> list[Record
     """
     if path.suffix == ".mcap":
         return _of_recording(path)
-    source, first, found = open_source(path, options or FileOptions()), dict[tuple[str, int], Recorded](), []
+    source, tables = open_source(path, options or FileOptions()), dict[tuple[str, int], list[Entry]]()
     for entry in source.entries:
-        like = first.get((entry.group, entry.rows))
-        unit = units.canonical(entry.unit)
-        found.append(Recorded(entry.name, unit, entry.rows, entry.rate_hz, _reading(source, entry), like=like))
-        first.setdefault((entry.group, entry.rows), found[-1])
-    return found
+        tables.setdefault((entry.group, entry.rows), []).append(entry)
+    known = {key: Table(key[1], len(entries), _reading(source, entries)) for key, entries in tables.items()}
+    return [
+        Recorded(
+            entry.name, units.canonical(entry.unit), known[key := (entry.group, entry.rows)],
+            tables[key].index(entry), entry.rate_hz,
+        )
+        for entry in source.entries
+    ]  # fmt: skip
 
 
-def _reading(source: Source, entry: Entry) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
-    def read() -> tuple[np.ndarray, np.ndarray | None]:
-        signal = source.read(entry)
-        return signal.physical, signal.times_s
+def _reading(source: Source, entries: Sequence[Entry]) -> Pieces:
+    kept: dict[int, list[np.ndarray]] = {}
 
-    return read
+    def whole(column: int) -> list[np.ndarray]:
+        """Stamps and values of one signal, from the disk where there are many."""
+        if column not in kept:
+            kept[column] = [_spooled(each) for each in _columns([source.read(entries[column])]).T]
+        return kept[column]
+
+    def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
+        if source.pieces is not None:
+            yield from map(_columns, source.pieces([entries[column] for column in columns]))
+            return
+        found = [whole(columns[0])[0], *(whole(column)[1] for column in columns)]
+        for begin in range(0, len(found[0]), _PART):
+            yield np.column_stack([each[begin : begin + _PART] for each in found])
+
+    return pieces
+
+
+def _columns(signals: Sequence[FileSignal]) -> np.ndarray:
+    times_s = signals[0].times_s
+    stamps = np.full(len(signals[0].values), np.nan) if times_s is None else times_s
+    return np.column_stack([stamps, *(signal.physical for signal in signals)])
+
+
+def _spooled(values: np.ndarray) -> np.ndarray:
+    """The same values, on the disk where there are many."""
+    if len(values) <= _EARLY:
+        return values
+    with tempfile.TemporaryFile() as file:
+        np.ascontiguousarray(values).tofile(file)
+        return np.memmap(file, values.dtype, "r", shape=values.shape)
 
 
 def _of_recording(path: Path) -> list[Recorded]:
     recording, found = Recording.open(path), list[Recorded]()
-    for key, stream in recording.streams.items():
-        for group in recording.table.groups.values():
-            like = None
-            for channel in group.channels if sensor_key(group.name) == key and stream.rows else ():
-                rate_hz = next(recording.blocks(key)).rate_hz
-                read = _recalling(recording, channel)
-                found.append(Recorded(channel.name, channel.unit, stream.rows, rate_hz, read, like=like))
-                like = like or found[-1]
+    for group in recording.table.groups.values():
+        stream = recording.streams.get(sensor_key(group.name))
+        if stream is not None and stream.rows:
+            rate_hz = next(recording.blocks(sensor_key(group.name))).rate_hz
+            table = Table(stream.rows, len(group.channels), _recalling(recording, group))
+            found += [Recorded(each.name, each.unit, table, n, rate_hz) for n, each in enumerate(group.channels)]
     if not found:
         raise InputError("FILE", "a recording with samples", str(path))
     return found
 
 
-def _recalling(recording: Recording, channel: Channel) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
-    def read() -> tuple[np.ndarray, np.ndarray | None]:
-        samples = recording.samples(channel.group).only(channel.name)
-        return samples.values[:, 0], samples.times_s
+def _recalling(recording: Recording, group: Group) -> Pieces:
+    def pieces(columns: Sequence[int]) -> Iterator[np.ndarray]:
+        scales, offsets = np.array([(group.channels[c].scale, group.channels[c].offset) for c in columns]).T
+        for block in recording.blocks(sensor_key(group.name)):
+            yield np.column_stack([block.times_s, block.values[:, columns] * scales + offsets])
 
-    return read
-
-
-def in_parts(columns: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Columns of one length in parts."""
-    for begin in range(0, len(columns[0]), _PART):
-        yield tuple(column[begin : begin + _PART] for column in columns)
+    return pieces

@@ -1,12 +1,12 @@
 """Which row of what was sent each recorded row is: missing, doubled, swapped and altered ones, of any number of rows.
 
 A row is known by the hash of its counts, alone or with the next three, where that is unique among the rows near by; the
-others by their neighbours. Where all is as it was sent, rows are only compared. Kept are the rows near by and one byte
-for each row that was sent.
+others by their neighbours. Where all is as it was sent, rows are only compared. Kept are the rows near by, and events.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -71,15 +71,16 @@ class Stretches:
         rows: How many rows.
     """
 
-    def __init__(self) -> None:
-        self.rows = 0
+    def __init__(self, most: float = math.inf) -> None:
+        """Keep so many stretches."""
+        self.rows, self._most = 0, most
         self._parts: list[np.ndarray] = []
         self._kept = 0
 
     def add(self, places: np.ndarray) -> None:
         """Take rows, behind those that were taken before, or nearly so, shape (n,)."""
         self.rows += len(places)
-        if len(places) and self._kept < _MOST_STRETCHES:
+        if len(places) and self._kept < self._most:
             self._parts.append(stretches(np.unique(places)))
             self._kept += len(self._parts[-1])
 
@@ -110,7 +111,7 @@ class Followed:
         swapped: Places of rows that came behind later ones, and numbers of the recorded rows, shape (n, 2).
         altered: Of each channel the rows whose value is another.
         foreign: Numbers of recorded rows that are none of those sent, shape (n,).
-        times: How often each row came, uint8, shape (sent,).
+        lost: First and last place of stretches between the first and the last row that did not come, shape (n, 2).
     """
 
     sent: int = 0
@@ -121,18 +122,16 @@ class Followed:
     swapped: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
     altered: list[Stretches] = field(default_factory=list)
     foreign: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    times: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=np.uint8))
+    lost: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
 
     @property
     def missing(self) -> np.ndarray:
-        """Places of rows between the first and the last that did not come, shape (n,)."""
-        if self.first < 0:
-            return np.empty(0, dtype=np.int64)
-        return np.flatnonzero(self.times[self.first : self.last + 1] == 0) + self.first
+        """Places of the rows in these stretches, shape (n,)."""
+        return np.concatenate([np.arange(a, b + 1) for a, b in self.lost] or [np.empty(0, dtype=np.int64)])
 
 
 class _Sent:
-    """The rows near by, of those that were sent."""
+    """The rows near by, of those that were sent, and how often each came; of those let go, which did not."""
 
     def __init__(self, chunks: Iterable[np.ndarray], by: np.ndarray) -> None:
         self._chunks = iter(chunks)
@@ -140,6 +139,7 @@ class _Sent:
         self.ended = False
         self.counts = np.empty((0, 0), dtype=np.int64)
         self.hashes = np.empty(0, dtype=np.uint64)
+        self.times, self.absent = np.empty(0, dtype=np.uint8), Stretches()
         self.by = by
 
     def know(self, by: np.ndarray) -> None:
@@ -161,17 +161,13 @@ class _Sent:
         if fresh or begin - self.start > 1 << 18:
             begin = min(max(begin, self.start), self.end)
             cut = begin - self.start
-            kept = [self.counts[cut:]] if len(self.counts) > cut else []
-            held = max(0, len(self.counts) - cut)
-            whole = [*kept, *fresh]
-            joined = np.concatenate(whole) if whole else self.counts[:0]
-            skip = len(joined) - (self.end - begin)  # rows that came and are let go at once
-            self.counts = joined[skip:]
-            new = row_hashes(self.counts[max(0, held - skip) :, self.by])
-            self.hashes = np.concatenate(
-                [self.hashes[len(self.hashes) - held + skip :] if held > skip else new[:0], new]
-            )
-            self.start = begin
+            new = np.concatenate(fresh) if fresh else self.counts[:0]
+            self.times = np.append(self.times, np.zeros(len(new), dtype=np.uint8))
+            self.absent.add(np.flatnonzero(self.times[:cut] == 0) + self.start)
+            late = row_hashes(new[max(0, cut - len(self.hashes)) :, self.by])
+            self.hashes = np.concatenate([self.hashes[cut:], late])
+            self.counts = np.concatenate([self.counts, new])[cut:] if len(self.counts) else new[cut:]
+            self.times, self.start = self.times[cut:], begin
 
 
 def follow(
@@ -192,7 +188,7 @@ def follow(
     events: dict[str, list[np.ndarray]] = {"doubled": [], "swapped": [], "foreign": []}
     due, highest = 0, -1
     for chunk in recorded:
-        found.altered = found.altered or [Stretches() for _ in range(chunk.shape[1])]
+        found.altered = found.altered or [Stretches(_MOST_STRETCHES) for _ in range(chunk.shape[1])]
         before = np.array([each.rows for each in found.altered])
         hashes = row_hashes(chunk[:, window.by])
         places = np.empty(len(chunk), dtype=np.int64)
@@ -217,8 +213,10 @@ def follow(
         yield places, found
     while not window.ended:
         window.hold(window.end, window.end + 1)
+    window.absent.add(np.flatnonzero(window.times == 0) + window.start)
     found.sent = window.end
-    found.times = _longer(found.times, found.sent)[: found.sent]
+    lost = window.absent.pairs()
+    found.lost = lost[(lost[:, 0] > found.first) & (lost[:, 1] < found.last)]
     for name, parts in events.items():
         if parts:
             setattr(found, name, np.concatenate(parts))
@@ -230,15 +228,15 @@ def _look_up(window: _Sent, hashes: np.ndarray, due: int, low: int) -> np.ndarra
     ahead = _AHEAD
     while True:
         window.hold(low, due + len(hashes) + ahead)
-        places, known = _places(window, hashes, due, due + len(hashes) + ahead)
+        places, known = _places(window, hashes, due, max(low, due - _BACK), due + len(hashes) + ahead)
         if known[-len(hashes) // 2 :].mean() > 0.5 or window.ended or ahead >= _MOST_AHEAD:
             return places
         ahead *= 8
 
 
-def _places(window: _Sent, hashes: np.ndarray, due: int, high: int) -> tuple[np.ndarray, np.ndarray]:
-    """Place of each row among those near by, up to one, and whether it is known by itself; -1 if it is none of them."""
-    start = max(window.start, due - _BACK)
+def _places(window: _Sent, hashes: np.ndarray, due: int, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+    """Place of each row from one to another, and whether it is known by itself; -1 if it is none of them."""
+    start = max(window.start, low)
     nearby = window.hashes[start - window.start : high - window.start]
     end = start + len(nearby)
     n, rows = len(hashes), np.arange(len(hashes))
@@ -295,12 +293,6 @@ def _by_nearest(places: np.ndarray, rows: np.ndarray, guess: np.ndarray, ranks: 
     places[rows] = np.where(nearer, order[low], order[high]) + start
 
 
-def _longer(times: np.ndarray, length: int) -> np.ndarray:
-    if length <= len(times):
-        return times
-    return np.concatenate([times, np.zeros(max(length, 2 * len(times)) - len(times), dtype=np.uint8)])
-
-
 def _note(
     found: Followed, events: dict[str, list[np.ndarray]], places: np.ndarray, counts: np.ndarray, window: _Sent,
     highest: int,
@@ -313,22 +305,20 @@ def _note(
     came, numbers, counts = places[real], numbers[real], counts[real]
     if not len(came):
         return highest
-    found.times = _longer(found.times, int(came.max()) + 1)
+    near, there = came - window.start, window.times
     tops = np.maximum.accumulate(np.concatenate([[highest], came]))
     if (np.diff(tops) > 0).all():  # each later than all before: neither doubled nor swapped
-        found.times[came] += 1
+        there[near] = 1
     else:
-        again = found.times[came] > 0
+        again = there[near] > 0
         order = np.argsort(came, kind="stable")
         again[order[1:]] |= came[order[1:]] == came[order[:-1]]
         events["doubled"].append(np.column_stack([came, numbers])[again])
         late = (came < tops[:-1]) & ~again
         events["swapped"].append(np.column_stack([came, numbers])[late])
-        np.add.at(found.times, came, np.minimum(1, 255 - found.times[came]).astype(np.uint8))
-    inside = came >= window.start
-    there = window.counts[came[inside] - window.start]
-    for column, known in enumerate((there != counts[inside]).T):
-        found.altered[column].add(came[inside][known])
+        there[near] = 1
+    for column, known in enumerate((window.counts[near] != counts).T):
+        found.altered[column].add(came[known])
     found.first = int(came.min()) if found.first < 0 else min(found.first, int(came.min()))
     found.last = max(found.last, int(came.max()))
     return int(tops[-1])

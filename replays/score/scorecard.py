@@ -84,7 +84,10 @@ ANALOGUE = {
     "ENOB": Quantity("bit", "IEEE 1057 four-parameter sine fit, chi squared", _SINE),
     "THD": Quantity("dB", "harmonics 2 to 10 of the sine fit, delta method", _SINE),
     "SFDR": Quantity("dB", "largest line of the sine fit's residual, delta method", _SINE),
-    "alias rejection": Quantity("dB", "-", "tones above half of the DAQ's rate, from a session at a higher rate"),
+    "alias rejection": Quantity(
+        "dB", f"of all that was sent above half of the rate, {_SANDWICH}",
+        "tones above half of the DAQ's rate, from a session at a higher rate",
+    ),
     "trigger row": DIGITAL["trigger row"],
 }  # fmt: skip
 QUANTITIES = {"digital": DIGITAL, "analogue": ANALOGUE}

@@ -12,6 +12,8 @@ _HALF_TAPS, _KAISER, _CUTOFF = 64, 10.0, 0.97
 EDGE = _HALF_TAPS + 4
 """Samples at each end between which nothing is told."""
 _CHUNK = 1 << 18
+_NARROWER, _SPLIT_TAPS = 0.9, 513
+"""A rate is too near to what was sent for anything to be above half of it from here on; and taps between the two."""
 
 
 class Stimulus(Protocol):
@@ -69,6 +71,32 @@ class Sampled:
             finer = upfirdn(taps, self._values[low:high], up=_FINER)[_HALF_TAPS * _FINER : -_HALF_TAPS * _FINER or None]
             self._kept = low, high, make_interp_spline(np.arange(len(finer)), finer, k=5)
         return self._kept[2]
+
+
+def parted(stimulus: Stimulus, rate_hz: float, sent_hz: float, least: float) -> tuple[Sampled, Sampled, Sampled] | None:
+    """What of a signal is below half of a rate, what is above, and that a quarter of a period later.
+
+    Args:
+        stimulus: The signal.
+        rate_hz: The rate [Hz].
+        sent_hz: Twice the highest frequency that it may have [Hz].
+        least: None is given where what is above is less than this [unit rms].
+    """
+    from scipy.signal import fftconvolve, firwin, hilbert
+
+    low, high = stimulus.span_s
+    rows = int((high - low) * 2.0 * sent_hz)
+    if rate_hz > _NARROWER * sent_hz or rows < 4 * _SPLIT_TAPS:
+        return None
+    values, _ = stimulus(low + np.arange(rows) / (2.0 * sent_hz))
+    taps = firwin(_SPLIT_TAPS, 0.5 * rate_hz, fs=2.0 * sent_hz, window=cast(Any, ("kaiser", _KAISER)))
+    below = fftconvolve(values, taps, "valid")
+    above = values[_SPLIT_TAPS // 2 :][: len(below)] - below
+    if np.std(above) < least:
+        return None
+    first_s = low + (_SPLIT_TAPS // 2) / (2.0 * sent_hz)
+    parts = below, above, hilbert(above).imag  # type: ignore[union-attr]
+    return cast(Any, tuple(Sampled(part, first_s, 2.0 * sent_hz) for part in parts))
 
 
 class Exact:

@@ -8,13 +8,14 @@ signal itself, as of samples between which it is interpolated, are part of what 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from replays.score.intervals import sandwich, student
 from replays.score.stimulus import Stimulus
 
-_BLOCKS = 64
 _FIRST_S = (0.25, 0.03)
 """Where the signal is steepest, a stretch this long is fitted first; it is doubled until it is all.
 
@@ -28,6 +29,8 @@ _SETTLED = 1e-3
 _MOST_DRIFT = 0.02
 _LEAST = 400
 """Fewest samples that are fitted."""
+_MOST, _FINER, _LIKE = 1 << 17, 4, 12
+"""Samples by which other beginnings are looked for, places between two of them, and how many are told."""
 _TAPS = 96
 _PASSES = 3
 """Rounds in which a fit behind a filter takes the signal at the times that the last one found."""
@@ -48,7 +51,7 @@ class Waveform:
     Attributes:
         gain, offset, late_s, drift: The four [1, unit, s, s/s], `late_s` in the middle of the record.
         covariance: Of the four, shape (4, 4).
-        freedom: Degrees of freedom of that covariance.
+        freedom: Degrees of freedom of the four variances, shape (4,).
         middle_s: The middle of the record by the clock of the file [s].
         times_s: Of the rows that were fitted, by the clock of the file, shape (n,).
         values: As recorded [unit], shape (n,).
@@ -61,7 +64,7 @@ class Waveform:
     late_s: float
     drift: float
     covariance: np.ndarray
-    freedom: int
+    freedom: np.ndarray
     middle_s: float
     times_s: np.ndarray
     values: np.ndarray
@@ -73,6 +76,11 @@ class Waveform:
     def spread(self) -> np.ndarray:
         """Standard deviation of the four, shape (4,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def half(self) -> np.ndarray:
+        """Half of the 95 % interval of the four, shape (4,)."""
+        return student(self.freedom) * self.spread
 
     @property
     def likeness(self) -> float:
@@ -183,27 +191,58 @@ def _solve(
         if number > 1 and (small.all() or number >= _ROUNDS + (_FINAL if final else 0)):
             break
     residual = residual - jacobian @ step
-    covariance, freedom = _sandwich(jacobian, residual, inverse)
+    covariance, freedom = sandwich(jacobian, residual)
     return Waveform(
         float(gain + step[0] / scale), float(offset + step[1]), float(late), float(drift),
         covariance / np.outer(units, units), freedom, middle, t[use], y[use], s, ds, residual,
     )  # fmt: skip
 
 
-def _sandwich(jacobian: np.ndarray, residual: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, int]:
-    """Covariance of a linear fit, and its degrees of freedom."""
-    edges = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)[:-1]
-    sums = np.add.reduceat(jacobian * residual[:, None], edges, axis=0)
-    n, parts = jacobian.shape
-    correction = _BLOCKS / (_BLOCKS - 1) * n / (n - parts)
-    return correction * inverse @ (sums.T @ sums) @ inverse, _BLOCKS - 1
+def beginnings(found: Waveform, stimulus: Stimulus) -> list[float]:
+    """Shifts of time after which the known signal is as like what was recorded, by the clock of a fit [s].
+
+    The likeliest are first. Where a signal nearly repeats, a fit finds its clock from any beginning.
+    """
+    from scipy.signal import correlate
+
+    low, high = stimulus.span_s
+    step_s = (1.0 + found.drift) * (found.times_s[-1] - found.times_s[0]) / (len(found.times_s) - 1)
+    rows = math.floor((high - low) / step_s)
+    y = found.values[: min(_MOST, rows // 2)]
+    n = len(y)
+    curve = np.zeros((rows - n, _FINER))
+    for phase in range(_FINER):
+        s, _ = stimulus(low + (np.arange(rows - 1) + phase / _FINER) * step_s)
+        sums, squares = (np.cumsum(np.concatenate([[0.0], each])) for each in (s, s**2))
+        power = squares[n:] - squares[:-n] - (sums[n:] - sums[:-n]) ** 2 / n
+        alike = correlate(s, y - y.mean(), "valid", "fft") / np.sqrt(np.maximum(power, 1e-12 * power.max()))
+        curve[:, phase] = np.abs(alike)
+    curve = curve.ravel()
+    at = np.flatnonzero((curve[1:-1] > curve[:-2]) & (curve[1:-1] >= curve[2:])) + 1
+    bend = curve[at - 1] - 2.0 * curve[at] + curve[at + 1]
+    aside = 0.5 * (curve[at - 1] - curve[at + 1]) / bend
+    best = np.argsort(-(curve[at] - 0.25 * (curve[at - 1] - curve[at + 1]) * aside))[:_LIKE]
+    began_s = found.times_s[0] + found.late_s + found.drift * (found.times_s[0] - found.middle_s)
+    return (low + (at[best] + aside[best]) * (step_s / _FINER) - began_s).tolist()
 
 
-def student(freedom: int) -> float:
-    """The 97.5 % quantile of Student's t."""
-    from scipy.stats import t
+def folded(found: Waveform, above: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """What of a residual is of frequencies above half of the rate, and times what was sent with its 95 % interval.
 
-    return float(t.ppf(0.975, freedom))
+    Args:
+        found: A fit of what is below.
+        above: What is above at the fitted instants, and that a quarter of a period later, each shape (n,).
+    """
+    columns = [*above, found.known, found.slope, np.ones(len(found.known))]
+    sizes = np.maximum([np.sqrt(np.mean(each**2)) for each in columns], 1e-300)
+    matrix = np.column_stack(columns) / sizes
+    parts = np.linalg.lstsq(matrix, found.residual, rcond=None)[0]
+    covariance, freedom = sandwich(matrix, found.residual - matrix @ parts)
+    both = parts[:2] / sizes[:2]
+    amount = max(float(np.linalg.norm(both)), 1e-300)
+    way = both / amount / sizes[:2]
+    half = float(student(freedom[:2].min())) * math.sqrt(way @ covariance[:2, :2] @ way)
+    return matrix @ parts, (amount, max(0.0, amount - half), amount + half)
 
 
 @dataclass(frozen=True)
@@ -252,7 +291,8 @@ def _powers(squared: np.ndarray, columns: list[np.ndarray], floor: float) -> lis
         # A square of normal noise spreads as its own mean.
         total = float(np.mean(squared))
         weights = np.maximum(matrix @ parts, 0.05 * total) ** -2.0 * total**2
-    covariance, freedom = _sandwich(weighted, squared - matrix @ parts, inverse)
+    root = np.sqrt(weights)
+    covariance, freedom = sandwich(matrix * root[:, None], (squared - matrix @ parts) * root, even=True)
     half = student(freedom) * np.sqrt(np.diag(covariance))
     roots = np.sqrt(np.maximum(0.0, [parts, parts - half, parts + half]))
     roots[1, 0] = math.sqrt(max(0.0, roots[1, 0] ** 2 - floor**2))
@@ -319,21 +359,17 @@ def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, 
     near = (f > 0.7 * at) & (f < 1.4 * at)
     if near.sum() < 8:
         return None
-    x = np.log(f[near] / at)
-    matrix = np.column_stack([np.ones(len(x)), x, x**2])
-    weights = spread[near] ** -2.0
-    weighted = matrix * weights[:, None]
-    inverse = np.linalg.inv(weighted.T @ matrix)
-    parts = inverse @ (weighted.T @ log[near])
-    left = log[near] - matrix @ parts
-    inverse *= max(1.0, float(np.sum(weights * left**2)) / (len(x) - 3))
-    roots = [r.real for r in np.roots([parts[2], parts[1], parts[0] - level]) if abs(r.imag) < 1e-9]
+    x, weights = np.log(f[near] / at), 1.0 / spread[near]
+    parts, inverse = np.polyfit(x, log[near], 2, w=weights, cov="unscaled")
+    left = weights * (log[near] - np.polyval(parts, x))
+    inverse *= max(1.0, float(left @ left) / (len(x) - 3))
+    roots = [r.real for r in np.roots(parts - [0.0, 0.0, level]) if abs(r.imag) < 1e-9]
     if not roots:
         return None
     root = min(roots, key=abs)
-    row = np.array([1.0, root, root**2])
+    row = np.array([root**2, root, 1.0])
     # Lines of a Hann window are not independent: 1.9 of them are one.
-    half = 1.96 * math.sqrt(1.9 * float(row @ inverse @ row)) / max(abs(parts[1] + 2.0 * parts[2] * root), 1e-300)
+    half = 1.96 * math.sqrt(1.9 * float(row @ inverse @ row)) / max(abs(parts[1] + 2.0 * parts[0] * root), 1e-300)
     return at * math.exp(root), at * math.exp(root - half), at * math.exp(root + half)
 
 
@@ -440,13 +476,13 @@ def _behind(found: Waveform, corner_hz: float, order: int, late_s: float | None)
     assert solved is not None
     s, ds, matrix, jacobian, sizes, parts = solved
     residual = y[kept] - matrix @ parts
-    covariance, freedom = _sandwich(jacobian, residual, np.linalg.pinv(jacobian.T @ jacobian))
+    covariance, freedom = sandwich(jacobian, residual)
     sizes = sizes * np.array([1.0, 1.0, 1.0, 0.5 * span_s, 1.0])
     covariance = covariance / np.outer(sizes, sizes)
-    half = student(freedom) * math.sqrt(covariance[4, 4])
+    half = float(student(freedom[4])) * math.sqrt(covariance[4, 4])
     fitted = Waveform(
         float(parts[0]), float(parts[1]), found.late_s + float(late_s or 0.0),
         found.drift + float(parts[3]) / (0.5 * span_s),
-        covariance[:4, :4], freedom, found.middle_s, found.times_s[kept], y[kept], s, ds, residual,
+        covariance[:4, :4], freedom[:4], found.middle_s, found.times_s[kept], y[kept], s, ds, residual,
     )  # fmt: skip
     return fitted, (math.exp(log), math.exp(log - half), math.exp(log + half))

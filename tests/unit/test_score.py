@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 
 from replays.recordings.export import write_run
+from replays.recordings.formats import columnar, delimited, mdf
+from replays.recordings.formats.mapping import FileOptions
+from replays.recordings.formats.source import open_source
 from replays.score.judgement import judge
 from replays.score.limits import load_limits
 from replays.score.rows import NO_COUNT, follow
@@ -452,22 +455,81 @@ def test_intervals_hold_as_often_as_they_say() -> None:
     assert all(0.93 - spread < np.mean(each) < 0.97 + spread for each in held.values())
 
 
-@pytest.mark.parametrize("name", ["test-two-tone", "test-chirp", "test-multisine"])
-def test_a_test_signal_is_known_by_its_formula(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "ppm"), [("test-two-tone", 30.0), ("test-two-tone", 60.0), ("test-chirp", 30.0), ("test-multisine", 30.0)]
+)
+def test_a_test_signal_is_known_by_its_formula(name: str, ppm: float, tmp_path: Path) -> None:
     """The session's own noise is then not in what the DAQ is held against."""
     scene = load_scene(name, {"duration_s": 0.8})
     write_run(Simulation(scene), tmp_path / "sent.mcap")
-    generator, true_s = np.random.default_rng(8), 0.05 + np.arange(12_000) / RATE_HZ / (1.0 + 3e-5)
+    generator, true_s = np.random.default_rng(8), 0.05 + np.arange(12_000) / RATE_HZ / (1.0 + 1e-6 * ppm)
     columns = {}
-    for name in ("disk_x", "P_N"):
-        source = scene.sources()[name]
+    for channel in ("disk_x", "P_N"):
+        source = scene.sources()[channel]
         noise = source.channel.noise_v * generator.standard_normal(len(true_s))
-        columns[f"{name} [V]"] = source.volts(true_s) + noise
+        columns[f"{channel} [V]"] = source.volts(true_s) + noise
     card = judge(write_parquet(tmp_path / "daq.parquet", columns), [tmp_path / "sent.mcap"])
     assert red(card) == set()
-    assert card.row("clock").value == pytest.approx(30.0, abs=0.05)
-    for name in ("disk_x", "P_N"):
-        assert [card.row(quantity, name).verdict for quantity in ("gain", "noise", "effective bits")] == [PASS] * 3
+    assert card.row("clock").value == pytest.approx(ppm, abs=0.05)
+    if name == "test-two-tone":  # which nearly repeats after 82.3 ms, and does, turned, after half a second
+        assert card.row("start", "disk_x").value % 0.5 == pytest.approx(0.05, abs=1e-6)
+    for channel in ("disk_x", "P_N"):
+        assert [card.row(quantity, channel).verdict for quantity in ("gain", "noise", "effective bits")] == [PASS] * 3
+
+
+@pytest.mark.parametrize(("rejection_db", "verdict"), [(40.0, FAIL), (75.0, PASS)])
+def test_a_tone_above_half_of_the_rate_shows_how_much_of_it_folds_back(
+    rejection_db: float, verdict: str, tmp_path: Path
+) -> None:
+    scene = load_scene("test-two-tone", {"duration_s": 0.8, "generator.frequencies": [79.0, 7001.0]})
+    write_run(Simulation(scene), tmp_path / "sent.mcap")
+    source, rate_hz = scene.sources()["disk_x"], RATE_HZ // 2
+    since_s = np.arange(7000) / rate_hz
+    true_s = 0.05 + since_s / (1.0 + 3e-5)
+    volts = source.volts(true_s)
+    low = source.channel.bias_v + 2.0 * np.sin(2.0 * np.pi * 79.0 * true_s)
+    volts = low + 10.0 ** (-rejection_db / 20.0) * (volts - low)
+    volts += source.channel.noise_v * np.random.default_rng(3).standard_normal(len(volts))
+    file = write_parquet(tmp_path / "daq.parquet", {"time [s]": since_s, "disk_x [V]": volts})
+    card = judge(file, [tmp_path / "sent.mcap"])
+    row = card.row("alias rejection", "disk_x")
+    assert row.low < rejection_db < row.high < row.low + 3.0
+    assert row.verdict == verdict
+    assert card.row("noise", "disk_x").verdict == PASS
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".csv", ".mf4"])
+def test_a_file_in_pieces_is_the_whole_file(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, path = 5000, tmp_path / f"daq{suffix}"
+    columns = {"time [s]": 2.0 + np.arange(rows) / RATE_HZ, "a": np.arange(rows), "b": np.sin(np.arange(rows))}
+    if suffix == ".mf4":
+        import asammdf
+
+        times_s = columns.pop("time [s]")
+        file = asammdf.MDF(version="4.10")
+        file.append([asammdf.Signal(values, times_s, name=name) for name, values in columns.items()])
+        file.save(path)
+        file.close()
+    elif suffix == ".csv":
+        lines = (",".join(map(repr, line)) for line in zip(*(each.tolist() for each in columns.values()), strict=True))
+        path.write_text("\n".join([",".join(columns), *lines]))
+    else:
+        write_parquet(path, columns)
+    monkeypatch.setattr(columnar, "_PIECE", 700)
+    monkeypatch.setattr(delimited, "_BLOCK", 1 << 12)
+    monkeypatch.setattr(delimited, "_KEPT", 0)
+    monkeypatch.setattr(mdf, "_PIECE", 1 << 12)
+    source = open_source(path, FileOptions())
+    assert source.pieces is not None
+    pieces = list(source.pieces(source.entries))
+    assert len(pieces) > 5
+    for n, entry in enumerate(source.entries):
+        whole = source.read(entry)
+        assert whole.times_s is not None
+        assert (entry.rows, entry.rate_hz) == (rows, pytest.approx(RATE_HZ))
+        assert np.array_equal(np.concatenate([piece[n].physical for piece in pieces]), whole.physical)
+        stamps = [piece[n].times_s for piece in pieces]
+        assert np.array_equal(np.concatenate([each for each in stamps if each is not None]), whole.times_s)
 
 
 @pytest.mark.parametrize(("bits", "noise"), [(24, 1e-3), (12, 1e-4), (24, 2e-2)])

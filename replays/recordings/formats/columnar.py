@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,9 @@ import numpy as np
 from replays.recordings.formats import export
 from replays.recordings.formats.dialect import parse_heading, time_column
 from replays.recordings.formats.source import Entry, FileSignal, Source, even_rate_hz
+
+_PIECE = 1 << 16
+"""Rows of a piece."""
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -27,7 +31,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     """
     from pyarrow import parquet
 
-    file = parquet.ParquetFile(path)
+    file = parquet.ParquetFile(path, buffer_size=1 << 20)
     schema = file.schema_arrow
     headings = [parse_heading(field.name) for field in schema]
     names = [name for name, _ in headings]
@@ -35,14 +39,21 @@ def look_into(path: Path, options: FileOptions) -> Source:
     if stamps is None and options.time_column is None:  # as pandas names an index of instants
         stamps = next((c for c in range(len(names)) if _is_clock(schema.field(c).type)), None)
 
-    def column(c: int) -> np.ndarray:
-        return numbers(file.read(columns=[schema.field(c).name]).column(0))
+    def batches(columns: Sequence[int], groups: Iterable[int]) -> Iterator[list[Any]]:
+        wanted = [schema.field(c).name for c in columns]
+        for group in groups:  # of several at once, pyarrow keeps those that it has read
+            for batch in file.iter_batches(_PIECE, row_groups=[group], columns=wanted, use_threads=False):
+                yield [batch.column(batch.schema.names.index(name)) for name in wanted]
 
-    times_s, start = None, None
+    scale, start, rate, base = 1.0, None, None, 0
     if stamps is not None:
-        times_s = column(stamps) * options.time_scale(headings[stamps][1])
-        start = first_instant(file.read_row_group(0, columns=[schema.field(stamps).name]).column(0))
-    rate = None if times_s is None else even_rate_hz(times_s)
+        scale = options.time_scale(headings[stamps][1])
+        (first,), last = next(batches([stamps], [0])), None
+        start, base = first_instant(first), base_ns(first)
+        for (last,) in batches([stamps], [file.num_row_groups - 1]):  # noqa: B007
+            pass
+        ends_s = [numbers(part, base)[at] * scale for part, at in ((first, 0), (last, -1))]
+        rate = even_rate_hz(np.array(ends_s), file.metadata.num_rows)
     about = schema.metadata or {}
     entries = []
     for c, (name, unit) in enumerate(headings):
@@ -53,11 +64,25 @@ def look_into(path: Path, options: FileOptions) -> Source:
                 Entry(name, "", unit or told.get("unit", ""), file.metadata.num_rows, rate, c, told.get("label", ""))
             )
 
+    @cache
+    def times_s() -> np.ndarray | None:
+        return None if stamps is None else whole(stamps) * scale
+
+    def whole(c: int) -> np.ndarray:
+        return numbers(file.read(columns=[schema.field(c).name]).column(0), base)
+
     def read(entry: Entry) -> FileSignal:
-        return FileSignal(values=column(entry.place), times_s=times_s)
+        return FileSignal(values=whole(entry.place), times_s=times_s())
+
+    def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
+        wanted = [entry.place for entry in entries]
+        for columns in batches(wanted if stamps is None else [*wanted, stamps], range(file.num_row_groups)):
+            found = [numbers(column, base) for column in columns]
+            part_s = None if stamps is None else found.pop() * scale
+            yield [FileSignal(values=values, times_s=part_s) for values in found]
 
     kept = {key.decode(): text.decode(errors="replace") for key, text in about.items() if key != b"ARROW:schema"}
-    return Source(path=path, format="Parquet", entries=tuple(entries), read=read, about=kept, start=start)
+    return Source(path, "Parquet", tuple(entries), read, pieces, about=kept, start=start)
 
 
 def _numeric(kind: Any) -> bool:
@@ -72,8 +97,13 @@ def _is_clock(kind: Any) -> bool:
     return types.is_timestamp(kind) or types.is_duration(kind)
 
 
-def numbers(column: Any) -> np.ndarray:
-    """A column of pyarrow as numbers, integers where they are and none is missing; times in seconds, missing: nan."""
+def numbers(column: Any, base: int = 0) -> np.ndarray:
+    """A column of pyarrow as numbers, integers where they are and none is missing; times in seconds, missing: nan.
+
+    Args:
+        column: The column, or a piece of it.
+        base: From when on instants count [ns], see `base_ns`.
+    """
     import pyarrow
     import pyarrow.compute as compute
     import pyarrow.types as types
@@ -81,15 +111,22 @@ def numbers(column: Any) -> np.ndarray:
     if _is_clock(column.type):
         zoned = types.is_timestamp(column.type)
         ns = column.cast(pyarrow.timestamp("ns", tz=column.type.tz) if zoned else pyarrow.duration("ns"))
-        whole = ns.cast(pyarrow.int64()).to_numpy()
-        if column.null_count:
-            return np.asarray(whole, dtype=float) / 1e9
-        # Instants count from the second of the first, which `first_instant` tells; durations from their own zero.
-        base = whole[0] - whole[0] % 1_000_000_000 if zoned else 0
-        return (whole - base) / 1e9
+        whole = np.array(ns.cast(pyarrow.int64()))
+        return np.asarray(whole, dtype=float) / 1e9 if column.null_count else (whole - base) / 1e9
     if column.null_count or not types.is_integer(column.type):
-        return np.array(compute.cast(column, pyarrow.float64()).to_numpy(), dtype=float)
-    return np.array(column.to_numpy())
+        return np.array(compute.cast(column, pyarrow.float64()), dtype=float)
+    return np.array(column)
+
+
+def base_ns(column: Any) -> int:
+    """The second in which a column of instants begins [ns], as `first_instant` tells it; 0 for other columns."""
+    import pyarrow
+    import pyarrow.types as types
+
+    if not types.is_timestamp(column.type) or not len(column) or not column[0].is_valid:
+        return 0  # durations count from their own zero
+    first = column[0].cast(pyarrow.timestamp("ns", tz=column.type.tz)).value
+    return first - first % 1_000_000_000
 
 
 def first_instant(column: Any) -> datetime | None:

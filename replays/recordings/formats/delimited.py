@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,11 @@ from replays.recordings.formats.dialect import MISSING, Layout, find_layout, ins
 from replays.recordings.formats.source import Entry, FileSignal, Source, damaged, even_rate_hz
 from rig.errors import InputError, Words
 from rig.text import printable
+
+_BLOCK = 1 << 23
+"""Bytes that are parsed at a time."""
+_KEPT = 1 << 24
+"""Values of a file that are kept once they are parsed; a longer one is parsed anew each time."""
 
 if TYPE_CHECKING:
     from replays.recordings.formats.mapping import FileOptions
@@ -33,23 +39,44 @@ def look_into(path: Path, options: FileOptions) -> Source:
     stamps = None if layout.empty_first else time_column(names, options.time_column, path=path)
     if stamps is None and options.time_column is None and not layout.empty_first:
         stamps = _column_of_instants(path, layout, options)
-    table = _parse(path, layout, options, stamps)
-    columns = [columnar.numbers(column) for column in table.columns]
-    times_s, start = None, layout.start
-    if stamps is not None:
-        start = start or columnar.first_instant(table.column(stamps))
-        times_s = columns[stamps] * options.time_scale(layout.units[stamps])
-        if np.isnan(times_s).any():
-            line = layout.first + int(np.argmax(np.isnan(times_s))) + 1
-            raise InputError("file.time_column", "a column without holes", Words(f"{path}, line {line}"))
-    rate = layout.rate_hz if times_s is None else even_rate_hz(times_s)
-    entries = tuple(
-        Entry(name, "", layout.units[c], len(columns[c]), rate, c) for c, name in enumerate(names) if c != stamps
-    )
+    start, base, rows, ends_s = layout.start, 0, 0, []
+    scale = 1.0 if stamps is None else options.time_scale(layout.units[stamps])
+    kept: list[list[Any]] | None = []
+    for part in _parsed(path, layout, options, stamps):
+        if stamps is not None:
+            if not rows:
+                start, base = start or columnar.first_instant(part[stamps]), columnar.base_ns(part[stamps])
+            part_s = columnar.numbers(part[stamps], base) * scale
+            if np.isnan(part_s).any():
+                line = layout.first + rows + int(np.argmax(np.isnan(part_s))) + 1
+                raise InputError("file.time_column", "a column without holes", Words(f"{path}, line {line}"))
+            ends_s = [*(ends_s or part_s)[:1], part_s[-1]]
+        rows += len(part[0])
+        kept = None if kept is None or rows * len(names) > _KEPT else [*kept, part]
+    if not rows:
+        raise InputError("file", "a text file with lines of numbers", str(path))
+    rate = layout.rate_hz if stamps is None else even_rate_hz(np.array(ends_s), rows)
+    entries = tuple(Entry(name, "", layout.units[c], rows, rate, c) for c, name in enumerate(names) if c != stamps)
+
+    def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
+        for part in _parsed(path, layout, options, stamps) if kept is None else kept:
+            part_s = None if stamps is None else columnar.numbers(part[stamps], base) * scale
+            yield [signal(columnar.numbers(part[entry.place]), part_s) for entry in entries]
+
+    def signal(values: np.ndarray, times_s: np.ndarray | None) -> FileSignal:
+        return FileSignal(values, times_s=times_s, rate_hz=layout.rate_hz, first_s=layout.first_s)
+
+    @cache
+    def columns() -> list[np.ndarray]:
+        parts = zip(*(_parsed(path, layout, options, stamps) if kept is None else kept), strict=True)
+        return [np.concatenate([columnar.numbers(each, base) for each in column]) for column in parts]
+
+    @cache
+    def times_s() -> np.ndarray | None:
+        return None if stamps is None else columns()[stamps] * scale
 
     def read(entry: Entry) -> FileSignal:
-        values = columns[entry.place]
-        return FileSignal(values=values, times_s=times_s, rate_hz=layout.rate_hz, first_s=layout.first_s)
+        return signal(columns()[entry.place], times_s())
 
     dialect = layout.dialect
     told: dict[str, str | int] = {"delimiter": dialect.delimiter, "decimal": dialect.decimal}
@@ -57,9 +84,7 @@ def look_into(path: Path, options: FileOptions) -> Source:
     told["first_line"] = layout.first + 1
     if stamps is not None:
         told["time_column"] = names[stamps] or stamps + 1
-    return Source(
-        path=path, format="text", entries=entries, read=read, start=start, remarks=layout.remarks, options=told
-    )
+    return Source(path, "text", entries, read, pieces, start=start, remarks=layout.remarks, options=told)
 
 
 def _first_fields(path: Path, layout: Layout) -> list[str]:
@@ -75,7 +100,12 @@ def _column_of_instants(path: Path, layout: Layout, options: FileOptions) -> int
     return None
 
 
-def _parse(path: Path, layout: Layout, options: FileOptions, stamps: int | None) -> Any:
+def _parsed(path: Path, layout: Layout, options: FileOptions, stamps: int | None) -> Iterator[list[Any]]:
+    """The columns in pieces, as pyarrow has them.
+
+    Raises:
+        InputError: Lines have more or fewer columns, or something in them cannot be read.
+    """
     import pyarrow
     from pyarrow import csv
 
@@ -92,10 +122,10 @@ def _parse(path: Path, layout: Layout, options: FileOptions, stamps: int | None)
     if stamps is not None and options.time_unit in (None, "datetime"):
         kinds[kept[stamps]] = _time_kind(_first_fields(path, layout)[stamps], layout, options)
     try:
-        table = csv.read_csv(
+        reader = csv.open_csv(
             source,
             read_options=csv.ReadOptions(
-                column_names=numbered, skip_rows=skipped, use_threads=False, encoding=encoding
+                column_names=numbered, skip_rows=skipped, use_threads=False, encoding=encoding, block_size=_BLOCK
             ),
             parse_options=csv.ParseOptions(
                 delimiter=layout.dialect.delimiter, invalid_row_handler=note, ignore_empty_lines=True
@@ -105,6 +135,12 @@ def _parse(path: Path, layout: Layout, options: FileOptions, stamps: int | None)
                 null_values=[*MISSING, *options.missing], strings_can_be_null=True,
             ),
         )  # fmt: skip
+        for batch in reader:
+            columns = batch.columns
+            if stamps is not None and pyarrow.types.is_string(columns[stamps].type):
+                columns[stamps] = _instants(path, columns[stamps], options)
+            if len(batch):
+                yield columns
     except pyarrow.ArrowInvalid as error:
         raise damaged(path, "text", error) from None
     if bad:
@@ -114,11 +150,6 @@ def _parse(path: Path, layout: Layout, options: FileOptions, stamps: int | None)
             "file", f"a text file of {layout.width} columns throughout",
             Words(f"{path}, where {len(bad)} lines are not so ({line}{row.actual_columns} columns, {row.text[:40]!r})"),
         )  # fmt: skip
-    if not table.num_rows:
-        raise InputError("file", "a text file with lines of numbers", str(path))
-    if stamps is not None and pyarrow.types.is_string(table.column(stamps).type):
-        table = table.set_column(stamps, kept[stamps], _instants(path, table.column(stamps), options))
-    return table
 
 
 def _body(path: Path, layout: Layout) -> tuple[Any, int, str]:
@@ -164,7 +195,7 @@ def _instants(path: Path, column: Any, options: FileOptions) -> Any:
     if isinstance(found[0], datetime):
         zoned = getattr(found[0], "tzinfo", None) is not None
         kind = pyarrow.timestamp("us", tz="UTC" if zoned else None)
-    return pyarrow.chunked_array([pyarrow.array(found, kind)])
+    return pyarrow.array(found, kind)
 
 
 def _quoted(name: str) -> str:

@@ -25,6 +25,10 @@ _TEXT = re.compile(r"<TX>(.*?)</TX>|<TX/>", re.DOTALL)
 """The text in a comment that is XML."""
 _SYNC_NONE, _SYNC_TIME = 0, 1
 """Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
+_PIECE = 1 << 22
+"""Bytes of records that are read at a time."""
+_MASTER, _REMOTE_MASTER = 2, 8
+"""Type of a channel of stamps that are recorded, and the flag of a group whose stamps are another's, in MDF4."""
 _MARKER, _BY_TOOL = 6, 2
 """Type and cause of an event in MDF4."""
 _IDENTITY, _LINEAR = 0, 1
@@ -51,14 +55,32 @@ def look_into(path: Path, options: FileOptions) -> Source:
         entries, texts = _entries(mdf)
 
     def read(entry: Entry) -> FileSignal:
-        group, index = entry.place
         with _quiet():
-            return _signal(mdf, group, index)
+            return _signal(mdf, *entry.place)
+
+    def pieces(signals: Sequence[Entry]) -> Iterator[list[FileSignal]]:
+        group = signals[0].group_number
+        if not _plain(mdf, group):
+            yield [read(entry) for entry in signals]
+            return
+        second, master = _second(mdf, group), mdf.masters_db[group]
+        kinds = [_linear(mdf, *entry.place) for entry in signals]
+        columns = [(master, None), *zip((entry.place[1] for entry in signals), kinds, strict=True)]
+        streams: list[Iterator[Any]] = [
+            mdf.iter_get(group=group, index=index, samples_only=True, raw=kind is not None) for index, kind in columns
+        ]
+        while True:
+            with _quiet():
+                found = [next(stream, ()) for stream in streams]
+            if not found[0]:
+                return
+            times_s = None if second is None else np.asarray(found[0][0], dtype=float) * second
+            yield [_of_records(part, kind, times_s) for part, kind in zip(found[1:], kinds, strict=True)]
 
     remarks = (f"{texts} channels without numbers are passed over",) if texts else ()
     about = {"version": str(mdf.version), "comment": str(mdf.header.description or ""), **_documents(mdf)}
     return Source(
-        path=path, format=f"MDF {mdf.version}", entries=tuple(entries), read=read, start=mdf.header.start_time,
+        path, f"MDF {mdf.version}", tuple(entries), read, pieces, start=mdf.header.start_time,
         about={key: text for key, text in about.items() if text}, remarks=remarks,
     )  # fmt: skip
 
@@ -77,7 +99,9 @@ def _open(path: Path) -> Any:
     asammdf = library("MDF", "asammdf")
     try:
         with _quiet():
-            return asammdf.MDF(path)
+            mdf = asammdf.MDF(path)
+            mdf.configure(read_fragment_size=_PIECE)
+            return mdf
     except Exception as error:
         # The half-made object of a file that asammdf cannot open closes itself when it goes, and fails aloud: it has
         # tried once here, and does not try again.
@@ -95,7 +119,8 @@ def _entries(mdf: Any) -> tuple[list[Entry], int]:
             continue
         name = str(getattr(group.channel_group, "acq_name", "") or f"group {number}")
         scale = _second(mdf, number)
-        rate = None if scale is None else even_rate_hz(mdf.get_master(number) * scale)
+        ends = [mdf.get_master(number, record_offset=at, record_count=1) for at in (0, rows - 1)]
+        rate = None if scale is None else even_rate_hz(np.concatenate(ends) * scale, rows)
         master = mdf.masters_db.get(number)
         for index, channel in enumerate(group.channels):
             if index == master:
@@ -133,22 +158,39 @@ def _numeric(mdf: Any, group: int, index: int) -> bool:
     return few.ndim == 1 and few.dtype.kind in "iufb"
 
 
+def _plain(mdf: Any, group: int) -> bool:
+    """Whether the stamps of a group stand in its own records, which can then be read in pieces."""
+    master, told = mdf.masters_db.get(group), mdf.groups[group]
+    own = not getattr(told.channel_group, "flags", 0) & _REMOTE_MASTER
+    return str(mdf.version) >= "4" and master is not None and own and told.channels[master].channel_type == _MASTER
+
+
+def _linear(mdf: Any, group: int, index: int) -> tuple[float, float] | None:
+    """What one and none of a channel's integers are; None where they are not integers, or not linear."""
+    told = {"group": group, "index": index, "record_offset": 0, "record_count": 1}
+    raw = mdf.get(raw=True, ignore_invalidation_bits=True, **told)
+    law = raw.conversion
+    kind = _IDENTITY if law is None else law.conversion_type
+    if raw.samples.dtype.kind not in "iu" or kind not in (_IDENTITY, _LINEAR):
+        return None
+    return (1.0, 0.0) if law is None or kind == _IDENTITY else (float(law.a), float(law.b))
+
+
 def _signal(mdf: Any, group: int, index: int) -> FileSignal:
-    raw = mdf.get(group=group, index=index, raw=True, ignore_invalidation_bits=True)
-    kind = _IDENTITY if raw.conversion is None else raw.conversion.conversion_type
-    scale, offset = 1.0, 0.0
-    if raw.samples.dtype.kind in "iu" and kind in (_IDENTITY, _LINEAR):
-        values = raw.samples
-        if kind == _LINEAR and raw.conversion is not None:
-            scale, offset = float(raw.conversion.a), float(raw.conversion.b)
-    else:
-        values = mdf.get(group=group, index=index, ignore_invalidation_bits=True).samples.astype(float)
-    invalid = raw.invalidation_bits
+    kind, second = _linear(mdf, group, index), _second(mdf, group)
+    found = mdf.get(group=group, index=index, raw=kind is not None, ignore_invalidation_bits=True)
+    times_s = None if second is None else np.asarray(found.timestamps, dtype=float) * second
+    return _of_records((found.samples, found.invalidation_bits), kind, times_s)
+
+
+def _of_records(record: Sequence[Any], linear: tuple[float, float] | None, times_s: np.ndarray | None) -> FileSignal:
+    values, invalid = record
+    if linear is None:
+        values = values.astype(float)
     if invalid is not None and np.any(invalid):
         values = values.astype(float)
         values[np.asarray(invalid, dtype=bool)] = np.nan
-    second = _second(mdf, group)
-    times_s = None if second is None else np.asarray(raw.timestamps, dtype=float) * second
+    scale, offset = linear or (1.0, 0.0)
     return FileSignal(values=values, scale=scale, offset=offset, times_s=times_s)
 
 

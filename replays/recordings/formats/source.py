@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -103,6 +103,7 @@ class Source:
         format: What it is, in words.
         entries: Its signals.
         read: Reads the values of one of them.
+        pieces: Reads some that have the same stamps, row after row in pieces; None: this format is read whole.
         start: When its time zero was, if it tells.
         about: What it tells of itself.
         documents: The rig's own by name, as text, where `rig export` has made the file.
@@ -114,6 +115,7 @@ class Source:
     format: str
     entries: tuple[Entry, ...]
     read: Callable[[Entry], FileSignal]
+    pieces: Callable[[Sequence[Entry]], Iterator[list[FileSignal]]] | None = None
     start: datetime | None = None
     about: dict[str, str] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)
@@ -153,6 +155,14 @@ def open_source(path: Path, options: FileOptions) -> Source:
             _check(signal)
         return signal
 
+    def pieces(entries: Sequence[Entry]) -> Iterator[list[FileSignal]]:
+        assert source.pieces is not None
+        with _parsing(path, what):
+            for piece in source.pieces(entries):
+                for signal in piece:
+                    _check(signal)
+                yield piece
+
     entries = tuple(
         entry if entry.rate_hz is None or 0.0 < entry.rate_hz <= _MOST_HZ else replace(entry, rate_hz=None)
         for entry in source.entries
@@ -166,8 +176,9 @@ def open_source(path: Path, options: FileOptions) -> Source:
     about = {key: text for key, text in source.about.items() if len(text) <= _MOST_ABOUT}
     documents = {name: source.about[name] for name in DOCUMENTS if name in source.about} or _beside(path)
     return replace(
-        source, entries=distinct, read=read, about=about, documents=documents, remarks=(*source.remarks, *twice)
-    )
+        source, entries=distinct, read=read, pieces=source.pieces and pieces, about=about, documents=documents,
+        remarks=(*source.remarks, *twice),
+    )  # fmt: skip
 
 
 def _beside(path: Path) -> dict[str, str]:
@@ -252,7 +263,7 @@ def damaged(path: Path, what: str, error: Exception | str) -> InputError:
     return InputError("file", f"an intact {what} file", Words(f"{path} ({text})"[:300]))
 
 
-def even_rate_hz(times_s: np.ndarray) -> float | None:
-    """Mean rate of time stamps [Hz]; None where there is no span."""
+def even_rate_hz(times_s: np.ndarray, rows: int | None = None) -> float | None:
+    """Mean rate of time stamps [Hz]; None where there is no span. Of so many rows, if not all of them are given."""
     span = float(times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
-    return (len(times_s) - 1) / span if span > 0.0 else None
+    return ((rows or len(times_s)) - 1) / span if span > 0.0 else None
