@@ -99,13 +99,14 @@ def endpoint_of(text: str, *, field: str, wait_s: float = 0.0) -> tuple[str, int
     """Where a rig listens that is told by HOST:PORT, or by its name: the one place that knows names.
 
     Args:
-        text: One of these; what has a colon is no name.
+        text: One of these, or a URL with one; what has a colon is no name.
         field: What errors call it.
         wait_s: How long to wait for a rig of that name to be there [s].
 
     Raises:
         InputError: It is neither.
     """
+    text = text.removeprefix("zenoh:")
     if ":" in text:
         return parse_endpoint(text, field=field)
     deadline = time.monotonic() + wait_s
