@@ -208,7 +208,7 @@ class Bench(Closing):
             time.sleep(0.02)
 
     def advance_to(self, time_s: float) -> None:
-        """Let the rig go on to a time of the run [s]: step it in lockstep, to whole blocks, or wait; or until it is stopped.
+        """Let the rig go on to a time [s] or to its end: step it in lockstep, to whole blocks, or wait.
 
         Raises:
             BenchError: It does not go on.
