@@ -21,7 +21,7 @@ from replays.studies.chart.store import COLUMNS, KEY, Store, read_table
 from replays.studies.peers import PEERS, Setting
 from replays.studies.peers.problem import Problem
 from replays.studies.peers.reference import Reference
-from replays.studies.peers.solution import Journal
+from replays.studies.peers.solution import Solution
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.kernels.signals import N_STATE
@@ -78,12 +78,12 @@ def hand_made(shift: float) -> tuple[Problem, Reference, Run]:
     """A reference that stands still, and a run that is off by `shift` scales in one of seven states, half the time."""
     problem = problem_of("exact", "first-impacts", "", end_s=4e-3)
     problem = Problem(**{**problem.__dict__, "times": problem.times[:4]})
-    solution = Journal(problem.times, 1.0).close()
-    object.__setattr__(solution, "states", np.zeros((4, N_STATE)))
+    solution = Solution(problem.times, 1.0).close()
+    solution.states = np.zeros((4, N_STATE))
     states = np.zeros((4, N_STATE))
     states[2:, 9] = 40.0 * shift
     done = Run(states=states, costs=[0.5, 0.1, 0.2], contacts=0, steps=1, evaluations=1, reached_s=problem.duration_s)
-    return problem, Reference(solution, solution, ("a", "b"), 1e-9, True), done
+    return problem, Reference(solution, ("a", "b"), 1e-9, (0.0, 0.0), True), done
 
 
 @pytest.mark.parametrize(

@@ -77,9 +77,8 @@ def run_engine(name: str, setting: Setting, problem: Problem, budget: Budget) ->
 
     def begin() -> Course:
         return Course(
-            name, problem.constants, problem.inputs, problem.y0, step=setting.step_us, tolerance=setting.tolerance,
-            tick=problem.start_tick,
-        )  # fmt: skip
+            name, problem.constants, problem.inputs, problem.y0, step=setting.step_us, tolerance=setting.tolerance
+        )
 
     rows = np.full((n + 1, N_ROW), np.nan)
     clock = time.perf_counter()

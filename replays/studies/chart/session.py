@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -145,8 +145,7 @@ def own_reference(problem: Problem) -> Reference | None:
     if first.failure is not None or second.failure:
         return None
     error = scaled_error(first.states, second.states)
-    other = replace(first, states=second.states, contacts=second.contacts)
-    return Reference(first, other, ("scipy-dop853", "rk8"), error, independent=False)
+    return Reference(first, ("scipy-dop853", "rk8"), error, (first.compile_s, second.compile_s), independent=False)
 
 
 @dataclass
@@ -190,8 +189,8 @@ class _Work:
     def solve(self, problem: Problem) -> Reference | None:
         reference = find_reference(problem, quick=self.mode == "quick") or own_reference(problem)
         if reference is not None:
-            for name, solution in zip(reference.names, (reference.solution, reference.second), strict=True):
-                self.compiling(PEERS[name].family if name in PEERS else OURS, solution.compile_s, again=False)
+            for name, seconds in zip(reference.names, reference.compile_s, strict=True):
+                self.compiling(PEERS[name].family if name in PEERS else OURS, seconds, again=False)
         return reference
 
     def keep(self, row: Row, columns: Row) -> None:

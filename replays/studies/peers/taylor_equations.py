@@ -117,7 +117,7 @@ def numbers_of(problem: Problem) -> dict[str, float]:
         "k_ns": house.pair_stiffness_vertical,
         "k_ew": house.pair_stiffness_horizontal,
         "gain": gain,
-        "speed": inputs.speed + inputs.speed_slope * (problem.start_tick - inputs.speed_tick) * inputs.tick_s,
+        "speed": inputs.speed,
         "slope": inputs.speed_slope,
         "H_x": inputs.hammer_force * inputs.hammer_x,
         "H_y": inputs.hammer_force * inputs.hammer_y,

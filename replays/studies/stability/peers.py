@@ -49,7 +49,7 @@ def _hammer(name: str, tolerance: float) -> float:
 
 def _problem(name: str, constants, inputs, y0: np.ndarray, duration_s: float) -> Problem:
     return Problem(
-        name=name, constants=constants, inputs=inputs, start_tick=0, y0=y0[:N_STATE], phase=FLIGHT,
+        name=name, constants=constants, inputs=inputs, y0=y0[:N_STATE], phase=FLIGHT,
         onset_speed=constants.contact.speed_floor, times=np.linspace(0.0, duration_s, 201),
     )  # fmt: skip
 
