@@ -20,6 +20,7 @@ from replays.studies.stability.motion import (
     state,
 )
 from rig.engines import ENGINES
+from rig.engines.memory import CEILING, FLOORED
 from rig.levels import ModelLevels
 
 ONSET_SPEEDS = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
@@ -71,10 +72,10 @@ def first_impact(engine: str, speed: float, *, tolerance: float = 0.0) -> dict[s
     lift_off = ticks * 1e-6 - (contact.clearance - place) / back
     return {
         "restitution": abs(back / speed / right.restitution - 1.0),
-        "impulse": abs(motion.impulse / right.impulse - 1.0),
+        "impulse": abs(motion.end_of("contact_impulse") / right.impulse - 1.0),
         "peak": abs(motion.peak_force / right.peak - 1.0),
         "duration": abs((lift_off - onset) / right.duration - 1.0),
-        "floored": float(motion.floored),
+        "floored": float(motion.memory[FLOORED]),
     }
 
 
@@ -108,12 +109,12 @@ def drop_cases(engine: str, quick: bool) -> Iterator[Cell]:
     constants = constants._replace(contact=constants.contact._replace(damping_factor=1.4328))  # e = 0.5
     y0 = model.state(ring_x=0.0, ring_y=constants.contact.clearance * (1.0 - 1e-12))
     motion = move(engine, constants, quiet_inputs(), y0, ticks=500_000, every=1000)
-    energy = float(motion.column("kinetic_energy")[-1]) if motion.finite else math.nan
+    energy = float(motion.column("kinetic_energy")[-1]) if np.isfinite(motion.end).all() else math.nan
     fallen = 0.5 * constants.shaft.mass * constants.shaft.gravity * constants.contact.clearance
     yield Cell("energy left", energy / fallen, 1e-6, "it comes to rest (e = 0.5)")
     yield Cell("contacts", float(motion.contacts), 40.0,
                "a compliant law with a lower limit of v0 ends in lasting contact: no Zeno")  # fmt: skip
-    yield Cell("steps given up", float(motion.ceiling), 0.0, "no stall")
+    yield Cell("steps given up", float(motion.memory[CEILING]), 0.0, "no stall")
 
 
 def pushed(engine: str, *, speed_floor: float) -> float:

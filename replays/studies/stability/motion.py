@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 
 from replays.studies.run import Course
-from rig.engines.memory import CEILING, CONTACTS, FLOORED, PEAK_FORCE
-from rig.kernels import signals as S
+from rig.engines.memory import CONTACTS, PEAK_FORCE
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.signals import COLUMN, N_ROW, N_STATE, N_VECTOR
 from rig.levels import ModelLevels
@@ -79,34 +78,14 @@ class Motion:
         return float(self.end[COLUMN[name]])
 
     @property
-    def finite(self) -> bool:
-        """Whether every number of the end is finite."""
-        return bool(np.isfinite(self.end).all())
-
-    @property
     def contacts(self) -> int:
         """Contacts begun."""
         return int(self.memory[CONTACTS])
 
     @property
-    def floored(self) -> int:
-        """Contacts begun slower than the lower limit of v0."""
-        return int(self.memory[FLOORED])
-
-    @property
-    def ceiling(self) -> int:
-        """Steps that stayed above the tolerance."""
-        return int(self.memory[CEILING])
-
-    @property
     def peak_force(self) -> float:
         """Largest normal force by the engine's own steps [N]."""
         return float(self.memory[PEAK_FORCE])
-
-    @property
-    def impulse(self) -> float:
-        """Integral of the normal force [N s]."""
-        return float(self.end[S.CONTACT_IMPULSE])
 
 
 def move(
