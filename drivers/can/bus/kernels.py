@@ -137,9 +137,7 @@ def header_and_data(identifier, length, flags, data, raw):
     n = _write(raw, n, _CODES[length], 4)
     if remote == 0:
         for i in range(length):
-            for k in range(7, -1, -1):
-                raw[n] = (data[i] >> k) & 1
-                n += 1
+            n = _write(raw, n, data[i], 8)
     return n, switch
 
 
