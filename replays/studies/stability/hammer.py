@@ -55,11 +55,9 @@ def rolling_cases(engine: str, quick: bool) -> Iterator[Cell]:
                    f"v_s atanh(needed / mu) = {creep:.2e} m/s")  # fmt: skip
 
 
-def first_impacts(
-    engine: str, friction: str, *, smoothing_speed: float | None = None, step: int = 0, tolerance: float = 0.0
-) -> Motion:
-    """The full rig, hit at time zero."""
-    constants, inputs, y0 = hammer_run(friction, smoothing_speed=smoothing_speed)
+def first_impacts(engine: str, law: str, *, step: int = 0, tolerance: float = 0.0, **contact: float) -> Motion:
+    """The full rig under a friction law, hit at time zero; `contact` as of `hammer_run`."""
+    constants, inputs, y0 = hammer_run(law, **contact)
     inputs = inputs._replace(hammer_start=0, hammer_end=5000)
     return move(engine, constants, inputs, y0, ticks=WINDOW_TICKS, step=step, every=1000, tolerance=tolerance)
 
