@@ -111,11 +111,11 @@ def test_heyoka_has_the_same_equations(changes: dict, phase: int) -> None:
         np.testing.assert_allclose(found, wanted, atol=1e-8 * np.max(np.abs(wanted)))
 
 
-@pytest.mark.parametrize(("friction", "memory"), [("smoothed", True), ("exact", False)])
+@pytest.mark.parametrize(("friction", "contact"), [("smoothed", {}), ("exact", {"damping_factor": 0.0})])
 @pytest.mark.parametrize(("name", "tolerance", "within"), [("heyoka", 1e-15, 1e-8), ("cvode-adams", 1e-13, 2e-7)])
-def test_tight_solvers_agree(name: str, tolerance: float, within: float, friction: str, memory: bool) -> None:
+def test_tight_solvers_agree(name: str, tolerance: float, within: float, friction: str, contact: dict) -> None:
     # 0.05 s: 14 to 16 contacts; exact and memoryless, they roll as well.
-    given = problem(0.05, friction=friction, memory=memory)
+    given = problem(0.05, friction=friction, **contact)
     found = solve(name, given, tolerance)
     wanted = solve("scipy-dop853", given, 1e-13)
     assert found.failure is None

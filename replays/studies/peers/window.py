@@ -12,7 +12,7 @@ from replays.studies.peers.problem import Problem
 from replays.studies.peers.right_hand_side import contact_at, pack
 from rig.commands import HammerCommand, ReleaseCommand, SpeedCommand
 from rig.errors import InputError
-from rig.kernels.constants import Constants, Inputs
+from rig.kernels.constants import Inputs
 from rig.kernels.contact import BACKWARD, FLIGHT, FORWARD, TOUCHING
 from rig.kernels.signals import N_STATE
 from rig.levels import FRICTION_LAWS
@@ -30,8 +30,7 @@ def cut_window(
     end_s: float | None = None,
     sample_s: float = 1e-4,
     friction: Literal["none", "smoothed", "exact"] | None = None,
-    smoothing_speed: float | None = None,
-    memory: bool = True,
+    **contact: float,
 ) -> Problem:
     """Cut a window out of a scene.
 
@@ -43,14 +42,16 @@ def cut_window(
         end_s: Its end [s]; None for the scene's end.
         sample_s: States are wanted this often [s], and at the end.
         friction: Friction law instead of the scene's.
-        smoothing_speed: v_s of the smoothed law instead of the scene's [m/s].
-        memory: False takes the damping term with its impact speed out of the contact law.
+        contact: What the contact has otherwise than the scene's, by field, such as `smoothing_speed`; a
+            `damping_factor` of 0 takes the damping term with its memory of the impact speed out of the law.
 
     Raises:
         InputError: The window is empty, or drive, magnets or a second pulse change inside it.
     """
     model = build_model(scene.load_parameters(), scene.model)
-    constants = _under_law(model.constants, friction, smoothing_speed, memory)
+    constants = model.constants._replace(contact=model.constants.contact._replace(**contact))
+    if friction is not None:
+        constants = constants._replace(levels=constants.levels._replace(friction=FRICTION_LAWS[friction]))
     end_s = scene.duration_s if end_s is None else end_s
     end_tick = round(end_s / TICK_S)
     inputs, until = _inputs(scene)
@@ -69,18 +70,6 @@ def cut_window(
         times=ticks * TICK_S,
     )
     return replace(problem, phase=_phase(problem))
-
-
-def _under_law(constants: Constants, friction: str | None, smoothing_speed: float | None, memory: bool) -> Constants:
-    """The model under another contact law; None keeps what it has."""
-    contact, levels = constants.contact, constants.levels
-    if friction is not None:
-        levels = levels._replace(friction=FRICTION_LAWS[friction])
-    if smoothing_speed is not None:
-        contact = contact._replace(smoothing_speed=smoothing_speed)
-    if not memory:
-        contact = contact._replace(damping_factor=0.0)
-    return constants._replace(contact=contact, levels=levels)
 
 
 def _phase(problem: Problem) -> int:
