@@ -40,7 +40,6 @@ class Course:
         *,
         step: int = 0,
         tolerance: float = 0.0,
-        tick: int = 0,
     ) -> None:
         """Start an engine.
 
@@ -51,11 +50,10 @@ class Course:
             y0: State at the start, shape (N_STATE,) or, with integrals, (N_VECTOR,).
             step: Ticks a step; 0 for the engine's own (in ticks of 1 µs).
             tolerance: Of an adaptive engine; 0 for its own.
-            tick: Present time.
         """
         method = ENGINES[engine]
         self._engine, self._constants, self._inputs = load_engine(engine), constants, inputs
-        self.step, self.tick = step or method.step_us, tick
+        self.step, self.tick = step or method.step_us, 0
         self.y, self.memory = np.zeros(N_VECTOR), np.zeros(MEMORY)
         self.y[: len(y0)] = y0
         tolerance = tolerance or method.tolerance
@@ -85,12 +83,10 @@ class Timed(NamedTuple):
 
     Attributes:
         rows: Observed rows, shape (n, N_ROW): of the whole run, or of its last block where they were not kept.
-        wall_s: Wall time of the steps [s].
         cpu_s: Processor time of this thread for the steps [s]: other load on the machine does not count.
     """
 
     rows: np.ndarray
-    wall_s: float
     cpu_s: float
 
 
@@ -110,18 +106,17 @@ def run_scene(
         SimulationError: It takes too long: an engine may stall.
     """
     kept: list[np.ndarray] = []
-    wall_s = cpu_s = 0.0
+    cpu_s = 0.0
     while simulation.tick < simulation.end_tick:
-        begin, begin_cpu = time.perf_counter(), time.thread_time()
+        begin = time.thread_time()
         frame = simulation.advance(min(block_ticks, simulation.end_tick - simulation.tick))
-        cpu_s += time.thread_time() - begin_cpu
-        wall_s += time.perf_counter() - begin
+        cpu_s += time.thread_time() - begin
         if cpu_s > limit_s:
             raise SimulationError(f"given up after {cpu_s:.0f} s at {simulation.tick * 1e-6:g} s of the scene")
         if not keep:
             kept.clear()
         kept.append(frame.rows[::every].copy())
-    return Timed(np.concatenate(kept), wall_s, cpu_s)
+    return Timed(np.concatenate(kept), cpu_s)
 
 
 def end_with_parent() -> None:

@@ -44,7 +44,7 @@ def test_known_failures_are_expected_to_fail():
 
 
 def test_a_cell_tells_when_it_disagrees():
-    cell = Cell("T1", "case", "engine", 2.0, "1", 1.0, True, "")
+    cell = Cell("case", 2.0, 1.0, "")
     assert not cell.holds
     assert not cell.agrees
     assert cell._replace(expected=False).agrees

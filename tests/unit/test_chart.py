@@ -21,7 +21,7 @@ from replays.studies.chart.store import COLUMNS, KEY, Store, read_table
 from replays.studies.peers import PEERS, Setting
 from replays.studies.peers.problem import Problem
 from replays.studies.peers.reference import Reference
-from replays.studies.peers.solution import Journal
+from replays.studies.peers.solution import Solution
 from rig.cli.main import main
 from rig.errors import InputError
 from rig.kernels.signals import N_STATE
@@ -41,8 +41,8 @@ def test_store_resumes_what_the_same_code_measured(tmp_path: Path) -> None:
     with (tmp_path / "chart.journal.jsonl").open("a") as file:
         file.write('{"mode": "qui')  # a run that was killed
     again = Store(tmp_path)
-    assert again.has(("quick", "exact", "whirl", "", "rk4", "5 us"))
-    assert not again.has(("full", "exact", "whirl", "", "rk4", "5 us"))
+    assert again.has(row())
+    assert not again.has(row(mode="full"))
     kept = again.rows("quick")[0]
     assert (kept["error"], kept["speed"]) == (1e-3, None)
     assert kept["machine"]
@@ -78,12 +78,14 @@ def hand_made(shift: float) -> tuple[Problem, Reference, Run]:
     """A reference that stands still, and a run that is off by `shift` scales in one of seven states, half the time."""
     problem = problem_of("exact", "first-impacts", "", end_s=4e-3)
     problem = Problem(**{**problem.__dict__, "times": problem.times[:4]})
-    solution = Journal(problem.times, 1.0).close()
-    object.__setattr__(solution, "states", np.zeros((4, N_STATE)))
+    solution = Solution(problem.times, 1.0).close()
+    solution.states = np.zeros((4, N_STATE))
     states = np.zeros((4, N_STATE))
     states[2:, 9] = 40.0 * shift
-    done = Run(states=states, costs=[0.5, 0.1, 0.2], contacts=0, steps=1, evaluations=1, reached_s=problem.duration_s)
-    return problem, Reference(solution, solution, ("a", "b"), 1e-9, True), done
+    ours = Solution(problem.times, 1.0).close()
+    ours.states, ours.failure = states, None
+    done = Run(ours, [0.5, 0.1, 0.2], problem.duration_s)
+    return problem, Reference(solution, ("a", "b"), 1e-9, (0.0, 0.0), True), done
 
 
 @pytest.mark.parametrize(
@@ -93,8 +95,8 @@ def test_error_and_verdict_of_a_hand_made_run(
     monkeypatch: pytest.MonkeyPatch, shift: float, contacts: int, failure: str
 ) -> None:
     problem, reference, done = hand_made(shift)
-    done.contacts = contacts
-    done.failure = failure if failure == "nan" else ""
+    done.solution.onsets = [(0.0, 0.1)] * contacts
+    done.solution.failure = "the state is not finite" if failure == "nan" else None
     monkeypatch.setattr(measure, "run", lambda *_: done)
     found = point(competitors(peers=False)["rk4"], Setting("5 us", 0.0, step_us=5), problem, reference, ONCE)
     assert found["failure"] == failure
@@ -112,9 +114,10 @@ def test_engine_called_directly_agrees_with_another_code_and_closes_its_ledger()
     done = run_engine("rk4", Setting("10 us", 0.0, step_us=10), problem, ONCE)
     truth = PEERS["scipy-dop853"].solve(problem, Setting("1e-9", 1e-9))
     assert done.failure == ""
-    assert measure.scaled_error(done.states, truth.states) < 1e-3
-    assert done.contacts == truth.contacts == len(done.onsets) == 2
-    assert done.onsets == pytest.approx([time for time, _ in truth.onsets], abs=1.01e-3)
+    assert measure.scaled_error(done.solution.states, truth.states) < 1e-3
+    assert done.solution.contacts == truth.contacts == 2
+    began = [[time for time, _ in each.onsets] for each in (done.solution, truth)]
+    assert began[0] == pytest.approx(began[1], abs=1.01e-3)
     assert done.energy_residual is not None
     assert done.energy_residual < 1e-4
     assert done.worst_frame_s is not None
@@ -125,7 +128,7 @@ def test_engine_without_time_is_a_failure_and_no_error() -> None:
     done = run_engine("rk4", Setting("10 us", 0.0, step_us=10), problem, Budget(0.0, 3))
     assert done.failure == "budget"
     assert done.reached_s == pytest.approx(1e-3)
-    assert np.isnan(done.states[-1]).all()
+    assert np.isnan(done.solution.states[-1]).all()
 
 
 def test_frames_must_be_whole_steps() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from replays.studies.peers import ERROR_SCALE, PEERS, Peer, Problem, Setting, scaled_error
+from replays.studies.peers import ERROR_SCALE, PEERS, Library, Peer, Problem, Setting, scaled_error
 from replays.studies.peers.plain_python import PlainPython
 from replays.studies.peers.reference import find_reference
 from replays.studies.peers.right_hand_side import derivative, jacobian, pack, switching
@@ -59,17 +59,7 @@ def test_a_window_ends_where_the_inputs_change() -> None:
     with pytest.raises(InputError, match=r"at most 0\.05 s"):
         cut_window(scene, end_s=0.051)
     with pytest.raises(InputError, match="end_s"):
-        cut_window(scene, start_s=0.03, end_s=0.03)
-
-
-def test_a_later_window_goes_on_from_an_earlier_one() -> None:
-    whole = solve("scipy-dop853", problem(0.034), 1e-9)
-    later = problem(0.034, start_s=0.0263)
-    assert later.phase == TOUCHING
-    rest = solve("scipy-dop853", later, 1e-9)
-    assert rest.contacts == whole.contacts - 1
-    assert rest.onset_speed == pytest.approx(whole.onset_speed, rel=1e-6)
-    assert scaled_error(rest.states[-1:], whole.states[-1:]) < 1e-5
+        cut_window(scene, end_s=0.0)
 
 
 @pytest.mark.parametrize("changes", [{}, {"drive.mode": "ideal"}, {"parameters": "as-printed"}])
@@ -121,11 +111,11 @@ def test_heyoka_has_the_same_equations(changes: dict, phase: int) -> None:
         np.testing.assert_allclose(found, wanted, atol=1e-8 * np.max(np.abs(wanted)))
 
 
-@pytest.mark.parametrize(("friction", "memory"), [("smoothed", True), ("exact", False)])
+@pytest.mark.parametrize(("friction", "contact"), [("smoothed", {}), ("exact", {"damping_factor": 0.0})])
 @pytest.mark.parametrize(("name", "tolerance", "within"), [("heyoka", 1e-15, 1e-8), ("cvode-adams", 1e-13, 2e-7)])
-def test_tight_solvers_agree(name: str, tolerance: float, within: float, friction: str, memory: bool) -> None:
+def test_tight_solvers_agree(name: str, tolerance: float, within: float, friction: str, contact: dict) -> None:
     # 0.05 s: 14 to 16 contacts; exact and memoryless, they roll as well.
-    given = problem(0.05, friction=friction, memory=memory)
+    given = problem(0.05, friction=friction, **contact)
     found = solve(name, given, tolerance)
     wanted = solve("scipy-dop853", given, 1e-13)
     assert found.failure is None
@@ -191,7 +181,7 @@ def test_every_peer_flies(name: str) -> None:
     assert solution.failure is None
     assert solution.states.shape == (5, 14)
     assert solution.contacts == 0
-    assert solution.steps > 0 or PEERS[name].build == "as installed"
+    assert solution.steps > 0 or name.endswith("-python")
     assert solution.evaluations > 0
     assert scaled_error(solution.states, wanted.states) < 1e-4
 
@@ -269,7 +259,7 @@ def test_a_state_that_pulses_up_is_a_failure() -> None:
 
 
 def test_a_missing_library_names_the_extra() -> None:
-    peer = Peer("none", "None", "none", "1", "compiled", (Setting("1", 1.0),), "scipy_solvers", module="no_such_solver")
+    peer = Peer("none", "None", Library("none", "scipy_solvers", "no_such_solver"), (Setting("1", 1.0),))
     assert not peer.installed
     with pytest.raises(InputError, match=r"rotor-stator-rig\[peers\]"):
         peer.solve(problem(0.01))

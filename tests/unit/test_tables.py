@@ -111,7 +111,7 @@ def lines_of_scenes() -> list[str]:
 def test_trials_are_legible() -> None:
     values = (0.0, -1.2345e-07, 1.6e240, float("inf"), float("nan"))
     cells = [
-        Cell(trial, f"case {number} of a long name", engine, value, "m", 1e-3, expected, "because of what is known")
+        Cell(f"case {number} of a long name", value, 1e-3, "because of what is known", expected, "m", trial, engine)
         for trial in ("T1", "T12")
         for engine in ENGINES
         for number, value in enumerate(values)

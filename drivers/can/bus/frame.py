@@ -21,11 +21,10 @@ REMOTE = 1 << 30
 ERROR = 1 << 29
 STANDARD_MASK = (1 << 11) - 1
 EXTENDED_MASK = (1 << 29) - 1
-# Flags in the byte of flags; ONE_SHOT is the bus model's own.
+# Flags in the byte of flags.
 FD = 1
 BRS = 2
 ESI = 4
-ONE_SHOT = 16
 
 CLASSIC_WIDTH = 8
 FD_WIDTH = 64
@@ -162,19 +161,6 @@ class Encoded(NamedTuple):
     crc: int
 
 
-def pad(data: bytes, *, fill: int = 0) -> bytes:
-    """Data with as many bytes appended as the next length of CAN FD needs.
-
-    Args:
-        data: At most 64 bytes.
-        fill: Value of the added bytes.
-    """
-    for length in FD_LENGTHS:
-        if length >= len(data):
-            return data + bytes([fill]) * (length - len(data))
-    raise InputError("data", "at most 64 bytes long", len(data))
-
-
 def record_of(frame: Frame, *, node: int = 0, time_ns: int = 0) -> Record:
     """A frame as its record.
 
@@ -228,17 +214,6 @@ def _frame(record: Record) -> Frame:
     )
 
 
-def check_records(array: np.ndarray, *, fd: bool = True) -> np.ndarray:
-    """The same array, if a controller can send all its frames; else an InputError that names the first bad one."""
-    if array.dtype.itemsize != RECORD.itemsize or array.dtype.names != RECORD.names:
-        raise InputError("frames", "an array of drivers.can.bus.frame.RECORD", array.dtype)
-    array = np.ascontiguousarray(array).view(RECORDS[FD_WIDTH])
-    if not (good := sendable(array, fd=fd)).all():
-        (bad,) = array[~good][:1].tolist()
-        raise InputError("frames", "frames that a controller can send", fault_of(Record(*bad), fd=fd))
-    return array.view(RECORD)
-
-
 def octets(array: np.ndarray) -> np.ndarray:
     """The data fields of an array of a `RECORDS` layout as bytes, shape (frames, width); a view."""
     return array.view(OCTETS[array.dtype["data"].itemsize])["data"]
@@ -266,16 +241,7 @@ def encode(frame: Frame) -> Encoded:
 
 def frame_bits(frame: Frame) -> tuple[int, int]:
     """Bits of a frame on the bus, with stuffing and intermission: at the nominal rate, and at the data rate."""
-    nominal, fast = bits_of(records([frame]))
-    return int(nominal[0]), int(fast[0])
-
-
-def bits_of(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`frame_bits` for an array of `RECORD`: nominal bits and fast bits, int64, shape (frames,)."""
     from drivers.can.bus import kernels
 
-    array = check_records(array)
-    nominal = np.zeros(len(array), np.int64)
-    fast = np.zeros(len(array), np.int64)
-    kernels.count_many(array["identifier"], array["length"], array["flags"], array["data"], nominal, fast)
-    return nominal, fast
+    row, work = records([frame])[0], np.empty((3, kernels.LONGEST), np.uint8)
+    return kernels.count_bits(int(row["identifier"]), int(row["length"]), int(row["flags"]), row["data"], work)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from drivers.can.bus.frame import BRS, ESI, EXTENDED, FD, FD_LENGTHS, FD_WIDTH, INTERMISSION, ONE_SHOT, REMOTE
+from drivers.can.bus.frame import BRS, ESI, EXTENDED, FD, FD_LENGTHS, FD_WIDTH, INTERMISSION, REMOTE
 
 # Kinds of an encoded bit, added up.
 FAST = 1
@@ -27,11 +27,11 @@ TAIL = 10
 """CRC delimiter 1, ACK 1, ACK delimiter 1, end of frame 7."""
 
 # Columns of `Bus.nodes`.
-ATTACHED, FIFO, LISTENING, AUTOMATIC, CAPACITY = 0, 1, 2, 3, 4
-TEC, REC, STATE, COUNT, HEAD, SUSPENDED, LEFT, RECOVERING, QUIET = 5, 6, 7, 8, 9, 10, 11, 12, 13
-DISTURBED, DISTURBED_BIT = 14, 15
-SENT, ERRORS, UNACKNOWLEDGED, DROPPED, REFUSED, GIVEN_UP, BUS_OFFS, DEEPEST, OUTBID = 16, 17, 18, 19, 20, 21, 22, 23, 24
-NODE_COLUMNS = 25
+ATTACHED, LISTENING, CAPACITY = 0, 1, 2
+TEC, REC, STATE, COUNT, HEAD, SUSPENDED, LEFT, RECOVERING, QUIET = 3, 4, 5, 6, 7, 8, 9, 10, 11
+DISTURBED, DISTURBED_BIT = 12, 13
+SENT, ERRORS, DROPPED, REFUSED, BUS_OFFS = 14, 15, 16, 17, 18
+NODE_COLUMNS = 19
 
 ACTIVE, PASSIVE, OFF = 0, 1, 2
 
@@ -41,11 +41,11 @@ SLOT_COLUMNS = 8
 
 # Cells of `Bus.cells`.
 NOW, FREE, SENDERS, START, END, OUTCOME, NEXT, ARRIVALS = 0, 1, 2, 3, 4, 5, 6, 7
-BUSY, FRAMES, BITS, FAULTS, WINDOW, WINDOW_BUSY, WINDOW_LAST, WINDOW_PEAK = 8, 9, 10, 11, 12, 13, 14, 15
-GAP, MORE, SEQUENCES, FREE_SLOTS, WINDOW_LENGTH, FLAG_BITS = 16, 17, 18, 19, 20, 21
-CELLS = 22
+BUSY, FRAMES, WINDOW, WINDOW_BUSY, WINDOW_LAST = 8, 9, 10, 11, 12
+GAP, MORE, SEQUENCES, FREE_SLOTS, WINDOW_LENGTH = 13, 14, 15, 16, 17
+CELLS = 18
 
-# Outcomes of a frame; those from SENT_OUTCOME on have no retry, unless the frame was one-shot.
+# Outcomes of a frame.
 OUTCOMES = (
     "",
     "bit error",
@@ -53,22 +53,17 @@ OUTCOMES = (
     "collision of equal identifiers",
     "queue full",
     "bus-off",
-    "lost arbitration",
     "detached",
 )
-GOOD, BIT_ERROR, NO_ACKNOWLEDGE, COLLISION, QUEUE_FULL, BUS_OFF, LOST_ARBITRATION, DETACHED = range(8)
+GOOD, BIT_ERROR, NO_ACKNOWLEDGE, COLLISION, QUEUE_FULL, BUS_OFF, DETACHED = range(7)
 
 # Columns of a result.
 R_SLOT, R_START, R_END, R_OUTCOME, R_ATTEMPT, R_NODE, R_AT, R_FINAL = 0, 1, 2, 3, 4, 5, 6, 7
 RESULT_COLUMNS = 8
 
-LATENCY_KEY, LATENCY_COUNT, LATENCY_SUM, LATENCY_WORST = 0, 1, 2, 3
-
 _FAR = np.int64(1) << 62
 _RECESSIVE_RUN = 11
 _RECOVERY = 128
-_PROBES = 64
-"""Places of the table of latencies to look at; where it is full of others, a new identifier goes uncounted."""
 
 
 class Bus(NamedTuple):
@@ -83,7 +78,6 @@ class Bus(NamedTuple):
         arrivals: Slots that are not queued yet, by time, shape (slots,).
         unused: Stack of free slots, shape (slots,).
         senders: Slots on the wire now; more than one only where nodes send the same identifier, shape (nodes,).
-        latencies: Open-addressed table of the identifiers' latencies, shape (power of two, 4).
         random: State of the generator of bit errors, shape (1,).
     """
 
@@ -95,7 +89,6 @@ class Bus(NamedTuple):
     arrivals: np.ndarray
     unused: np.ndarray
     senders: np.ndarray
-    latencies: np.ndarray
     random: np.ndarray
 
 
@@ -144,9 +137,7 @@ def header_and_data(identifier, length, flags, data, raw):
     n = _write(raw, n, _CODES[length], 4)
     if remote == 0:
         for i in range(length):
-            for k in range(7, -1, -1):
-                raw[n] = (data[i] >> k) & 1
-                n += 1
+            n = _write(raw, n, data[i], 8)
     return n, switch
 
 
@@ -225,16 +216,6 @@ def count_bits(identifier, length, flags, data, work):
     if (flags & BRS) != 0:
         return slow + TAIL - 1 + INTERMISSION, count - slow + tail + 1
     return slow + tail + TAIL + INTERMISSION, 0
-
-
-@njit(cache=True, error_model="numpy")
-def count_many(identifiers, lengths, flags, data, nominal, quick):
-    """`count_bits` for many frames: arrays of shape (frames,), data (frames, 64)."""
-    work = np.empty((3, LONGEST), np.uint8)
-    for i in range(identifiers.shape[0]):
-        nominal[i], quick[i] = count_bits(
-            np.int64(identifiers[i]), np.int64(lengths[i]), np.int64(flags[i]), data[i], work
-        )
 
 
 @njit(cache=True, error_model="numpy")
@@ -364,19 +345,15 @@ def _put(out, count, slot, start, end, outcome, slots, final):
 
 @njit(cache=True, error_model="numpy")
 def _find_head(bus, node):
-    """The frame that the node would send next: by priority, or the oldest; equal priorities keep their order."""
+    """The frame that the node would send next: by priority; equal ones keep their order."""
     head = np.int64(-1)
-    fifo = bus.nodes[node, FIFO] != 0
     for k in range(bus.nodes[node, COUNT]):
         s = bus.queues[node, k]
         if head < 0:
             head = s
             continue
         key, best = bus.slots[s, KEY], bus.slots[head, KEY]
-        if fifo or key == best:
-            if bus.slots[s, SEQUENCE] < bus.slots[head, SEQUENCE]:
-                head = s
-        elif key < best:
+        if key < best or (key == best and bus.slots[s, SEQUENCE] < bus.slots[head, SEQUENCE]):
             head = s
     bus.nodes[node, HEAD] = head
 
@@ -423,23 +400,22 @@ def _admit(bus, out, count):
     cells[SEQUENCES] += 1
     bus.queues[n, nodes[n, COUNT]] = s
     nodes[n, COUNT] += 1
-    nodes[n, DEEPEST] = max(nodes[n, DEEPEST], nodes[n, COUNT])
     head = nodes[n, HEAD]
-    if head < 0 or (nodes[n, FIFO] == 0 and bus.slots[s, KEY] < bus.slots[head, KEY]):
+    if head < 0 or bus.slots[s, KEY] < bus.slots[head, KEY]:
         nodes[n, HEAD] = s
     return count
 
 
 @njit(cache=True, error_model="numpy")
 def _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers):
-    """Time and length of an error that the sender sees in the bit at `position` of the frame on the wire.
+    """Length of an error that the sender sees in the bit at `position` of the frame on the wire.
 
     The sender's flag starts with the next bit. Receivers see it when six equal bits have passed and answer with theirs:
     superposed they last 6 to 12 bits (ISO 11898-1:2015, 10.4.4). In a field of fixed form, or where the bad bit itself
     makes six equal ones, all see it at once. Then 8 bits of delimiter.
 
     Returns:
-        Time from the start of frame to the end of the delimiter [ns], bits of the flags.
+        Time from the start of frame to the end of the delimiter [ns].
     """
     work = np.empty((3, LONGEST), np.uint8)
     bits, kinds = work[0], work[1]
@@ -464,7 +440,7 @@ def _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers):
             flag = 12 - (run if level == (1 if passive else 0) else 0)
     elif receivers_active and position == total - INTERMISSION - 9:
         flag = 7  # The acknowledge is missing: receivers see it from the flag's first bit, in the delimiter.
-    return (time_ps + (flag + 8) * nominal_ps + 500) // 1000, flag
+    return (time_ps + (flag + 8) * nominal_ps + 500) // 1000
 
 
 @njit(cache=True, error_model="numpy")
@@ -485,14 +461,12 @@ def _differ(bus):
 
 
 @njit(cache=True, error_model="numpy")
-def _begin(bus, start, out, count, nominal_ps, data_ps, chance):
+def _begin(bus, start, nominal_ps, data_ps, chance):
     """Arbitrate at `start`, put the winner on the wire and decide when and how its transmission ends."""
     cells, nodes, slots = bus.cells, bus.nodes, bus.slots
     best = _FAR
-    rivals = 0
     for n in range(nodes.shape[0]):
         if nodes[n, COUNT] > 0 and nodes[n, SUSPENDED] <= start:
-            rivals += 1
             best = min(best, slots[nodes[n, HEAD], KEY])
     cells[SENDERS] = 0
     for n in range(nodes.shape[0]):
@@ -502,13 +476,6 @@ def _begin(bus, start, out, count, nominal_ps, data_ps, chance):
                 bus.senders[cells[SENDERS]] = s
                 cells[SENDERS] += 1
                 slots[s, ATTEMPTS] += 1
-            else:
-                nodes[n, OUTBID] += 1
-                if (bus.store[s]["flags"] & ONE_SHOT) != 0:
-                    nodes[n, GIVEN_UP] += 1
-                    slots[s, ATTEMPTS] += 1
-                    count = _put(out, count, s, start, start, LOST_ARBITRATION, slots, 1)
-                    _remove(bus, n, s)
     receivers = False
     receivers_active = False
     for n in range(nodes.shape[0]):
@@ -545,17 +512,12 @@ def _begin(bus, start, out, count, nominal_ps, data_ps, chance):
         outcome = NO_ACKNOWLEDGE
         position = total - 9
     cells[START] = start
-    cells[FLAG_BITS] = 0
     if position < 0:
         cells[OUTCOME] = GOOD
         cells[END] = start + slots[s, DURATION]
     else:
         cells[OUTCOME] = outcome
-        length, flag = _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers)
-        cells[END] = start + length
-        cells[FLAG_BITS] = flag
-        cells[BITS] += position + 1 + flag + 8
-    return count
+        cells[END] = start + _fault(bus, position, nominal_ps, data_ps, receivers_active, receivers)
 
 
 @njit(cache=True, error_model="numpy")
@@ -573,28 +535,11 @@ def _settle(bus, n):
 
 
 @njit(cache=True, error_model="numpy")
-def _note_latency(bus, identifier, latency):
-    table = bus.latencies
-    mask = table.shape[0] - 1
-    k = (identifier * 0x9E3779B >> 20) & mask
-    for _ in range(_PROBES):
-        if table[k, LATENCY_COUNT] == 0:
-            table[k, LATENCY_KEY] = identifier
-        if table[k, LATENCY_KEY] == identifier:
-            table[k, LATENCY_COUNT] += 1
-            table[k, LATENCY_SUM] += latency
-            table[k, LATENCY_WORST] = max(table[k, LATENCY_WORST], latency)
-            return
-        k = (k + 1) & mask
-
-
-@njit(cache=True, error_model="numpy")
 def close_windows(cells, t):
     """Close every window of the load that ended by t."""
     length = cells[WINDOW_LENGTH]
     if t >= cells[WINDOW] + length:
         cells[WINDOW_LAST] = cells[WINDOW_BUSY]
-        cells[WINDOW_PEAK] = max(cells[WINDOW_PEAK], cells[WINDOW_BUSY])
         cells[WINDOW_BUSY] = 0
         cells[WINDOW] += length
         if t >= cells[WINDOW] + length:
@@ -624,12 +569,7 @@ def _complete(bus, out, count, nominal_ps):
     run_ns = (_RECESSIVE_RUN * nominal_ps + 500) // 1000
     _occupy(cells, start, cells[FREE])
     good = outcome == GOOD
-    if good:
-        cells[FRAMES] += 1
-        cells[BITS] += slots[bus.senders[0], NOMINAL] + slots[bus.senders[0], QUICK]
-    else:
-        cells[FAULTS] += 1
-        cells[BITS] += INTERMISSION
+    cells[FRAMES] += good
     for n in range(nodes.shape[0]):
         if nodes[n, ATTACHED] == 0:
             continue
@@ -661,22 +601,14 @@ def _complete(bus, out, count, nominal_ps):
         if good:
             nodes[n, SENT] += 1
             nodes[n, TEC] = max(nodes[n, TEC] - 1, 0)
-            _note_latency(bus, np.int64(bus.store[s]["identifier"]), end - slots[s, AT])
             _settle(bus, n)
         else:
             nodes[n, ERRORS] += 1
-            if outcome == NO_ACKNOWLEDGE:
-                nodes[n, UNACKNOWLEDGED] += 1
             # A passive node that only misses the acknowledge counts no further: a lone node never goes bus-off.
             if not (outcome == NO_ACKNOWLEDGE and nodes[n, STATE] == PASSIVE):
                 nodes[n, TEC] += 8
             off = _settle(bus, n)
-            if off:
-                final = 1
-            elif (bus.store[s]["flags"] & ONE_SHOT) != 0:
-                nodes[n, GIVEN_UP] += 1
-            else:
-                final = 0
+            final = 1 if off else 0
         if nodes[n, ATTACHED] == 0:
             final = 1
         count = _put(out, count, s, start, end, outcome, slots, final)
@@ -693,7 +625,7 @@ def _complete(bus, out, count, nominal_ps):
             nodes[n, SUSPENDED] = 0
             nodes[n, LEFT] = _RECOVERY
             nodes[n, QUIET] = cells[FREE]
-            nodes[n, RECOVERING] = nodes[n, AUTOMATIC]
+            nodes[n, RECOVERING] = 1
     cells[SENDERS] = 0
     return count
 
@@ -746,7 +678,7 @@ def advance(bus, until, out, nominal_ps, data_ps, chance):
             _rejoin(bus, until, run_ns)
             break
         _rejoin(bus, start, run_ns)
-        count = _begin(bus, start, out, count, nominal_ps, data_ps, chance)
+        _begin(bus, start, nominal_ps, data_ps, chance)
     cells[NOW] = until
     close_windows(cells, cells[START] if cells[SENDERS] > 0 else until)
     return count

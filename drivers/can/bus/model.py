@@ -21,7 +21,7 @@ import numpy as np
 
 from drivers.can.bus import frame as frames
 from drivers.can.bus import kernels
-from drivers.can.bus.results import OUTCOMES, RESULT, STATES, BusState, Delivery, Latency, NodeState
+from drivers.can.bus.results import OUTCOMES, RESULT, STATES, BusState, Delivery, NodeState
 from drivers.can.bus.timing import Speed, speed
 from rig.errors import InputError, Words
 
@@ -32,12 +32,11 @@ _COUNTERS = {
     "tec": kernels.TEC,
     "rec": kernels.REC,
     "queued": kernels.COUNT,
-    **{name: getattr(kernels, name.upper()) for name in (
-        "deepest", "sent", "errors", "unacknowledged", "dropped", "refused", "given_up", "outbid", "bus_offs",
-    )},
-}  # fmt: skip
+    **{name: getattr(kernels, name.upper()) for name in ("sent", "errors", "dropped", "refused", "bus_offs")},
+}
 """Column of each of a node's counters."""
-_LATENCIES = 1 << 14
+_WINDOW_NS = 100_000_000
+"""Length of the windows of the load."""
 _GROWTH = 1 << 10
 
 
@@ -57,8 +56,6 @@ class BusModel:
         rate: Bit rates, as `drivers.can.bus.timing.speed` takes them.
         error_rate: Chance of an error a bit.
         seed: Seed of these errors.
-        window_ns: Length of the windows of the load [ns].
-        start_ns: Time at which it starts [ns].
 
     One thread at a time may use it.
     """
@@ -69,22 +66,15 @@ class BusModel:
         *,
         error_rate: float = 0.0,
         seed: int = 0,
-        window_ns: int = 100_000_000,
-        start_ns: int = 0,
     ) -> None:
         """Start with an idle bus that has no nodes."""
-        if window_ns <= 0:
-            raise InputError("window_ns", "above zero", window_ns)
-        if not 0 <= start_ns < 1 << 61:
-            raise InputError("start_ns", "not negative and below 2 ** 61", start_ns)
+        if not 0.0 <= error_rate <= 1.0:
+            raise InputError("error_rate", "between 0 and 1", error_rate)
         self.speed = speed(rate)
         self._names: list[str] = []
         self._offers: list[np.ndarray] = []
         cells = np.zeros(kernels.CELLS, np.int64)
-        for cell in (kernels.NOW, kernels.FREE, kernels.WINDOW):
-            cells[cell] = start_ns
-        cells[kernels.WINDOW_LENGTH] = window_ns
-        self._start_ns = start_ns
+        cells[kernels.WINDOW_LENGTH] = _WINDOW_NS
         self._bus = kernels.Bus(
             cells=cells,
             nodes=np.zeros((0, kernels.NODE_COLUMNS), np.int64),
@@ -94,48 +84,24 @@ class BusModel:
             arrivals=np.zeros(0, np.int64),
             unused=np.zeros(0, np.int64),
             senders=np.zeros(0, np.int64),
-            latencies=np.zeros((_LATENCIES, 4), np.int64),
             random=np.array([seed & 0xFFFFFFFFFFFFFFFF], np.uint64),
         )
         self._results = np.zeros((0, kernels.RESULT_COLUMNS), np.int64)
-        self._error_rate = 0.0
-        self.error_rate = error_rate
+        self._error_rate = float(error_rate)
+        kernels.draw_gap(self._bus, self._error_rate)
 
     @property
     def now_ns(self) -> int:
         """Time up to which the bus was advanced [ns]."""
         return int(self._bus.cells[kernels.NOW])
 
-    @property
-    def error_rate(self) -> float:
-        """Chance of an error a bit of a frame."""
-        return self._error_rate
-
-    @error_rate.setter
-    def error_rate(self, chance: float) -> None:
-        if not 0.0 <= chance <= 1.0:
-            raise InputError("error_rate", "between 0 and 1", chance)
-        self._error_rate = float(chance)
-        kernels.draw_gap(self._bus, self._error_rate)
-
-    def attach(
-        self,
-        name: str = "",
-        *,
-        queue: int = 64,
-        fifo: bool = False,
-        listen_only: bool = False,
-        automatic_recovery: bool = True,
-    ) -> int:
-        """Add a node.
+    def attach(self, name: str = "", *, queue: int = 64, listen_only: bool = False) -> int:
+        """Add a node. It sends the highest priority first, as a controller with buffers compares them.
 
         Args:
             name: What to call it in messages.
             queue: Frames that can wait, the one on the wire with them; a frame beyond is dropped and counted.
-            fifo: Send in the order of offering. The default sends the highest priority first, as a controller with
-                buffers compares them; a first-in-first-out queue lets a frame of low priority hold up those behind it.
             listen_only: It sends nothing, not even acknowledges.
-            automatic_recovery: Whether it recovers from bus-off by itself, or only by `recover`.
 
         Returns:
             Its number.
@@ -160,9 +126,7 @@ class BusModel:
         row = bus.nodes[node]
         row[:] = 0
         row[kernels.ATTACHED] = 1
-        row[kernels.FIFO] = fifo
         row[kernels.LISTENING] = listen_only
-        row[kernels.AUTOMATIC] = automatic_recovery
         row[kernels.CAPACITY] = queue
         row[kernels.HEAD] = -1
         return node
@@ -181,47 +145,28 @@ class BusModel:
         row[kernels.RECOVERING] = 0
         row[kernels.ATTACHED] = 0
 
-    def offer(self, node: int, frame: frames.Frame, at_ns: int | None = None, *, one_shot: bool = False) -> None:
+    def offer(self, node: int, frame: frames.Frame, at_ns: int | None = None) -> None:
         """Hand a frame to a node's controller.
 
         Args:
             node: Number of the node.
             frame: The frame.
             at_ns: When [ns]; a time that has passed, or none, is now.
-            one_shot: Give it up when it loses an arbitration or meets an error.
         """
         if self._row(node)[kernels.LISTENING]:
             raise InputError("node", "one that may send", Words(f"{self._names[node]} (listen only)"))
         if frame.fd and not self.speed.fd:
             raise InputError("frame", f"classic on a bus of {self.speed}", frame)
-        time_ns = self.now_ns if at_ns is None else max(at_ns, self._start_ns)
-        record = frames.record_of(frame, node=node, time_ns=time_ns)
-        if one_shot:
-            record = record._replace(flags=record.flags | frames.ONE_SHOT)
+        record = frames.record_of(frame, node=node, time_ns=self.now_ns if at_ns is None else max(at_ns, 0))
         self.take(frames.packed([record], frames.FD_WIDTH))
 
-    def offer_records(self, offers: np.ndarray) -> None:
-        """`offer` for many frames.
+    def take(self, offers: np.ndarray) -> None:
+        """`offer` for many frames of which it is known that their node can send them.
 
         Args:
-            offers: Array of `drivers.can.bus.frame.RECORD`, best in the order of its times; `node` by whom, `time_ns`
-                when.
+            offers: Array of `drivers.can.bus.frame.RECORD`, which is kept, best in the order of its times; `node` by
+                whom, `time_ns` when.
         """
-        if not self.speed.fd and (offers["flags"] & frames.FD).any():
-            raise InputError("frame", f"classic on a bus of {self.speed}", Words("a CAN FD frame"))
-        offers = frames.check_records(offers)
-        nodes = offers["node"]
-        highest = int(nodes.max()) if len(nodes) else -1
-        if highest >= len(self._names):
-            raise InputError("node", "the number of a node of this bus", highest)
-        allowed = (self._bus.nodes[:, kernels.ATTACHED] != 0) & (self._bus.nodes[:, kernels.LISTENING] == 0)
-        if not allowed[nodes].all():
-            raise InputError("node", "attached and not listen only", int(nodes[~allowed[nodes]][0]))
-        # The caller may write to its array again before the next step.
-        self.take(offers.copy())
-
-    def take(self, offers: np.ndarray) -> None:
-        """`offer_records` for frames of which it is known that their node can send them; keeps the array."""
         self._offers.append(offers.view(frames.RECORD))
 
     def advance(self, until_ns: int) -> list[Delivery]:
@@ -287,14 +232,6 @@ class BusModel:
         row[kernels.DISTURBED] = count
         row[kernels.DISTURBED_BIT] = bit
 
-    def recover(self, node: int) -> None:
-        """Ask a node that is bus-off to join again; it does after 128 runs of 11 recessive bits from now."""
-        row = self._row(node)
-        if row[kernels.STATE] == kernels.OFF and not row[kernels.RECOVERING]:
-            row[kernels.RECOVERING] = 1
-            row[kernels.LEFT] = 128
-            row[kernels.QUIET] = max(self.now_ns, int(self._bus.cells[kernels.FREE]))
-
     def node(self, node: int) -> NodeState:
         """A node's counters, also when it has gone."""
         row = self._row(node, gone=True)
@@ -304,30 +241,13 @@ class BusModel:
     def state(self) -> BusState:
         """The bus as a whole."""
         cells = self._bus.cells
-        passed = max(self.now_ns - self._start_ns, int(cells[kernels.FREE]) - self._start_ns, 1)
-        window = int(cells[kernels.WINDOW_LENGTH])
+        passed = max(self.now_ns, int(cells[kernels.FREE]), 1)
         return BusState(
             now_ns=self.now_ns,
             load=int(cells[kernels.BUSY]) / passed,
-            window_load=int(cells[kernels.WINDOW_LAST]) / window,
-            peak_load=int(cells[kernels.WINDOW_PEAK]) / window,
+            window_load=int(cells[kernels.WINDOW_LAST]) / _WINDOW_NS,
             frames=int(cells[kernels.FRAMES]),
-            bits=int(cells[kernels.BITS]),
-            errors=int(cells[kernels.FAULTS]),
         )
-
-    def latencies(self) -> dict[tuple[int, bool], Latency]:
-        """Latencies by identifier and whether it is extended; of the first 15000 or so identifiers."""
-        table = self._bus.latencies
-        result: dict[tuple[int, bool], Latency] = {}
-        for word, count, total, worst in table[table[:, kernels.LATENCY_COUNT] > 0].tolist():
-            key = (word & frames.EXTENDED_MASK, word & frames.EXTENDED != 0)
-            if key in result:  # A remote frame beside a data frame with the same identifier.
-                other = result[key]
-                total += round(other.mean_s * other.count * 1e9)
-                count, worst = count + other.count, max(worst, round(other.worst_s * 1e9))
-            result[key] = Latency(count, total / count * 1e-9, worst * 1e-9)
-        return dict(sorted(result.items()))
 
     def _row(self, node: int, *, gone: bool = False) -> np.ndarray:
         if not 0 <= node < len(self._names) or not (gone or self._bus.nodes[node, kernels.ATTACHED]):

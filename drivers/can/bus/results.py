@@ -1,4 +1,4 @@
-"""What a bus tells of itself: what happened to each frame, how its nodes are, its load and latencies."""
+"""What a bus tells of itself: what happened to each frame, how its nodes are, and its load."""
 
 from __future__ import annotations
 
@@ -63,14 +63,10 @@ class NodeState:
         tec: Transmit error counter.
         rec: Receive error counter.
         queued: Frames waiting.
-        deepest: Most frames that ever waited.
         sent: Frames sent.
         errors: Attempts that ended in an error.
-        unacknowledged: Those of them for want of an acknowledge.
         dropped: Frames that found the queue full.
         refused: Frames lost because the node was or went bus-off.
-        given_up: One-shot frames given up.
-        outbid: Arbitrations lost.
         bus_offs: How often it went bus-off.
     """
 
@@ -78,14 +74,10 @@ class NodeState:
     tec: int
     rec: int
     queued: int
-    deepest: int
     sent: int
     errors: int
-    unacknowledged: int
     dropped: int
     refused: int
-    given_up: int
-    outbid: int
     bus_offs: int
 
 
@@ -97,31 +89,10 @@ class BusState:
         now_ns: Time [ns].
         load: Share of the time that it was taken, intermissions and errors with it.
         window_load: The same in the last window that has ended.
-        peak_load: The highest of any window that has ended.
         frames: Frames sent.
-        bits: Bits on the wire, intermissions with them.
-        errors: Transmissions that ended in an error.
     """
 
     now_ns: int
     load: float
     window_load: float
-    peak_load: float
     frames: int
-    bits: int
-    errors: int
-
-
-@dataclass(frozen=True, slots=True)
-class Latency:
-    """Time from offer to end of frame, of all frames with one identifier.
-
-    Attributes:
-        count: Frames sent.
-        mean_s: Mean [s].
-        worst_s: Longest [s].
-    """
-
-    count: int
-    mean_s: float
-    worst_s: float

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from drivers.can.bus import frame as frames
 from rig.errors import InputError
 
@@ -52,11 +50,6 @@ class Speed(NamedTuple):
     def duration(self, frame: frames.Frame) -> float:
         """Time that a frame takes on the bus, with its intermission [s]."""
         return self.duration_ns(*frames.frame_bits(frame)) * 1e-9
-
-    def durations(self, array: np.ndarray) -> np.ndarray:
-        """`duration` for an array of `drivers.can.bus.frame.RECORD` [s], shape (frames,)."""
-        nominal, fast = frames.bits_of(array)
-        return (nominal * self.nominal_ps + fast * self.data_ps) * 1e-12
 
     def __str__(self) -> str:
         """The text that `speed` reads."""

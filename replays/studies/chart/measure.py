@@ -46,25 +46,28 @@ class Budget(NamedTuple):
 class Run:
     """What a method made of a problem."""
 
-    states: np.ndarray
-    """At the problem's instants, nan from where it stopped, shape (n, 14)."""
+    solution: Solution
+    """Of an engine of ours each contact began, to a frame, at an unknown speed."""
     costs: list[float]
     """Processor time of each run [s]: other load on the machine does not count."""
-    contacts: int
-    steps: int
-    evaluations: int
     reached_s: float
     """Simulated time that was got through [s]."""
-    failure: str = ""
-    """Kind: "", nan, hammer, budget, error, contacts or branch."""
-    message: str = ""
-    compile_s: float = 0.0
     own_costs: list[float] = field(default_factory=list)
     """Of the same runs, processor time inside the library's own calls [s], where a Python loop drives it."""
     energy_residual: float | None = None
     worst_frame_s: float | None = None
-    onsets: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """Times at which contacts began, to a frame [s]."""
+
+    @property
+    def failure(self) -> str:
+        """Kind: "", nan, hammer, budget or error."""
+        words = self.solution.failure or ""
+        kinds = {
+            "": not words,
+            "hammer": words == MISSED_HAMMER,
+            "budget": words.startswith(("over the budget", "more than")),
+            "nan": "not finite" in words,
+        }
+        return next((kind for kind, holds in kinds.items() if holds), "error")
 
 
 def run_engine(name: str, setting: Setting, problem: Problem, budget: Budget) -> Run:
@@ -77,39 +80,27 @@ def run_engine(name: str, setting: Setting, problem: Problem, budget: Budget) ->
 
     def begin() -> Course:
         return Course(
-            name, problem.constants, problem.inputs, problem.y0, step=setting.step_us, tolerance=setting.tolerance,
-            tick=problem.start_tick,
-        )  # fmt: skip
+            name, problem.constants, problem.inputs, problem.y0, step=setting.step_us, tolerance=setting.tolerance
+        )
 
     rows = np.full((n + 1, N_ROW), np.nan)
     clock = time.perf_counter()
     begin().advance(1, 1, rows[:1])
     compile_s = time.perf_counter() - clock
     frames = _by_frame(begin, rows, stride, budget)
-    course, costs, failure = frames.course, [frames.cpu_s], frames.failure
-    states = rows[:, :N_STATE].copy()
-    if not failure:
-        costs = _in_one_go(begin, n, stride, budget)
-    residual = None
-    if not failure and not np.isfinite(states).all():
-        failure = "the state is not finite"
-    if not failure:
+    solution = Solution(times, budget.solve_s, compile_s, failure=frames.failure or None)
+    solution.states[:] = rows[:, :N_STATE]
+    solution.steps, solution.evaluations = (int(frames.course.memory[name]) for name in (STEPS, EVALUATIONS))
+    began = np.repeat(times, np.diff(frames.counts, prepend=0.0).clip(0).astype(int))
+    solution.onsets = [(time_s, np.nan) for time_s in began.tolist()]
+    done = Run(solution, [frames.cpu_s], float(times[frames.reached]))
+    if not done.failure:
+        done.costs = _in_one_go(begin, n, stride, budget)
+    if solution.close().failure is None:
         balance = energy_balance(rows, rows[0])
-        residual = float(np.max(np.abs(balance["residual"])) / max(float(balance["dissipated"][-1]), 1e-6))
-    return Run(
-        states=states,
-        costs=costs,
-        contacts=int(course.memory[CONTACTS]),
-        steps=int(course.memory[STEPS]),
-        evaluations=int(course.memory[EVALUATIONS]),
-        reached_s=float(times[frames.reached]),
-        failure=_kind_of(failure),
-        message=failure,
-        compile_s=compile_s,
-        energy_residual=residual,
-        worst_frame_s=None if failure else float(frames.best_s.max()),
-        onsets=np.repeat(times, np.diff(frames.counts, prepend=0.0).clip(0).astype(int)),
-    )
+        done.energy_residual = float(np.max(np.abs(balance["residual"])) / max(float(balance["dissipated"][-1]), 1e-6))
+        done.worst_frame_s = float(frames.best_s.max())
+    return done
 
 
 class _Frames(NamedTuple):
@@ -149,7 +140,7 @@ def _by_frame(begin: Callable[[], Course], rows: np.ndarray, stride: int, budget
             spent[i] = after - before
             counts[i + 1] = course.memory[CONTACTS]
             if after - begun > budget.solve_s:
-                rows[i + 1 :] = np.nan
+                rows[i + 1 :], counts[i + 2 :] = np.nan, counts[i + 1]
                 cpu_s = time.thread_time() - begun_cpu
                 return _Frames(course, counts, best, cpu_s, i + 1, f"over the budget of {budget.solve_s:g} s")
         cpu_s = time.thread_time() - begun_cpu
@@ -172,27 +163,16 @@ def _in_one_go(begin: Callable[[], Course], frames: int, stride: int, budget: Bu
     return costs
 
 
-def _kind_of(failure: str) -> str:
-    """The kind of a failure that is given in words."""
-    kinds = {
-        "": not failure,
-        "hammer": failure == MISSED_HAMMER,
-        "budget": failure.startswith(("over the budget", "more than")),
-        "nan": "not finite" in failure,
-    }
-    return next((kind for kind, holds in kinds.items() if holds), "error")
-
-
 def run_peer(name: str, setting: Setting, problem: Problem, budget: Budget) -> Run:
     """Run a peer; the first run counts only where it is long, as it may load what the others find loaded."""
-    peer, compile_s = PEERS[name], 0.0
     costs: list[float] = []
     own_costs: list[float] = []
     solution: Solution | None = None
     while solution is None or len(costs) < budget.runs:
         fresh = solution is None
-        solution = peer.solve(problem, setting, budget_s=budget.solve_s)
-        compile_s = max(compile_s, solution.compile_s)
+        compile_s = 0.0 if solution is None else solution.compile_s
+        solution = PEERS[name].solve(problem, setting, budget_s=budget.solve_s)
+        solution.compile_s = max(compile_s, solution.compile_s)
         if not fresh or solution.failure is not None or solution.cpu_s > 0.2 or solution.cpu_s > budget.single_s:
             costs.append(solution.cpu_s)
             own_costs += [solution.own_s] if solution.own_s else []
@@ -200,20 +180,7 @@ def run_peer(name: str, setting: Setting, problem: Problem, budget: Budget) -> R
             break
     good: np.ndarray = np.isfinite(solution.states.sum(axis=1))
     reached = len(good) if good.all() else int(np.argmin(good))
-    message = solution.failure or ""
-    return Run(
-        states=solution.states,
-        costs=costs,
-        contacts=solution.contacts,
-        steps=solution.steps,
-        evaluations=solution.evaluations,
-        reached_s=float(problem.times[max(reached - 1, 0)]),
-        failure=_kind_of(message),
-        message=message,
-        compile_s=compile_s,
-        own_costs=own_costs,
-        onsets=np.array([time_s for time_s, _ in solution.onsets]),
-    )
+    return Run(solution, costs, float(problem.times[max(reached - 1, 0)]), own_costs)
 
 
 def run(contender: Competitor, setting: Setting, problem: Problem, budget: Budget) -> Run:
@@ -226,13 +193,13 @@ def point(
 ) -> dict[str, Any]:
     """Measure a point with a pointwise error, as columns of the store."""
     done = run(contender, setting, problem, budget)
-    wanted = reference.solution.contacts
-    error = scaled_error(done.states, reference.solution.states) if not done.failure else None
-    failure, message = done.failure, done.message
+    contacts, wanted = done.solution.contacts, reference.solution.contacts
+    error = scaled_error(done.solution.states, reference.solution.states) if not done.failure else None
+    failure, message = done.failure, done.solution.failure or ""
     if error is not None and error > OFF:
         failure, message = "branch", f"scaled error {error:.2g}: another branch of the motion"
-    elif error is not None and abs(done.contacts - wanted) > max(_SLACK, _SLACK_SHARE * wanted):
-        failure, message = "contacts", f"{done.contacts} contacts instead of {wanted}"
+    elif error is not None and abs(contacts - wanted) > max(_SLACK, _SLACK_SHARE * wanted):
+        failure, message = "contacts", f"{contacts} contacts instead of {wanted}"
     return {
         **_cost(done, problem),
         "error": error,
@@ -252,11 +219,12 @@ def statistics_point(
 ) -> dict[str, Any]:
     """Measure a point of chaotic motion: means over blocks of time, with 95 % bootstrap bars."""
     done = run(contender, setting, problem, budget)
-    columns: dict[str, Any] = {**_cost(done, problem), "failure": done.failure, "message": done.message}
+    columns: dict[str, Any] = {**_cost(done, problem), "failure": done.failure, "message": done.solution.failure or ""}
     if done.failure:
         return columns
-    force = elastic_forces(problem, done.states)
-    for name, (mean, low, high) in block_statistics(problem.times, force, done.onsets, settle_s=settle_s).items():
+    force = elastic_forces(problem, done.solution.states)
+    onsets = np.array([time_s for time_s, _ in done.solution.onsets])
+    for name, (mean, low, high) in block_statistics(problem.times, force, onsets, settle_s=settle_s).items():
         columns |= {name: mean, f"{name}_low": low, f"{name}_high": high}
     return columns
 
@@ -327,11 +295,11 @@ def _cost(done: Run, problem: Problem) -> dict[str, Any]:
         "speed": done.reached_s / cost,
         "speed_min": done.reached_s / max(costs),
         "speed_max": done.reached_s / min(costs),
-        "compile_s": done.compile_s,
+        "compile_s": done.solution.compile_s,
         "own_cpu_s": statistics.median(done.own_costs) if done.own_costs else None,
-        "steps": done.steps,
-        "evaluations": done.evaluations,
-        "contacts": done.contacts,
+        "steps": done.solution.steps,
+        "evaluations": done.solution.evaluations,
+        "contacts": done.solution.contacts,
         "energy_residual": done.energy_residual,
         "worst_frame_ms": None if done.worst_frame_s is None else done.worst_frame_s * 1e3,
     }

@@ -67,6 +67,5 @@ def _peer(name: str) -> Competitor:
     # The coarsest, one in the middle, and the finest that is worth its time.
     picks = sorted({0, len(peer.ladder) // 2, max(len(peer.ladder) - 2, 0)})
     quick = tuple(peer.ladder[i] for i in picks[:_QUICK_PEERS])
-    title = peer.title + (", as installed" if peer.build == "as installed" and "Python" in peer.title else "")
-    title = title.replace(", plain Python, as installed", ", as installed")
+    title = peer.title.replace(", plain Python", ", as installed")
     return Competitor(name, title, peer.family, peer.ladder, quick, peer.known_failure)

@@ -166,5 +166,5 @@ def problem_of(
         sample_s=FRAME_S if panel != RUB else RUB_SAMPLE_S,
         friction=friction_of(panel, case),
         smoothing_speed=smoothing_speed,
-        memory=case != "no memory",
+        **{"damping_factor": 0.0} if case == "no memory" else {},
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -141,12 +141,11 @@ def draw_again(folder: Path, *, only: str | None = None, panels: list[str] | Non
 def own_reference(problem: Problem) -> Reference | None:
     """Where no second peer is installed: scipy's DOP853 and our rk8, which share the equations but not the code."""
     first = PEERS["scipy-dop853"].solve(problem, Setting("1e-13", 1e-13), budget_s=300.0)
-    second = run_engine("rk8", Setting("1e-12", 1e-12, step_us=25), problem, Budget(300.0, 1))
-    if first.failure is not None or second.failure:
+    second = run_engine("rk8", Setting("1e-12", 1e-12, step_us=25), problem, Budget(300.0, 1)).solution
+    if first.failure is not None or second.failure is not None:
         return None
     error = scaled_error(first.states, second.states)
-    other = replace(first, states=second.states, contacts=second.contacts)
-    return Reference(first, other, ("scipy-dop853", "rk8"), error, independent=False)
+    return Reference(first, ("scipy-dop853", "rk8"), error, (first.compile_s, second.compile_s), independent=False)
 
 
 @dataclass
@@ -190,8 +189,8 @@ class _Work:
     def solve(self, problem: Problem) -> Reference | None:
         reference = find_reference(problem, quick=self.mode == "quick") or own_reference(problem)
         if reference is not None:
-            for name, solution in zip(reference.names, (reference.solution, reference.second), strict=True):
-                self.compiling(PEERS[name].family if name in PEERS else OURS, solution.compile_s, again=False)
+            for name, seconds in zip(reference.names, reference.compile_s, strict=True):
+                self.compiling(PEERS[name].family if name in PEERS else OURS, seconds, again=False)
         return reference
 
     def keep(self, row: Row, columns: Row) -> None:
@@ -238,8 +237,9 @@ def _measure(work: _Work, panels: list[str], only: str | None, outcome: Outcome,
 
 def _references(work: _Work, panel: str, phase: str, case: str) -> None:
     """The reference and, on the exact panel, how far the smoothed laws are from it."""
-    base = {"mode": work.mode, "panel": panel, "phase": phase, "case": case or "exact", "family": "reference"}
-    if work.store.has((work.mode, panel, phase, case or "exact", "reference", "")):
+    own = {"mode": work.mode, "panel": panel, "phase": phase, "case": case or "exact", "family": "reference"}
+    own |= {"method": "reference", "rung": ""}
+    if work.store.has(own):
         return
     reference = work.reference(panel, phase, case)
     if reference is None:
@@ -256,17 +256,17 @@ def _references(work: _Work, panel: str, phase: str, case: str) -> None:
         if smooth is not None:
             distance = scaled_error(smooth.solution.states, reference.solution.states)
             work.store.add(
-                {**base, "case": "floor", "method": "floor", "rung": f"v_s = {speed * 1e3:g} mm/s", "error": distance,
+                {**own, "case": "floor", "method": "floor", "rung": f"v_s = {speed * 1e3:g} mm/s", "error": distance,
                  "smoothing_speed": speed, "reference_error": smooth.error}
             )  # fmt: skip
-    work.store.add({**base, "method": "reference", **columns})
+    work.store.add(own | columns)
 
 
 def _point(work: _Work, task: Task, outcome: Outcome, progress: Progress, deadline: float) -> None:
     contender = work.contenders[task.method]
     progress.step(f"{task.panel}, {task.phase}: {contender.title}, {task.setting.label}")
     row = work.base(task.panel, task.phase, task.case, contender, task.setting)
-    if work.store.has((work.mode, task.panel, task.phase, task.case, task.method, task.setting.label)):
+    if work.store.has(row):
         outcome.resumed += 1
         return
     if time.perf_counter() > deadline + work.compile_s:
@@ -297,8 +297,10 @@ def _profile(work: _Work, scenes: int, outcome: Outcome, progress: Progress, dea
     for seed in range(scenes):
         progress.step(f"profile, scene {seed + 1} of {scenes}")
         scene = f"scene-{seed:03d}"
-        keys = {one.name: (work.mode, "profile", scene, "", one.name) for one in rivals}
-        waiting = [one for one in rivals if not work.store.has((*keys[one.name], "cheapest"))]
+        # The setting found is no part of the key: a scene and a method are one point.
+        own = {"friction": "exact", "rung": "cheapest"}
+        rows = [(one, work.base("profile", scene, "", one, None) | own) for one in rivals]
+        waiting = [(one, row) for one, row in rows if not work.store.has(row)]
         if not waiting:
             outcome.resumed += 1
             continue
@@ -309,15 +311,12 @@ def _profile(work: _Work, scenes: int, outcome: Outcome, progress: Progress, dea
         reference = work.solve(problem)
         # A chaotic draw has no pointwise reference: its row says so, and it counts for nobody.
         blunt = reference is None or reference.error > profile.SHARP * profile.TARGET
-        for one in waiting:
-            row = {**work.base("profile", scene, "", one, None), "friction": "exact"}
+        for one, row in waiting:
             if reference is None or blunt:
                 columns: Row = {"failure": "reference", "message": "no reference sharp enough: a chaotic draw",
                                 "reference_error": None if reference is None else reference.error}  # fmt: skip
             else:
                 columns = profile.cheapest(one, problem, reference, budget)
-            # The setting found is no part of the key: a scene and a method are one point.
-            found = columns.pop("rung", "")
-            message = columns.get("message") or f"cheapest setting {found}"
+            message = columns.get("message") or f"cheapest setting {columns.get('rung', '')}"
             work.keep(row, {**columns, "rung": "cheapest", "message": message})
             outcome.measured += 1

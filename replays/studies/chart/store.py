@@ -51,11 +51,11 @@ class Store:
         self.stamp = stamp()
         self._journal = Journal(folder, "chart.journal.jsonl", self.stamp["code"], fresh=fresh)
         self.outdated = self._journal.outdated
-        self._rows = {tuple(row[name] for name in KEY): row for row in self._journal.rows}
+        self._rows = {_key(row): row for row in self._journal.rows}
 
-    def has(self, key: tuple[Any, ...]) -> bool:
-        """Whether a point has been measured."""
-        return key in self._rows
+    def has(self, row: Row) -> bool:
+        """Whether the point of a row has been measured."""
+        return _key(row) in self._rows
 
     def rows(self, mode: str) -> list[Row]:
         """All points of a mode."""
@@ -69,7 +69,7 @@ class Store:
             if isinstance(value, float) and not math.isfinite(value):
                 whole[name] = None
         self._journal.add(whole)
-        self._rows[tuple(whole[name] for name in KEY)] = whole
+        self._rows[_key(whole)] = whole
 
     def write(self, mode: str) -> list[Path]:
         """Write the points of a mode as Parquet and CSV."""
@@ -90,6 +90,10 @@ class Store:
         pyarrow.parquet.write_table(table, paths[0])
         pyarrow.csv.write_csv(table, paths[1], pyarrow.csv.WriteOptions(quoting_style="needed"))
         return paths
+
+
+def _key(row: Row) -> tuple[Any, ...]:
+    return tuple(row[name] for name in KEY)
 
 
 def _digits(value: float) -> float:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from replays.studies.ladder.quantity import QUANTITIES, Ending, Trace, Value, ending, slides
-from replays.studies.run import bare_sensors, run_scene
+from replays.studies.run import Timed, bare_sensors, run_scene
 from rig.engines import ENGINES
 from rig.errors import InputError, SimulationError
 from rig.kernels.signals import COLUMN
@@ -149,15 +149,8 @@ def measure(
     trace, health = None, {}
     try:
         while len(spent) < runs and (not spent or sum(spent) < _ENOUGH_S):
-            simulation = Simulation(placed)
-            _ = simulation.first_row
             first = trace is None
-            # Short blocks, which cost, where a stall has to be noticed; long ones where time is measured.
-            blocks = max(1, (GRID_TICKS if first else 100_000) // simulation.block_ticks)
-            every = max(1, GRID_TICKS // simulation.row_ticks)
-            done = run_scene(
-                simulation, block_ticks=blocks * simulation.block_ticks, every=every, keep=first, limit_s=limit_s
-            )
+            simulation, done = _run(placed, limit_s, first=first)
             if not first or runs == 1:
                 spent.append(done.cpu_s)
             if first:
@@ -198,17 +191,21 @@ def saving(
     spent: list[list[float]] = []
     total_s = 0.0
     while total_s < (_ENOUGH_S if len(spent) < runs else _LEAST_S):
-        turn = []
-        for each in placed:
-            simulation = Simulation(each)
-            _ = simulation.first_row
-            blocks = max(1, 100_000 // simulation.block_ticks)
-            done = run_scene(simulation, block_ticks=blocks * simulation.block_ticks, keep=False, limit_s=limit_s)
-            turn.append(done.cpu_s)
+        turn = [_run(each, limit_s)[1].cpu_s for each in placed]
         spent.append(turn)
         total_s += sum(turn)
     medians = np.median(spent, axis=0)
     return float(1.0 - medians[0] / medians[1])
+
+
+def _run(placed: Scene, limit_s: float, *, first: bool = False) -> tuple[Simulation, Timed]:
+    """Run a scene: at first in short blocks, which cost, to notice a stall, and with its rows; else for the time."""
+    simulation = Simulation(placed)
+    _ = simulation.first_row
+    blocks = max(1, (GRID_TICKS if first else 100_000) // simulation.block_ticks)
+    every = max(1, GRID_TICKS // simulation.row_ticks)
+    ticks = blocks * simulation.block_ticks
+    return simulation, run_scene(simulation, block_ticks=ticks, every=every, keep=first, limit_s=limit_s)
 
 
 def _trace(

@@ -50,41 +50,25 @@ def with_pick(text: str, pick: Pick) -> str:
     Raises:
         InputError: Something else than the table would change.
     """
-    end = "\r\n" if "\r\n" in text else "\n"
-    lines = text.splitlines()
-    kept: list[str] = []
-    place: int | None = None
-    inside = False
-    trailing: list[str] = []
-    for line in lines:
-        header = _HEADER.match(line)
-        if header:
+    tables: list[tuple[str, list[str]]] = [("", [])]
+    for line in text.splitlines():
+        if header := _HEADER.match(line):
             name = header["name"].split(".")[0].strip().strip("\"'")
-            if inside and name != "pick":
-                # Comments and blank lines before the next header are that table's.
-                kept += trailing
-            inside = name == "pick"
-            trailing = []
-            if inside and place is None:
-                place = len(kept)
-        if not inside:
-            kept.append(line)
-        elif not line.strip() or (line.lstrip().startswith("#") and line.strip() != _COMMENT):
-            trailing.append(line)
-        else:
-            trailing = []
-    if inside:
-        kept += [line for line in trailing if line.strip()]
-    table = pick_table(pick).splitlines()
-    if place is None:
-        place = len(kept)
-    before, after = kept[:place], kept[place:]
-    while before and not before[-1].strip():
-        before.pop()
-    while after and not after[0].strip():
-        after.pop(0)
-    joined = [*before, "", *table, *([""] if after else []), *after]
-    new = end.join(joined) + end
+            tables += [(name, [])] if name != tables[-1][0] else []
+        tables[-1][1].append(line)
+    before: list[str] = []
+    after: list[str] = []
+    kept = before
+    for name, lines in tables:
+        if name == "pick":
+            # Comments and blank lines behind its last entry are the next table's.
+            last = max(n for n, line in enumerate(lines) if not _is_loose(line))
+            kept, lines = after, lines[last + 1 :]
+        kept += lines
+    parts = ["\n".join(before).rstrip("\n"), pick_table(pick).rstrip("\n"), "\n".join(after).lstrip("\n")]
+    if tables[-1][0] == "pick":
+        parts[-1] = parts[-1].rstrip("\n")
+    new = ("\n\n".join(part for part in parts if part) + "\n").replace("\n", "\r\n" if "\r\n" in text else "\n")
     old_data = tomllib.loads(text)
     old_data.pop("pick", None)
     try:
@@ -94,6 +78,10 @@ def with_pick(text: str, pick: Pick) -> str:
     if new_data.pop("pick", None) is None or old_data != new_data:
         raise InputError("--write", "a file whose [pick] stands in a table of its own", Words("text that hides it"))
     return new
+
+
+def _is_loose(line: str) -> bool:
+    return not line.strip() or (line.lstrip().startswith("#") and line.strip() != _COMMENT)
 
 
 def pick_table(pick: Pick) -> str:

@@ -16,16 +16,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from replays.studies.peers.problem import ERROR_COLUMNS, ERROR_SCALE, Problem, scaled_error
-from replays.studies.peers.solution import Journal, Manner, Setting, Solution
+from replays.studies.peers.solution import PROPER, Manner, Setting, Solution
 from rig.errors import InputError, Words
 
 __all__ = [
-    "ERROR_COLUMNS", "ERROR_SCALE", "PEERS", "Peer", "Problem", "Setting", "Solution", "scaled_error",
+    "ERROR_COLUMNS", "ERROR_SCALE", "PEERS", "Library", "Peer", "Problem", "Setting", "Solution", "scaled_error",
 ]  # fmt: skip
 
 
@@ -35,7 +35,21 @@ def _ladder(*tolerances: float) -> tuple[Setting, ...]:
 
 ODE15S = Setting("ode15s's defaults", 1e-3, 1e-6)
 """Relative 1e-3 and absolute 1e-6 in every SI unit, as MATLAB's ode15s has them by default."""
-_CVODE = _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10)
+_USUAL = _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10)
+_FINE = (*_USUAL, *_ladder(1e-12))
+_LATE = _ladder(1e-3, 1e-4, 1e-6, 1e-8)
+"""Of those without events, which no tolerance helps."""
+
+
+class Library(NamedTuple):
+    """Where a solver comes from."""
+
+    name: str
+    """Its name in a legend."""
+    file: str
+    """Module of this package that drives it."""
+    module: str = ""
+    """Python module that must be installed; empty where the rig itself needs it anyway."""
 
 
 @dataclass(frozen=True)
@@ -45,46 +59,48 @@ class Peer:
     Attributes:
         name: Its name here.
         title: Its name for a legend.
-        family: Library it comes from.
-        order: Order of the method in words.
-        build: How the right-hand side is called.
+        library: Where it comes from.
         ladder: Tolerances to chart, the coarsest first; of MuJoCo, its steps.
-        file: Module of this package that drives it.
-        known_failure: Why it is expected to fail or to mislead; empty for a peer in good order.
-        exact_friction: Whether it takes problems with Coulomb's set-valued law.
-        module: Python module that must be installed; empty where the rig itself needs it anyway.
-        options: What that module's `solve` is given beside the problem.
+        options: What the driving module's `solve` is given beside the problem and its manner.
+        manner: How it is driven.
+        model_failure: Why its very model is expected to mislead; empty for a peer that has the rig's.
     """
 
     name: str
     title: str
-    family: str
-    order: str
-    build: Literal["compiled", "as installed"]
+    library: Library
     ladder: tuple[Setting, ...]
-    file: str
-    known_failure: str = ""
-    exact_friction: bool = True
-    module: str = ""
     options: dict[str, Any] = field(default_factory=dict)
+    manner: Manner = PROPER
+    model_failure: str = ""
+
+    @property
+    def family(self) -> str:
+        """Library it comes from, by name."""
+        return self.library.name
+
+    @property
+    def module(self) -> str:
+        """Python module that must be installed; empty where there is none."""
+        return self.library.module
+
+    @property
+    def known_failure(self) -> str:
+        """Why it is expected to fail or to mislead; empty for a peer in good order."""
+        if not self.manner.stops:
+            return "no stop at the hammer's corners: may step over the pulse"
+        late = "" if self.manner.events else "no events: the impact speed is latched at a step's end"
+        return self.model_failure or late
+
+    @property
+    def exact_friction(self) -> bool:
+        """Whether it takes problems with Coulomb's set-valued law."""
+        return self.manner.events and not self.manner.plain
 
     @property
     def installed(self) -> bool:
         """Whether its library is there."""
         return not self.module or find_spec(self.module) is not None
-
-    def require(self) -> None:
-        """Check that its library is there.
-
-        Raises:
-            InputError: It is not; the message names the extra that brings it.
-        """
-        if not self.installed:
-            raise InputError(
-                "peer",
-                f"installed ({self.name} needs {self.module}: pip install 'rotor-stator-rig[peers]')",
-                Words("missing"),
-            )
 
     def solve(self, problem: Problem, setting: Setting | None = None, *, budget_s: float = 60.0) -> Solution:
         """Solve a problem.
@@ -98,102 +114,58 @@ class Peer:
             The solution; its `failure` tells what went wrong.
 
         Raises:
-            InputError: Its library is not installed.
+            InputError: Its library is not installed; the message names the extra that brings it.
         """
-        self.require()
+        if not self.installed:
+            must = f"installed ({self.name} needs {self.module}: pip install 'rotor-stator-rig[peers]')"
+            raise InputError("peer", must, Words("missing"))
         setting = setting or self.ladder[len(self.ladder) // 2]
-        begun = Journal(problem.times, budget_s)
+        begun = Solution(problem.times, budget_s)
         try:
-            solver = import_module(f"replays.studies.peers.{self.file}")
+            solver = import_module(f"replays.studies.peers.{self.library.file}")
+            options = self.options if self.manner is PROPER else {**self.options, "manner": self.manner}
             with np.errstate(all="ignore"):  # trial steps that overflow are the solver's own affair
-                return solver.solve(problem, setting=setting, budget_s=budget_s, **self.options)
+                return solver.solve(problem, setting=setting, budget_s=budget_s, **options)
         except Exception as error:  # whatever a foreign library raises is a result on the chart
             begun.failure = f"{type(error).__name__}: {error}"
             return begun.close()
 
 
 _PLAIN, _UNSTOPPED, _EVENTLESS = Manner(plain=True), Manner(stops=False), Manner(events=False)
-_NO_STOPS = "no stop at the hammer's corners: may step over the pulse"
-_NO_EVENTS = "no events: the impact speed is latched at a step's end"
+_SCIPY, _SUNDIALS = Library("scipy", "scipy_solvers"), Library("SUNDIALS", "cvode", "sksundae")
+_BDF, _DOP853 = {"method": "BDF"}, {"method": "DOP853"}
+_CVODE_ADAMS, _CVODE_BDF = {"method": 1}, {"method": 2}
+_MUJOCO = "another contact law and a polygon for the ring: the error is the model's"
 
 _ALL = (
+    Peer("scipy-bdf", "scipy BDF + events", _SCIPY, (ODE15S, *_ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)), _BDF),
     Peer(
-        "scipy-bdf", "scipy BDF + events", "scipy", "1 to 5", "compiled",
-        (ODE15S, *_ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)), "scipy_solvers", options={"method": "BDF"},
+        "scipy-radau", "scipy Radau + events", _SCIPY, _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8), {"method": "Radau"}
     ),
+    Peer("scipy-lsoda", "scipy LSODA + events", _SCIPY, _USUAL, {"method": "LSODA"}),
+    Peer("scipy-dop853", "scipy DOP853 + events", _SCIPY, _FINE, _DOP853),
+    Peer("scipy-bdf-python", "scipy BDF + events, plain Python", _SCIPY, (ODE15S, *_ladder(1e-4, 1e-6)), _BDF, _PLAIN),
     Peer(
-        "scipy-radau", "scipy Radau + events", "scipy", "5", "compiled",
-        _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8), "scipy_solvers", options={"method": "Radau"},
+        "scipy-bdf-no-stops", "scipy BDF + events, no stops", _SCIPY, (ODE15S, *_ladder(1e-3, 1e-4, 1e-6)), _BDF,
+        _UNSTOPPED,
     ),
-    Peer(
-        "scipy-lsoda", "scipy LSODA + events", "scipy", "1 to 12", "compiled",
-        _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10), "scipy_solvers", options={"method": "LSODA"},
-    ),
-    Peer(
-        "scipy-dop853", "scipy DOP853 + events", "scipy", "8", "compiled",
-        _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10, 1e-12), "scipy_solvers", options={"method": "DOP853"},
-    ),
-    Peer(
-        "scipy-bdf-python", "scipy BDF + events, plain Python", "scipy", "1 to 5", "as installed",
-        (ODE15S, *_ladder(1e-4, 1e-6)), "scipy_solvers", exact_friction=False,
-        options={"method": "BDF", "manner": _PLAIN},
-    ),
-    Peer(
-        "scipy-bdf-no-stops", "scipy BDF + events, no stops", "scipy", "1 to 5", "compiled",
-        (ODE15S, *_ladder(1e-3, 1e-4, 1e-6)), "scipy_solvers", known_failure=_NO_STOPS,
-        options={"method": "BDF", "manner": _UNSTOPPED},
-    ),
-    Peer(
-        "scipy-bdf-no-events", "scipy BDF, no events", "scipy", "1 to 5", "compiled",
-        (ODE15S, *_ladder(1e-3, 1e-4, 1e-6, 1e-8)), "scipy_solvers", known_failure=_NO_EVENTS, exact_friction=False,
-        options={"method": "BDF", "manner": _EVENTLESS},
-    ),
-    Peer(
-        "scipy-dop853-no-events", "scipy DOP853, no events", "scipy", "8", "compiled",
-        _ladder(1e-3, 1e-4, 1e-6, 1e-8), "scipy_solvers", known_failure=_NO_EVENTS, exact_friction=False,
-        options={"method": "DOP853", "manner": _EVENTLESS},
-    ),
-    Peer(
-        "cvode-bdf", "CVODE BDF", "SUNDIALS", "1 to 5", "compiled", _CVODE, "cvode", module="sksundae",
-        options={"method": 2},
-    ),
-    Peer(
-        "cvode-adams", "CVODE Adams", "SUNDIALS", "1 to 12", "compiled", (*_CVODE, *_ladder(1e-12)), "cvode",
-        module="sksundae", options={"method": 1, "tuned": False},
-    ),
+    Peer("scipy-bdf-no-events", "scipy BDF, no events", _SCIPY, (ODE15S, *_LATE), _BDF, _EVENTLESS),
+    Peer("scipy-dop853-no-events", "scipy DOP853, no events", _SCIPY, _LATE, _DOP853, _EVENTLESS),
+    Peer("cvode-bdf", "CVODE BDF", _SUNDIALS, _USUAL, _CVODE_BDF),
+    Peer("cvode-adams", "CVODE Adams", _SUNDIALS, _FINE, {**_CVODE_ADAMS, "tuned": False}),
     # Both: tuned gains over many scenes, but in the chart's own hammer scene chance favours the defaults.
+    Peer("cvode-adams-tuned", "CVODE Adams, tuned", _SUNDIALS, _FINE, _CVODE_ADAMS),
+    Peer("cvode-bdf-python", "CVODE BDF, plain Python", _SUNDIALS, _ladder(1e-4, 1e-6, 1e-8), _CVODE_BDF, _PLAIN),
+    Peer("cvode-adams-python", "CVODE Adams, plain Python", _SUNDIALS, _ladder(1e-4, 1e-6, 1e-8), _CVODE_ADAMS, _PLAIN),
+    Peer("cvode-bdf-no-stops", "CVODE BDF, no stops", _SUNDIALS, _ladder(1e-3, 1e-4, 1e-6), _CVODE_BDF, _UNSTOPPED),
+    Peer("cvode-bdf-no-events", "CVODE BDF, no events", _SUNDIALS, _LATE, _CVODE_BDF, _EVENTLESS),
     Peer(
-        "cvode-adams-tuned", "CVODE Adams, tuned", "SUNDIALS", "1 to 12", "compiled", (*_CVODE, *_ladder(1e-12)),
-        "cvode", module="sksundae", options={"method": 1},
+        "heyoka", "heyoka, Taylor series", Library("heyoka", "taylor", "heyoka"),
+        _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15),
     ),
     Peer(
-        "cvode-bdf-python", "CVODE BDF, plain Python", "SUNDIALS", "1 to 5", "as installed",
-        _ladder(1e-4, 1e-6, 1e-8), "cvode", exact_friction=False, module="sksundae",
-        options={"method": 2, "manner": _PLAIN},
-    ),
-    Peer(
-        "cvode-adams-python", "CVODE Adams, plain Python", "SUNDIALS", "1 to 12", "as installed",
-        _ladder(1e-4, 1e-6, 1e-8), "cvode", exact_friction=False, module="sksundae",
-        options={"method": 1, "manner": _PLAIN},
-    ),
-    Peer(
-        "cvode-bdf-no-stops", "CVODE BDF, no stops", "SUNDIALS", "1 to 5", "compiled",
-        _ladder(1e-3, 1e-4, 1e-6), "cvode", known_failure=_NO_STOPS, module="sksundae",
-        options={"method": 2, "manner": _UNSTOPPED},
-    ),
-    Peer(
-        "cvode-bdf-no-events", "CVODE BDF, no events", "SUNDIALS", "1 to 5", "compiled",
-        _ladder(1e-3, 1e-4, 1e-6, 1e-8), "cvode", known_failure=_NO_EVENTS, exact_friction=False, module="sksundae",
-        options={"method": 2, "manner": _EVENTLESS},
-    ),
-    Peer(
-        "heyoka", "heyoka, Taylor series", "heyoka", "5 to 20, by the tolerance", "compiled",
-        _ladder(1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15), "taylor", module="heyoka",
-    ),
-    Peer(
-        "mujoco", "MuJoCo, closest model", "MuJoCo", "1, fixed step", "as installed",
-        tuple(Setting(f"{us} us", us * 1e-6) for us in (200, 100, 50, 20, 10)), "mujoco_engine", module="mujoco",
-        known_failure="another contact law and a polygon for the ring: the error is the model's",
+        "mujoco", "MuJoCo, closest model", Library("MuJoCo", "mujoco_engine", "mujoco"),
+        tuple(Setting(f"{us} us", us * 1e-6) for us in (200, 100, 50, 20, 10)), model_failure=_MUJOCO,
     ),
 )  # fmt: skip
 PEERS: dict[str, Peer] = {peer.name: peer for peer in _ALL}

@@ -35,7 +35,7 @@ from replays.studies.peers.right_hand_side import (
     take_switch,
     vector_callbacks,
 )
-from replays.studies.peers.solution import MISSED_HAMMER, PROPER, SWITCH_CEILING, Journal, Manner, Setting, Solution
+from replays.studies.peers.solution import MISSED_HAMMER, PROPER, SWITCH_CEILING, Manner, Setting, Solution
 from rig.kernels.signals import STATE_SCALE
 
 ADAMS, BDF = 1, 2
@@ -233,8 +233,8 @@ def solve(
     now = np.zeros(8)
     now[_SAMPLE] = 1.0
 
-    journal = Journal(problem.times, budget_s, compiling_s)
-    journal.states[0] = problem.y0
+    solution = Solution(problem.times, budget_s, compiling_s)
+    solution.states[0] = problem.y0
     with ExitStack() as stack:
         session = _Session(
             library, problem, parameters, setting, method=method, events=manner.events, tuned=tuned, stack=stack
@@ -244,19 +244,18 @@ def solve(
         while not done:
             done = run(
                 session.memory, session.place, session.y, session.spare_place, session.spare, parameters, problem.times,
-                corners, np.array(pulse or (0.0, 0.0)), journal.states, onsets, now, manner.events,
+                corners, np.array(pulse or (0.0, 0.0)), solution.states, onsets, now, manner.events,
             )  # fmt: skip
-            journal.steps, journal.switches = int(now[_STEPS]), int(now[_SWITCHES])
-            done = done or journal.overrun()
+            solution.steps, solution.switches = int(now[_STEPS]), int(now[_SWITCHES])
+            done = done or solution.overrun()
     flag = int(now[_FLAG])
-    if journal.failure is None and flag < 0:
-        journal.failure = f"CVODE gave up at {now[_T]:.6g} s: {_MESSAGES.get(flag, f'flag {flag}')}"
-    if journal.failure is None and not manner.stops and pulse is not None and now[_PULSE_SEEN] == 0.0:
-        journal.failure = MISSED_HAMMER
-    journal.onsets = [(float(t), float(speed)) for t, speed in onsets[: int(now[_ONSETS])]]
-    journal.evaluations = int(parameters[0]["evaluations"])
-    journal.phase, journal.onset_speed = int(parameters[0]["phase"]), float(parameters[0]["onset_speed"])
-    return journal.close()
+    if solution.failure is None and flag < 0:
+        solution.failure = f"CVODE gave up at {now[_T]:.6g} s: {_MESSAGES.get(flag, f'flag {flag}')}"
+    if solution.failure is None and not manner.stops and pulse is not None and now[_PULSE_SEEN] == 0.0:
+        solution.failure = MISSED_HAMMER
+    solution.onsets = [(float(t), float(speed)) for t, speed in onsets[: int(now[_ONSETS])]]
+    solution.evaluations = int(parameters[0]["evaluations"])
+    return solution.close()
 
 
 class _Session:
@@ -354,8 +353,8 @@ def _solve_plain(problem: Problem, *, setting: Setting, budget_s: float, method:
 
     gap.direction = [-1]  # pyright: ignore[reportFunctionMemberAccess]
     atol = setting.tolerance * STATE_SCALE if setting.absolute is None else setting.absolute
-    journal = Journal(problem.times, budget_s)
-    journal.states[0] = y = problem.y0.copy()
+    solution = Solution(problem.times, budget_s)
+    solution.states[0] = y = problem.y0.copy()
     solver = sundae.CVODE(
         rates, method="Adams" if method == ADAMS else "BDF", rtol=setting.tolerance, atol=atol, eventsfn=gap,
         num_events=1, max_num_steps=_CHUNK,
@@ -363,32 +362,31 @@ def _solve_plain(problem: Problem, *, setting: Setting, budget_s: float, method:
     t, sample = 0.0, 1
     corners = [*problem.corners, problem.duration_s]
     solver.init_step(t, y)
-    while corners and not journal.overrun():
+    while corners and not solution.overrun():
         if sample < len(problem.times) and problem.times[sample] - t < _INSTANT:
-            journal.states[sample] = y
+            solution.states[sample] = y
             sample += 1
             continue
         target = float(min(problem.times[sample], corners[0])) if sample < len(problem.times) else corners[0]
         result = solver.step(target, method="normal", tstop=corners[0])
         if not result.success:
-            journal.failure = f"CVODE gave up at {t:.6g} s: {result.message}"
+            solution.failure = f"CVODE gave up at {t:.6g} s: {result.message}"
             break
         t, y = float(result.t), np.array(result.y, dtype=float).ravel()
         if sample < len(problem.times) and t >= problem.times[sample]:
-            journal.states[sample] = y
+            solution.states[sample] = y
             sample += 1
         switched = result.status == ROOT_RETURN
         if switched:
-            journal.switches += 1
+            solution.switches += 1
             began = take_switch(t, y, parameters, 0)
             law.phase, law.onset_speed = int(parameters[0]["phase"]), float(parameters[0]["onset_speed"])
             if began:
-                journal.onsets.append((t, law.onset_speed))
+                solution.onsets.append((t, law.onset_speed))
         at_corner = t >= corners[0]
         if at_corner:
             corners.pop(0)
         if (at_corner or switched) and corners:
             solver.init_step(t, y)
-    journal.evaluations = law.evaluations
-    journal.phase, journal.onset_speed = law.phase, law.onset_speed
-    return journal.close()
+    solution.evaluations = law.evaluations
+    return solution.close()

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from replays.studies.peers.problem import Problem
-from replays.studies.peers.solution import Journal, Setting, Solution
-from rig.kernels.contact import FLIGHT, NO_FRICTION, TOUCHING
+from replays.studies.peers.solution import Setting, Solution
+from rig.kernels.contact import FLIGHT, NO_FRICTION
 from rig.kernels.geometry import gap
 from rig.kernels.magnet import magnet_force
 
@@ -45,8 +45,8 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
     data: Any = mujoco.MjData(model)
     _set(data, problem.y0)
     magnet_force(0.0, 0.0, problem.constants.magnet)  # compiled before the clock starts
-    journal = Journal(problem.times, budget_s)
-    journal.states[0] = now = problem.y0.copy()
+    solution = Solution(problem.times, budget_s)
+    solution.states[0] = now = problem.y0.copy()
     reached, touching = 1, problem.phase != FLIGHT
     steps = math.ceil(problem.duration_s / setting.tolerance - 1e-9)
     complaints: list[str] = []
@@ -57,27 +57,26 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
             t = step * setting.tolerance
             data.qfrc_applied[:3] = _applied(problem, t, now)
             mujoco.mj_step(model, data)
-            journal.steps += 1
+            solution.steps += 1
             if complaints:
-                journal.failure = complaints[0].strip()
-            if journal.failure or (step % 64 == 0 and journal.overrun()):
+                solution.failure = complaints[0].strip()
+            if solution.failure or (step % 64 == 0 and solution.overrun()):
                 break
             before, now = now, _state(data)
             end = t + setting.tolerance
             while reached < len(problem.times) and (problem.times[reached] <= end or step == steps - 1):
                 share = (problem.times[reached] - t) / setting.tolerance
-                journal.states[reached] = before + share * (now - before)
+                solution.states[reached] = before + share * (now - before)
                 reached += 1
             if (data.ncon > 0) != touching:
                 touching = not touching
-                journal.switches += 1
+                solution.switches += 1
                 if touching:
-                    journal.onsets.append((end, float(gap(problem.constants, before)[1])))
+                    solution.onsets.append((end, float(gap(problem.constants, before)[1])))
     finally:
         mujoco.set_mju_user_warning(usual)
-    journal.evaluations = journal.steps
-    journal.phase = TOUCHING if touching else FLIGHT
-    return journal.close()
+    solution.evaluations = solution.steps
+    return solution.close()
 
 
 def _state(data: Any) -> np.ndarray:
@@ -113,8 +112,7 @@ def _applied(problem: Problem, t: float, y: np.ndarray) -> tuple[float, float, f
         Fx, Fy, _ = magnet_force(lB * sb, -lB * sG * cb, magnet)
         Lx += lB * (Fx - magnet.damping_x * lB * cb * y[8])
         Ly += lB * (Fy - magnet.damping_y * lB * (sG * sb * y[8] - cG * cb * y[7]))
-    elapsed = (problem.start_tick - inputs.speed_tick) * inputs.tick_s + t
-    torque = problem.constants.torque_gain * (inputs.speed + inputs.speed_slope * elapsed - y[9])
+    torque = problem.constants.torque_gain * (inputs.speed + inputs.speed_slope * t - y[9])
     return -cG * cb * Ly + sb * torque, cb * Lx + sG * sb * Ly, torque
 
 

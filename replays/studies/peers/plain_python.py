@@ -39,8 +39,6 @@ class PlainPython:
         self._inputs = problem.inputs
         self._friction = 0.0 if levels.friction == NO_FRICTION else self._contact.friction
         self._begin, self._end = problem.pulse or (0.0, 0.0)
-        elapsed = (problem.start_tick - self._inputs.speed_tick) * self._inputs.tick_s
-        self._speed = self._inputs.speed + self._inputs.speed_slope * elapsed
 
     def rates(self, t: float, state: np.ndarray) -> list[float]:
         """Rates of the 14 states at `t` [s] from the window's start."""
@@ -70,7 +68,7 @@ class PlainPython:
         Lx += shaft.arm_ring * Fx
         Ly += shaft.arm_ring * Fy
         couple = -shaft.radius * Ft
-        torque = 0.0 if inputs.ideal_drive else self._gain * (self._speed + inputs.speed_slope * t - dth)
+        torque = 0.0 if inputs.ideal_drive else self._gain * (inputs.speed + inputs.speed_slope * t - dth)
 
         # Lagrange: only b enters the mass matrix [[m, 0, p], [0, Ixx, 0], [p, 0, Izz]] of (G, b, theta).
         m, p = Ixx * cb * cb + Izz * sb * sb, Izz * sb

@@ -1,7 +1,6 @@
 """A problem that our engines and other people's solvers are both given, and the distance of two solutions of it.
 
-It holds the kernels' own numbers (`Constants`, `Inputs`), so that there is one model and only the method differs. Time
-runs from 0 at the window's start; `start_tick` is that instant in the scene's ticks.
+It holds the kernels' own numbers (`Constants`, `Inputs`), so that there is one model and only the method differs.
 """
 
 from __future__ import annotations
@@ -22,24 +21,21 @@ ERROR_SCALE = STATE_SCALE[list(ERROR_COLUMNS)]
 
 @dataclass(frozen=True)
 class Problem:
-    """One window of a scene.
+    """One window of a scene, from its start.
 
     Attributes:
         name: Name of the scene.
         constants: The model; `levels.friction` is the friction law, `contact.damping_factor` 0 leaves the memory out.
         inputs: Hammer, drive and magnets, the same over the whole window.
-        start_tick: Where the window begins, in the scene's ticks.
         y0: State at the start, shape (14,).
         phase: Phase of the contact at the start (`rig.kernels.contact`).
         onset_speed: v0 of a contact that is running at the start [m/s].
-        times: Instants at which states are wanted, from the window's start [s], ascending from 0, shape (n,); the last
-            is the window's end.
+        times: Instants at which states are wanted [s], ascending from 0, shape (n,); the last is the window's end.
     """
 
     name: str
     constants: Constants
     inputs: Inputs
-    start_tick: int
     y0: np.ndarray
     phase: int
     onset_speed: float
@@ -57,10 +53,9 @@ class Problem:
 
     @property
     def pulse(self) -> tuple[float, float] | None:
-        """Start and end of the hammer's pulse, from the window's start [s], where any of it lies inside the window."""
+        """Start and end of the hammer's pulse [s], where any of it lies inside the window."""
         inputs = self.inputs
-        begin = (inputs.hammer_start - self.start_tick) * inputs.tick_s
-        end = (inputs.hammer_end - self.start_tick) * inputs.tick_s
+        begin, end = inputs.hammer_start * inputs.tick_s, inputs.hammer_end * inputs.tick_s
         if inputs.hammer_force == 0.0 or end <= max(begin, 0.0) or begin >= self.duration_s:
             return None
         return begin, end

@@ -21,16 +21,16 @@ class Reference:
 
     Attributes:
         solution: The run to measure against.
-        second: The run that it is held against.
         names: Names of both peers.
         error: Their distance, as `scaled_error`: the reference's error bar.
+        compile_s: What compiling took for each [s].
         independent: Whether the two share neither method nor derivation.
     """
 
     solution: Solution
-    second: Solution
     names: tuple[str, str]
     error: float
+    compile_s: tuple[float, float]
     independent: bool
 
 
@@ -56,8 +56,8 @@ def find_reference(problem: Problem, *, quick: bool = False) -> Reference | None
     (name, solution), (other, second) = found
     return Reference(
         solution=solution,
-        second=second,
         names=(name, other),
         error=scaled_error(solution.states, second.states),
+        compile_s=(solution.compile_s, second.compile_s),
         independent=name == first[0],
     )

@@ -36,7 +36,6 @@ PARAMETERS = np.dtype(
     [
         ("constants", layout(Constants)),
         ("inputs", layout(Inputs)),
-        ("start_tick", np.int64),
         ("phase", np.int64),
         ("onset_speed", np.float64),
         ("evaluations", np.int64),
@@ -51,15 +50,7 @@ PARAMETERS = np.dtype(
 def pack(problem: Problem) -> np.ndarray:
     """The struct of a problem, shape (1,), of its own for each solve: the phase changes in place."""
     parameters = np.zeros(1, PARAMETERS)
-    parameters[0] = (
-        plain(problem.constants),
-        plain(problem.inputs),
-        problem.start_tick,
-        problem.phase,
-        problem.onset_speed,
-        0,
-        0,
-    )
+    parameters[0] = (plain(problem.constants), plain(problem.inputs), problem.phase, problem.onset_speed, 0, 0)
     return parameters
 
 
@@ -105,7 +96,7 @@ def _rates(t, y, p, f):
     p.evaluations += 1
     dy = carray(_stack(N_VECTOR), (N_VECTOR,))
     out = carray(_stack(N_OBSERVED), (N_OBSERVED,))
-    evaluate(p.constants, p.inputs, p.start_tick, t / p.inputs.tick_s, p.onset_speed, p.phase, False, y, dy, out)
+    evaluate(p.constants, p.inputs, 0, t / p.inputs.tick_s, p.onset_speed, p.phase, False, y, dy, out)
     for i in range(N_STATE):
         f[i] = dy[i]
 
@@ -123,7 +114,7 @@ def contact_at(t, y, p, phase):
     """Penetration [m], its rate, sliding speed [m/s], normal and friction force [N] under a phase."""
     dy = carray(_stack(N_VECTOR), (N_VECTOR,))
     out = carray(_stack(N_OBSERVED), (N_OBSERVED,))
-    evaluate(p.constants, p.inputs, p.start_tick, t / p.inputs.tick_s, p.onset_speed, phase, False, y, dy, out)
+    evaluate(p.constants, p.inputs, 0, t / p.inputs.tick_s, p.onset_speed, phase, False, y, dy, out)
     return (
         out[S.PENETRATION],
         out[S.PENETRATION_RATE],

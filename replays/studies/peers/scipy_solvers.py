@@ -32,7 +32,7 @@ from replays.studies.peers.right_hand_side import (
     switching,
     take_switch,
 )
-from replays.studies.peers.solution import MISSED_HAMMER, PROPER, Journal, Manner, Setting, Solution
+from replays.studies.peers.solution import MISSED_HAMMER, PROPER, Manner, Setting, Solution
 from rig.kernels.signals import STATE_SCALE
 
 LEAST_TOLERANCE = 2.3e-14
@@ -77,45 +77,44 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float, method: str, m
     pulse = problem.pulse
     pulse_seen = pulse is None
 
-    journal = Journal(problem.times, budget_s, compiling_s)
-    journal.states[0] = y = problem.y0.copy()
-    journal.reached = 1
+    solution = Solution(problem.times, budget_s, compiling_s)
+    solution.states[0] = y = problem.y0.copy()
+    solution.reached = 1
     t = 0.0
-    while corners and journal.failure is None:
+    while corners and solution.failure is None:
         run = integrator(law.rates, t, y, corners[0], rtol=rtol, atol=atol, **own)
         before = law.switching(t, y)
         young = True
-        while run.status == "running" and not journal.overrun():
+        while run.status == "running" and not solution.overrun():
             message = run.step()
             if run.status == "failed":
-                journal.failure = f"gave up at {run.t:.6g} s: {message}"
+                solution.failure = f"gave up at {run.t:.6g} s: {message}"
                 break
-            journal.steps += 1
+            solution.steps += 1
             after = law.switching(run.t, run.y)
             if not np.isfinite(run.y).all():
-                journal.failure = f"the state is not finite at {run.t:.6g} s"
+                solution.failure = f"the state is not finite at {run.t:.6g} s"
                 break
             # A function that starts at 0 to rounding may be back below it within the first step.
             fallen = [i for i in range(N_SWITCH) if after[i] <= 0.0 and (before[i] > 0.0 or young)]
             met = _first_zero(law, run, fallen) if manner.events and fallen else None
             t = run.t if met is None else met[0]
             pulse_seen = pulse_seen or (pulse is not None and pulse[0] < t < pulse[1])
-            _sample(journal, run, t)
+            _sample(solution, run, t)
             if met is not None:
                 y = run.dense_output()(t)
-                _switch(journal, law, parameters, t, y, met[1])
+                _switch(solution, law, parameters, t, y, met[1])
                 break
             if not manner.events and follow_sign(t, run.y, parameters):
-                journal.onsets.append((t, float(parameters[0]["onset_speed"])))
+                solution.onsets.append((t, float(parameters[0]["onset_speed"])))
             y, before, young = run.y, after, False
         if t >= corners[0]:
             corners.pop(0)
-    journal.evaluations = law.plain.evaluations if law.plain else int(parameters[0]["evaluations"])
+    solution.evaluations = law.plain.evaluations if law.plain else int(parameters[0]["evaluations"])
     # With stops, a step from corner to corner has its stages inside.
-    if journal.failure is None and not manner.stops and not pulse_seen:
-        journal.failure = MISSED_HAMMER
-    journal.phase, journal.onset_speed = int(parameters[0]["phase"]), float(parameters[0]["onset_speed"])
-    return journal.close()
+    if solution.failure is None and not manner.stops and not pulse_seen:
+        solution.failure = MISSED_HAMMER
+    return solution.close()
 
 
 def _law(problem: Problem, parameters: np.ndarray, manner: Manner) -> _Law:
@@ -155,19 +154,19 @@ def _first_zero(law: _Law, run: Any, fallen: list[int]) -> tuple[float, int] | N
     return min(zeros) if zeros else None
 
 
-def _sample(journal: Journal, run: Any, t: float) -> None:
+def _sample(solution: Solution, run: Any, t: float) -> None:
     """Keep the states wanted up to `t`, from the interpolant of the step just taken."""
-    end = int(np.searchsorted(journal.times, t, side="right"))
-    if end > journal.reached:
-        journal.states[journal.reached : end] = run.dense_output()(journal.times[journal.reached : end]).T
-        journal.reached = end
+    end = int(np.searchsorted(solution.times, t, side="right"))
+    if end > solution.reached:
+        solution.states[solution.reached : end] = run.dense_output()(solution.times[solution.reached : end]).T
+        solution.reached = end
 
 
-def _switch(journal: Journal, law: _Law, parameters: np.ndarray, t: float, y: np.ndarray, which: int) -> None:
+def _switch(solution: Solution, law: _Law, parameters: np.ndarray, t: float, y: np.ndarray, which: int) -> None:
     began = take_switch(t, y, parameters, which)
-    journal.switches += 1
+    solution.switches += 1
     if began:
-        journal.onsets.append((t, float(parameters[0]["onset_speed"])))
+        solution.onsets.append((t, float(parameters[0]["onset_speed"])))
     if law.plain is not None:
         law.plain.phase = int(parameters[0]["phase"])
         law.plain.onset_speed = float(parameters[0]["onset_speed"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -43,45 +44,25 @@ class Manner(NamedTuple):
 PROPER = Manner()
 
 
-@dataclass(frozen=True)
+@dataclass
 class Solution:
-    """One solve of one problem. A failure is a result like any other.
+    """One solve of one problem, under way or closed. A failure is a result like any other.
 
     Attributes:
         times: The problem's instants [s], shape (n,).
+        budget_s: Wall time allowed [s].
+        compile_s: What compiling took in this process before the first solve could start [s].
         states: States there, nan from where the solver failed, shape (n, 14).
+        reached: How many of them are there, where a solver counts by it.
         onsets: Time [s] and impact speed v0 [m/s] of each contact that began.
-        contacts: How many began.
         switches: Changes of phase: onsets, lift-offs, those between sliding and rolling, and of heyoka the clamps.
         steps: Accepted steps; 0 where the library does not tell.
         evaluations: Of the right-hand side, with those for a Jacobian; of a Taylor series, its order times its steps.
-        cpu_s: Processor time of the solve, without compilation [s].
-        compile_s: What compiling took in this process before the first solve could start [s].
         failure: Why it failed, or None.
-        phase: Phase of the contact at the end.
-        onset_speed: v0 at the end [m/s].
         own_s: Processor time inside the library's own calls alone [s], where a Python loop of ours drives it: what is
             left if that loop cost nothing. None where there is no such loop, or where it costs as good as nothing.
+        cpu_s: Processor time of the solve, without compilation [s]; there when it is closed.
     """
-
-    times: np.ndarray
-    states: np.ndarray
-    onsets: tuple[tuple[float, float], ...]
-    contacts: int
-    switches: int
-    steps: int
-    evaluations: int
-    cpu_s: float
-    compile_s: float
-    failure: str | None
-    phase: int
-    onset_speed: float
-    own_s: float | None = None
-
-
-@dataclass
-class Journal:
-    """A solve under way: what it has reached, and the clock that it must not overrun."""
 
     times: np.ndarray
     budget_s: float
@@ -92,10 +73,9 @@ class Journal:
     switches: int = 0
     steps: int = 0
     evaluations: int = 0
-    phase: int = 0
-    onset_speed: float = 0.0
     failure: str | None = None
     own_s: float | None = None
+    cpu_s: float = math.nan
     _begin: float = field(default_factory=time.perf_counter)
     _cpu_begin: float = field(default_factory=time.thread_time)
 
@@ -103,13 +83,13 @@ class Journal:
         self.states = np.full((len(self.times), N_STATE), np.nan)
 
     @property
-    def deadline(self) -> float:
-        """Instant of `time.perf_counter` at which the budget is spent."""
-        return self._begin + self.budget_s
+    def contacts(self) -> int:
+        """How many contacts began."""
+        return len(self.onsets)
 
     def overrun(self) -> bool:
         """Whether a budget is spent; notes it as the failure."""
-        if time.perf_counter() > self.deadline:
+        if time.perf_counter() > self._begin + self.budget_s:
             self.failure = f"over the budget of {self.budget_s:g} s"
         elif self.steps > STEP_CEILING:
             self.failure = f"more than {STEP_CEILING} steps"
@@ -118,22 +98,8 @@ class Journal:
         return self.failure is not None
 
     def close(self) -> Solution:
-        """The solution as it stands."""
-        cpu_s = time.thread_time() - self._cpu_begin
+        """The same, with the time that it took."""
+        self.cpu_s = time.thread_time() - self._cpu_begin
         if self.failure is None and not np.isfinite(self.states).all():
             self.failure = "the state is not finite"
-        return Solution(
-            times=self.times,
-            states=self.states,
-            onsets=tuple(self.onsets),
-            contacts=len(self.onsets),
-            switches=self.switches,
-            steps=self.steps,
-            evaluations=self.evaluations,
-            cpu_s=cpu_s,
-            compile_s=self.compile_s,
-            failure=self.failure,
-            phase=self.phase,
-            onset_speed=self.onset_speed,
-            own_s=self.own_s,
-        )
+        return self

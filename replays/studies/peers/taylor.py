@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replays.studies.peers.problem import Problem
-from replays.studies.peers.solution import Journal, Setting, Solution
+from replays.studies.peers.solution import Setting, Solution
 from replays.studies.peers.taylor_equations import (
     PARAMETERS,
     SLACK,
@@ -85,16 +85,16 @@ def solve(problem: Problem, *, setting: Setting, budget_s: float) -> Solution:
         for hit in {False, problem.pulse is not None}:
             _system(kind_of(problem, phase, hit=hit), setting.tolerance)
             _contact_function(kind_of(problem, ROLLING, hit=hit))
-    journal = Journal(problem.times, budget_s, time.perf_counter() - begin)
-    _run(problem, setting.tolerance, journal)
+    solution = Solution(problem.times, budget_s, time.perf_counter() - begin)
+    _run(problem, setting.tolerance, solution)
     house = problem.constants.house
     for stretch, stiffness in (
-        (journal.states[:, 4] - journal.states[:, 6], house.pair_stiffness_vertical),
-        (journal.states[:, 5], house.pair_stiffness_horizontal),
+        (solution.states[:, 4] - solution.states[:, 6], house.pair_stiffness_vertical),
+        (solution.states[:, 5], house.pair_stiffness_horizontal),
     ):
-        if journal.failure is None and np.max(np.abs(stretch)) * 0.5 * stiffness > house.preload:
-            journal.failure = "a transducer loses its preload, which the series leaves out"
-    return journal.close()
+        if solution.failure is None and np.max(np.abs(stretch)) * 0.5 * stiffness > house.preload:
+            solution.failure = "a transducer loses its preload, which the series leaves out"
+    return solution.close()
 
 
 def _check(problem: Problem) -> None:
@@ -105,8 +105,8 @@ def _check(problem: Problem) -> None:
         raise NotImplementedError("the series has no switch friction")
 
 
-def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
-    """Go from phase to phase until the end, into the journal."""
+def _run(problem: Problem, tolerance: float, solution: Solution) -> None:
+    """Go from phase to phase until the end, into the solution."""
     numbers = numbers_of(problem)
     values = np.array([numbers[name] for name in PARAMETERS])
     margin_at, speed_at = PARAMETERS.index("margin"), PARAMETERS.index("v0")
@@ -132,7 +132,7 @@ def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
     hit, own_s = False, 0.0
     values[speed_at] = problem.onset_speed
     values[margin_at] = _margin(problem, problem.onset_speed, tolerance)
-    while corners and not journal.overrun():
+    while corners and not solution.overrun():
         hit = pulse is not None and pulse[0] <= t < pulse[1]
         system = system_of(phase, hit)
         series = system.integrator
@@ -149,8 +149,8 @@ def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
         begin = time.thread_time()
         outcome, _, _, steps, _, reached = series.propagate_grid(grid, max_steps=_STEPS)
         own_s += time.thread_time() - begin
-        journal.steps += int(steps)
-        journal.evaluations += int(steps) * series.order
+        solution.steps += int(steps)
+        solution.evaluations += int(steps) * series.order
         # The goal itself is a sample only where it is wanted.
         kept = reached[1:][: len(times) - first]
         kept = kept[: int(np.searchsorted(times[first:], grid[len(reached) - 1], side="right"))]
@@ -158,14 +158,14 @@ def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
         t, state = float(series.time), series.state.copy()
         number = -int(outcome) - 1
         if not np.isfinite(state).all():
-            journal.failure = f"the series broke down at {t:.9g} s"
+            solution.failure = f"the series broke down at {t:.9g} s"
         elif 0 <= number < len(system.following):
-            journal.switches += 1
+            solution.switches += 1
             following = system.following[number]
             depth, rate, sliding, _, _ = look(t, state)
             if phase == FLIGHT:
                 speed = max(rate, problem.constants.contact.speed_floor)
-                journal.onsets.append((t, speed))
+                solution.onsets.append((t, speed))
                 values[speed_at] = speed
                 values[margin_at] = margin = _margin(problem, max(rate, 1e-9), tolerance)
                 beyond = t + margin / max(rate, 1e-9)
@@ -187,13 +187,8 @@ def _run(problem: Problem, tolerance: float, journal: Journal) -> None:
             phase = following
         if t >= corners[0]:
             corners.pop(0)
-    journal.own_s = own_s
-    journal.states = from_series(samples, ideal_drive=problem.inputs.ideal_drive)
-    if phase == SLACK:
-        phase = TOUCHING
-        if problem.exact_friction:
-            phase = FORWARD if look(t, state)[2] > 0.0 else BACKWARD
-    journal.phase, journal.onset_speed = phase, float(values[speed_at])
+    solution.own_s = own_s
+    solution.states = from_series(samples, ideal_drive=problem.inputs.ideal_drive)
 
 
 def _margin(problem: Problem, rate: float, tolerance: float) -> float:

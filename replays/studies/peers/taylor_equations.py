@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from importlib import import_module
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,13 +29,21 @@ SLACK = 5
 SERIES_SCALE = np.where(np.arange(14) == 2, 40.0, STATE_SCALE)
 """As `STATE_SCALE`, but for the spin angle, which grows to tens of radians and would be the largest state."""
 
-PARAMETERS = (
-    "Ixx", "Izz", "lA", "lB", "lI", "R", "unbalance", "phi", "moment",
-    "K_m", "a3", "a5", "a7", "ripple", "growth", "D_x", "D_y",
-    "r0", "x0", "y0", "K", "c", "D", "mu", "v_s", "both", "v0", "margin",
-    "M_ih", "M_oh", "K_bv", "D_bv", "K_bh", "D_bh", "k_ns", "k_ew",
-    "gain", "speed", "slope", "H_x", "H_y", "t_hit", "T_hit",
-)  # fmt: skip
+_PLACES = {
+    "Ixx": "shaft.transverse_inertia", "Izz": "shaft.polar_inertia", "lA": "shaft.arm_ring", "lB": "shaft.arm_magnet",
+    "lI": "shaft.arm_disk", "R": "shaft.radius", "unbalance": "shaft.unbalance", "phi": "shaft.unbalance_phase",
+    "moment": "", "K_m": "magnet.stiffness", "a3": "magnet.a3", "a5": "magnet.a5", "a7": "magnet.a7",
+    "ripple": "magnet.ripple", "growth": "magnet.growth", "D_x": "magnet.damping_x", "D_y": "magnet.damping_y",
+    "r0": "contact.clearance", "x0": "contact.offset_x", "y0": "contact.offset_y", "K": "contact.stiffness",
+    "c": "contact.damping_factor", "D": "contact.viscous_damping", "mu": "", "v_s": "contact.smoothing_speed",
+    "both": "contact.gap_counts_outer", "v0": "", "margin": "", "M_ih": "house.inner_mass", "M_oh": "house.outer_mass",
+    "K_bv": "house.inner_beam_stiffness", "D_bv": "house.inner_beam_damping", "K_bh": "house.outer_beam_stiffness",
+    "D_bh": "house.outer_beam_damping", "k_ns": "house.pair_stiffness_vertical",
+    "k_ew": "house.pair_stiffness_horizontal", "gain": "torque_gain",
+    "speed": "", "slope": "", "H_x": "", "H_y": "", "t_hit": "", "T_hit": "",
+}  # fmt: skip
+"""By the paper's symbol, where each number stands in the model; empty where `numbers_of` works it out."""
+PARAMETERS = tuple(_PLACES)
 """Numbers that a compiled system is given, so that it serves every problem of its kind."""
 
 
@@ -76,54 +85,22 @@ def kind_of(problem: Problem, phase: int, *, hit: bool) -> Kind:
 
 def numbers_of(problem: Problem) -> dict[str, float]:
     """The numbers of a problem by the paper's symbols."""
-    _, shaft, magnet, contact, house, gain = problem.constants
-    inputs = problem.inputs
+    constants, inputs = problem.constants, problem.inputs
+    shaft = constants.shaft
     begin, end = problem.pulse or (0.0, 1.0)
-    return {
-        "Ixx": shaft.transverse_inertia,
-        "Izz": shaft.polar_inertia,
-        "lA": shaft.arm_ring,
-        "lB": shaft.arm_magnet,
-        "lI": shaft.arm_disk,
-        "R": shaft.radius,
-        "unbalance": shaft.unbalance,
-        "phi": shaft.unbalance_phase,
+    worked_out = {
         "moment": shaft.arm_centre * shaft.mass * shaft.gravity,
-        "K_m": magnet.stiffness,
-        "a3": magnet.a3,
-        "a5": magnet.a5,
-        "a7": magnet.a7,
-        "ripple": magnet.ripple,
-        "growth": magnet.growth,
-        "D_x": magnet.damping_x,
-        "D_y": magnet.damping_y,
-        "r0": contact.clearance,
-        "x0": contact.offset_x,
-        "y0": contact.offset_y,
-        "K": contact.stiffness,
-        "c": contact.damping_factor,
-        "D": contact.viscous_damping,
-        "mu": 0.0 if problem.constants.levels.friction == NO_FRICTION else contact.friction,
-        "v_s": contact.smoothing_speed,
-        "both": contact.gap_counts_outer,
+        "mu": 0.0 if constants.levels.friction == NO_FRICTION else constants.contact.friction,
         "v0": problem.onset_speed,
         "margin": 0.0,
-        "M_ih": house.inner_mass,
-        "M_oh": house.outer_mass,
-        "K_bv": house.inner_beam_stiffness,
-        "D_bv": house.inner_beam_damping,
-        "K_bh": house.outer_beam_stiffness,
-        "D_bh": house.outer_beam_damping,
-        "k_ns": house.pair_stiffness_vertical,
-        "k_ew": house.pair_stiffness_horizontal,
-        "gain": gain,
-        "speed": inputs.speed + inputs.speed_slope * (problem.start_tick - inputs.speed_tick) * inputs.tick_s,
+        "speed": inputs.speed,
         "slope": inputs.speed_slope,
         "H_x": inputs.hammer_force * inputs.hammer_x,
         "H_y": inputs.hammer_force * inputs.hammer_y,
         "t_hit": begin,
         "T_hit": end - begin,
     }
+    return {name: attrgetter(place)(constants) if place else worked_out[name] for name, place in _PLACES.items()}
 
 
 def to_series(y: np.ndarray, *, ideal_drive: bool) -> np.ndarray:

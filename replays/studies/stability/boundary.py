@@ -37,7 +37,7 @@ class Boundary(NamedTuple):
 
 def whirl_class(engine: str, mu: float, force_n: float, *, tolerance: float = 0.0) -> int:
     """Class of the run over its last 50 ms: the pulse lasts 5 ms, the rotor runs at 6.2 Hz, friction is Coulomb's."""
-    constants, inputs, y0 = hammer_run("exact", mu=mu, force_n=force_n)
+    constants, inputs, y0 = hammer_run("exact", friction=mu, force_n=force_n)
     motion = move(engine, constants, inputs, y0, ticks=round(_DURATION_S * 1e6), every=1000, tolerance=tolerance)
     last = motion.times > _DURATION_S - _WINDOW_S
     touching = motion.column("penetration")[last] > 0.0

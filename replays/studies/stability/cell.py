@@ -5,56 +5,35 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+_DOCUMENT = (
+    "trial", "case", "method", "value", "unit", "limit", "expected", "because", "skipped", "holds", "agrees",
+)  # fmt: skip
 
-class Case(NamedTuple):
+
+class Cell(NamedTuple):
     """One case of a trial on one method.
 
     Attributes:
-        name: Which one.
+        case: Which one.
         value: What was measured.
         limit: The largest value that still holds.
         because: Why it should hold or fail.
         expected: Whether it should hold; None where nobody has said so: then the value alone stands.
         unit: Unit of value and limit.
+        trial: T1 to T14, once it stands in the table.
+        method: Engine, or peer, likewise.
+        skipped: Why it was not run; empty where it was.
     """
 
-    name: str
+    case: str
     value: float
     limit: float
     because: str
     expected: bool | None = True
     unit: str = "1"
-
-
-class Cell(NamedTuple):
-    """One trial of one method.
-
-    Attributes:
-        trial: T1 to T14.
-        case: Which of its cases.
-        method: Engine, or peer.
-        value: What was measured.
-        unit: Its unit.
-        limit: The largest value that still holds.
-        expected: Whether it should hold; None where nobody has said so: then the value alone stands.
-        because: Why it should hold or fail.
-        skipped: Why it was not run; empty where it was.
-    """
-
-    trial: str
-    case: str
-    method: str
-    value: float
-    unit: str
-    limit: float
-    expected: bool | None
-    because: str
+    trial: str = ""
+    method: str = ""
     skipped: str = ""
-
-    @classmethod
-    def of(cls, trial: str, method: str, case: Case) -> Cell:
-        """A case as a cell of the table."""
-        return cls(trial, case.name, method, case.value, case.unit, case.limit, case.expected, case.because)
 
     @property
     def holds(self) -> bool:
@@ -69,4 +48,4 @@ class Cell(NamedTuple):
     def document(self) -> dict[str, Any]:
         """As a JSON document; a value that is not finite is a string."""
         value: float | str = self.value if math.isfinite(self.value) else str(self.value)
-        return {**self._asdict(), "value": value, "holds": self.holds, "agrees": self.agrees}
+        return {name: getattr(self, name) for name in _DOCUMENT} | {"value": value}

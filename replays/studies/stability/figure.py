@@ -95,8 +95,7 @@ def draw_ladders(engines: list[str], *, quick: bool) -> Any:
             smooth.loglog(reach, [smoothing_distance(engine, v) for v in reach], **style)
         places = np.geomspace(1e-5, 1.0, 11 if quick else 21)
         graze.loglog(places, [max(1e-12, first_impact(engine, float(v))["restitution"]) for v in places], **style)
-        limits = np.geomspace(1e-5, 1.0, 11 if quick else 21)
-        stale.loglog(limits, [max(1e-12, pushed(engine, speed_floor=float(v))) for v in limits], **style)
+        stale.loglog(places, [max(1e-12, pushed(engine, speed_floor=float(v))) for v in places], **style)
     slope = smoothing_distance("tsit5", 1e-3) / 1e-3
     smooth.loglog(speeds, [slope * v for v in speeds], color="0.6", lw=5, alpha=0.5, zorder=0, label="linear in vₛ")
     lowest = 1e-5 if quick else 1e-6

@@ -10,7 +10,7 @@ import numpy as np
 from replays.studies.closed_forms import Mode, linear_motion, stiffest_mode
 from replays.studies.engines import traits
 from replays.studies.peers.problem import scaled_error
-from replays.studies.stability.cell import Case
+from replays.studies.stability.cell import Cell
 from replays.studies.stability.motion import bare_shaft, base_model, move, quiet_inputs, state
 from rig.engines import ENGINES
 from rig.kernels.constants import Constants
@@ -63,9 +63,9 @@ def _ring_down(engine: str, duration_s: float, hw: float = 0.0) -> float:
         return float(np.mean(energy[-window:]) / energy[0])
 
 
-def ring_down_cases(engine: str, quick: bool) -> Iterator[Case]:
+def ring_down_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T1: an undamped mode at the engine's own step, and at steps about the limits of theory."""
-    yield Case("own step, 0.2 s", abs(_ring_down(engine, 0.2) - 1.0), 0.01,
+    yield Cell("own step, 0.2 s", abs(_ring_down(engine, 0.2) - 1.0), 0.01,
                "an undamped mode keeps its energy within 1 %")  # fmt: skip
     limit = traits(engine).oscillator_limit
     for hw in (1.9, 2.5, 3.0):
@@ -78,10 +78,10 @@ def ring_down_cases(engine: str, quick: bool) -> Iterator[Case]:
             because = because or f"h w = {hw:g} against its limit of {limit:.4g}"
         # It must not grow without end: near the limit energy swings by 1/(1 - h w/2), beyond it by powers of ten. That
         # a coarse step damps is the atlas's affair.
-        yield Case(f"step of h w = {hw:g}", growth, 100.0, because, expected)
+        yield Cell(f"step of h w = {hw:g}", growth, 100.0, because, expected)
 
 
-def pulse_cases(engine: str, quick: bool) -> Iterator[Case]:
+def pulse_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T5: a shaft at rest is hit for 5 ms, on the engine's own step and on the longest that a scene takes."""
     constants = bare_shaft()
     constants = constants._replace(contact=constants.contact._replace(clearance=_WIDE))
@@ -94,7 +94,7 @@ def pulse_cases(engine: str, quick: bool) -> Iterator[Case]:
         allowance = traits(engine).allowance
         # An engine of low order sees it, if badly: the trapezoidal rule of five steps.
         limit = 0.5 if step and allowance > 1.0 else 1e-3 * allowance
-        yield Case(case, abs(got / right - 1.0), limit,
+        yield Cell(case, abs(got / right - 1.0), limit,
                    "no step is longer than the grid's, which is shorter than the pulse")  # fmt: skip
 
 
@@ -140,7 +140,7 @@ def _linear_rates(c: Constants, spin: float) -> tuple[np.ndarray, np.ndarray]:
     return a, b
 
 
-def free_flight_cases(engine: str, quick: bool) -> Iterator[Case]:
+def free_flight_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T6: free flight against the matrix exponential."""
     limit = 1e-4 * traits(engine).allowance
-    yield Case("0.2 s", free_flight(engine), limit, "a smooth linear problem")
+    yield Cell("0.2 s", free_flight(engine), limit, "a smooth linear problem")

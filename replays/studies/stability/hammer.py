@@ -13,7 +13,7 @@ from replays.studies.closed_forms import RUNGE_KUTTA_4_REAL_LIMIT
 from replays.studies.engines import friction_of, is_adaptive, traits
 from replays.studies.peers.problem import scaled_error
 from replays.studies.stability.boundary import QUICK_POINTS, whirl_class
-from replays.studies.stability.cell import Case
+from replays.studies.stability.cell import Cell
 from replays.studies.stability.motion import Motion, hammer_run, move
 from rig.engines import ENGINES
 from rig.kernels.signals import COLUMN
@@ -37,29 +37,27 @@ def _slip(motion: Motion) -> float:
     return float(np.sqrt(np.mean(part[:, COLUMN["sliding_speed"]] ** 2))) if len(part) else math.nan
 
 
-def rolling_cases(engine: str, quick: bool) -> Iterator[Case]:
+def rolling_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T3: rolling is a constraint; a smoothed law creeps."""
     if friction_of(engine) == "exact":
-        yield Case("exact Coulomb", _slip(_whirl(engine, "exact")), 2e-5, "rolling is a constraint: no slip",
+        yield Cell("exact Coulomb", _slip(_whirl(engine, "exact")), 2e-5, "rolling is a constraint: no slip",
                    unit="m/s")  # fmt: skip
     if "smoothed" in ENGINES[engine].frictions:
         slip = _slip(_whirl(engine, "smoothed"))
-        yield Case("tanh, v_s = 5 mm/s", slip, 2e-5, "a smoothed law creeps by v_s atanh(needed / mu)", False, "m/s")
+        yield Cell("tanh, v_s = 5 mm/s", slip, 2e-5, "a smoothed law creeps by v_s atanh(needed / mu)", False, "m/s")
         # What rolling needs, by an engine that rolls: the smoothed law must creep by just so much.
         exact = _whirl("rk8", "exact")
         part = exact.rows[exact.times > exact.times[-1] - 0.1]
         contact = hammer_run("smoothed")[0].contact
         needed = part[:, COLUMN["friction_force"]] / (contact.friction * part[:, COLUMN["normal_force"]])
         creep = contact.smoothing_speed * float(np.sqrt(np.mean(np.arctanh(needed) ** 2)))
-        yield Case("creep against theory", abs(slip / creep - 1.0), 0.1,
+        yield Cell("creep against theory", abs(slip / creep - 1.0), 0.1,
                    f"v_s atanh(needed / mu) = {creep:.2e} m/s")  # fmt: skip
 
 
-def first_impacts(
-    engine: str, friction: str, *, smoothing_speed: float | None = None, step: int = 0, tolerance: float = 0.0
-) -> Motion:
-    """The full rig, hit at time zero."""
-    constants, inputs, y0 = hammer_run(friction, smoothing_speed=smoothing_speed)
+def first_impacts(engine: str, law: str, *, step: int = 0, tolerance: float = 0.0, **contact: float) -> Motion:
+    """The full rig under a friction law, hit at time zero; `contact` as of `hammer_run`."""
+    constants, inputs, y0 = hammer_run(law, **contact)
     inputs = inputs._replace(hammer_start=0, hammer_end=5000)
     return move(engine, constants, inputs, y0, ticks=WINDOW_TICKS, step=step, every=1000, tolerance=tolerance)
 
@@ -85,12 +83,12 @@ def least_smoothing_speed(engine: str) -> float:
     return ENGINES[engine].step_us * 1e-6 * largest * mobility / RUNGE_KUTTA_4_REAL_LIMIT
 
 
-def smoothing_cases(engine: str, quick: bool) -> Iterator[Case]:
+def smoothing_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T7: the exact law, and smoothed ones ever nearer to it."""
     allowance = traits(engine).allowance
     if friction_of(engine) == "exact":
         distance = scaled_error(first_impacts(engine, "exact").states, sharp_impacts("exact").states)
-        yield Case("exact law", distance, 5e-4 * allowance, "the set-valued limit itself")
+        yield Cell("exact law", distance, 5e-4 * allowance, "the set-valued limit itself")
     if "smoothed" not in ENGINES[engine].frictions:
         return
     # Far above the limit of any step the distance is the law's own: linear in v_s.
@@ -109,15 +107,15 @@ def smoothing_cases(engine: str, quick: bool) -> Iterator[Case]:
             expected, because = False, f"its step is beyond 2.785 on the real axis below v_s = {least:.1e} m/s"
         # Within twice the linear law and what the engine itself can do.
         limit = 2.0 * slope * v_s + 1e-4 * (allowance if v_s >= 1e-3 else 1.0)
-        yield Case(f"v_s = {v_s:.0e} m/s", distance, limit, because, expected)
+        yield Cell(f"v_s = {v_s:.0e} m/s", distance, limit, because, expected)
 
 
-def boundary_cases(engine: str, quick: bool) -> Iterator[Case]:
+def boundary_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T9: points on either side of the boundary between whirl and none."""
     if friction_of(engine) != "exact":
         return
     wrong = sum(whirl_class(engine, mu, force) != right for mu, force, right in QUICK_POINTS)
-    yield Case(f"{len(QUICK_POINTS)} points beside the boundary", float(wrong), 0.0,
+    yield Cell(f"{len(QUICK_POINTS)} points beside the boundary", float(wrong), 0.0,
                "the class that tsit5 finds at a tolerance of 1e-9", unit="wrong")  # fmt: skip
 
 
@@ -132,12 +130,12 @@ def ladder(engine: str) -> list[float]:
     return [scaled_error(motion.states, sharp_impacts(friction).states) for motion in motions]
 
 
-def ladder_cases(engine: str, quick: bool) -> Iterator[Case]:
+def ladder_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T11: a finer setting gives less error."""
     # Where the error is larger it is another motion altogether, and a finer step may be no nearer.
     errors = [error for error in ladder(engine) if error < 0.2]
     worst = max(fine / coarse for coarse, fine in pairwise(errors))
-    yield Case("worst rung over the one before", worst, 1.5, "asking for more gives more")
+    yield Cell("worst rung over the one before", worst, 1.5, "asking for more gives more")
     # An engine whose grid alone is fine enough has nowhere to go.
     gain = errors[-1] / max(errors[0], 1e-6)
-    yield Case("last rung over the first", gain, 0.1, "the ladder leads somewhere")
+    yield Cell("last rung over the first", gain, 0.1, "the ladder leads somewhere")

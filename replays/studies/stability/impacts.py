@@ -9,7 +9,7 @@ import numpy as np
 
 from replays.studies.closed_forms import RUNGE_KUTTA_4_REAL_LIMIT, impact, pushed_contact
 from replays.studies.engines import friction_of, is_adaptive, traits
-from replays.studies.stability.cell import Case
+from replays.studies.stability.cell import Cell
 from replays.studies.stability.motion import (
     Motion,
     bare_shaft,
@@ -20,6 +20,7 @@ from replays.studies.stability.motion import (
     state,
 )
 from rig.engines import ENGINES
+from rig.engines.memory import CEILING, FLOORED
 from rig.levels import ModelLevels
 
 ONSET_SPEEDS = (1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0)
@@ -43,14 +44,14 @@ def bounce(engine: str, step: int = 0) -> tuple[float, Motion]:
         return float(np.max(np.abs(energy[free] / energy[0] - 1.0))), motion
 
 
-def bounce_cases(engine: str, quick: bool) -> Iterator[Case]:
+def bounce_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T2: elastic, frictionless impacts."""
     drift, motion = bounce(engine)
-    yield Case("own step", drift, 1e-4 * traits(engine).allowance, "nothing takes energy out")
+    yield Cell("own step", drift, 1e-4 * traits(engine).allowance, "nothing takes energy out")
     missing = float(max(0, 24 - motion.contacts))
-    yield Case("own step: impacts missing", missing, 0.0, "the shaft cannot leave the ring")
+    yield Cell("own step: impacts missing", missing, 0.0, "the shaft cannot leave the ring")
     expected, because = traits(engine).coarse_bounce
-    yield Case("step of 200 us", bounce(engine, 200)[0], 1e-3, because, expected)
+    yield Cell("step of 200 us", bounce(engine, 200)[0], 1e-3, because, expected)
 
 
 def first_impact(engine: str, speed: float, *, tolerance: float = 0.0) -> dict[str, float]:
@@ -71,26 +72,26 @@ def first_impact(engine: str, speed: float, *, tolerance: float = 0.0) -> dict[s
     lift_off = ticks * 1e-6 - (contact.clearance - place) / back
     return {
         "restitution": abs(back / speed / right.restitution - 1.0),
-        "impulse": abs(motion.impulse / right.impulse - 1.0),
+        "impulse": abs(motion.end_of("contact_impulse") / right.impulse - 1.0),
         "peak": abs(motion.peak_force / right.peak - 1.0),
         "duration": abs((lift_off - onset) / right.duration - 1.0),
-        "floored": float(motion.floored),
+        "floored": float(motion.memory[FLOORED]),
     }
 
 
-def first_impact_cases(engine: str, quick: bool) -> Iterator[Case]:
+def first_impact_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T4: one impact at 0.3 m/s."""
     errors = first_impact(engine, 0.3)
     limit = 1e-3 * traits(engine).allowance
     for name in ("impulse", "peak", "duration"):
-        yield Case(name, errors[name], limit, "a quadrature in one dimension knows it")
+        yield Cell(name, errors[name], limit, "a quadrature in one dimension knows it")
 
 
-def grazing_cases(engine: str, quick: bool) -> Iterator[Case]:
+def grazing_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T8: impacts from grazing to hard."""
     errors = [first_impact(engine, speed) for speed in ONSET_SPEEDS]
     worst = max(error["restitution"] for error in errors)
-    yield Case("restitution, 1e-5 to 1 m/s", worst, 2e-3 * traits(engine).allowance,
+    yield Cell("restitution, 1e-5 to 1 m/s", worst, 2e-3 * traits(engine).allowance,
                "the law with v0 at its lower limit is a law like any other")  # fmt: skip
     limit = bare_shaft().contact.speed_floor
     wrong = sum(
@@ -98,22 +99,22 @@ def grazing_cases(engine: str, quick: bool) -> Iterator[Case]:
         for speed, error in zip(ONSET_SPEEDS, errors, strict=True)
         if abs(speed / limit - 1.0) > 1e-3
     )
-    yield Case("floor not told", float(wrong), 0.0, "a floored v0 is counted, no other")
+    yield Cell("floor not told", float(wrong), 0.0, "a floored v0 is counted, no other")
 
 
-def drop_cases(engine: str, quick: bool) -> Iterator[Case]:
+def drop_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T10: the full rig dropped from the top of the ring."""
     model = base_model(ModelLevels.model_validate({"friction": friction_of(engine)}))
     constants = model.constants
     constants = constants._replace(contact=constants.contact._replace(damping_factor=1.4328))  # e = 0.5
     y0 = model.state(ring_x=0.0, ring_y=constants.contact.clearance * (1.0 - 1e-12))
     motion = move(engine, constants, quiet_inputs(), y0, ticks=500_000, every=1000)
-    energy = float(motion.column("kinetic_energy")[-1]) if motion.finite else math.nan
+    energy = float(motion.column("kinetic_energy")[-1]) if np.isfinite(motion.end).all() else math.nan
     fallen = 0.5 * constants.shaft.mass * constants.shaft.gravity * constants.contact.clearance
-    yield Case("energy left", energy / fallen, 1e-6, "it comes to rest (e = 0.5)")
-    yield Case("contacts", float(motion.contacts), 40.0,
+    yield Cell("energy left", energy / fallen, 1e-6, "it comes to rest (e = 0.5)")
+    yield Cell("contacts", float(motion.contacts), 40.0,
                "a compliant law with a lower limit of v0 ends in lasting contact: no Zeno")  # fmt: skip
-    yield Case("steps given up", float(motion.ceiling), 0.0, "no stall")
+    yield Cell("steps given up", float(motion.memory[CEILING]), 0.0, "no stall")
 
 
 def pushed(engine: str, *, speed_floor: float) -> float:
@@ -150,10 +151,10 @@ def stale_stiffness(engine: str, speed_floor: float) -> float:
     return ENGINES[engine].step_us * 1e-6 * rate
 
 
-def stale_cases(engine: str, quick: bool) -> Iterator[Case]:
+def stale_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T14: contact that lasts on a v0 long out of date."""
     own = traits(engine)
-    yield Case("v0 = 1e-2 m/s", pushed(engine, speed_floor=1e-2), 2e-2,
+    yield Cell("v0 = 1e-2 m/s", pushed(engine, speed_floor=1e-2), 2e-2,
                f"h lambda = {stale_stiffness(engine, 1e-2):.2g} and less: not stiff")  # fmt: skip
     for limit in (1e-3, 1e-4, 1e-5):
         z = stale_stiffness(engine, limit)
@@ -165,4 +166,4 @@ def stale_cases(engine: str, quick: bool) -> Iterator[Case]:
             because = f"measured, h lambda = {z:.2g}: {own.damping_because}"
             if own.on_real_axis:
                 because = f"h lambda = {z:.2g} against {RUNGE_KUTTA_4_REAL_LIMIT:.4g}"
-        yield Case(f"v0 = {limit:.0e} m/s", pushed(engine, speed_floor=limit), 2e-2, because, expected)
+        yield Cell(f"v0 = {limit:.0e} m/s", pushed(engine, speed_floor=limit), 2e-2, because, expected)

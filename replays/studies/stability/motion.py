@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 
 from replays.studies.run import Course
-from rig.engines.memory import CEILING, CONTACTS, FLOORED, PEAK_FORCE
-from rig.kernels import signals as S
+from rig.engines.memory import CONTACTS, PEAK_FORCE
 from rig.kernels.constants import Constants, Inputs
 from rig.kernels.signals import COLUMN, N_ROW, N_STATE, N_VECTOR
 from rig.levels import ModelLevels
@@ -79,34 +78,14 @@ class Motion:
         return float(self.end[COLUMN[name]])
 
     @property
-    def finite(self) -> bool:
-        """Whether every number of the end is finite."""
-        return bool(np.isfinite(self.end).all())
-
-    @property
     def contacts(self) -> int:
         """Contacts begun."""
         return int(self.memory[CONTACTS])
 
     @property
-    def floored(self) -> int:
-        """Contacts begun slower than the lower limit of v0."""
-        return int(self.memory[FLOORED])
-
-    @property
-    def ceiling(self) -> int:
-        """Steps that stayed above the tolerance."""
-        return int(self.memory[CEILING])
-
-    @property
     def peak_force(self) -> float:
         """Largest normal force by the engine's own steps [N]."""
         return float(self.memory[PEAK_FORCE])
-
-    @property
-    def impulse(self) -> float:
-        """Integral of the normal force [N s]."""
-        return float(self.end[S.CONTACT_IMPULSE])
 
 
 def move(
@@ -154,51 +133,33 @@ def pivoted_mass(constants: Constants) -> float:
     return constants.shaft.transverse_inertia / constants.shaft.arm_ring**2
 
 
-def bare_shaft(
-    *,
-    damping_factor: float | None = None,
-    exponent: float = 1.5,
-    stiffness: float | None = None,
-    speed_floor: float | None = None,
-    gravity: bool = False,
-) -> Constants:
+def bare_shaft(*, gravity: bool = False, **contact: float) -> Constants:
     """Planar shaft in a rigid, centred, frictionless ring: along x it is a mass on one line.
 
     Args:
-        damping_factor: c of the contact; None for the rig's own.
-        exponent: n.
-        stiffness: K [N/m^n]; None for the rig's own.
-        speed_floor: Lower limit of v0 [m/s]; None for the rig's own.
         gravity: Whether there is any.
+        contact: What the contact has otherwise than the rig's with Hertz's exponent, by field.
     """
     levels = ModelLevels(magnet="linear", shaft="planar", stator="rigid", friction="none")
-    constants = base_model(levels).constants
-    contact = constants.contact
-    contact = contact._replace(
-        offset_x=0.0,
-        offset_y=0.0,
-        exponent=exponent,
-        viscous_damping=0.0,
-        damping_factor=contact.damping_factor if damping_factor is None else damping_factor,
-        stiffness=contact.stiffness if stiffness is None else stiffness,
-        speed_floor=contact.speed_floor if speed_floor is None else speed_floor,
-    )
-    shaft = constants.shaft._replace(unbalance=0.0, gravity=constants.shaft.gravity if gravity else 0.0)
-    return constants._replace(
-        contact=contact, shaft=shaft, magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0)
+    own = base_model(levels).constants
+    centred = {"offset_x": 0.0, "offset_y": 0.0, "exponent": 1.5, "viscous_damping": 0.0}
+    return own._replace(
+        contact=own.contact._replace(**{**centred, **contact}),
+        shaft=own.shaft._replace(unbalance=0.0, gravity=own.shaft.gravity if gravity else 0.0),
+        magnet=own.magnet._replace(damping_x=0.0, damping_y=0.0),
     )
 
 
-def hammer_run(
-    friction: str, *, force_n: float = 100.0, mu: float | None = None, smoothing_speed: float | None = None
-) -> tuple[Constants, Inputs, np.ndarray]:
-    """The full rig running at 6.2 Hz, hit for 5 ms along x at 20 ms: the scene `hammer`."""
-    model = base_model(ModelLevels.model_validate({"friction": friction}))
-    contact = model.constants.contact
-    contact = contact._replace(
-        friction=contact.friction if mu is None else mu,
-        smoothing_speed=contact.smoothing_speed if smoothing_speed is None else smoothing_speed,
-    )
+def hammer_run(law: str, *, force_n: float = 100.0, **contact: float) -> tuple[Constants, Inputs, np.ndarray]:
+    """The full rig running at 6.2 Hz, hit for 5 ms along x at 20 ms: the scene `hammer` under a friction law.
+
+    Args:
+        law: Of friction.
+        force_n: Peak of the pulse [N].
+        contact: What the contact has otherwise than the rig's, by field.
+    """
+    model = base_model(ModelLevels.model_validate({"friction": law}))
     spin = 2.0 * np.pi * 6.2
     inputs = quiet_inputs(spin=spin, magnets=True, pulse=(force_n, 20_000, 25_000))
-    return model.constants._replace(contact=contact), inputs, model.state(spin=spin)
+    changed = model.constants.contact._replace(**contact)
+    return model.constants._replace(contact=changed), inputs, model.state(spin=spin)

@@ -9,7 +9,7 @@ import numpy as np
 
 from replays.studies.peers import PEERS, Problem, Setting
 from replays.studies.peers.window import cut_window
-from replays.studies.stability.cell import Case, Cell
+from replays.studies.stability.cell import Cell
 from replays.studies.stability.flight import house_energy, house_oscillator
 from replays.studies.stability.motion import quiet_inputs, state
 from rig.kernels.contact import FLIGHT
@@ -23,7 +23,7 @@ def peer_cells(trial: str) -> Iterator[Cell]:
         peer = PEERS[name]
         value = _RUNS[trial](name, tolerance) if peer.installed else math.nan
         missing = "" if peer.installed else f"needs {peer.module}: pip install 'rotor-stator-rig[peers]'"
-        yield Cell.of(trial, name, Case(case, value, _LIMIT, because, expected))._replace(skipped=missing)
+        yield Cell(case, value, _LIMIT, because, expected, trial=trial, method=name, skipped=missing)
 
 
 def _ring_down(name: str, tolerance: float) -> float:
@@ -49,7 +49,7 @@ def _hammer(name: str, tolerance: float) -> float:
 
 def _problem(name: str, constants, inputs, y0: np.ndarray, duration_s: float) -> Problem:
     return Problem(
-        name=name, constants=constants, inputs=inputs, start_tick=0, y0=y0[:N_STATE], phase=FLIGHT,
+        name=name, constants=constants, inputs=inputs, y0=y0[:N_STATE], phase=FLIGHT,
         onset_speed=constants.contact.speed_floor, times=np.linspace(0.0, duration_s, 201),
     )  # fmt: skip
 

@@ -8,32 +8,28 @@ of which `replays.studies.engines` has no row are held to what everybody is held
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from replays.studies.stability import flight, hammer, impacts, whole_runs
-from replays.studies.stability.cell import Case, Cell
+from replays.studies.stability.cell import Cell
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One trial.
-
-    Attributes:
-        name: T1 to T14.
-        title: What is done.
-        value: What is measured, in words.
-        cases: Gives the cases of one engine; the flag asks for few of them.
-    """
+class Trial(NamedTuple):
+    """One trial."""
 
     name: str
+    """T1 to T14."""
     title: str
+    """What is done."""
     value: str
-    cases: Callable[[str, bool], Iterator[Case]]
+    """What is measured, in words."""
+    cases: Callable[[str, bool], Iterator[Cell]]
+    """Gives the cases of one engine; the flag asks for few of them."""
 
     def run(self, engine: str, quick: bool) -> Iterator[Cell]:
         """The cells of one engine."""
-        for case in self.cases(engine, quick):
-            yield Cell.of(self.name, engine, case)
+        for cell in self.cases(engine, quick):
+            yield cell._replace(trial=self.name, method=engine)
 
 
 _ALL = (

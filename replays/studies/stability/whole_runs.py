@@ -10,7 +10,7 @@ import numpy as np
 
 from replays.studies.engines import friction_of, is_adaptive, traits
 from replays.studies.run import bare_sensors
-from replays.studies.stability.cell import Case
+from replays.studies.stability.cell import Cell
 from rig.engines import ENGINES
 from rig.errors import SimulationError
 from rig.scenes import EngineChoice, Scene, load_scene
@@ -27,14 +27,14 @@ def engine_scene(name: str, **choice: float) -> Scene:
     return scene.model_copy(update={"engine": engine, "model": levels, "sensors": sensors})
 
 
-def bit_cases(engine: str, quick: bool) -> Iterator[Case]:
+def bit_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T12: the same bits however a run is cut, and after a restart."""
     scene = engine_scene(engine)
     total = 200 if quick else 1000
     whole = Simulation(scene).advance(total * 1000).rows
     cut = Simulation(scene)
     parts = np.vstack([cut.advance(1000).rows.copy() for _ in range(total)])
-    yield Case("frames of 1 ms against one run", float(np.sum(parts != whole)), 0.0,
+    yield Cell("frames of 1 ms against one run", float(np.sum(parts != whole)), 0.0,
                "a call's length is none of the engine's business", unit="numbers differ")  # fmt: skip
     first, second = Simulation(scene), Simulation(scene)
     first.advance(total * 500)
@@ -42,7 +42,7 @@ def bit_cases(engine: str, quick: bool) -> Iterator[Case]:
     first.advance(total * 500)
     second.restore(kept)
     again = second.advance(total * 500).rows
-    yield Case("restart from a snapshot", float(np.sum(again != whole[total // 2 :])), 0.0,
+    yield Cell("restart from a snapshot", float(np.sum(again != whole[total // 2 :])), 0.0,
                "a snapshot holds all that changes", unit="numbers differ")  # fmt: skip
 
 
@@ -78,21 +78,21 @@ def _silent(warnings: list[str], *words: str) -> float:
     return float(not any(word in warning for warning in warnings for word in words))
 
 
-def warning_cases(engine: str, quick: bool) -> Iterator[Case]:
+def warning_cases(engine: str, quick: bool) -> Iterator[Cell]:
     """T13: a run says what goes wrong in it."""
-    yield Case("nan", float(not _is_poisoned(engine)), 0.0, "the state is checked", unit="silent")
+    yield Cell("nan", float(not _is_poisoned(engine)), 0.0, "the state is checked", unit="silent")
     # A step of 1 ms is far too long for anything but error control; with that, a tolerance that cannot be met.
     if is_adaptive(engine):
         warnings = warnings_of(engine_scene(engine, step_us=500, tolerance=1e-30), 1000)
-        yield Case("tolerance out of reach", _silent(warnings, "engine.tolerance"), 0.0,
+        yield Cell("tolerance out of reach", _silent(warnings, "engine.tolerance"), 0.0,
                    "the step's ceiling is counted", unit="silent")  # fmt: skip
     else:
         for case, step in (("step of 100 us", 100), ("step of 1 ms", 1000)):
             warnings = warnings_of(engine_scene(engine, step_us=step), traits(engine).warned_within_ticks)
             silent, because = _silent(warnings, "energy residual ", "finite"), "the ledger sees it"
-            yield Case(case, silent, 0.0, because, unit="silent")
+            yield Cell(case, silent, 0.0, because, unit="silent")
     base = engine_scene(engine)
     for case, word, floor_mm_s in (("v0 at its floor", "speed_floor", 50.0), ("law that would pull", "pulled", 1.0)):
         drop = load_scene("drop", {"contact.damping_factor": 1.4328, "contact.speed_floor": floor_mm_s})
         drop = drop.model_copy(update={"engine": base.engine, "model": base.model, "sensors": base.sensors})
-        yield Case(case, _silent(warnings_of(drop, 500_000), word), 0.0, "counted", unit="silent")
+        yield Cell(case, _silent(warnings_of(drop, 500_000), word), 0.0, "counted", unit="silent")
