@@ -108,6 +108,8 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     module = "replays.campaigns.plugin"
     there = any(each.value == module for each in entry_points(group="pytest11"))
     plugins = ["-p", "no:cacheprovider", *([] if there else ["-p", module])]
+    # This command is of the plugin's own package, which is loaded by now.
+    plugins += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     with beside_pytest(progress_bar(transient=True)) as bar:
         progress = Progress(bar)
         status = pytest.main([*plugins, *options, *files], plugins=[progress])

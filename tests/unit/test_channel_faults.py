@@ -230,9 +230,9 @@ def test_faults_of_a_scene_are_recorded_and_done_again_bit_by_bit(tmp_path: Any)
     blind = validate(recording, blind=True)
     assert not blind.good
     assert blind.explained is not None
-    # Of a preload that rests, a gain and an offset look alike.
+    # Of a preload that rests, much looks alike.
     found = {one.name: one.change for one in blind.explained.ranked}
-    assert found["P_E offset or gain or open"] == "+150 N"
+    assert found["P_E offset or gain or open or saturation"] == "+150 N"
     assert found["ring_x hum"] == "50 Hz, 0.01271 mm"
 
 

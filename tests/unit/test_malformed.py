@@ -244,7 +244,7 @@ CASES = [
     Case("unknown option", (*DROP, "--bogus"), "option", "one of `rig simulate -h`"),
     Case("unknown command", ("fly",), "command", "one of `rig -h`"),
     Case("no such pace", ("run", "drop", "--pace", "warp"), "--pace", "lockstep"),
-    Case("listen without port", ("run", "drop", "--listen", "abc"), "listen", "HOST:PORT with a port of 1 to 65535"),
+    Case("listen without port", ("run", "drop", "--listen", "abc"), "listen", "HOST:PORT with a port of 0 to 65535"),
     Case(
         "listen on another host",
         ("run", "drop", "--listen", "0.0.0.0:7460"),
