@@ -97,9 +97,7 @@ def test_a_kill_in_the_middle_takes_the_last_rows_alone(
     killed_s = bench.status()["time_s"]
     bench.advance_to(killed_s + 0.2)
     lost = lost_s(record, measure, killed_s)
-    measure(
-        "lost before the kill", lost, "s", "<=", WRITE_S, source="assumed; `rig record` promises 0.5 s"
-    )
+    measure("lost before the kill", lost, "s", "<=", WRITE_S, source="assumed; `rig record` promises 0.5 s")
 
 
 @pytest.mark.bench(scene=SCENE)
