@@ -158,6 +158,21 @@ WRONG = {
         5,
         "given by one of at_s, event and signal",
     ),
+    "value of no number": (
+        HEAD + '[[expect]]\nscore = "mapping"\nfile = "x.csv"\nmust = "== 1"\n',
+        6,
+        "expect.must must be left out where score is mapping",
+    ),
+    "unit of which channel": (
+        HEAD + '[[expect]]\nscore = "noise"\nfile = "x.csv"\nmust = "<= 2 um"\n',
+        3,
+        "expect.channel must be one of the channels with must",
+    ),
+    "unit of a quantity": (
+        HEAD + '[[expect]]\nscore = "corner"\nfile = "x.csv"\nmust = ">= 5"\n',
+        6,
+        "must be with a unit, as corner is in Hz",
+    ),
     "no such quantity": (HEAD + '[[expect]]\nscore = "gian"\nfile = "x.csv"\n', 4, "such as gain"),
 }
 
