@@ -357,7 +357,7 @@ class ExpectScore(_Expect):
             return Must("==", 0.0, "1")
         if self.score in ("all", "mapping", "polarity"):
             raise InputError(f"{where}.must", f"left out where score is {self.score}", self.must)
-        if self.channel not in ("", *units[""]) or not (unit := known[self.score].unit or units[""].get(self.channel)):
+        if not (unit := known[self.score].unit or units[""].get(self.channel, "")):
             what = f"one of the channels with must, as {self.score} is in the unit of its channel"
             raise UnknownNameError(f"{where}.channel", what, self.channel, units[""])
         return _asked(self.must, unit, where=where, of=self.score)
@@ -373,7 +373,10 @@ class ExpectScore(_Expect):
         except InputError as error:
             yield Measurement(what, math.nan, must, self.source, note=str(error))
             return
-        rows = [row for row in card.rows if self.score in ("all", row.quantity) and self.channel in ("", row.channel)]
+        rows = [
+            row for row in card.rows
+            if self.score in ("all", row.quantity) and self.channel in ("", *row.channel.split(", "))
+        ]  # fmt: skip
         if self.must:
             yield from self._values(rows, must)
             return

@@ -122,6 +122,8 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     module = "replays.campaigns.plugin"
     there = any(each.value == module for each in entry_points(group="pytest11"))
     plugins = ["-p", "no:cacheprovider", *([] if there else ["-p", module])]
+    # This runs before pytest does: asserts in what is imported already are not told in pieces, and need not be.
+    plugins += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     with beside_pytest(progress_bar(transient=True)) as bar:
         progress = Progress(bar)
         status = pytest.main([*plugins, *options, *files], plugins=[progress])

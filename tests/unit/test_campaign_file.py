@@ -208,8 +208,8 @@ def test_the_command_tells_it_and_ends_with_2(tmp_path: Path, capsys: pytest.Cap
 
 
 SHIPPED = {
-    "daq-acceptance": 4, "fault-endurance": 10, "hammer": 2, "protection-alarms": 4, "protection-trip": 2,
-    "protection-votes": 18, "recorder-acceptance": 3,
+    "daq-acceptance": 5, "daq-loss": 2, "fault-endurance": 10, "hammer": 2, "protection-alarms": 4,
+    "protection-trip": 2, "protection-votes": 18, "recorder-acceptance": 3,
 }  # fmt: skip
 """Campaigns that come with the rig, and how many cases each has."""
 
