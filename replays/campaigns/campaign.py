@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import itertools
 import re
 import shlex
@@ -123,10 +124,31 @@ class Campaign:
     cases: tuple[Case, ...]
 
 
+def shipped() -> dict[str, Path]:
+    """Files of the campaigns that come with the rig, in TOML or for pytest, by name."""
+    found = {file.name.removesuffix(SUFFIX): file for file in FOLDER.glob(f"*{SUFFIX}")}
+    found |= {file.stem.removeprefix("test_").replace("_", "-"): file for file in FOLDER.glob("test_*.py")}
+    return dict(sorted(found.items()))
+
+
+def title_of(path: Path) -> str:
+    """What a campaign that comes with the rig is called."""
+    text = path.read_text("utf-8")
+    if path.suffix == ".toml":
+        return str(tomllib.loads(text)["title"])
+    return (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0].removesuffix(".")
+
+
 def campaign_path(name_or_path: str) -> Path:
-    """The file of a campaign that comes with the rig, by its name, or of a user's own."""
-    shipped = FOLDER / f"{name_or_path}{SUFFIX}"
-    return shipped if re.fullmatch(r"[\w-]+", name_or_path) and shipped.is_file() else Path(name_or_path)
+    """The file of a campaign that comes with the rig, by its name, or of a user's own.
+
+    Raises:
+        UnknownNameError: It looks like a name, is none, and no file either.
+    """
+    known, path = shipped(), Path(name_or_path)
+    if name_or_path not in known and re.fullmatch(r"[\w-]+", name_or_path) and not path.exists():
+        raise UnknownNameError("FILE", "a file, or one of the campaigns that ship", name_or_path, known)
+    return known.get(name_or_path, path)
 
 
 def load_campaign(path: Path) -> Campaign:

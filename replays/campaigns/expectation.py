@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from rig.outside import Written
 
 if TYPE_CHECKING:
     from recorder.reader import Recording
-    from replays.score.scorecard import Scorecard
+    from replays.score.scorecard import Scorecard, ScoreRow
     from rig.samples import Samples
 
 Time = Annotated[FiniteFloat, Field(ge=0.0, le=86_400.0)]
@@ -327,28 +327,40 @@ class ExpectOrder(_Within):
 
 
 class ExpectScore(_Expect):
-    """Rows of the scorecard of what a DAQ under test has written: a quantity, or `all`."""
+    """Rows of the scorecard of what a DAQ under test has written: a quantity, or `all`.
+
+    With `must` a quantity's own value is held against that with its whole interval, and not against limits of the card:
+    also for what none ask about, such as the trigger row, and for rows that have to be missing.
+    """
 
     score: str
     channel: str = ""
     file: Annotated[str, Field(min_length=1)]
     limits: str | None = None
     path: Literal["digital", "analogue"] | None = None
+    must: str = ""
 
     def check(self, units: Units, *, where: str) -> Must:
-        """Nothing fails.
+        """Nothing fails, or what is asked of the quantity's values.
 
         Raises:
-            InputError: There is no such quantity, or limits.
+            InputError: There is no such quantity, or limits, or it has no values in the unit of what is asked.
         """
         from replays.score.limits import load_limits
         from replays.score.scorecard import QUANTITIES
 
-        known = {quantity for quantities in QUANTITIES.values() for quantity in quantities}
-        if self.score not in known | {"all"}:
+        known = {quantity: about for quantities in QUANTITIES.values() for quantity, about in quantities.items()}
+        if self.score not in {*known, "all"}:
             raise UnknownNameError(f"{where}.score", "a quantity of `rig score`, or all", self.score, sorted(known))
         load_limits(self.limits)
-        return Must("==", 0.0, "1")
+        if not self.must:
+            return Must("==", 0.0, "1")
+        if self.score in ("all", "mapping", "polarity"):
+            raise InputError(f"{where}.must", f"left out where score is {self.score}", self.must)
+        if not (unit := known[self.score].unit or units[""].get(self.channel, "")):
+            what = f"one of the channels with must, as {self.score} is in the unit of its channel"
+            raise UnknownNameError(f"{where}.channel", what, self.channel, units[""])
+        return _asked(self.must, unit, where=where, of=self.score)
 
     def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
         """A measurement for each row that is not as asked, or that shows nothing; else one for all of them."""
@@ -361,7 +373,13 @@ class ExpectScore(_Expect):
         except InputError as error:
             yield Measurement(what, math.nan, must, self.source, note=str(error))
             return
-        rows = [row for row in card.rows if self.score in ("all", row.quantity) and self.channel in ("", row.channel)]
+        rows = [
+            row for row in card.rows
+            if self.score in ("all", row.quantity) and self.channel in ("", *row.channel.split(", "))
+        ]  # fmt: skip
+        if self.must:
+            yield from self._values(rows, must)
+            return
         # Of one quantity, nothing shown is nothing passed; of all, some are never shown.
         bad = [row for row in rows if row.verdict == FAIL or (row.verdict == NOT_SHOWN and self.score != "all")]
         shown = sum(row.verdict == PASS for row in rows)
@@ -370,6 +388,18 @@ class ExpectScore(_Expect):
         value = float(len(bad)) if shown or bad else math.nan
         note = told or ("" if shown else "nothing of it is shown")
         yield Measurement(what, value, must, source, note=note, channels=tuple(row.channel for row in bad[:2]))
+
+    def _values(self, rows: Sequence[ScoreRow], must: Must) -> Iterator[Measurement]:
+        """Of each row that end of the interval, or the value, which is nearest to what it must not be."""
+        for row in rows:
+            what = self.name or f"{row.quantity} {row.channel}".strip()
+            ends = [_in_unit(float(each), row.unit, must) for each in (row.value, row.low, row.high)]
+            value = min(ends, key=must.margin) if all(map(math.isfinite, ends)) else math.nan
+            note = row.note or ("" if math.isfinite(value) else "this run does not show it")
+            yield Measurement(what, value, must, self.source, note=note, channels=(row.channel,))
+        if not rows:
+            what = self.name or f"{self.score} {self.channel}".strip()
+            yield Measurement(what, math.nan, must, self.source, note="nothing of it is shown")
 
 
 Expect = ExpectSignal | ExpectEvent | ExpectOrder | ExpectScore

@@ -1,7 +1,7 @@
 """Runs a program, and ends it with all that it has started when its own input ends: with whoever started both.
 
-A program of its own, `python keeper.py PROGRAM ...`, of the standard library alone: a test run that is killed leaves
-nothing running.
+What comes in before that kills it at once. A program of its own, `python keeper.py PROGRAM ...`, of the standard
+library alone: a test run that is killed leaves nothing running.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def keep(command: list[str]) -> int:
 
 def _watch(child: subprocess.Popen[bytes]) -> None:
     while os.read(0, 4096):  # not through Python's own buffer, whose lock nobody could take at the end
-        pass
+        _signal(child.pid, signal.SIGKILL)
     _signal(child.pid, signal.SIGTERM)
     try:
         child.wait(PATIENCE_S)

@@ -179,7 +179,9 @@ def dut(bench: Bench, rig_trial: Trial, request: pytest.FixtureRequest) -> Calla
 @pytest.fixture
 def record(bench: Bench, rig_trial: Trial) -> Record:
     """A recording of the bench from the start of the test on; `record.stop()` gives it."""
-    return rig_trial.start_record()
+    made = rig_trial.start_record()
+    made.wait_until_there()  # or its link would be taken for that of a device
+    return made
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -70,6 +71,14 @@ class Program:
                 return None
             time.sleep(0.02)
         return None
+
+    def kill(self) -> None:
+        """Kill it, as a power cut would, and wait until it is gone."""
+        assert self._kept.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended already
+            self._kept.stdin.write(b"kill")
+            self._kept.stdin.flush()
+        self._kept.wait()
 
     def end(self) -> None:
         """End it: first by SIGTERM, and at the latest after some seconds."""

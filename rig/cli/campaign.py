@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rig.cli.folder import check_folder
-from rig.cli.tables import echo, progress_bar
+from rig.cli.tables import echo, new_table, progress_bar, table_console
 from rig.errors import InputError, UnknownNameError, Words
 
 _TOML = ".campaign.toml"
@@ -19,12 +19,13 @@ _EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
 
 def campaign(
     files: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
-            metavar="FILE...",
-            help="A *.campaign.toml, one of the rig's by name (hammer), or tests of pytest; FILE::CASE for one case.",
+            metavar="[FILE...]",
+            help="A *.campaign.toml, one of the rig's by name (hammer), or tests of pytest; FILE::CASE for one case. "
+            "Without: list the rig's.",
         ),
-    ],
+    ] = None,
     *,
     keyword: Annotated[
         str | None, typer.Option("--keyword", "-k", metavar="WORDS", help="Only cases with these words in their names.")
@@ -49,6 +50,9 @@ def campaign(
     Exit status 0: all cases passed, or were skipped. 1: one failed. 2: wrong input, or nothing to run. Ctrl-C leaves
     nothing running, and the results of what was done.
     """
+    if not files:
+        _list()
+        return
     if importlib.util.find_spec("pytest") is None:
         raise InputError("rig campaign", _EXTRA, Words("without pytest"))
     if jobs > 1 and importlib.util.find_spec("xdist") is None:
@@ -67,6 +71,16 @@ def campaign(
     status = _run(files, options, output)
     if status:
         raise typer.Exit(status)
+
+
+def _list() -> None:
+    from replays.campaigns.campaign import FOLDER, shipped, title_of
+
+    table = new_table("", "campaign", "what it tests", wrapped=["what it tests"])
+    for name, path in shipped().items():
+        table.add_row(name, title_of(path))
+    table_console().print(table)
+    echo(f"files in {FOLDER}")
 
 
 def _checked(files: list[str], against: Path | None, replay: Path | None) -> list[str]:
@@ -108,7 +122,7 @@ def _run(files: list[str], options: list[str], output: Path | None) -> int:
     module = "replays.campaigns.plugin"
     there = any(each.value == module for each in entry_points(group="pytest11"))
     plugins = ["-p", "no:cacheprovider", *([] if there else ["-p", module])]
-    # This command is of the plugin's own package, which is loaded by now.
+    # This runs before pytest does: asserts in what is imported already are not told in pieces, and need not be.
     plugins += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     with beside_pytest(progress_bar(transient=True)) as bar:
         progress = Progress(bar)

@@ -61,7 +61,7 @@ def rates(
 ) -> np.ndarray:
     """Rates of the 14 states, in a contact that began at a speed, or in flight, shape (14,)."""
     phase = FLIGHT if onset_speed is None else TOUCHING
-    given = Problem("state", constants, inputs, 0, y[:14], phase, onset_speed or 1.0, np.array([0.0, 1.0]))
+    given = Problem("state", constants, inputs, y[:14], phase, onset_speed or 1.0, np.array([0.0, 1.0]))
     return derivative(t, y[:14].copy(), pack(given))
 
 

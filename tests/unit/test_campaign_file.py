@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from replays.campaigns.campaign import Campaign, load_campaign
+from replays.campaigns.campaign import Campaign, campaign_path, load_campaign, shipped, title_of
 from replays.campaigns.lines import lines_of
 from rig.errors import InputError
 from tests.commands import said
@@ -158,6 +158,21 @@ WRONG = {
         5,
         "given by one of at_s, event and signal",
     ),
+    "value of no number": (
+        HEAD + '[[expect]]\nscore = "mapping"\nfile = "x.csv"\nmust = "== 1"\n',
+        6,
+        "expect.must must be left out where score is mapping",
+    ),
+    "unit of which channel": (
+        HEAD + '[[expect]]\nscore = "noise"\nfile = "x.csv"\nmust = "<= 2 um"\n',
+        3,
+        "expect.channel must be one of the channels with must",
+    ),
+    "unit of a quantity": (
+        HEAD + '[[expect]]\nscore = "corner"\nfile = "x.csv"\nmust = ">= 5"\n',
+        6,
+        "must be with a unit, as corner is in Hz",
+    ),
     "no such quantity": (HEAD + '[[expect]]\nscore = "gian"\nfile = "x.csv"\n', 4, "such as gain"),
 }
 
@@ -190,6 +205,29 @@ def test_the_command_tells_it_and_ends_with_2(tmp_path: Path, capsys: pytest.Cap
         status, _, err = said(capsys, "campaign", *arguments)
         assert (status, err.count("\n")) == (2, 1), err
         assert says in err
+
+
+SHIPPED = {
+    "daq-acceptance": 5, "daq-loss": 2, "fault-endurance": 10, "hammer": 2, "protection-alarms": 4,
+    "protection-trip": 2, "protection-votes": 18, "recorder-acceptance": 3,
+}  # fmt: skip
+"""Campaigns that come with the rig, and how many cases each has."""
+
+
+def test_what_ships_is_listed_by_name_and_loads(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(shipped()) == list(SHIPPED)
+    status, out, err = said(capsys, "campaign")
+    assert (status, err) == (0, "")
+    for name, count in SHIPPED.items():
+        path = campaign_path(name)
+        if path.suffix == ".py":
+            assert path.read_text(encoding="utf-8").count("\ndef test_") == count
+        else:
+            assert len(load_campaign(path).cases) == count, name
+        assert f"{name} " in out
+        assert title_of(path)[:30] in out
+    with pytest.raises(InputError, match="one of the campaigns that ship, such as hammer"):
+        campaign_path("hamer")
 
 
 MATRIX = """

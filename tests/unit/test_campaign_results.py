@@ -19,10 +19,12 @@ from replays.campaigns.page import changes, make_page
 from replays.campaigns.picture import draw
 from replays.campaigns.results import load_results, write_junit
 from replays.report import junit
+from rig.channels import default_table
 from rig.errors import InputError
 from rig.orbit import whirl_frequency
 from rig.outside import check
 from tests.processes import ROOT
+from tests.score_daqs import counts_of, write_parquet, write_session
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +100,23 @@ def test_a_scorecard_is_an_expectation(seen: Seen) -> None:
     absent = one(itself, score="all", file="nothing.csv")
     assert not absent.good
     assert "nothing.csv" in absent.note
+
+
+def test_rows_that_have_to_be_missing_are_an_expectation(tmp_path: Path) -> None:
+    counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
+    session = Seen(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
+    names = default_table().groups["probes"].names
+    kept = np.delete(counts, slice(1000, 1100), axis=0)
+    write_parquet(tmp_path / "daq.parquet", dict(zip(names, kept.T, strict=True)))
+    for must, good, margin in (("== 100", True, 0.0), (">= 1", True, 99.0), ("<= 50", False, -50.0)):
+        told = one(session, score="missing rows", file="daq.parquet", must=must)
+        assert (told.value, told.good, told.must.margin(told.value)) == (100.0, good, margin)
+        assert told.note == "rows 1000 to 1099"
+    assert not one(session, score="missing rows", file="daq.parquet").good
+    scale = one(session, score="scale", channel="disk_x", file="daq.parquet", must="-1 to 1 ppm")
+    assert (scale.value, scale.good) == (0.0, True)
+    absent = one(session, score="gain", channel="disk_x", file="daq.parquet", must="-1 to 1 ppm")
+    assert (absent.good, absent.note) == (False, "nothing of it is shown")
 
 
 @pytest.mark.parametrize(("op", "limit", "value", "margin", "good"), [
