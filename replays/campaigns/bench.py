@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
 import os
+import queue
 import socket
 import statistics
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +25,7 @@ from rig.errors import InputError, RefusedError, Words
 
 if TYPE_CHECKING:
     from drivers.client import Rig
+    from drivers.console import AcceptedStep
     from rig.commands import TimedCommand
 
 START_S = 300.0
@@ -228,12 +232,50 @@ class Bench(Closing):
         while tick < last:
             ticks = min(-(-min(last - tick, _PIECE) // block) * block, end - tick)
             try:
-                reply = client.step(int(ticks), timeout_s=_STEP_S)
+                reply = self._step(int(ticks))
             except RefusedError as error:
                 if "a run that ended: stopped" in str(error):
                     return  # as a device may
                 raise BenchError(f"the rig does not go on: {error}") from None
             tick = reply.tick
+
+    def _step(self, ticks: int) -> AcceptedStep:
+        """Step the rig, and see whether it still can be.
+
+        Raises:
+            BenchError: It has died, or waits for a device for too long.
+            RefusedError: It refuses to.
+        """
+        answer: queue.SimpleQueue[AcceptedStep | Exception] = queue.SimpleQueue()
+
+        def ask() -> None:
+            try:
+                answer.put(self._console.step(ticks, timeout_s=_STEP_S))
+            except Exception as error:
+                answer.put(error)
+
+        threading.Thread(target=ask, daemon=True).start()
+        since_s, tick = time.monotonic(), -1
+        while True:
+            with contextlib.suppress(queue.Empty):
+                got = answer.get(timeout=_LOOK_S)
+                if isinstance(got, Exception):
+                    raise got
+                return got
+            if self._program is not None and self._program.status is not None:
+                raise BenchError(f"the rig has died (status {self._program.status}): {self._program.last_line}")
+            try:
+                status = self.status()
+            except ConnectionError:
+                continue  # the next look tells why, or the step's own patience
+            if status["tick"] != tick:
+                since_s, tick = time.monotonic(), status["tick"]
+            elif time.monotonic() - since_s > _DEVICE_S:
+                behind = [row["name"] for row in status.get("devices", []) if row["tick"] < tick]
+                waits = ", ".join(behind) or "nobody that has joined"
+                raise BenchError(
+                    f"the rig has stood at {tick / _TICK_RATE_HZ:g} s for {_DEVICE_S:g} s: it waits for {waits}"
+                )
 
     def floor_ms(self) -> tuple[float, float]:
         """Round trips of a request to the rig: median and longest [ms], what a command's latency cannot be below."""
@@ -311,6 +353,8 @@ _TICK_RATE_HZ = 1_000_000
 _PIECE = 1_000_000
 """Ticks that are stepped at a time."""
 _STEP_S = 600.0
+_LOOK_S, _DEVICE_S = 1.0, 60.0
+"""How often a rig that is stepped is looked after, and how long it may stand at one time, waiting for a device [s]."""
 
 
 def _ticks(time_s: float) -> int:

@@ -30,6 +30,11 @@ Take = Literal[
 _TIMES = ("first beyond", "last beyond", "time beyond")
 Units = Mapping[str, Mapping[str, str]]
 """Units of columns by table: "" for the channels, else a table of the truth."""
+EventName = Literal[
+    "start", "end", "command", "note", "warning", "device", "hammer", "speed", "release", "fault", "clear", "pause",
+    "resume", "seek", "rate",
+]  # fmt: skip
+"""What a rig or a replay tells of."""
 
 
 class _Signal(Written):
@@ -71,7 +76,7 @@ class _Signal(Written):
 class EventOf(Written):
     """An event by its name and by what stands in it: `where` compares fields, and looks into lists."""
 
-    event: str
+    event: EventName
     where: dict[str, Any] = Field(default={})
     text: str = ""
 
@@ -99,7 +104,7 @@ class Since(_Signal):
     """A moment that times are counted from: one of the case, an event, or the first row beyond a level."""
 
     at_s: Time | None = None
-    event: str = ""
+    event: EventName | Literal[""] = ""
     where: dict[str, Any] = Field(default={})
     text: str = ""
     beyond: str = ""
@@ -241,7 +246,7 @@ _STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
 class ExpectEvent(_Within):
     """An event that comes, does not come, or comes in time."""
 
-    event: str
+    event: EventName
     where: dict[str, Any] = Field(default={})
     text: str = ""
     appears: bool = True

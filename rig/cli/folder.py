@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from rig.errors import InputError
@@ -21,3 +22,5 @@ def check_folder(path: Path, *, field: str) -> None:
         raise InputError(field, "a folder, not a file", str(path))
     if not path.parent.is_dir():
         raise InputError(field, "a folder, or a new one in a folder that exists", str(path))
+    if not os.access(path if path.exists() else path.parent, os.W_OK | os.X_OK):
+        raise InputError(field, "a folder that can be written to", str(path))
