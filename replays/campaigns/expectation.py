@@ -391,7 +391,10 @@ class ExpectScore(_Expect):
         told = "; ".join(" ".join(filter(None, (*row.cells(), row.note))) for row in bad[:4])
         source = self.source or ", ".join(dict.fromkeys(row.limit.source for row in bad if row.limit is not None))
         value = float(len(bad)) if shown or bad else math.nan
-        note = told or ("" if shown else "nothing of it is shown")
+        hidden = sum(row.verdict == NOT_SHOWN for row in rows)
+        note = told or (
+            f"{card.path} path, {shown} rows pass, {hidden} not shown" if shown else "nothing of it is shown"
+        )
         yield Measurement(what, value, must, source, note=note, channels=tuple(row.channel for row in bad[:2]))
 
     def _values(self, rows: Sequence[ScoreRow], must: Must) -> Iterator[Measurement]:
