@@ -82,7 +82,7 @@ class Declared(Continuity):
         self._holes: dict[str, deque[tuple[int, int]]] = {}
         self._never: dict[str, deque[tuple[int, int]]] = {}
         self._untold: dict[str, deque[tuple[int, int, int]]] = {}
-        """Number, tick and length of the blocks since numbers began anew, of which nothing was told."""
+        """Number, tick and length of the latest blocks, since numbers began anew, of which nothing was told."""
         self._anew: dict[str, tuple[int, int]] = {}
         """Number behind the last of these that was told since, as it was sent, and as it is."""
 
@@ -103,6 +103,8 @@ class Declared(Continuity):
                 else:
                     never.append((one.row, one.rows))
             for each in sent:
+                if each.index != one.row:
+                    self._untold.setdefault(one.key, deque(maxlen=_AHEAD))
                 if (which := (each.index, each.tick, one.rows)) in self._untold.get(one.key, ()):
                     self._untold[one.key].remove(which)
                     self._tell(one.key, each.index + one.rows, one.row + one.rows)
@@ -134,7 +136,7 @@ class Declared(Continuity):
         self._first.setdefault(key, due)
         if told is None and (row < due or key in self._untold):
             self._untold.setdefault(key, deque(maxlen=_AHEAD)).append(which)
-        if (told is not None and row > due == block.index and key in self._untold) or (due, row) == self._anew.get(key):
+        if (told is not None and row > due == block.index) or (due, row) == self._anew.get(key):
             # Those before it, of which nothing was told in time, were numbered as it is.
             self.next[key] = due = row
             self._know(key)
@@ -153,7 +155,6 @@ class Declared(Continuity):
     def _know(self, key: str) -> None:
         """What seemed to be numbers that began anew was told to be none."""
         self.runs[key] = max(0, self.runs.get(key, 0) - 1)
-        self._untold.pop(key, None)
         self._anew.pop(key, None)
 
     def _tell(self, key: str, number: int, row: int) -> None:

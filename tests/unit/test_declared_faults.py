@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from functools import cache
@@ -125,6 +126,20 @@ def test_what_is_told_late_counts_nevertheless(kind: str, behind: int, tmp_path:
     summary = recorded(tmp_path / "late.mcap", kind, held)
     assert (summary.good, summary.losses) == (True, ())
     assert summary.rows[PROBES] == 8000
+
+
+@pytest.mark.parametrize("seed", [25, 34, 40, 57])
+def test_what_is_told_comes_in_bursts(seed: int, tmp_path: Path) -> None:
+    """Blocks that are numbered anew, and what is told of that, each in order, one ahead of the other by chance."""
+    rng, items = random.Random(seed), list(published("restart"))
+    end, held = items.pop(), list[tuple[str, bytes]]()
+    streams = [[item for item in items if (item[0] == wire.FAULTS) == told] for told in (True, False)]
+    while any(streams):
+        most = rng.randint(1, rng.choice((3, 15, 60)))
+        stream = streams[0 if rng.random() < 0.5 else 1]
+        held += stream[:most]
+        del stream[:most]
+    assert recorded(tmp_path / "bursts.mcap", "restart", [*held, end]).good
 
 
 @pytest.mark.parametrize("kind", ["lose-blocks", "reorder-blocks"])
