@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import textwrap
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from rig.cli.folder import check_folder
-from rig.cli.tables import echo, new_table, progress_bar, table_console
+from rig.cli.tables import echo, progress_bar
 from rig.errors import InputError, UnknownNameError, Words
 
 _TOML = ".campaign.toml"
@@ -76,10 +77,8 @@ def campaign(
 def _list() -> None:
     from replays.campaigns.campaign import FOLDER, shipped, title_of
 
-    table = new_table("", "campaign", "what it tests", wrapped=["what it tests"])
     for name, path in shipped().items():
-        table.add_row(name, title_of(path))
-    table_console().print(table)
+        echo(textwrap.fill(f"{name}: {title_of(path)}", 80, subsequent_indent="  "))
     echo(f"files in {FOLDER}")
 
 
