@@ -375,15 +375,16 @@ class Rig(Console):
         ticks = row * self._tick_rate_hz / self.daq.rate_hz - self._at
         if self._steps and ticks > 0.0:
             try:
-                whole = math.ceil(ticks / self._block_ticks - 1e-9) * self._block_ticks
-                # A rig that was killed never answers.
-                self._step(whole, timeout_s=_STEP_S + 10.0 * whole / self._tick_rate_hz)
+                self._step(ticks)
             except RefusedError as error:
                 return error
         return None
 
-    def _step(self, ticks: int, **settings: Any) -> None:
-        taken = self.step(ticks, **settings)
+    def _step(self, ticks: float) -> None:
+        """Step by whole blocks, so many ticks at least."""
+        whole = math.ceil(ticks / self._block_ticks - 1e-9) * self._block_ticks
+        # A rig that was killed never answers.
+        taken = self.step(whole, timeout_s=_STEP_S + 10.0 * whole / self._tick_rate_hz)
         self._at = taken.tick
         self.lost |= taken.lost
 
@@ -445,8 +446,7 @@ class Rig(Console):
         found: Samples | None = None
         while found is None or (to_s is not None and found.times_s[-1] + 1.0 / found.rate_hz < to_s - 1e-9):
             if to_s is not None and self._steps and to_s * self._tick_rate_hz > self._at:
-                blocks = math.ceil((to_s * self._tick_rate_hz - self._at) / self._block_ticks - 1e-9)
-                self._step(blocks * self._block_ticks)
+                self._step(to_s * self._tick_rate_hz - self._at)
             try:
                 fresh = made.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:

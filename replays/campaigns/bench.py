@@ -8,12 +8,11 @@ import json
 import math
 import os
 import queue
-import socket
 import statistics
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,6 +21,8 @@ from replays.campaigns.process import Program
 from rig import wire
 from rig.closing import Closing
 from rig.errors import InputError, RefusedError, Words
+from rig.sampling import TICKS_HZ
+from rig.transport.endpoint import free_port
 
 if TYPE_CHECKING:
     from drivers.client import Rig
@@ -144,7 +145,7 @@ class Bench(Closing):
         if self.target.replay is not None:
             return [*rig, "replay", str(self.target.replay), "--pause", *listen]
         if settings.can:
-            bus = f"zenoh:can0?endpoint=127.0.0.1:{_free_port()}"
+            bus = f"zenoh:can0?endpoint=127.0.0.1:{free_port()}"
             self.can_url = f"can:{bus}"
             listen += ["--can", bus]
         changes = dict(settings.set)
@@ -204,8 +205,29 @@ class Bench(Closing):
         Raises:
             BenchError: It does not in time.
         """
+        self.first_joined(lambda name: name == device, device, timeout_s=timeout_s)
+
+    def first_joined(
+        self, fits: Callable[[str], bool], device: str, *, timeout_s: float = JOIN_S,
+        look: Callable[[], object] = lambda: None,
+    ) -> str:  # fmt: skip
+        """Wait until a device that fits takes part in lockstep; returns what the rig calls it.
+
+        Args:
+            fits: Whether one of that name is it.
+            device: What it is called in errors.
+            timeout_s: How long [s].
+            look: Called meanwhile.
+
+        Raises:
+            BenchError: None does in time.
+        """
         deadline = time.monotonic() + timeout_s
-        while device not in (now := self.joined):
+        while True:
+            now = self.joined
+            if found := next(filter(fits, now), None):
+                return found
+            look()
             if time.monotonic() > deadline:
                 others = ", ".join(now) or "nobody"
                 raise BenchError(f"device {device} did not join in {timeout_s:g} s; what has: {others}")
@@ -274,7 +296,7 @@ class Bench(Closing):
                 behind = [row["name"] for row in status.get("devices", []) if row["tick"] < tick]
                 waits = ", ".join(behind) or "nobody that has joined"
                 raise BenchError(
-                    f"the rig has stood at {tick / _TICK_RATE_HZ:g} s for {_DEVICE_S:g} s: it waits for {waits}"
+                    f"the rig has stood at {tick / TICKS_HZ:g} s for {_DEVICE_S:g} s: it waits for {waits}"
                 )
 
     def floor_ms(self) -> tuple[float, float]:
@@ -349,7 +371,6 @@ DEFAULT_SCENE = "stable-run"
 _NUMBERS = itertools.count(1)
 _SHORT_S = 0.01
 """A recording may lack this of a run [s]: the rows behind its last one."""
-_TICK_RATE_HZ = 1_000_000
 _PIECE = 1_000_000
 """Ticks that are stepped at a time."""
 _STEP_S = 600.0
@@ -358,7 +379,7 @@ _LOOK_S, _DEVICE_S = 1.0, 60.0
 
 
 def _ticks(time_s: float) -> int:
-    return round(time_s * _TICK_RATE_HZ)
+    return round(time_s * TICKS_HZ)
 
 
 def _key(command: Mapping[str, Any]) -> str:
@@ -375,9 +396,3 @@ def toml_value(value: Any) -> str:
     if value is None or not isinstance(value, str | bool | int | float):
         raise InputError("set", "of numbers, texts, lists and tables", Words(type(value).__name__))
     return json.dumps(value)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]

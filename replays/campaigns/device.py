@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from replays.campaigns.bench import JOIN_S, Bench, BenchError
+from replays.campaigns.bench import Bench, BenchError
 from replays.campaigns.process import Program
 from rig.errors import InputError
 
@@ -55,17 +55,9 @@ class Device:
         Raises:
             BenchError: It ended, or does not in time.
         """
-        deadline = time.monotonic() + JOIN_S
-        while True:
-            now = self._bench.joined
-            if new := [name for name in now if name not in self._others]:
-                self.joined_as = new[0]
-                return
-            self.check_running()
-            if time.monotonic() > deadline:
-                others = ", ".join(now) or "nobody"
-                raise BenchError(f"device {self.name} did not join in {JOIN_S:g} s; what has: {others}")
-            time.sleep(0.02)
+        self.joined_as = self._bench.first_joined(
+            lambda name: name not in self._others, self.name, look=self.check_running
+        )
 
     def wait_until_linked(self, before: int) -> None:
         """Wait until there is one link more to the rig than before; not for long, as on a CAN bus it has none.

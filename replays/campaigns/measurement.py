@@ -156,10 +156,8 @@ def quantity(text: str, unit: str, *, field: str, of: str) -> float:
     Raises:
         InputError: It does not read so, or its unit is missing or of something else.
     """
-    match = _QUANTITY.fullmatch(text)
-    if match is None:
-        raise InputError(field, "a number with its unit, such as '0.2 mm'", text)
-    return float(match[1]) * _factor((match[2] or "1").strip(), unit, field=field, of=of, text=text)
+    number, given = split_quantity(text, field=field)
+    return number * _factor(given, unit, field=field, of=of, text=text)
 
 
 def split_quantity(text: str, *, field: str) -> tuple[float, str]:

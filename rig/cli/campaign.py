@@ -13,7 +13,6 @@ from rig.cli.folder import check_folder
 from rig.cli.tables import echo, progress_bar
 from rig.errors import InputError, UnknownNameError, Words
 
-_TOML = ".campaign.toml"
 _INTERRUPTED = 130
 _EXTRA = "installed with its extra: pip install 'rotor-stator-rig[campaigns]'"
 
@@ -84,7 +83,7 @@ def _list() -> None:
 
 def _checked(files: list[str], against: Path | None, replay: Path | None) -> list[str]:
     """The files by their paths; what is wrong with them is refused before anything runs."""
-    from replays.campaigns.campaign import campaign_path, load_campaign
+    from replays.campaigns.campaign import SUFFIX, campaign_path, load_campaign
     from replays.campaigns.results import load_results
 
     paths = []
@@ -92,14 +91,14 @@ def _checked(files: list[str], against: Path | None, replay: Path | None) -> lis
         name, colons, case = file.partition("::")
         name = str(campaign_path(name))
         paths.append(f"{name}{colons}{case}")
-        if name.endswith(_TOML):
+        if name.endswith(SUFFIX):
             known = [each.id for each in load_campaign(Path(name)).cases]
             if colons and case not in known:
                 raise UnknownNameError("FILE", f"one of the cases of {name}", case, known)
         elif not Path(name).exists():
-            raise InputError("FILE", f"a *{_TOML} file, or tests of pytest, that exists", name)
+            raise InputError("FILE", f"a *{SUFFIX} file, or tests of pytest, that exists", name)
         elif Path(name).is_file() and not name.endswith(".py"):
-            raise InputError("FILE", f"a file that ends in {_TOML} or .py, or a folder", name)
+            raise InputError("FILE", f"a file that ends in {SUFFIX} or .py, or a folder", name)
     if against is not None:
         load_results(against)
     if replay is not None:

@@ -82,12 +82,13 @@ def _record_session(file: Path, *, speed_hz: float, whirl_s: float, say: Callabl
     from rig.cli.progress import reporting
     from rig.scenes import load_scene
     from rig.simulation import Simulation
+    from rig.transport.endpoint import free_port
     from rig.transport.zenoh import ZenohClient
 
     with reporting(compiles=True) as reporter:
         reporter.say("loading the kernels")
         Simulation(load_scene("stable-run")).warm_up()  # what has to be compiled is compiled where it is seen
-    endpoint = f"127.0.0.1:{_free_port()}"
+    endpoint = f"127.0.0.1:{free_port()}"
     with _processes(file.with_name("processes.log")) as start:
         say(f"starting the service: rig run stable-run --set drive.speed_hz={speed_hz:g} --listen {endpoint}")
         arguments = ("--set", f"drive.speed_hz={speed_hz}", "--duration-s", "3600", "--listen", endpoint)
@@ -166,14 +167,6 @@ def _wait_until_up(endpoint: str, service: Process) -> None:
 def _complain(log: Path | None, text: str) -> int:
     echo(f"rig: {text}" + (f"; see {log}" if log else ""), err=True)
     return 1
-
-
-def _free_port() -> int:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def verdict_table(verdict: Verdict) -> Table:

@@ -56,11 +56,14 @@ def place_to_listen(text: str, *, field: str) -> tuple[str, int]:
         InputError: It is not of that form, or not of this machine alone.
     """
     host, port = parse_loopback(text, field=field, least=0)
+    return host, port or free_port()
+
+
+def free_port() -> int:
+    """A port of 127.0.0.1 that nobody listens on, as yet."""
     with socket.socket() as probe:
-        if port == 0:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
-    return host, port
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def check_free(place: tuple[str, int], *, field: str) -> None:

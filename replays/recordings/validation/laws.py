@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -61,8 +62,11 @@ def law_of(one: Shown) -> Law:
     if one.moves and one.even:
         laws += [*late(one), *filtered(one)]
     best = min(laws, key=lambda law: one.cost(law.left, law.count))
+    rings = cache(lambda: list(ringing(one)))
     if one.counts is not None:
-        names = " or ".join([best.name, *_alike(one, best, laws)])
+        # Of a narrow band, a resonance is a gain with a delay.
+        others = [*laws, *(rings() if one.moves and best.name in _ALSO else ())]
+        names = " or ".join([best.name, *_alike(one, best, others)])
         best = replace(best, name=" or ".join(dict.fromkeys(names.split(" or "))))
     rms = rms_of(before)
     if one.counts is None:
@@ -81,16 +85,14 @@ def law_of(one: Shown) -> Law:
         timed = best.name.split(" or ")[0] in _TIMES
         if timed and abs(twice - 1.0) < _EXACTLY + 3.0 / math.sqrt(len(before)) and _white(best.left):
             return best
-        for law in ringing(one):
+        for law in rings():
             if rms_of(law.left) < 2.0 * _EXACTLY * rms:  # knocks between samples ring, too
                 return law
     return next(_at_random(one), replace(best, sure=False))
 
 
-def _alike(one: Shown, best: Law, laws: list[Law]) -> dict[str, None]:
+def _alike(one: Shown, best: Law, others: list[Law]) -> dict[str, None]:
     """Names of other laws than the best that leave as little: what moves evenly, or little, tells them not apart."""
-    # Of a narrow band, a resonance is a gain with a delay.
-    others = [*laws, *(ringing(one) if one.moves and best.name in _ALSO else ())]
     least, kind = one.cost(best.left, 0) + DECIDES, best.name.partition(" ")[0]
     return dict.fromkeys(
         law.name
