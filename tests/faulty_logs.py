@@ -70,6 +70,19 @@ def _late(names: tuple[str, ...], late_s: float) -> Callable[[Values, float], Va
     return change
 
 
+def _added(name: str, what: Callable[[np.ndarray], np.ndarray]) -> Callable[[Values, float], Values]:
+    """Something added that is a function of time [s]."""
+    return lambda values, hz: values | {name: values[name] + what(np.arange(len(values[name])) / hz)}
+
+
+def _bent(name: str, end: float) -> Callable[[Values, float], Values]:
+    return lambda values, _: values | {name: end * np.tanh(values[name] / end)}
+
+
+def _beside(name: str, other: str, part: float) -> Callable[[Values, float], Values]:
+    return lambda values, _: values | {name: values[name] + part * (values[other] - values[other].mean())}
+
+
 def _swapped(a: str, b: str) -> Callable[[Values, float], Values]:
     return lambda values, _: values | {a: values[b], b: values[a]}
 
@@ -97,6 +110,18 @@ def _held(name: str, from_s: float, for_s: float, level: float | None = None) ->
         rows, shown = (own_s >= from_s) & (own_s < from_s + for_s), values[name].copy()
         shown[rows] = shown[np.argmax(rows)] if level is None else level
         return own_s, values | {name: shown}
+
+    return change
+
+
+def _in_steps(name: str, step: float) -> Behind:
+    return lambda own_s, values: (own_s, values | {name: np.round(values[name] / step) * step})
+
+
+def _spikes(name: str, size: float) -> Behind:
+    def change(own_s: np.ndarray, values: Values) -> tuple[np.ndarray, Values]:
+        rng = np.random.default_rng(3)
+        return own_s, values | {name: values[name] + size * (rng.random(len(own_s)) < 60.0 * (own_s[1] - own_s[0]))}
 
     return change
 
@@ -196,6 +221,21 @@ CASES = tuple(
        for ms in (0.3, 1.0, 3.0)]
     + [Case(f"{name} behind {hz} Hz", f"{name} (bandwidth|delay|gain and delay|signal missing)", before=_slow(name, hz))
        for name, hz in (("P_E", 3000), ("P_E", 1000), ("P_N", 300))]
+    + [Case(f"{name} nonlinear to {end:g}", f"{name} nonlinear", before=_bent(name, end))
+       for name, end in (("P_E", 20000.0), ("P_E", 6000.0), ("P_N", 3000.0), ("disk_x", 4.0), ("ring_y", 0.4))]
+    + [Case(f"{name} hum {size:g}", f"{name} hum", before=_added(name, lambda t, k=size: k * np.sin(314.0 * t)))
+       for name, size in (("P_W", 30.0), ("P_W", 300.0), ("disk_y", 0.02))]
+    + [Case(f"{name} drift {rate:g} a second", f"{name} drift", before=_added(name, lambda t, k=rate: k * t))
+       for name, rate in (("P_S", 20.0), ("P_S", 200.0), ("ring_x", 0.05))]
+    + [Case(f"{name} spikes {size:g}", f"{name} spikes", behind=_spikes(name, size))
+       for name, size in (("P_N", 300.0), ("disk_x", 0.3), ("inner_y", 50.0))]
+    + [Case(f"{name} in steps of {step:g}", f"{name} bits", behind=_in_steps(name, step))
+       for name, step in (("P_N", 200.0), ("disk_x", 0.05), ("ring_y", 0.02))]
+    + [Case(f"{name} with {part:g} of {other}", f"{name} crosstalk|{other} angle", before=_beside(name, other, part))
+       for name, other, part in (("P_N", "P_E", 0.1), ("disk_x", "disk_y", 0.1), ("ring_x", "ring_y", 0.03))]
+    + [Case(f"P_N {us} us late with gain {gain}", "P_N gain and delay",
+            before=lambda v, hz, us=us, gain=gain: _late(("P_N",), us * 1e-6)(v | {"P_N": gain * v["P_N"]}, hz))
+       for us, gain in ((200, 1.1), (100, 0.5), (1000, 2.0))]
     + [Case(f"{rows} rows lost at {at_s:g} s", "time rows|clock: [-+]", behind=_lost(at_s, rows))
        for at_s, rows in ((0.5, 20), (0.5, 200), (0.81, 100))]
 )  # fmt: skip

@@ -475,7 +475,8 @@ def conclude(
         if also:
             text = f"sensor: {text}, or {_listed(also)} explain it alike; this recording cannot tell"
             return text, (*names, *(one.name for one in also))
-        return f"sensor: {text} ({min(1.0, sum(one.explained for one in cured)):.1%} of the difference)", names
+        beyond = f"; {rest:.2g} times the noise is left" if (rest := max(one.left for one in cured)) > _NEAR else ""
+        return f"sensor: {text} ({min(1.0, most):.1%} of the difference{beyond})", names
     if single is None or single.explained < rules.enough:
         most = f"; the most is {single.name} with {single.explained:.0%}" if single else ""
         return f"no single candidate explains it{most}", ()

@@ -27,6 +27,8 @@ from rig.channels import Channel
 
 _TURNED_OFF = 0.02
 """By so much may two probes' signals differ from ones that are turned."""
+_FADED = 1e-3
+"""Part of a level by which a row more or less lets an AC-coupled channel be off."""
 _SURE = 6.0
 """Times its noise, by which a sample, or the mean of some, is off."""
 SOME = 100
@@ -217,7 +219,7 @@ def _swapped(a: Shown, b: Shown, told: _Telling) -> Explanation | None:
             continue  # its converter may be too small for it: the other of the two tells
         if not y.moves:
             (level,), left = x.left([x.level], x.values - shown)
-            if abs(level) > OFF * x.noise:
+            if abs(level) > OFF * x.noise + _FADED * float(np.abs(shown).max()):
                 return None
         own = min(own, excess(x.left([x.foretold, x.level])[1]))
         crossed = np.concatenate([crossed, left])

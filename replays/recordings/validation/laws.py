@@ -24,12 +24,16 @@ _HIGHEST_HZ = 1000.0
 """Of a hum."""
 _ALSO = ("gain and delay", "bandwidth")
 """What a resonance may look like."""
+_BENDS = ("resonance", "wander")
+"""Laws of more numbers that look like simpler ones where little is seen of them."""
 _MORE = {"offset": ("drift", "hum", "crosstalk", "delay", "gain and offset"), "delay": ("clock", "wander", "gain")}
 """Laws that are one with another number."""
 _TIMES = ("delay", "clock", "wander")
 """Laws by which noise is drawn again, so that there is exactly that of two draws."""
 _LOUD = 0.5
 """Less than this part of what it should show is left without its loudest line."""
+_OWN = 0.25
+"""A line of its own, over that of a hum, by which it is not told from it."""
 _HALF = 0.5
 """What is left where noise was drawn again may be this part of what was there."""
 _ANOTHER = 1.6
@@ -42,6 +46,8 @@ _SLACK, _FADING = 1e-3, 0.02
 """Parts of its span by which a channel may be off a level."""
 _ROUNDED = 2
 """Counts that rounding may make."""
+_CLEARLY = 0.25
+"""Of what a straight line leaves of a log, that a curve may leave: what is off elsewhere bends, too."""
 _SPARSE = 0.3
 """Fewer than this part of the samples are spikes."""
 
@@ -49,7 +55,7 @@ _SPARSE = 0.3
 def law_of(one: Shown) -> Law:
     """The simplest law of a channel that leaves noise, else the one that leaves least."""
     before = one.apart
-    for law in _by_counts(one):
+    for law in _in_steps(one) if one.counts is None else _by_counts(one, one.counts):
         return law
     held = steady_rows(one.values) if one.noise > 0.0 and one.counts is None else np.zeros(len(before), dtype=bool)
     if held.any() and excess(before[held]) > 0.5 * excess(before):
@@ -82,7 +88,7 @@ def law_of(one: Shown) -> Law:
         if is_noise(best.left) or rms_of(best.left) < (_HALF if drawn else _EXACTLY) * rms:
             return best
         twice = rms_of(best.left) * float(one.floor[0]) / (math.sqrt(2.0) * one.noise) if one.noise > 0.0 else 0.0
-        timed = best.name.split(" or ")[0] in _TIMES
+        timed = best.name.split(" or ")[0] in _TIMES and one.cost(best.left, best.count) < one.cost(before, 0)
         if timed and abs(twice - 1.0) < _EXACTLY + 3.0 / math.sqrt(len(before)) and _white(best.left):
             return best
         for law in rings():
@@ -98,7 +104,7 @@ def _alike(one: Shown, best: Law, others: list[Law]) -> dict[str, None]:
         law.name
         for law in others
         if not {law.name, law.name.partition(" ")[0]} & {kind, *_MORE.get(kind, ())}
-        and (law.count <= best.count + 1 or law.name == "resonance")
+        and (law.count <= best.count + 1 or law.name in _BENDS)
         and one.cost(law.left, 0) < least
     )
 
@@ -107,11 +113,9 @@ def _white(left: np.ndarray) -> bool:
     return abs(float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300)) < 0.1
 
 
-def _by_counts(one: Shown) -> Iterator[Law]:
-    """What is seen in counts alone, and leaves nothing."""
-    if one.counts is None:
-        return
-    said, sound = one.counts.T
+def _by_counts(one: Shown, counts: np.ndarray) -> Iterator[Law]:
+    """What is seen in counts alone, shape (n, 2), and leaves nothing."""
+    said, sound = counts.T
     none = np.zeros(len(said))
     if (said == said[0]).all() and one.noise > 0.0 and one.at_begin(said[0] * one.channel.scale + one.channel.offset):
         yield Law("freeze", f"at {one.channel.scale * said[0] + one.channel.offset:.6g} {one.unit}", 0.0, none)
@@ -133,6 +137,16 @@ def _by_counts(one: Shown) -> Iterator[Law]:
     sizes = np.abs(said - sound)[off]
     if off.mean() < _SPARSE and len(sizes) and sizes.min() == sizes.max() > _ROUNDED:
         yield _spikes(one, off, none)
+
+
+def _in_steps(one: Shown) -> Iterator[Law]:
+    """A log's numbers that are rounded far more than they should be."""
+    levels, apart = np.unique(one.values), one.values - one.foretold
+    step = float(np.diff(levels).min(initial=np.inf))
+    left = (apart - np.clip(apart, -0.5 * step, 0.5 * step)) / one.floor
+    ragged = np.abs((levels - levels[0]) / step % 1.0 - 0.5) < 0.5 - _SLACK
+    if len(levels) > 1 and step > OFF * one.noise and not ragged.any() and is_noise(left):
+        yield Law("bits", f"in steps of {step:.4g} {one.unit}", step, left, 1, one.unit)
 
 
 def _spikes(one: Shown, rows: np.ndarray, left: np.ndarray) -> Law:
@@ -210,7 +224,11 @@ def _of_time(one: Shown) -> Iterator[Law]:
         return [ones, *(wave(turn) for turn in turns for wave in (np.cos, np.sin))]
 
     peak, span = float(hz[within][size[within].argmax()]), 1.0 / length_s
-    if rms_of(one.left(columns(peak), one.foretold)[1]) < _LOUD * float(one.foretold.std() / one.floor.min()):
+    own, rest = one.left(columns(peak), one.foretold)
+    added = one.left(columns(peak), d)[0]
+    if rms_of(rest) < _LOUD * float(one.foretold.std() / one.floor.min()) and math.hypot(*own[1:]) > _OWN * math.hypot(
+        *added[1:]
+    ):
         return  # what is as loud there by itself is not hum
     for third in (False, True):
         f = least_at(
@@ -245,13 +263,17 @@ def _of_others(one: Shown) -> Iterator[Law]:
 
 def _bent(one: Shown) -> Iterator[Law]:
     """A curve, or an end, of what it can show."""
-    e, reach = one.foretold, float(np.abs(one.foretold).max())
+    e, reach, log = one.foretold, float(np.abs(one.foretold).max()), one.counts is None
     if reach == 0.0:
         return
     starts = [[reach * part] for part in (0.1, 0.3, 0.6, 1.0, 2.0, 5.0, 15.0)]
-    (end,), left = one.fitted(lambda p: p[0] * np.tanh(e / p[0]), starts, [reach])
-    count = 1 if one.counts is not None else 2
-    yield Law("nonlinear", f"end at {abs(end):.4g} {one.unit}", abs(float(end)), left, count, one.unit)
+    # Of a log, nobody knows about what level.
+    for about in (0.0, float(e.mean())) if log else (0.0,):
+        (end,), left = one.fitted(lambda p, at=about: at + p[0] * np.tanh((e - at) / p[0]), starts, [reach])
+        if not log or excess(left) < _CLEARLY * min(
+            excess(one.left(line)[1]) for line in ([e], [e - about + one.level])
+        ):
+            yield Law("nonlinear", f"end at {abs(end):.4g} {one.unit}", abs(float(end)), left, 1, one.unit)
     low, high = float(one.values.min()), float(one.values.max())
     for _ in range(8):  # the ends of what it shows, less what noise adds to them
         over, under = e > high, e < low

@@ -98,8 +98,10 @@ def own_faults(
     # A recording may begin, and end, inside a run.
     begin_s = min(float(part.times_s[0]) for part in parts.values())
     end_s = max(float(part.times_s[-1]) for part in parts.values())
-    edges = _own_edges(*(each[(each > begin_s) & (each < end_s)] for each in (recorded_s, made_s)))
-    return found if edges is None else [*(one for one in found if not one.name.startswith("keyphasor")), edges]
+    others = [one for one in found if not one.name.startswith("keyphasor")]
+    late = any("delay" in one.name for one in found if one not in others)
+    edges = _own_edges(*(each[(each > begin_s) & (each < end_s)] for each in (recorded_s, made_s)), late=late)
+    return found if edges is None else [*others, edges]
 
 
 def _shown(
@@ -130,13 +132,16 @@ def _bare(
     return again({part.group: alone}).values[part.group][rows, 0]
 
 
-def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray) -> Explanation | None:
-    """What keyphasor edges lack, have too many, or how they move; None where the signal tells more."""
+def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Explanation | None:
+    """What keyphasor edges lack, have too many, or how they move; None where the signal, late or not, tells more."""
     lacking, more = np.setdiff1d(made_s, recorded_s), np.setdiff1d(recorded_s, made_s)
     off = np.sort(np.concatenate([lacking, more]))
     moved_s = more - lacking if len(more) == len(lacking) else np.empty(0)
     turns = np.count_nonzero((made_s >= off[0]) & (made_s <= off[-1])) if len(off) else 0
-    if len(moved_s) > 1 and moved_s.std() > _EVEN_S:
+    if len(moved_s) == 1 and late:  # of one, nobody can tell
+        what, value, unit = "delay or edge-jitter", float(moved_s[0]), "s"
+        change = f"{1e6 * value:+.4g} µs, one edge"
+    elif len(moved_s) > 1 and moved_s.std() > _EVEN_S:
         what, value, unit = "edge-jitter", float(moved_s.std()), "s"
         change = f"{1e6 * value:.4g} µs about {1e6 * moved_s.mean():.4g} µs"
     elif len(moved_s) or not len(off):

@@ -91,7 +91,8 @@ class Shown:
     @property
     def price(self) -> float:
         """What another number must take away: more than noise makes, and than what is wrong elsewhere brings along."""
-        return max(DECIDES, _SLIGHT * excess(self.apart))
+        moving = excess(self.apart - self.apart.mean())  # a level may be off by far more than anything moves
+        return max(DECIDES, _SLIGHT * moving, _SLIGHT**2 * excess(self.apart))
 
     def cost(self, left: np.ndarray, count: int) -> float:
         """Of a law with so many numbers that leaves so much over the floor, shape (n,) or fewer."""

@@ -27,6 +27,8 @@ _SETTLES_S = 0.02
 """Behind this it is another filter's."""
 _RINGS_HZ, _RINGS = (20.0, 4000.0), 60
 """Between these resonances are looked for, at so many."""
+_SEEN = 0.3
+"""Of what differs, that must be left where a filter has settled."""
 _SAME = 0.8
 """Of the noise, below which what is left has none of its own."""
 
@@ -47,9 +49,10 @@ def late(one: Shown) -> Iterator[Law]:
             yield Law("delay and offset", f"{change}, {shift:+.4g} {one.unit}", late_s, left, 2, "s", of)
         if one.counts is not None and abs(late_s) < -_EARLIEST_S:
             return  # there is no delay in it
-        factors, left = one.left([delayed, ones])
-        what, also = gain_words(gain := float(factors[0]))
-        yield Law(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 3, "", of)
+        for columns in [[delayed], [delayed, ones]][one.counts is not None :]:
+            factors, left = one.left(columns)
+            what, also = gain_words(gain := float(factors[0]))
+            yield Law(f"{what} and delay", f"{also}, {change}", gain - 1.0, left, 1 + len(columns), "", of)
     if one.counts is None or one.channel.signal == "keyphasor":
         return  # of a log, the time of all is fitted before; pulses tell by their edges
     at, delays = _delays(one)
@@ -164,8 +167,11 @@ def filtered(one: Shown) -> Iterator[Law]:
     near, step = min(grid, key=cost), grid[1] - grid[0]
     corner_hz = math.exp(least_at(cost, near - step, min(near + step, grid[-1])))
     margin = max(margin, min(len(one.values) // 2, round(_SETTLED / corner_hz / one.period_s)))
-    left = left_by(through(corner_hz))
-    if rms_of(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
+    left, differs = left_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
+    settled = rms_of(differs) > _SEEN * rms_of(one.apart)
+    if settled and rms_of(left) < _SAME * max(
+        1.0, one.noise / float(one.floor[0])
+    ):  # else noise of another time is in it
         yield Law("bandwidth", f"{corner_hz:.4g} Hz", corner_hz, left, 1, "Hz")
     if one.bare is not None and (rms_of(left_by(1.0)) < _HARDLY * rms_of(one.apart)):
         _, left = one.left([one.level] if channel.highpass_hz else [np.zeros(len(one.values))], one.values - one.bare())
