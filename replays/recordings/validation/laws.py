@@ -46,6 +46,8 @@ _SLACK, _FADING = 1e-3, 0.02
 """Parts of its span by which a channel may be off a level."""
 _ROUNDED = 2
 """Counts that rounding may make."""
+_NOTHING = 0.02
+"""What shows no more than this part of its signal shows nothing."""
 _CLEARLY = 0.25
 """Of what a straight line leaves of a log, that a curve may leave: what is off elsewhere bends, too."""
 _SPARSE = 0.3
@@ -67,7 +69,7 @@ def law_of(one: Shown) -> Law:
         laws += _bent(one)
     if one.moves and one.even:
         laws += [*late(one), *filtered(one)]
-    best = min(laws, key=lambda law: one.cost(law.left, law.count))
+    best = min((law for law in laws if law.sure), key=lambda law: one.cost(law.left, law.count))
     rings = cache(lambda: list(ringing(one)))
     if one.counts is not None:
         # Of a narrow band, a resonance is a gain with a delay.
@@ -78,7 +80,7 @@ def law_of(one: Shown) -> Law:
     if one.counts is None:
         if is_noise(best.left) or rms_of(best.left) < _NEARLY * min(1.0, rms) + 1.0:
             return best
-    elif rms < _ROUNDED:
+    elif rms < (_ROUNDED if one.moves else OFF):
         return replace(best, sure=False)
     else:
         # Late samples have noise of their own, which is as good as none.
@@ -270,9 +272,8 @@ def _bent(one: Shown) -> Iterator[Law]:
     # Of a log, nobody knows about what level.
     for about in (0.0, float(e.mean())) if log else (0.0,):
         (end,), left = one.fitted(lambda p, at=about: at + p[0] * np.tanh((e - at) / p[0]), starts, [reach])
-        if not log or excess(left) < _CLEARLY * min(
-            excess(one.left(line)[1]) for line in ([e], [e - about + one.level])
-        ):
+        plain = min(excess(one.left(line)[1]) for line in ([e], [e - about + one.level])) if log else math.inf
+        if abs(end) > _NOTHING * reach and excess(left) < _CLEARLY * plain:
             yield Law("nonlinear", f"end at {abs(end):.4g} {one.unit}", abs(float(end)), left, 1, one.unit)
     low, high = float(one.values.min()), float(one.values.max())
     for _ in range(8):  # the ends of what it shows, less what noise adds to them
@@ -280,7 +281,8 @@ def _bent(one: Shown) -> Iterator[Law]:
         high = float(one.values[over].mean()) if over.any() else high
         low = float(one.values[under].mean()) if under.any() else low
     # Of a log, knocks behind a slow filter look as if they were cut off.
-    if one.counts is not None and ((e > high).any() or (e < low).any()):
+    cut = (e > high).any() or (e < low).any()
+    if one.counts is not None and cut and max(abs(low), abs(high)) > _NOTHING * reach:
         left = (one.values - np.clip(e, low, high)) / one.floor
         yield Law("saturation", f"from {low:.4g} to {high:.4g} {one.unit}", max(abs(low), abs(high)), left, 2, one.unit)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -30,6 +31,8 @@ _NO_FILTER = 1e4
 """A corner so many times its own is none."""
 _NAMES = re.compile(r"((?:\w+(?:, | and ))*\w+) ?(.*)")
 """Channels, and what they have."""
+_MOVES = 0.1
+"""Of a turn, by which an edge may move."""
 _EVEN_S = 1e-5
 """Edges that move by less than this about their mean move alike."""
 
@@ -135,6 +138,13 @@ def _bare(
 def _own_edges(recorded_s: np.ndarray, made_s: np.ndarray, *, late: bool) -> Explanation | None:
     """What keyphasor edges lack, have too many, or how they move; None where the signal, late or not, tells more."""
     lacking, more = np.setdiff1d(made_s, recorded_s), np.setdiff1d(recorded_s, made_s)
+    if 1 <= min(len(lacking), len(more)) == max(len(lacking), len(more)) - 1:  # one may have moved over an end
+        most = _MOVES * float(np.diff(made_s).min(initial=math.inf))
+        for part in (slice(1, None), slice(None, -1)):
+            fewer = (lacking[part], more) if len(lacking) > len(more) else (lacking, more[part])
+            if np.abs(fewer[1] - fewer[0]).max() < most:
+                lacking, more = fewer
+                break
     off = np.sort(np.concatenate([lacking, more]))
     moved_s = more - lacking if len(more) == len(lacking) else np.empty(0)
     turns = np.count_nonzero((made_s >= off[0]) & (made_s <= off[-1])) if len(off) else 0

@@ -168,11 +168,9 @@ def filtered(one: Shown) -> Iterator[Law]:
     corner_hz = math.exp(least_at(cost, near - step, min(near + step, grid[-1])))
     margin = max(margin, min(len(one.values) // 2, round(_SETTLED / corner_hz / one.period_s)))
     left, differs = left_by(through(corner_hz)), one.apart[margin : -round(_ENDS_S / one.period_s)]
-    settled = rms_of(differs) > _SEEN * rms_of(one.apart)
-    if settled and rms_of(left) < _SAME * max(
-        1.0, one.noise / float(one.floor[0])
-    ):  # else noise of another time is in it
-        yield Law("bandwidth", f"{corner_hz:.4g} Hz", corner_hz, left, 1, "Hz")
+    if rms_of(left) < _SAME * max(1.0, one.noise / float(one.floor[0])):  # else noise of another time is in it
+        seen = rms_of(differs) > _SEEN * rms_of(one.apart)
+        yield Law("bandwidth", f"{corner_hz:.4g} Hz", corner_hz, left, 1, "Hz", sure=seen)
     if one.bare is not None and (rms_of(left_by(1.0)) < _HARDLY * rms_of(one.apart)):
         _, left = one.left([one.level] if channel.highpass_hz else [np.zeros(len(one.values))], one.values - one.bare())
         yield Law("no-filter", "what is above half of the rate folds back", 0.0, left, 1)
@@ -219,4 +217,5 @@ def ringing(one: Shown) -> Iterator[Law]:
     close = {"xatol": 1e-7, "fatol": 1e-3}
     found: Any = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options=close)
     hz, quality = math.exp(found.x[0]), 0.5 + math.exp(found.x[1])
-    yield Law("resonance", f"at {hz:.4g} Hz, quality {quality:.3g}", hz, left(found.x), 4, "Hz")
+    if hz > 0.5 * _RINGS_HZ[0]:
+        yield Law("resonance", f"at {hz:.4g} Hz, quality {quality:.3g}", hz, left(found.x), 4, "Hz")
