@@ -22,8 +22,6 @@ _PERIODS = 1.5
 """So many periods of a hum must be there."""
 _HIGHEST_HZ = 1000.0
 """Of a hum."""
-_ALSO = ("gain and delay", "bandwidth")
-"""What a resonance may look like."""
 _BENDS = ("resonance", "wander")
 """Laws of more numbers that look like simpler ones where little is seen of them."""
 _MORE = {"offset": ("drift", "hum", "crosstalk", "delay", "gain and offset"), "delay": ("clock", "wander", "gain")}
@@ -72,9 +70,8 @@ def law_of(one: Shown) -> Law:
     best = min((law for law in laws if law.sure), key=lambda law: one.cost(law.left, law.count))
     rings = cache(lambda: list(ringing(one)))
     if one.counts is not None:
-        # Of a narrow band, a resonance is a gain with a delay.
-        others = [*laws, *(rings() if one.moves and best.name in _ALSO else ())]
-        names = " or ".join([best.name, *_alike(one, best, others)])
+        # Of a narrow band, a resonance is a gain with a delay, or what has the same band.
+        names = " or ".join([best.name, *_alike(one, best, [*laws, *(rings() if one.moves else ())])])
         best = replace(best, name=" or ".join(dict.fromkeys(names.split(" or "))))
     rms = rms_of(before)
     if one.counts is None:
@@ -226,18 +223,17 @@ def _of_time(one: Shown) -> Iterator[Law]:
         return [ones, *(wave(turn) for turn in turns for wave in (np.cos, np.sin))]
 
     peak, span = float(hz[within][size[within].argmax()]), 1.0 / length_s
+    # What is as loud there by itself is not hum, unless that leaves noise.
     own, rest = one.left(columns(peak), one.foretold)
-    added = one.left(columns(peak), d)[0]
-    if rms_of(rest) < _LOUD * float(one.foretold.std() / one.floor.min()) and math.hypot(*own[1:]) > _OWN * math.hypot(
-        *added[1:]
-    ):
-        return  # what is as loud there by itself is not hum
+    alone = rms_of(rest) < _LOUD * float(one.foretold.std() / one.floor.min())
     for third in (False, True):
         f = least_at(
             lambda f, third=third: float(np.sum(one.left(columns(f, third), d)[1] ** 2)), peak - span, peak + span
         )
         factors, left = one.left(columns(f, third), d)
         amplitude = math.hypot(factors[1], factors[2])
+        if alone and math.hypot(*own[1:]) > _OWN * amplitude and not is_noise(left):
+            continue
         change = f"{f:.5g} Hz, {amplitude:.4g} {one.unit}"
         yield Law("hum", change + (" with its third" if third else ""), amplitude, left, 6 if third else 4, one.unit)
 

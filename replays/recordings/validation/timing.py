@@ -27,6 +27,8 @@ _SETTLES_S = 0.02
 """Behind this it is another filter's."""
 _RINGS_HZ, _RINGS = (20.0, 4000.0), 60
 """Between these resonances are looked for, at so many."""
+_RINGS_LONGEST = 1000.0
+"""A quality that no transducer has."""
 _SEEN = 0.3
 """Of what differs, that must be left where a filter has settled."""
 _SAME = 0.8
@@ -115,11 +117,18 @@ def delayed_by(one: Shown) -> tuple[float, np.ndarray, np.ndarray]:
         rows = np.unique(np.rint(np.concatenate([np.arange(-16, 17), far])))
     else:
         rows = np.arange(0.0, _HELD_S / period_s)
-    late_s = float(min(rows * period_s, key=cost))
-    for _ in range(6):
-        at = one.times_s - late_s
-        (_, step, _), _ = one.left([spline(at), -slope(at), np.ones(len(at))])
-        late_s = float(np.clip(late_s + np.clip(step, -period_s, period_s), -_HELD_S, _HELD_S))
+
+    def refined(late_s: float) -> float:
+        for _ in range(6):
+            at = one.times_s - late_s
+            (_, step, _), _ = one.left([spline(at), -slope(at), np.ones(len(at))])
+            late_s = float(np.clip(late_s + np.clip(step, -period_s, period_s), -_HELD_S, _HELD_S))
+        return late_s
+
+    # What rings is about as much alike a period later: between rows, another one may be the best.
+    costs = np.array([cost(late_s) for late_s in rows * period_s])
+    least = np.flatnonzero((costs <= np.r_[np.inf, costs[:-1]]) & (costs <= np.r_[costs[1:], np.inf]))
+    late_s = min((refined(late_s) for late_s in (rows[least] * period_s).tolist()), key=cost)
     at = one.times_s - late_s
     return late_s, spline(at), slope(at)
 
@@ -217,5 +226,5 @@ def ringing(one: Shown) -> Iterator[Law]:
     close = {"xatol": 1e-7, "fatol": 1e-3}
     found: Any = minimize(cost, min(starts, key=cost), method="Nelder-Mead", options=close)
     hz, quality = math.exp(found.x[0]), 0.5 + math.exp(found.x[1])
-    if hz > 0.5 * _RINGS_HZ[0]:
+    if 0.5 * _RINGS_HZ[0] < hz < 2.0 * _RINGS_HZ[1] and quality < _RINGS_LONGEST:
         yield Law("resonance", f"at {hz:.4g} Hz, quality {quality:.3g}", hz, left(found.x), 4, "Hz")
