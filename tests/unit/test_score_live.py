@@ -42,8 +42,8 @@ def red(card: Scorecard) -> set[str]:
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
-    """Three seconds of noise."""
-    volts = np.random.default_rng(1).standard_normal((3 * RATE_HZ, 4))
+    """Two seconds of noise."""
+    volts = np.random.default_rng(1).standard_normal((2 * RATE_HZ, 4))
     return counts_of("probes", volts, None)
 
 
@@ -135,7 +135,7 @@ def test_an_interruption_keeps_the_whole_lines_that_there_were(tmp_path: Path) -
     read, write = os.pipe()
     daq.source = read
     os.write(write, (HEADING + lines(block_of(sensor_key("probes"), 0).values) + "0.1,0.").encode())
-    threading.Timer(1.0, daq.stopped.set).start()
+    threading.Timer(0.5, daq.stopped.set).start()
     found = daq.collect(tmp_path)
     assert found.remarks[0].endswith(", until it was interrupted")
     assert len(found.file.read_text(encoding="utf-8").splitlines()) == 1 + BLOCK == found.arrivals.rows[-1]
