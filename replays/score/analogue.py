@@ -138,13 +138,11 @@ def _begun(
     name = max(wires, key=lambda each: (len(wires[each].others_s) > 0, wires[each].likeness))
     wire, best = wires[name], (math.inf, 0.0)
     shifts = [0.0, *(other_s - wire.late_s for other_s in wire.others_s)]
-    tried: list[float] = []
-    while shifts:
-        tried.append(shift := shifts.pop(0))
+    for n, shift in enumerate(shifts):
         one = fit(name, replace(wire, own_s=wire.own_s + shift))
         if one is not None:
-            if len(tried) == 1 and wire.others_s:
-                shifts = [shift + each for each in beginnings(one.clean, known(name, wire))] + shifts
+            if not n and wire.others_s:
+                shifts[1:1] = beginnings(one.clean, known(name, wire))
             left = float(np.std(one.clean.residual))
             best = (left, shift) if left < _BETTER * best[0] else best
             if left < _PURER * one.channel.noise_v / abs(one.channel.sensitivity_v):

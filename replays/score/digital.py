@@ -14,6 +14,7 @@ from itertools import chain
 import numpy as np
 
 from replays.score.intervals import student
+from replays.score.live import Arrivals
 from replays.score.recorded import Recorded, Table
 from replays.score.rows import NO_COUNT, Followed, follow, located, stretches
 from replays.score.scorecard import Interval, Scorecard
@@ -36,7 +37,9 @@ _BATCHES, _APART = 256, 32
 _MOST_BATCH = 1 << 12
 """Rows of a batch."""
 _SAME_CLOCK_S = 10.0
-"""Stamps that are farther from the wall time of the session are of another clock."""
+"""Stamps that are farther from the wall time of the session are of another clock, unless told."""
+_BACKLOG_S = 1.0
+"""Rows that wait in a pipe have come by then [s]."""
 _NAMED = 5
 """Rows that are named in a line; all stand in the document."""
 
@@ -126,11 +129,13 @@ class Taken:
     Attributes:
         scale: Of its counts.
         step, phase: Those rows whose number is the phase, modulo the step.
+        early: So many of its own rows, at the beginning, were sent before the session began.
     """
 
     scale: Scale
     step: int = 1
     phase: int = 0
+    early: int = 0
 
 
 def settle(
@@ -158,6 +163,11 @@ def settle(
         sent_hz = session.rate_hz(session.channels[of].group)
         return max(1, round(sent_hz / (recorded[name].rate_hz or sent_hz)))
 
+    def taken(scale: Scale, step: int, begin: int, index: int) -> Taken:
+        # Before its run a rig has sent nothing.
+        early = -(begin // step) if begin < 0 <= index + begin else 0
+        return Taken(scale, step, (index + begin) % step, early)
+
     def taken_of(name: str, of: str) -> Taken | None:
         """By where its table begins, as far as that is known; else by where its counts are."""
         signal, channel, step = recorded[name], session.channels[of], step_of(name, of)
@@ -168,24 +178,24 @@ def settle(
             values, unit, there, _ = tried(name, of, begin)
             if len(values) > 1 and (scale := find_scale(values, unit, there, channel)) is not None:
                 begins[table] = begin
-                return Taken(scale, step, (index + begin) % step)
+                return taken(scale, step, begin, index)
         if table not in begins:
             there = counts[:, session.place(of)] >> signal.lost_bits << signal.lost_bits
             for scale in _candidates(signal.unit, channel):
                 begin = located(scale.counts(signal.early[:_LOOKED]), there, step)
                 if begin is not None:
                     begins[table] = begin
-                    return Taken(scale, step, (index + begin) % step)
+                    return taken(scale, step, begin, index)
         return None
 
-    settled = {name: taken for name, wire in wires.items() if wire.channel and (taken := taken_of(name, wire.channel))}
+    settled = {name: one for name, wire in wires.items() if wire.channel and (one := taken_of(name, wire.channel))}
     found = dict(wires)
     if 2 * len(settled) <= len(wires):
         return found, settled
     for name, wire in wires.items():
         for other in () if name in settled else sorted(session.channels, key=lambda each: each != name):
-            if (taken := taken_of(name, other)) is not None:
-                found[name], settled[name] = replace(wire, channel=other, rivals=()), taken
+            if (one := taken_of(name, other)) is not None:
+                found[name], settled[name] = replace(wire, channel=other, rivals=()), one
                 break
         named = name if name in session.channels else "" if wire.rivals else wire.channel
         if name not in settled and named:
@@ -198,24 +208,24 @@ def settle(
 
             found[name] = replace(wire, channel=named)
             scale = replace(min(_candidates(unit, channel), key=apart), known=False)
-            settled[name] = Taken(scale, step, (held[channel.group][0] + begin) % step)
+            settled[name] = taken(scale, step, begin, held[channel.group][0])
     return found, settled
 
 
 def score_digital(
     card: Scorecard, recorded: Mapping[str, Recorded], wires: Mapping[str, Wire], taken: Mapping[str, Taken],
-    session: Session,
+    session: Session, arrivals: Arrivals | None = None,
 ) -> None:  # fmt: skip
-    """Put the rows of the digital path onto a scorecard."""
+    """Put the rows of the digital path onto a scorecard; latency, too, where it is known when the rows came."""
     for name, each in taken.items():
         _score_scale(card, name, each.scale, session.channels[wires[name].channel])
     tables: dict[tuple[float, ...], list[str]] = {}
     for name in sorted(taken, key=lambda each: not taken[each].scale.known):
         rate_hz = session.rate_hz(session.channels[wires[name].channel].group)
-        table = recorded[name].rows, rate_hz, taken[name].step, taken[name].phase
+        table = recorded[name].rows, rate_hz, taken[name].step, taken[name].phase, taken[name].early
         tables.setdefault(table, []).append(name)
     for names in tables.values():
-        _score_rows(card, names, wires, recorded, taken, session)
+        _score_rows(card, names, wires, recorded, taken, session, arrivals)
 
 
 def _exact(count: float) -> Interval:
@@ -231,7 +241,7 @@ def _score_scale(card: Scorecard, name: str, scale: Scale, channel: Channel) -> 
 
 def _score_rows(
     card: Scorecard, names: Sequence[str], wires: Mapping[str, Wire], recorded: Mapping[str, Recorded],
-    taken: Mapping[str, Taken], session: Session,
+    taken: Mapping[str, Taken], session: Session, arrivals: Arrivals | None,
 ) -> None:  # fmt: skip
     """Follow the rows of signals that are as long as each other, and judge what became of them and of their stamps."""
     groups = list(dict.fromkeys(session.channels[wires[name].channel].group for name in names))
@@ -248,24 +258,35 @@ def _score_rows(
     tables: dict[Table, list[str]] = {}
     for name in names:
         tables.setdefault(recorded[name].table, []).append(name)
-    stamps = Stamps(recorded[names[0]].table)
+    beside = recorded[names[0]].table
+    stamps, delays, longest_s = Stamps(beside), Stamps(beside, shown=True), -math.inf
 
     def counts() -> Iterator[np.ndarray]:
+        left = one.early
         for parts in zip(
             *(each.parts([recorded[name].column for name in inside]) for each, inside in tables.items()), strict=True
         ):
+            parts, left = [part[left:] for part in parts], max(0, left - len(parts[0]))
             stamps.times_s = parts[0][:, 0]
             columns = zip(chain(*tables.values()), chain(*(part.T[1:] for part in parts)), strict=True)
             found = {name: scales[name].counts(values) for name, values in columns}
             yield np.column_stack([found[name] for name in names])
 
     bits = np.array([recorded[name].lost_bits for name in names])
-    found, trigger, at = Followed(), None, 0
+    found, trigger, at = Followed(), None, one.early
     for places, found in follow((chunk[:, columns] >> bits << bits for chunk in sent), counts(), sound):  # noqa: B007
         known = np.flatnonzero(places >= 0)
-        stamps.take(sent.first_s, sent.since_s(places[known]), known, len(places))
+        since_s = sent.since_s(places[known]) if len(known) else np.empty(0)
+        stamps.take(sent.first_s, since_s, known, len(places))
+        if arrivals is not None and len(known):
+            came_s = arrivals.since_s(at + known)
+            settled = came_s > _BACKLOG_S
+            sent_s = session.arrived_s(groups, sent.first_s + since_s[settled]) - arrivals.unix_s[0]
+            delays.times_s = came_s[settled]
+            delays.take(0.0, sent_s, np.arange(len(sent_s)), len(sent_s))
+            longest_s = max(longest_s, float(np.max(delays.times_s - sent_s, initial=-math.inf)))
         if trigger is None and session.trigger_s is not None and len(known):
-            behind = np.flatnonzero(sent.first_s + sent.since_s(places[known]) >= session.trigger_s)
+            behind = np.flatnonzero(sent.first_s + since_s >= session.trigger_s)
             # Row 0 is behind whatever was before the recording.
             trigger = at + int(known[behind[0]]) if len(behind) and at + known[behind[0]] else None
         at += len(places)
@@ -282,7 +303,12 @@ def _score_rows(
     add("missing rows", table, found.lost)
     for quantity, pairs in (("doubled rows", found.doubled), ("swapped rows", found.swapped)):
         add(quantity, table, stretches(np.unique(pairs[:, 0])), len(pairs))
-    add("foreign rows", table, stretches(found.foreign), numbered=False)
+    foreign, early = found.foreign, one.early
+    if early:  # to some rows, where some are lost
+        first = int(np.sum(foreign == np.arange(len(foreign))))
+        foreign, early = foreign[first:], early + first
+        card.remarks.append(f"{table}: the first {early} rows are not judged: they stand before the session's first")
+    add("foreign rows", table, stretches(foreign + one.early), numbered=False)
     for name, altered in zip(names, found.altered, strict=True):
         add("altered values", name, altered.pairs(), altered.rows)
     told = {
@@ -290,8 +316,15 @@ def _score_rows(
         "rows after the last": _exact(found.sent - 1 - found.last), **stamps.judged(session.wall_s),
         "trigger row": None if trigger is None else _exact(trigger),
     }  # fmt: skip
+    notes = {}
+    if arrivals is not None:
+        told["latency"] = delays.judged(0.0, apart_s=math.inf)["latency"]
+        notes["latency"] = (
+            f"arrival here less that of the rig's block, from {_BACKLOG_S:g} s on; {longest_s:.2g} s at most; "
+            f"a line through a pipe takes {arrivals.floor_s:.2g} s"
+        )
     for quantity, estimate in told.items():
-        card.add(quantity, table, estimate)
+        card.add(quantity, table, estimate, note=notes.get(quantity, ""))
     card.pictures[f"stamps {table}"] = stamps.picture()
 
 
@@ -302,10 +335,10 @@ class Stamps:
         times_s: Those of the next rows [s], shape (n,).
     """
 
-    def __init__(self, table: Table) -> None:
-        """Take what they stand in."""
+    def __init__(self, table: Table, *, shown: bool = False) -> None:
+        """Take what they stand in; or others in their place, which are shown then."""
         self.times_s = np.empty(0)
-        self._stamped, self._size = table.stamped, max(4, min(table.rows // _BATCHES, _MOST_BATCH))
+        self._stamped, self._size = shown or table.stamped, max(4, min(table.rows // _BATCHES, _MOST_BATCH))
         self._back, self._last_s = 0, -math.inf
         self._means: list[np.ndarray] = []
         self._squares, self._freedom = 0.0, 0
@@ -324,11 +357,12 @@ class Stamps:
             self._squares += float(np.sum((late - late.mean()) ** 2))
             self._freedom += size - 1
 
-    def judged(self, wall_s: float | None) -> dict[str, Interval | None]:
+    def judged(self, wall_s: float | None, *, apart_s: float = _SAME_CLOCK_S) -> dict[str, Interval | None]:
         """Offset at the first row [s], rate [ppm], jitter [s], steps back, latency [s], with low and high ends if told.
 
         Args:
             wall_s: Wall time at which what was sent at time zero came to who recorded the session [s].
+            apart_s: Stamps that are farther from it are of another clock [s].
         """
         names = ("stamp offset", "stamp rate", "stamp jitter", "stamps that go back", "latency")
         if not self._stamped:
@@ -350,7 +384,7 @@ class Stamps:
             ("stamp rate", rate, half[0], 1e6),
         ):
             found[name] = size * at, size * (at - wide), size * (at + wide)
-        if wall_s is not None and abs(late.mean() - wall_s) < _SAME_CLOCK_S:
+        if wall_s is not None and abs(late.mean() - wall_s) < apart_s:
             value, wide = late.mean() - wall_s, student(len(late) - 1) * late.std(ddof=1) / math.sqrt(len(late))
             found["latency"] = float(value), float(value - wide), float(value + wide)
         ends = [math.sqrt(self._squares / chi2.ppf(p, self._freedom)) for p in (0.975, 0.025)]

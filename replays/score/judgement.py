@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,7 @@ from replays.score.analogue import score_analogue
 from replays.score.can_log import is_can_log, open_can_log
 from replays.score.digital import Taken, score_digital, settle
 from replays.score.limits import Limits, load_limits
+from replays.score.live import Arrivals
 from replays.score.recorded import Recorded, open_recorded
 from replays.score.scorecard import FAIL, NO_LIMIT, NOT_SHOWN, PASS, QUANTITIES, Scorecard, ScoreRow, Verdict
 from replays.score.sent import Formula, Session
@@ -28,7 +30,7 @@ _NEAR = 0.01
 def judge(
     file: Path, against: Sequence[Path], *, limits: Limits | None = None,
     path: Literal["digital", "analogue"] | None = None, formulas: Mapping[str, Formula] | None = None,
-    options: FileOptions | None = None,
+    options: FileOptions | None = None, arrivals: Arrivals | None = None,
 ) -> Scorecard:  # fmt: skip
     """Make the scorecard of a DAQ.
 
@@ -40,6 +42,7 @@ def judge(
         formulas: What was sent exactly, by channel: value [unit] of the session's time [s]; otherwise as the scene's
             test signal has it, or its own samples.
         options: How a text file is read, where it does not say so itself.
+        arrivals: When the lines of a text file came, headings included, where it was delivered live.
 
     Raises:
         InputError: A file cannot be read, or nothing in it is like what was sent.
@@ -71,7 +74,10 @@ def judge(
     card = Scorecard(f"{file.name} against {session.path.name}", path, limits.title, limits.bounds)
     _score_wires(card, recorded, wires, session, rows if path == "digital" else {}, sent)
     if path == "digital":
-        score_digital(card, recorded, wires, rows, session)
+        if arrivals is not None:
+            headings = int(arrivals.rows[-1]) - max(each.rows for each in recorded.values())
+            arrivals = replace(arrivals, rows=arrivals.rows - headings)
+        score_digital(card, recorded, wires, rows, session, arrivals)
     else:
         score_analogue(card, recorded, wires, session, {**session.formulas(), **(formulas or {})})
     return card

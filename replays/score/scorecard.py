@@ -62,8 +62,8 @@ DIGITAL = {
     "stamps that go back": Quantity("1", _EXACT, _STAMPED),
     "latency": Quantity(
         "s",
-        "stamps less the arrival of the rows at the session's recorder, Student's t",
-        "the DAQ, stamping rows by the computer's clock as they come, beside `rig record` of a rig that runs",
+        "stamps, or live the rows' arrival, less their arrival at the session's recorder, Student's t",
+        "live, `my-daq | rig score -`; or the DAQ, stamping rows by the computer's clock, beside `rig record`",
     ),
     "trigger row": Quantity("1", _EXACT, "a triggered recording of a scene with a hammer or another command"),
 }

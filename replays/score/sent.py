@@ -55,6 +55,7 @@ class Session:
         if not self.channels:
             raise InputError("--against", "a recording with samples", str(self.path))
         self._kept: dict[str, tuple[np.ndarray, float, float]] = {}
+        self._blocks: dict[str, np.ndarray] = {}
 
     def rate_hz(self, group: str) -> float:
         """Rows a second of a group [Hz]."""
@@ -79,6 +80,19 @@ class Session:
         """Wall time at which what was sent at time zero came to its recorder [unix s]; None where that is not told."""
         clock = self.recording.clock
         return float(np.median(clock[:, 1] - clock[:, 0])) if len(clock) else None
+
+    def arrived_s(self, groups: Sequence[str], times_s: np.ndarray) -> np.ndarray:
+        """When the rows of some times were there of all of some groups, by their blocks [unix s], shape (n,)."""
+        found = []
+        for group in groups:
+            if group not in self._blocks:
+                key, of = sensor_key(group), self.recording.everything()
+                self._blocks[group] = np.array([(at, wall) for topic, at, wall, _ in of if topic == key]).T * 1e-9
+            begins_s, wall_s = self._blocks[group]
+            # A row's time is rounded otherwise than that of its block.
+            at = np.searchsorted(begins_s, times_s + 0.5 / self.rate_hz(group), side="right") - 1
+            found.append(wall_s[np.maximum(at, 0)])
+        return np.max(found, axis=0)
 
     @property
     def noisy(self) -> bool:

@@ -376,14 +376,13 @@ def _corner(f: np.ndarray, log: np.ndarray, spread: np.ndarray) -> tuple[float, 
 def through(found: Waveform) -> Waveform:
     """The fit behind the linear response of the channel: 96 taps by least squares, so that what is left is noise."""
     from scipy.linalg import solve_toeplitz
+    from scipy.signal import correlate
 
     x = found.known - found.known.mean()
     y = found.values - found.values.mean()
     n, half = len(x), _TAPS // 2
-    size = 1 << int(2 * n).bit_length()
-    fx, fy = np.fft.rfft(x, size), np.fft.rfft(y, size)
-    auto = np.fft.irfft(np.abs(fx) ** 2, size)[:_TAPS]
-    cross = np.roll(np.fft.irfft(np.conj(fx) * fy, size), half)[:_TAPS]
+    auto = correlate(x, x, method="fft")[n - 1 :][:_TAPS]
+    cross = correlate(y, x, method="fft")[n - 1 - half :][:_TAPS]
     auto[0] *= 1.0 + 1e-9
     taps = solve_toeplitz(auto, cross)
     known = np.convolve(x, taps)[half : half + n]

@@ -5,20 +5,26 @@ from __future__ import annotations
 import json
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from rig.cli.connection import Connection
+from rig.cli.groups import panel
 from rig.cli.options import Force, Wide
 from rig.cli.origin import origin
 from rig.cli.tables import echo, new_table, shown, table_console
-from rig.errors import check_new_file, check_not_among, whole_file
+from rig.errors import InputError, Words, check_new_file, check_not_among, whole_file
 from rig.text import finite
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from replays.score.limits import Limits
     from replays.score.scorecard import Scorecard
+
+_live = panel("Live")
+_FOR_S = 10.0
 
 
 class _Way(StrEnum):
@@ -31,12 +37,23 @@ _STYLES = {"pass": "", "fail": "red", "this run does not show it": "yellow", "no
 
 def score(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="What the DAQ recorded: as `rig import`, .mcap, or a CAN log.")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="What the DAQ recorded: as `rig import`, .mcap, or a CAN log; - for CSV that comes in while a rig "
+            "runs.",
+        ),
     ],
     *,
     against: Annotated[
-        list[Path], typer.Option("--against", metavar="SESSION.mcap", help="What the rig sent; its parts, repeated.")
-    ],
+        list[Path] | None,
+        typer.Option("--against", metavar="SESSION.mcap", help="What the rig sent; its parts, repeated."),
+    ] = None,
+    for_s: Annotated[
+        float | None,
+        _live("How long, from the first line on, in s; 10 unless given. Ctrl-C ends it before.", metavar="S"),
+    ] = None,
+    connection: Connection,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="Report with pictures, .html or .pdf.")
     ] = None,
@@ -52,7 +69,8 @@ def score(
     """Judge a DAQ by what it recorded, against what the rig sent.
 
     A DAQ that took counts is judged row by row, exactly; one that sampled by itself by least squares against the known
-    signal. Ends with 1 where a limit is not kept, or nothing is shown.
+    signal. Where FILE is -, what comes in is judged against what the rig at --connect sends meanwhile. Ends with 1
+    where a limit is not kept, or nothing is shown.
     """
     from replays.report import check_report
     from replays.score.judgement import judge
@@ -64,17 +82,24 @@ def score(
     for made, field, suffix in ((junit, "--junit", ".xml"), (as_json, "--json", ".json")):
         if made is not None:
             check_new_file(made, field=field, suffixes=(suffix,), force=force)
-            check_not_among([file, *against], made, field=field)
-    card = judge(
-        file,
-        against,
-        limits=load_limits(limits),
-        path=None if path is None else "digital" if path is _Way.DIGITAL else "analogue",
-    )
+            check_not_among([file, *(against or ())], made, field=field)
+    asked = load_limits(limits)
+    way = None if path is None else "digital" if path is _Way.DIGITAL else "analogue"
+    live = str(file) == "-"
+    if live == (against is not None):
+        must = "left out where FILE is -: what the rig at --connect sends" if live else "given: what the rig sent"
+        raise InputError("--against", must, None if against is None else str(against[0]))
+    if for_s is not None and not live:
+        raise InputError("--for-s", "left out where a file is judged", for_s)
+    if live:
+        card = _judge_live(connection, _FOR_S if for_s is None else for_s, asked, way)
+    else:
+        card = judge(file, against or [], limits=asked, path=way)
     if output is not None:
         from replays.score.report import make_report
 
-        make_report(card, origin=origin(file=file.name, session=against[0].name, limits=card.limits)).write(output)
+        session = against[0].name if against else connection.connect
+        make_report(card, origin=origin(file=file.name, session=session, limits=card.limits)).write(output)
     if junit is not None:
         write_junit(card, junit)
     if as_json is not None:
@@ -86,6 +111,33 @@ def score(
             echo(f"written  {made}")
     if not card.good:
         raise typer.Exit(1)
+
+
+def _judge_live(
+    connection: Connection, for_s: float, limits: Limits, path: Literal["digital", "analogue"] | None
+) -> Scorecard:
+    """Take down what comes in by standard input, and what the rig sends meanwhile, and judge that."""
+    import sys
+    import tempfile
+    import threading
+
+    from replays.score.judgement import judge
+    from replays.score.live import LONGEST_S, SHORTEST_S, collect
+    from rig.cli.progress import reporting
+    from rig.cli.signals import stopping_on_signals
+
+    if not SHORTEST_S <= for_s <= LONGEST_S:
+        raise InputError("--for-s", f"from {SHORTEST_S:g} to {LONGEST_S:g}", for_s)
+    if sys.stdin.isatty():
+        raise InputError("FILE", "fed by a pipe where it is -: my-daq | rig score -", Words("a terminal"))
+    stopped = threading.Event()
+    with tempfile.TemporaryDirectory(prefix="rig-score-") as folder:
+        with connection.client() as client, reporting() as reporter, stopping_on_signals(stopped.set):
+            found = collect(client, sys.stdin.fileno(), Path(folder), for_s, stopped=stopped, tell=reporter.part)
+        card = judge(found.file, [found.session], limits=limits, path=path, arrivals=found.arrivals)
+    card.title = f"what came in, against the rig at {connection.connect}"
+    card.remarks[:0] = found.remarks
+    return card
 
 
 def _show(card: Scorecard, console: Console, *, wide: bool) -> None:

@@ -18,7 +18,7 @@ from replays.recordings.formats.source import Entry, FileSignal, Source, damaged
 from rig.errors import InputError, Words
 from rig.text import printable
 
-_BLOCK = 1 << 23
+_BLOCK = 1 << 21
 """Bytes that are parsed at a time."""
 _KEPT = 1 << 24
 """Values of a file that are kept once they are parsed; a longer one is parsed anew each time."""

@@ -5,16 +5,19 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
+from io import StringIO
 from pathlib import Path
 from traceback import walk_tb
 from typing import TYPE_CHECKING, Any
+from weakref import finalize
 
 import numpy as np
 
 from replays.recordings.formats import export
 from replays.recordings.formats.source import DOCUMENTS, Entry, FileSignal, Source, damaged, even_rate_hz, library
 from rig import units
+from rig.outside import open_file
 
 if TYPE_CHECKING:
     from replays.recordings.formats.history import ExportEvent
@@ -27,6 +30,8 @@ _SYNC_NONE, _SYNC_TIME = 0, 1
 """Kinds of master channel in MDF4; 2 is an angle, 3 a length, 4 an index."""
 _PIECE = 1 << 22
 """Bytes of records that are read at a time."""
+_HEAD, _FLAGS = 64, 4
+"""Bytes of the first block, and those at its end that say what of a file was not finished, in MDF4."""
 _MASTER, _REMOTE_MASTER = 2, 8
 """Type of a channel of stamps that are recorded, and the flag of a group whose stamps are another's, in MDF4."""
 _MARKER, _BY_TOOL = 6, 2
@@ -37,8 +42,11 @@ _IDENTITY, _LINEAR = 0, 1
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Deprecations inside asammdf, and of what it calls in numpy and pandas, are not ours to mend."""
-    with warnings.catch_warnings():
+    """Deprecations inside asammdf, and of what it calls in numpy and pandas, are not ours to mend.
+
+    Nor are lines on its speed, which it prints where reading takes long.
+    """
+    with warnings.catch_warnings(), redirect_stdout(StringIO()):
         for category in (DeprecationWarning, FutureWarning, PendingDeprecationWarning):
             warnings.simplefilter("ignore", category)
         yield
@@ -97,12 +105,17 @@ def _documents(mdf: Any) -> dict[str, str]:
 
 def _open(path: Path) -> Any:
     asammdf = library("MDF", "asammdf")
+    file = open_file(path)
+    finished = file.read(_HEAD)[-_FLAGS:] == bytes(_FLAGS)
     try:
         with _quiet():
-            mdf = asammdf.MDF(path)
+            # By its path asammdf maps all of a file into memory, and mends a copy of one that was not finished.
+            mdf = asammdf.MDF(file if finished else path)
             mdf.configure(read_fragment_size=_PIECE)
+            finalize(mdf, file.close)
             return mdf
     except Exception as error:
+        file.close()
         # The half-made object of a file that asammdf cannot open closes itself when it goes, and fails aloud: it has
         # tried once here, and does not try again.
         for frame, _ in walk_tb(error.__traceback__):
