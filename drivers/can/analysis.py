@@ -127,25 +127,6 @@ def load(messages: Sequence[Message], rate: str | float | Speed | can.BitTiming 
     return math.fsum(_transmission_ps(message, timing) / _ps(message.period_s) for message in messages)
 
 
-def check_load(
-    messages: Sequence[Message],
-    rate: str | float | Speed | can.BitTiming | can.BitTimingFd,
-    *,
-    limit: float = 1.0,
-) -> float:
-    """The load, if it is within the limit; else an InputError that says how high it is.
-
-    Args:
-        messages: The schedule.
-        rate: Bit rates of the bus.
-        limit: Highest load allowed.
-    """
-    share = load(messages, rate)
-    if share > limit:
-        raise InputError("load of the bus", f"at most {limit:.0%} at {speed(rate)}", Words(f"{share:.1%}"))
-    return share
-
-
 def worst_case(
     messages: Sequence[Message],
     rate: str | float | Speed | can.BitTiming | can.BitTimingFd,
