@@ -171,19 +171,15 @@ class Gateway:
         for thread in self._threads:
             thread.start()
 
-    def close(self, *, timeout_s: float = 2.0) -> None:
-        """Send what is still due, then end.
-
-        Args:
-            timeout_s: How long that may take [s].
-        """
+    def close(self) -> None:
+        """Send what is still due, then end."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
         self.commands.close()
         for thread in self._threads:
             if thread.is_alive():
-                thread.join(timeout=timeout_s)
+                thread.join(timeout=2.0)
 
     def __enter__(self) -> Gateway:
         self.start()
