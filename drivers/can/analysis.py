@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.can.bus import frame as frames
 from drivers.can.bus.timing import Speed, speed
-from rig.errors import InputError, Words
+from rig.errors import InputError
 
 if TYPE_CHECKING:
     import can
