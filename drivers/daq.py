@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import threading
 import time
 from collections import deque
@@ -317,6 +316,8 @@ class Daq(Closing):
 
     async def aread(self, rows: int | None = None, *, timeout_s: float = 5.0) -> Samples:
         """As `read`, for asyncio."""
+        import asyncio
+
         loop, event = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:

@@ -39,7 +39,8 @@ _ROUND_NS = NS // 5
 """Streams that begin within this time of each other begin together, each with its first block [ns]."""
 HEARTBEAT_S = 0.5
 QUIET_S = 0.3
-"""After the end of the stream, with all streams whole: silence after which nothing more is expected [s]."""
+"""After the end of the stream, with all streams whole but no last status: silence after which nothing more is expected
+[s]."""
 RECOVERY_S = 2.0
 """After the end of the stream, or of the time to record, with blocks still missing: silence after which they are given
 up [s]."""
@@ -169,6 +170,8 @@ class RecordingSession:
         self._end_reason = ""
         self._end_rows: dict[str, int] | None = None
         """Number of the row after the last one published, by key, as the end event states it."""
+        self._last_status = False
+        """The status that a run publishes behind all else has come."""
         self._rig: str | None = None
         """Who the rig is, by its transport."""
         self._rig_lost = False
@@ -328,8 +331,9 @@ class RecordingSession:
             self._end_rows = document.get("rows")
             self._end_reason = printable(document.get("reason") or "ended", 500)
             self._wake.set()
-        elif payload.key == wire.STATUS and document.get("state") == "ended" and not self._end_reason:
-            self._end_reason = "ended before the recording began"
+        elif payload.key == wire.STATUS and document.get("state") == "ended":
+            self._end_reason = self._end_reason or "ended before the recording began"
+            self._last_status = True
             self._wake.set()
 
     # On the calling thread.
@@ -380,6 +384,8 @@ class RecordingSession:
             return True
         # The `end` event can overtake blocks that are being recovered: while a stream is short of it, wait longer.
         whole = self._end_rows is not None and not self.waiting and not writer.tally.short_of(self._end_rows)
+        if whole and self._last_status and writer.tally.next.keys() >= (self._end_rows or {}).keys():
+            return True
         quiet_s = now_s - max(ended_s, self._heard_s)
         return quiet_s > (QUIET_S if whole or self._rig_lost else RECOVERY_S)
 

@@ -86,8 +86,8 @@ class Declared(Continuity):
         self._anew: dict[str, tuple[int, int]] = {}
         """Number behind the last of these that was told since, as it was sent, and as it is."""
 
-    def declare(self, document: Mapping[str, Any], *, door: str = "zenoh") -> bool:
-        """Take note of a document on faults, for those behind a door; whether it is one."""
+    def declare(self, document: Mapping[str, Any]) -> bool:
+        """Take note of a document on faults, for those behind zenoh; whether it is one."""
         try:
             told = check(_Document, dict(document), field="faults")
         except InputError:
@@ -95,7 +95,7 @@ class Declared(Continuity):
         for one in told.blocks:
             if one.key not in self._known and len(self._known) >= _MOST_STREAMS:
                 continue
-            sent, known = [each for each in one.sent if door in each.doors], self._known.setdefault(one.key, {})
+            sent, known = [each for each in one.sent if "zenoh" in each.doors], self._known.setdefault(one.key, {})
             if not sent:
                 never = self._never.setdefault(one.key, deque(maxlen=_MOST))
                 if never and sum(never[-1]) == one.row:

@@ -249,7 +249,7 @@ def fit_map(geometry: MagnetGeometry) -> MagnetMap:
     reach = geometry.reach
     x, y, r = _sector(geometry, reach)
     outward = np.stack([x, y], axis=-1) / r[:, None]
-    force = field_sum_force(x, y, geometry)
+    force = _sector_field_sum(geometry, reach)
     radial = np.sum(force * outward, axis=-1)
     scaled = r / reach
     powers = np.stack([scaled, scaled**3, scaled**5, scaled**7], axis=-1)
@@ -350,7 +350,7 @@ def _errors(geometry: MagnetGeometry, radius: float) -> tuple[float, ...]:
     """The errors of the chain over a radius [m]."""
     spring, radial, cylinders = linear_map(geometry), fit_map(geometry), fit_cylinder_map(geometry)
     x, y, _ = _sector(geometry, radius)
-    exact, far = cylinder_force(x, y, geometry), field_sum_force(x, y, geometry)
+    exact, far = cylinder_force(x, y, geometry), _sector_field_sum(geometry, radius)
     in_radial, in_spring = map_force(x, y, radial), map_force(x, y, spring)
     return (
         _deviation(in_spring, in_radial),
@@ -376,6 +376,15 @@ def _sector(geometry: MagnetGeometry, radius: float) -> tuple[np.ndarray, np.nda
         for grid in np.meshgrid(np.linspace(radius / 40, radius, 40), np.linspace(0.0, np.pi / geometry.number, 9))
     )
     return r * np.sin(angle), -r * np.cos(angle), r
+
+
+@cache
+def _sector_field_sum(geometry: MagnetGeometry, radius: float) -> np.ndarray:
+    """The field sum over a sector [N], shape (n, 2): the fit and its errors share the dearest of what they need."""
+    x, y, _ = _sector(geometry, radius)
+    force = field_sum_force(x, y, geometry)
+    force.setflags(write=False)
+    return force
 
 
 def _deviation(force: np.ndarray, better: np.ndarray) -> float:

@@ -23,7 +23,7 @@ def rare_collections() -> Iterator[None]:
     Little of that is garbage, and looking for it took a tenth of the time.
     """
     before = gc.get_threshold()
-    gc.set_threshold(100_000, *before[1:])
+    gc.set_threshold(300_000, *before[1:])
     try:
         yield
     finally:

@@ -462,9 +462,6 @@ class Service(ServedRun):
         self._sent[wire.EVENTS] = self._sent.get(wire.EVENTS, 0) + 1
         self._server.publish(wire.EVENTS, wire.encode_document(finite(self._rows.tell(event))))
 
-    def _publish_told(self, told: dict[str, Any]) -> None:
-        self._server.publish(wire.FAULTS, wire.encode_document(finite(told)))
-
     def _publish_status(self) -> None:
         self._server.publish(wire.STATUS, wire.encode_document(self.status()))
 

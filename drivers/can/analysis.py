@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.can.bus import frame as frames
 from drivers.can.bus.timing import Speed, speed
-from rig.errors import InputError, Words
+from rig.errors import InputError
 
 if TYPE_CHECKING:
     import can
@@ -125,25 +125,6 @@ def load(messages: Sequence[Message], rate: str | float | Speed | can.BitTiming 
     """Share of the bus that messages take at most: the sum of transmission time over period."""
     timing = speed(rate)
     return math.fsum(_transmission_ps(message, timing) / _ps(message.period_s) for message in messages)
-
-
-def check_load(
-    messages: Sequence[Message],
-    rate: str | float | Speed | can.BitTiming | can.BitTimingFd,
-    *,
-    limit: float = 1.0,
-) -> float:
-    """The load, if it is within the limit; else an InputError that says how high it is.
-
-    Args:
-        messages: The schedule.
-        rate: Bit rates of the bus.
-        limit: Highest load allowed.
-    """
-    share = load(messages, rate)
-    if share > limit:
-        raise InputError("load of the bus", f"at most {limit:.0%} at {speed(rate)}", Words(f"{share:.1%}"))
-    return share
 
 
 def worst_case(

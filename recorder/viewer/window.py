@@ -17,12 +17,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal, Self, TypeVar
+from typing import Literal, TypeVar
 
 from rerun.experimental import ViewerClient, ViewerState
 
 from recorder.viewer.canvas import PICTURE, SIMULATED
 from recorder.viewer.page import Page
+from rig.closing import Closing
 from rig.errors import InputError, Words
 
 Kind = Literal["native", "web", "headless"]
@@ -70,7 +71,7 @@ class WindowError(RuntimeError):
     """The viewer could not be started, or it went away."""
 
 
-class Window:
+class Window(Closing):
     """A running rerun viewer, or the server of one.
 
     Attributes:
@@ -229,12 +230,6 @@ class Window:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait(_ENDED_S)
         self._output.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _wait_for(self, port: int) -> None:
         for _ in self._while_it_runs(_READY_S, 0.05):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import io
+import os
 import sys
 
 from rig.cli import signals
@@ -21,6 +22,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def entry() -> None:
     """Run the command as a process of its own."""
+    # Matrices here are thin: threads of BLAS that wait for each other take half of the processor's time and give
+    # nothing back, and what they sum depends on how many there are.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signals.listen()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -101,6 +101,22 @@ def test_records_to_the_end_of_the_stream(path):
     assert progress[-1].lost == 0
 
 
+@pytest.mark.parametrize(("status", "short", "reason"), [(True, 0, "completed"), (False, 0, "late"), (True, 1, "late")])
+def test_the_last_status_ends_it_where_all_rows_are_there_and_only_there(path, status, short, reason):
+    client = ScriptedClient()
+    *items, _ = stream(3)
+    end = {"event": "end", "tick": 30_000, "time_s": 0.03, "reason": "completed", "rows": {PROBES: 600 + short}}
+    items.append((EVENTS, encode_document(end)))
+    if status:
+        items.append((STATUS, encode_document({"tick": 30_000, "time_s": 0.03, "state": "ended"})))
+    session = RecordingSession(client, path, monotonic_s=lambda: 0.0)  # no silence lasts where time stands still
+    late = threading.Timer(0.3 if reason == "late" else 10.0, session.stop, ["late"])
+    late.start()
+    summary = record(session, client, play(client, items))
+    late.cancel()
+    assert (summary.reason, summary.rows[PROBES]) == (reason, 600)
+
+
 def test_over_the_memory_transport(path):
     server = MemoryServer()
     for key, document in documents().items():

@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from drivers.can.bus.model import BusModel, warm_up
 from drivers.can.bus.results import OUTCOMES
 from drivers.health import Guard, Rising
 from rig import wire
+from rig.closing import Closing
 from rig.errors import InputError
 from rig.outside import check
 from rig.transport.limit import Bucket
@@ -59,7 +60,7 @@ acknowledge slot); other outcomes are the sender's affair."""
 _CONTROLLER_STATES = (codec.ACTIVE_AGAIN, codec.TRANSMIT_PASSIVE)
 
 
-class Hub:
+class Hub(Closing):
     """The one owner of a channel's bus.
 
     Args:
@@ -139,12 +140,9 @@ class Hub:
         for local in locals_:
             self._guard(local.lost)
 
-    def __enter__(self) -> Hub:
+    def __enter__(self) -> Self:
         self.start()
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # Endpoints.
 

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import pydantic
 
@@ -27,6 +27,7 @@ from drivers.can.signals import EventKind, State
 from drivers.health import Guard, Rising
 from rig import wire
 from rig.channels import ChannelTable
+from rig.closing import Closing
 from rig.intake import block_end_in
 from rig.outside import DOCUMENT_BYTES, Outside, check, input_error
 from rig.transport import Client
@@ -66,7 +67,7 @@ class _Told(Outside, extra="ignore"):
     blocks: list[_Stretch] = pydantic.Field(default=[])
 
 
-class Gateway:
+class Gateway(Closing):
     """Sends what a rig publishes as CAN messages, and gives it the commands that come from the bus.
 
     Args:
@@ -171,26 +172,19 @@ class Gateway:
         for thread in self._threads:
             thread.start()
 
-    def close(self, *, timeout_s: float = 2.0) -> None:
-        """Send what is still due, then end.
-
-        Args:
-            timeout_s: How long that may take [s].
-        """
+    def close(self) -> None:
+        """Send what is still due, then end."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
         self.commands.close()
         for thread in self._threads:
             if thread.is_alive():
-                thread.join(timeout=timeout_s)
+                thread.join(timeout=2.0)
 
-    def __enter__(self) -> Gateway:
+    def __enter__(self) -> Self:
         self.start()
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def figures(self) -> dict[str, float]:
         """Counts for the rig's status."""

@@ -281,7 +281,7 @@ def spin_kept(constants: Constants) -> float:
     return shaft.polar_inertia / (shaft.polar_inertia + pivoted_mass(constants) * shaft.radius**2)
 
 
-def slips_to_rolling(whirls_hz: tuple[float, ...] = (12.0, 20.0, 40.0), *, spin_hz: float = 6.2) -> list[Slip]:
+def slips_to_rolling() -> list[Slip]:
     """From a sliding whirl to rolling: simulated, and by closed form.
 
     m r w' = mu N with N = m r (w^2 - w_n^2), so the time is an integral of dw / (mu (w^2 - w_n^2)), elementary; the
@@ -290,9 +290,9 @@ def slips_to_rolling(whirls_hz: tuple[float, ...] = (12.0, 20.0, 40.0), *, spin_
     constants = bare_rig(0.25)
     constants = constants._replace(magnet=constants.magnet._replace(damping_x=0.0, damping_y=0.0), torque_gain=0.0)
     own, r0, radius = oscillator(constants), constants.contact.clearance, constants.shaft.radius
-    spin, kept, mu = 2.0 * math.pi * spin_hz, spin_kept(constants), constants.contact.friction
+    spin, kept, mu = 2.0 * math.pi * 6.2, spin_kept(constants), constants.contact.friction
     found = []
-    for whirl_hz in whirls_hz:
+    for whirl_hz in (12.0, 20.0, 40.0):
         begin = 2.0 * math.pi * whirl_hz
         # Its whirl adds to what friction gives: I_zz spin + m R_S v is kept.
         after = kept + (1.0 - kept) * r0 * begin / (radius * spin)

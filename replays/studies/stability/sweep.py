@@ -46,7 +46,6 @@ def sweep(
     engines: list[str],
     folder: Path | None = None,
     run: Callable[[Task], Run] | None = None,
-    limit_s: float = _LIMIT_S,
 ) -> Iterator[Row]:
     """Scenes as they are measured, those that are in the folder's journal first.
 
@@ -56,7 +55,6 @@ def sweep(
         engines: Engines under test.
         folder: Where the journal is kept; None for none.
         run: Does a run; None for a process of its own.
-        limit_s: Processor time of a run [s].
 
     Raises:
         InputError: The folder cannot be written.
@@ -74,7 +72,7 @@ def sweep(
     stamp = {"code": code, "commit": commit(), "machine": machine()}
     with Worker() as worker:
         for number in missing:
-            found = measure(draw_scene(seed, number), engines, run or worker.run, limit_s=limit_s)
+            found = measure(draw_scene(seed, number), engines, run or worker.run, limit_s=_LIMIT_S)
             row = {"seed": seed, "number": number, **found, **stamp}
             if journal is not None:
                 journal.add(row)
