@@ -425,11 +425,11 @@ class ZenohClient(Closing):
         """Ask the rig and return its reply.
 
         Raises:
-            NoReplyError: Nobody answered in time, or the answer is that the rig failed to make one.
+            NoReplyError: Nobody answered in time, the rig went meanwhile, or it says that it failed to make an answer.
         """
         import zenoh
 
-        deadline = time.monotonic() + timeout_s
+        deadline, asked = time.monotonic() + timeout_s, self._linked()
         while True:
             replies: Iterator[Any] = self._session.session.get(
                 key,
@@ -446,6 +446,9 @@ class ZenohClient(Closing):
                     return payload_back
                 if (text := payload_back.decode(errors="replace")) != "Timeout":
                     raise NoReplyError(f"the rig at {self.endpoint} could not answer {key}: {text}")
+            if asked and not asked & self._linked():
+                # It may have done what it was asked for, so that another that starts there is not asked again.
+                raise NoReplyError(f"the rig at {self.endpoint} has gone, and has not answered {key}")
             # Without a rig the reply is empty at once: it may be about to start. So it is where the rig denies this.
             late = time.monotonic() + 0.05 >= deadline
             role = None if self._holder is None else self._holder.name
