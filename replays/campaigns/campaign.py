@@ -17,9 +17,10 @@ from pydantic import Field, FiniteFloat
 
 from replays.campaigns.bench import BenchSettings, Pace
 from replays.campaigns.device import PLACES, check_program
-from replays.campaigns.expectation import KINDS, Expect, Time, Units
+from replays.campaigns.expectation import KINDS, Expect
 from replays.campaigns.lines import line_of, lines_of
 from replays.campaigns.measurement import split_quantity
+from replays.campaigns.seen import Time, Units
 from rig import units
 from rig.commands import COMMANDS, FaultCommand, TimedCommand, check_command
 from rig.errors import InputError, UnknownNameError, Words

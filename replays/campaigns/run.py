@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from replays.campaigns.bench import NotThereError
-from replays.campaigns.expectation import EventOf, Seen
+from replays.campaigns.expectation import EventOf
 from replays.campaigns.measurement import Measurement, Must
+from replays.campaigns.seen import Seen
 from rig.commands import ClearCommand, FaultCommand, HammerCommand, SpeedCommand, TimedCommand
 from rig.errors import RefusedError
 

@@ -90,8 +90,7 @@ class ZenohServer(Closing):
         host, port = place_to_listen(endpoint, field="listen")
         self.endpoint = f"{host}:{port}"
         self._ports = {port}
-        locators = [locator(host, port)]
-        settings: dict[str, Any] = dict(_FROM_CLIENTS)
+        locators, settings = [locator(host, port)], dict[str, Any](_FROM_CLIENTS)
         if exposed is not None:
             host, port = parse_endpoint(exposed.endpoint, field="expose")
             self._ports.add(port)
@@ -285,8 +284,7 @@ class ZenohClient(Closing):
         return False
 
     def _from_rig(self, sample: Any) -> bool:
-        info = sample.source_info
-        return self._is_rigs(None if info is None else str(info.source_id.zid))
+        return self._is_rigs(None if (info := sample.source_info) is None else str(info.source_id.zid))
 
     def _open(self, wait_s: float) -> Session:
         import zenoh
@@ -435,8 +433,8 @@ class ZenohClient(Closing):
                 key,
                 payload=payload,
                 timeout=max(deadline - time.monotonic(), 0.01),
-                # Replies inherit both. One that waits for room in the queue of a stalled client would hold up all
-                # others and close the link after 5 s; and replies need not queue behind recovered blocks.
+                # Replies inherit both: one that waited for a stalled client would hold up all others, and close the link
+                # after 5 s; and replies need not queue behind recovered blocks.
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.INTERACTIVE_HIGH,
             )
@@ -450,8 +448,7 @@ class ZenohClient(Closing):
                 # It may have done what it was asked for, so that another that starts there is not asked again.
                 raise NoReplyError(f"the rig at {self.endpoint} has gone, and has not answered {key}")
             # Without a rig the reply is empty at once: it may be about to start. So it is where the rig denies this.
-            late = time.monotonic() + 0.05 >= deadline
-            role = None if self._holder is None else self._holder.name
+            late, role = time.monotonic() + 0.05 >= deadline, self._holder and self._holder.name
             denied = not allows(role, Verb.ASK, key)
             if (late or denied) and self.tokens(wire.ALIVE):
                 what = f"denies {key} to {role or 'everybody'}" if denied else f"does not answer {key}"

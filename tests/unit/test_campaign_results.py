@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.campaigns.expectation import KINDS, Seen
+from replays.campaigns.expectation import KINDS
 from replays.campaigns.measurement import Measurement, Must, measured
 from replays.campaigns.page import changes, make_page
 from replays.campaigns.picture import draw
 from replays.campaigns.results import load_results, write_junit
+from replays.campaigns.seen import Seen
 from replays.report import junit
 from rig.channels import default_table
 from rig.errors import InputError
@@ -117,6 +118,35 @@ def test_rows_that_have_to_be_missing_are_an_expectation(tmp_path: Path) -> None
     assert (scale.value, scale.good) == (0.0, True)
     absent = one(session, score="gain", channel="disk_x", file="daq.parquet", must="-1 to 1 ppm")
     assert (absent.good, absent.note) == (False, "nothing of it is shown")
+
+
+def test_all_asks_for_every_channel_and_row_that_was_sent_but_for_what_is_granted(tmp_path: Path) -> None:
+    counts = counts_of("probes", np.cumsum(np.random.default_rng(1).normal(size=(4000, 4)), axis=0) * 1e-3, None)
+    session = Seen(Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts})), tmp_path)
+    names, times_s = default_table().groups["probes"].names, np.arange(4000) / 20_000
+
+    def told(rows: slice, columns: list[str], **more: Any) -> tuple[bool, str]:
+        file = write_parquet(
+            tmp_path / f"{rows}{columns}.parquet",
+            {"time_s": times_s[rows], **dict(zip(columns, counts[rows].T, strict=False))},
+        )
+        made = one(session, score="all", file=file.name, **more)
+        return made.good, made.note
+
+    whole, part, half = slice(None), slice(1000, 3600), slice(None, None, 2)
+    assert told(whole, list(names))[0]
+    assert told(whole, list(names)[:3]) == (False, "ring_y is not in the file, or not found in it")
+    assert told(whole, list(names)[:3], channel=["disk_x", "ring_x"])[0]
+    good, note = told(whole, ["disk_y", "disk_x", *names[2:]])
+    assert (good, "mapping disk_y disk_x fail" in note) == (False, True)
+    assert told(half, list(names)) == (False, "row step of probes: 2, not 1")
+    assert told(half, list(names), every=2)[0]
+    assert told(part, list(names)) == (
+        False,
+        "rows before the first of probes: 1000; rows after the last of probes: 400",
+    )
+    assert told(part, list(names), begins_s=0.05, ends_s=0.01) == (False, "rows after the last of probes: 400")
+    assert told(part, list(names), begins_s=0.05, ends_s=0.02)[0]
 
 
 @pytest.mark.parametrize(("op", "limit", "value", "margin", "good"), [
