@@ -327,7 +327,7 @@ class Rig(Console):
                     yield from blocks.rows(end)
                     self.done(end.tick)
         except RefusedError as error:
-            if "a run that ended" not in str(error):
+            if wire.ENDED not in str(error):
                 raise
         except ConnectionError:
             if self.daq.ended is None:

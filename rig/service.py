@@ -389,7 +389,7 @@ class Service(ServedRun):
             self._desk.warn(text)
 
     def _end(self, reason: str) -> dict[str, Any]:
-        self._desk.close(f"a run that ended: {reason}", [*(each for _, each, _ in self._steps), *self._waiting])
+        self._desk.close(f"{wire.ENDED}: {reason}", [*(each for _, each, _ in self._steps), *self._waiting])
         self._end_event = self._event("end", self._simulation.tick, reason=reason)
         self._queue.close()
         if self._publisher.ident is not None:

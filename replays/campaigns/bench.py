@@ -253,7 +253,7 @@ class Bench(Closing):
             try:
                 reply = self._step(int(ticks))
             except RefusedError as error:
-                if "a run that ended: stopped" in str(error):
+                if f"{wire.ENDED}: stopped" in str(error):
                     return  # as a device may
                 raise BenchError(f"the rig does not go on: {error}") from None
             tick = reply.tick

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -256,20 +256,21 @@ class ExpectEvent(_Within):
         return asked(self.must, "1" if self.take == "count" else "s", where=where, of=self.label)
 
     @property
-    def _event(self) -> EventOf:
+    def of(self) -> EventOf:
+        """The event."""
         return EventOf(event=self.event, where=self.where, text=self.text)
 
     @property
     def label(self) -> str:
         """What is measured, in words."""
         what = "time" if self.must and self.take == "time" else "number"
-        return self.name or f"{what} of {self._event}"
+        return self.name or f"{what} of {self.of}"
 
     def measure(self, seen: Seen, units: Units) -> Iterator[Measurement]:
         """What the recording shows of it."""
         must = self.check(units, where="expect")
         to_s = math.inf if self.to_s is None else self.to_s
-        times_s = [each for each in self._event.times_s(seen) if self.from_s <= each < to_s]
+        times_s = [each for each in self.of.times_s(seen) if self.from_s <= each < to_s]
         if not self.must or self.take == "count":
             at_s = times_s[0] if times_s else None
             yield Measurement(self.label, float(len(times_s)), must, self.source, at_s=at_s)
@@ -278,7 +279,7 @@ class ExpectEvent(_Within):
         since_s = 0.0 if self.since is None else self.since.time_s(seen, units, from_s=self.from_s)
         # What it is counted from is what makes it come: what was there before that is another one.
         at_s = next((each for each in times_s if not each < since_s), math.nan)
-        note = "" if math.isfinite(at_s) else f"no {self._event} came"
+        note = "" if math.isfinite(at_s) else f"no {self.of} came"
         note = "what it is counted from never came" if math.isnan(since_s) else note
         value = math.nan
         if math.isfinite(at_s - since_s):
@@ -321,6 +322,15 @@ KINDS: dict[str, type[Expect]] = {
     "signal": ExpectSignal, "event": ExpectEvent, "order": ExpectOrder, "score": ExpectScore,
 }  # fmt: skip
 """What an expectation is about, by the key that says so."""
+
+
+def expected_events(expects: Iterable[Expect]) -> Iterator[EventOf]:
+    """Events that are expected, alone or in order."""
+    for expect in expects:
+        if isinstance(expect, ExpectOrder):
+            yield from expect.order
+        elif isinstance(expect, ExpectEvent) and expect.appears:
+            yield expect.of
 
 
 def _name(names: tuple[str, ...]) -> str:

@@ -433,7 +433,7 @@ class ZenohClient(Closing):
                 key,
                 payload=payload,
                 timeout=max(deadline - time.monotonic(), 0.01),
-                # Replies inherit both: one that waited for a stalled client would hold up all others, and close the link
+                # Replies inherit both: one that waited for a stalled client would hold up all others and close its link
                 # after 5 s; and replies need not queue behind recovered blocks.
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=zenoh.Priority.INTERACTIVE_HIGH,

@@ -5,20 +5,26 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from recorder.reader import Recording
+from replays.campaigns.bench import Target
+from replays.campaigns.campaign import load_campaign, shipped
 from replays.campaigns.expectation import KINDS
 from replays.campaigns.measurement import Measurement, Must, measured
 from replays.campaigns.page import changes, make_page
 from replays.campaigns.picture import draw
 from replays.campaigns.results import load_results, write_junit
+from replays.campaigns.run import end_device, measure_end
 from replays.campaigns.seen import Seen
+from replays.campaigns.trial import Trial
 from replays.report import junit
 from rig.channels import default_table
 from rig.errors import InputError
@@ -147,6 +153,39 @@ def test_all_asks_for_every_channel_and_row_that_was_sent_but_for_what_is_grante
     )
     assert told(part, list(names), begins_s=0.05, ends_s=0.01) == (False, "rows after the last of probes: 400")
     assert told(part, list(names), begins_s=0.05, ends_s=0.02)[0]
+
+
+def test_a_run_that_is_stopped_before_the_case_is_over_fails_unless_that_is_expected(tmp_path: Path) -> None:
+    stop = {"event": "command", "command": "stop", "from": "guard", "tick": 10_000, "time_s": 0.01}
+    end = {"event": "end", "reason": "stopped", "tick": 10_000, "time_s": 0.01}
+    counts = counts_of("probes", np.zeros((200, 4)), None)
+    recording = Recording.open(write_session(tmp_path / "sent.mcap", {"probes": counts}))
+    case = next(iter(load_campaign(shipped()["hammer"]).cases))
+
+    def told(*events: dict[str, Any], **expected: Any) -> list[str]:
+        trial, session = Trial("a", folder=tmp_path), Seen(recording, tmp_path)
+        session.events = [(event["time_s"], event) for event in events]
+        expects = (check(KINDS["event"], expected, field=""),) if expected else ()
+        measure_end(session, trial, replace(case, duration_s=0.5, expects=expects))
+        return [each.line for each in trial.measurements]
+
+    (line,) = told(stop, end)
+    assert line == (
+        "end of the run must be >= 0.5 s; instead received 0.01 s (stopped by guard, before the case was over)"
+        " [margin -0.49 s]"
+    )
+    assert told(stop, end, event="note") == [line]
+    assert told(stop, end, event="end") == told(stop, end, event="command", where={"command": "stop"}) == []
+    assert told({**end, "reason": "completed"}) == told({**end, "time_s": 0.5}) == told() == []
+
+
+def test_a_device_that_has_to_be_killed_fails_and_one_that_ends_when_it_is_told_to_does_not(tmp_path: Path) -> None:
+    for status, notes in ((137, ["it had to be killed: it did not end within 5 s of a SIGTERM"]), (143, []), (0, [])):
+        program = SimpleNamespace(status=None, last_line="", end=lambda: None)
+        program.end = lambda program=program, status=status: setattr(program, "status", status)
+        trial = Trial("a", folder=tmp_path, target=Target(url="zenoh:elsewhere"))
+        end_device(cast("Any", SimpleNamespace(name="guard", program=program)), trial)
+        assert [each.note for each in trial.measurements if not each.good] == notes
 
 
 @pytest.mark.parametrize(("op", "limit", "value", "margin", "good"), [
