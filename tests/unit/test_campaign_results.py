@@ -307,7 +307,8 @@ def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> No
     make_page(now, tmp_path, then).write(tmp_path / "index.html")
     page = (tmp_path / "index.html").read_text(encoding="utf-8")
     order = (
-        "1 failed, 1 error, 1 skipped, 1 passed.", "</a>: no rig</li>", "failed: x.campaign.toml::bad</h2>", "it is 1.25 mm", "<img",
+        "1 failed, 1 error, 1 skipped, 1 passed.", "</a>: no rig</li>", "failed: x.campaign.toml::bad</h2>",
+        "it is 1.25 mm", "<img",
         "rig campaign x.campaign.toml::bad", "Against the earlier campaign</h2>", "Measurements</h2>", "median 0.3 ms",
     )  # fmt: skip
     places = [page.index(words) for words in order]

@@ -188,6 +188,7 @@ def test_a_stop_does_not_wait_for_devices() -> None:
         ("join", {"device": "a"}, "join.device must be a name under which no other device has joined; instead"),
         ("join", {"device": "b", "patience_s": 0}, "join.patience_s must be greater than 0"),
         ("join", {"device": "b\n"}, "join.device must be a line of 1 to 100 printable characters"),
+        ("join", {"device": "  "}, "join.device must be a line of 1 to 100 printable characters, not all blank"),
         ("join", {}, "join.device must be given"),
         ("done", {"device": "b", "tick": 0}, "done.device must be one that has joined; instead received 'b'"),
         ("done", {"device": "a", "tick": -1}, "done.tick must be greater than or equal to 0"),
