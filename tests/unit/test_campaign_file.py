@@ -114,7 +114,7 @@ WRONG = {
     "unknown place": (
         HEAD + '[device]\ncommand = "python -m json.tool {danger}"\n' + PEAK,
         4,
-        "with names of [limits] or [matrix.device] between braces, such as url, can, name, folder; instead",
+        "with names of [limits] or [matrix.device] between braces, such as",
     ),
     "misspelt place": (
         HEAD + '[limits]\ndanger = "2 mm"\n' + PEAK.replace("2 mm", "{dangr}"),
