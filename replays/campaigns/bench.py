@@ -97,6 +97,18 @@ class BenchSettings:
         }  # fmt: skip
 
 
+def check_replay(path: Path) -> None:
+    """Refuse what no campaign is run on, before anything runs.
+
+    Raises:
+        InputError: It is no recording, or was cut off: what is not in it would be taken for what did not happen.
+    """
+    from recorder.reader import Recording
+
+    if not Recording.open(path).complete:
+        raise InputError("--replay", "a recording that was finished", Words(f"{path}, which was cut off"))
+
+
 class Bench(Closing):
     """A bench that is there; close it, or use it as a context manager.
 

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 from recorder.reader import Recording
-from replays.campaigns.bench import Target
+from replays.campaigns.bench import Target, check_replay
 from replays.campaigns.campaign import load_campaign, shipped
 from replays.campaigns.expectation import KINDS
 from replays.campaigns.measurement import Measurement, Must, measured
 from replays.campaigns.page import changes, make_page
 from replays.campaigns.picture import draw
-from replays.campaigns.results import load_results, write_junit
+from replays.campaigns.results import Results, load_results, write_junit
 from replays.campaigns.run import end_device, measure_end
 from replays.campaigns.seen import Seen
 from replays.campaigns.trial import Trial
@@ -313,6 +313,23 @@ def test_the_page_says_first_what_failed_then_what_changed(tmp_path: Path) -> No
     )  # fmt: skip
     places = [page.index(words) for words in order]
     assert places == sorted(places)
+
+
+def test_a_recording_that_was_cut_off_is_no_bench(tmp_path: Path) -> None:
+    data, half = (ROOT / "replays/sessions/hammer-6.2.mcap").read_bytes(), tmp_path / "half.mcap"
+    half.write_bytes(data[: len(data) // 2])
+    check_replay(ROOT / "replays/sessions/hammer-6.2.mcap")
+    with pytest.raises(InputError, match=r"^--replay must be a recording that was finished; instead.*half.mcap, which"):
+        check_replay(half)
+
+
+def test_two_campaigns_do_not_write_into_one_folder(tmp_path: Path) -> None:
+    config = cast("Any", SimpleNamespace())
+    first = Results(tmp_path / "out", None, config)
+    with pytest.raises(InputError, match="^--output must be a folder that no other campaign writes to now; instead"):
+        Results(tmp_path / "out", None, config)
+    first.pytest_sessionfinish(cast("Any", None))
+    Results(tmp_path / "out", None, config).pytest_sessionfinish(cast("Any", None))
 
 
 def test_results_that_are_none_are_told(tmp_path: Path) -> None:
