@@ -326,7 +326,7 @@ def test_a_recording_that_was_cut_off_is_no_bench(tmp_path: Path) -> None:
 def test_two_campaigns_do_not_write_into_one_folder(tmp_path: Path) -> None:
     config = cast("Any", SimpleNamespace())
     first = Results(tmp_path / "out", None, config)
-    with pytest.raises(InputError, match="^--output must be a folder that no other campaign writes to now; instead"):
+    with pytest.raises(InputError, match=r"^--output must be a folder that no other campaign writes to now; instead"):
         Results(tmp_path / "out", None, config)
     first.pytest_sessionfinish(cast("Any", None))
     Results(tmp_path / "out", None, config).pytest_sessionfinish(cast("Any", None))
