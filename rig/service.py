@@ -43,6 +43,8 @@ _HELD_S = 0.1
 """How long devices are waited for at a time, where none of them must be put out sooner [s]."""
 _WAITING = 256
 """Commands that may wait for other devices."""
+_ANY_HZ = 1e9
+"""Commands a second of one sender in lockstep: any."""
 _HELD_UP_S = 1.0
 """Blocks that wait to be published for longer than this are told [s]."""
 
@@ -79,7 +81,7 @@ class Service(ServedRun):
             with one client that stalls in the middle of its recovery.
         status_period_s: Wall time between status messages [s].
         linger_s: At the end of a run, wait at most this long [s] until clients have recovered what they missed.
-        limit: How many commands a second are taken.
+        limit: How many commands a second are taken; in lockstep any unless given.
 
     Raises:
         InputError: `block_ticks` does not fit the simulation.
@@ -111,7 +113,8 @@ class Service(ServedRun):
             },
             running="the rig runs",
             linger_s=linger_s,
-            limit=limit,
+            # In lockstep nobody is held up by many, and none may be refused by the clock on the wall.
+            limit=limit or (CommandLimit(_ANY_HZ) if isinstance(clock, Lockstep) else None),
         )
         simulation.serve(tuple(doors_of(server)))
         self._simulation = simulation

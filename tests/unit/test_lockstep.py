@@ -283,3 +283,8 @@ def test_a_stop_refuses_what_waits_for_others() -> None:
         speed.join(20.0)
     assert len(caught) == 2
     assert all("a run that ended: stopped" in each for each in caught)
+
+
+def test_in_lockstep_no_command_is_refused_by_the_clock_on_the_wall() -> None:
+    with running() as rig:
+        assert [rig.console.note("again").id for _ in range(1000)] == list(range(1, 1001))
